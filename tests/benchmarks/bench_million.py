@@ -1,7 +1,8 @@
 """What requests cost in a PostgreSQL database with 200 surrogates, a million samples and 1,000 open sessions.
 
 A server of its own answers one client over HTTP, while two owners renew and record the sessions, as
-hosts of a cluster do.
+hosts of a cluster do. The times of pages of 1,000 samples are divided as in ``bench_samples_page.py``, which shows what
+their slowest hundredth waits for.
 The plan of each statement is written to a file.
 """
 
@@ -13,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import httpx
 import sqlalchemy as sa
+from bench_samples_page import request, show, summary
 from common import parser, started, write
 
 from support.million import APART, FIRST, fill
@@ -80,6 +83,13 @@ class Hosts(threading.Thread):
             self.ending.wait(max(0.0, 2.0 - (time.perf_counter() - begun)))
 
 
+def page_of(names: list[str], samples: int, limit: int) -> str:
+    """The path of a page somewhere in the samples of one of the surrogates."""
+    number = random.randrange(len(names))
+    after = APART * number + 1_000 + random.randrange(max(1, samples // len(names) - limit))
+    return f"/v1/surrogates/{names[number]}/samples?limit={limit}&after={after}"
+
+
 def requests(client: httpx.Client, names: list[str], samples: int, count: int) -> dict[str, dict[str, float]]:
     """The times of each kind of request."""
 
@@ -88,11 +98,6 @@ def requests(client: httpx.Client, names: list[str], samples: int, count: int) -
 
     def name() -> str:
         return random.choice(names)
-
-    def page(limit: int) -> str:
-        number = random.randrange(len(names))
-        after = APART * number + 1_000 + random.randrange(max(1, samples // len(names) - limit))
-        return f"/v1/surrogates/{names[number]}/samples?limit={limit}&after={after}"
 
     def claim_and_answer() -> None:
         chosen = name()
@@ -121,8 +126,8 @@ def requests(client: httpx.Client, names: list[str], samples: int, count: int) -
         "list of surrogates": lambda: "/v1/surrogates",
         "page of 100 surrogates": lambda: "/v1/surrogates?limit=100",
         "one surrogate": lambda: f"/v1/surrogates/{name()}",
-        "page of 1,000 samples": lambda: page(1_000),
-        "page of 100 samples": lambda: page(100),
+        "page of 1,000 samples": lambda: page_of(names, samples, 1_000),
+        "page of 100 samples": lambda: page_of(names, samples, 100),
         "metrics": lambda: "/metrics",
         "readiness": lambda: "/readyz",
     }
@@ -202,17 +207,21 @@ def main() -> None:
             httpx.Client(base_url=server.url, timeout=120) as client,
         ):
             report = requests(client, names, samples, count)
+            path = partial(page_of, names, samples, 1_000)
+            pages = [request(client, server.process.pid, postgresql.pid, path) for _ in range(5 * count)]
+            parts = {f"{len(pages):,} pages": summary(pages)}
         report |= of_storage(storage, names, max(10, count // 4))
         hosts.ending.set()
         hosts.join()
         report |= {"renewal of half of the sessions": quantiles(hosts.renewals), "checkpoint": quantiles(hosts.records)}
         for what, figures in report.items():
             print(f"{what:34}" + "  ".join(f"{key} {value:8.1f}" for key, value in figures.items()))
+        show("ms of a page of 1,000 samples", parts)
         told = plans(url, names)
         storage.close()
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "million-plans.txt").write_text("\n\n".join(told))
-    write(options.out, "million", {"requests": report})
+    write(options.out, "million", {"requests": report, "pages": parts})
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -141,13 +140,16 @@ def measured(database: str, postmaster: int | None, counts: Sequence[int], windo
 
 
 def main() -> None:
-    options = started(parser(__doc__))
+    made = parser(__doc__)
+    made.add_argument("--database", choices=("SQLite", "PostgreSQL"), help="only this one")
+    options = started(made)
     counts, window = (QUICK_COUNTS, QUICK_WINDOW) if options.quick else (COUNTS, WINDOW)
-    with ExitStack() as stack:
-        report = {"SQLite": measured("", None, counts, window)}
-        postgresql = stack.enter_context(running_postgresql())
-        postmaster = postgresql.pid
-        report["PostgreSQL"] = measured(postgresql.new_database(), postmaster, counts, window)
+    report = {}
+    if options.database != "PostgreSQL":
+        report["SQLite"] = measured("", None, counts, window)
+    if options.database != "SQLite":
+        with running_postgresql() as postgresql:
+            report["PostgreSQL"] = measured(postgresql.new_database(), postgresql.pid, counts, window)
     write(options.out, "samplers", report)
 
 

@@ -14,7 +14,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -38,10 +38,11 @@ WHO = ("server", "PostgreSQL", "client")
 
 
 def ran_and_waited(pid: int) -> np.ndarray:
-    """Milliseconds for which the threads of a process ran, and for which they waited for a core."""
+    """Milliseconds for which the threads of a process ran, and for which they waited for a core; 0 if it has ended."""
     found = np.zeros(2)
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        found += np.array((task / "schedstat").read_text().split()[:2], dtype=float) / 1e6
+    with suppress(FileNotFoundError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            found += np.array((task / "schedstat").read_text().split()[:2], dtype=float) / 1e6
     return found
 
 
@@ -49,18 +50,16 @@ def children(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
-def request(client: httpx.Client, server: int, postmaster: int, after: Callable[[], int]) -> list[float]:
+def request(client: httpx.Client, server: int, postmaster: int, path: Callable[[], str]) -> list[float]:
     """Milliseconds of one page, and for which each of ``WHO`` ran and waited."""
     backends = children(postmaster)
-
-    def counts() -> np.ndarray:
-        database = sum((ran_and_waited(pid) for pid in backends), np.zeros(2))
-        return np.stack([ran_and_waited(server), database, ran_and_waited(os.getpid())])
-
-    before, begun = counts(), time.perf_counter()
-    client.get(f"/v1/surrogates/{FIRST}/samples", params={"limit": PAGE, "after": after()}).raise_for_status()
+    before = {pid: ran_and_waited(pid) for pid in (server, *backends, os.getpid())}
+    begun = time.perf_counter()
+    client.get(path()).raise_for_status()
     seconds = time.perf_counter() - begun
-    return [1e3 * seconds, *(counts() - before).ravel()]
+    since = {pid: np.maximum(ran_and_waited(pid) - counts, 0.0) for pid, counts in before.items()}
+    database = sum((since[pid] for pid in backends), np.zeros(2))
+    return [1e3 * seconds, *since[server], *database, *since[os.getpid()]]
 
 
 def summary(rows: Sequence[Sequence[float]]) -> dict[str, float]:
@@ -121,6 +120,10 @@ def in_process(url: str, after: Callable[[], int], rounds: int) -> dict[str, dic
 
 def over_http(url: str, postmaster: int, after: Callable[[], int], rounds: int) -> dict[str, dict[str, float]]:
     """Milliseconds of a page from a server with each threshold."""
+
+    def path() -> str:
+        return f"/v1/surrogates/{FIRST}/samples?limit={PAGE}&after={after()}"
+
     with ExitStack() as stack:
         ways = {}
         for name, threshold in THRESHOLDS.items():
@@ -129,7 +132,7 @@ def over_http(url: str, postmaster: int, after: Callable[[], int], rounds: int) 
             server = start_server(folder, "--log-level", "warning", "--database", url, program=program)
             stack.callback(server.stop)
             client = stack.enter_context(httpx.Client(base_url=server.url, timeout=120))
-            ways[name] = partial(request, client, server.process.pid, postmaster, after)
+            ways[name] = partial(request, client, server.process.pid, postmaster, path)
         for way in ways.values():
             way()
         rows: dict[str, list[list[float]]] = {name: [] for name in ways}

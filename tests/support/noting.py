@@ -150,8 +150,8 @@ class NotingSamplers:
 
     def in_a_step(self) -> list[Path]:
         """Those that have begun a step which is not acknowledged yet: they hold a lease."""
-        read = ((path, path.read_text().rpartition("\n")[0].rpartition("\n")[2]) for path in self.working)
-        return [path for path, last in read if last.startswith('{"begun"')]
+        noted = {path: self.notes_in(path) for path in self.working}
+        return [path for path, notes in noted.items() if len(notes.begun) > len(notes.acknowledged)]
 
     def signal(self, path: Path, number: int) -> None:
         os.kill(self.working[path].pid, number)
@@ -173,7 +173,7 @@ class NotingSamplers:
 
     def notes_in(self, *paths: Path) -> Notes:
         """Those of some samplers."""
-        lines = [json.loads(line) for path in paths for line in path.read_text().splitlines()]
+        lines = [json.loads(line) for path in paths for line in path.read_text().rpartition("\n")[0].splitlines()]
         return Notes(
             [tuple(line["begun"]) for line in lines if "begun" in line],
             {line["id"]: tuple(line["sample"]) for line in lines if "id" in line},

@@ -26,7 +26,7 @@ from surrogym_client.cli.sampling_on_ray import RayOptions
 
 if TYPE_CHECKING:
     from surrogym_client.sampler.on_ray import Line, SamplerPlan
-    from surrogym_client.sampler.worker import Outcome, SamplerReport, SamplerSettings
+    from surrogym_client.sampler.settings import Outcome, SamplerReport, SamplerSettings
     from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import Phase, Query
@@ -110,8 +110,8 @@ def command(
     """
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_client.sampler.on_ray import SamplerPlan
+    from surrogym_client.sampler.settings import SamplerSettings, worker_name
     from surrogym_client.sampler.snapshots import Bounds
-    from surrogym_client.sampler.worker import SamplerSettings, worker_name
 
     cluster.require_fit(worker_limits=once or max_queries is not None)
     if exit_with_parent:

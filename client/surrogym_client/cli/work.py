@@ -72,7 +72,7 @@ def command(
     """
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
-    from surrogym_client.sampler.worker import worker_name
+    from surrogym_client.sampler.settings import worker_name
     from surrogym_client.work.worker import Worker, WorkerSettings
     from surrogym_shared.terminal import on_interrupt, progress, say
 

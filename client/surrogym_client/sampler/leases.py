@@ -15,7 +15,7 @@ from surrogym_client.transport.connection import Retries
 from surrogym_shared.wire import Query
 
 AWAY = (ServerUnreachable, Unavailable)
-ONE_ATTEMPT = Retries(seconds=0)  # for a renewal, because the next renewal repeats it
+ONE_ATTEMPT = Retries(seconds=0)  # for requests that are repeated anyway
 NEARLY_OVER = 0.1  # remaining share of a lease that counts as nearly over
 
 

@@ -15,7 +15,8 @@ from uuid import uuid4
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.original.errors import OriginalError
 from surrogym_client.original.loading import isolated
-from surrogym_client.sampler.worker import Outcome, Sampler, SamplerReport, SamplerSettings
+from surrogym_client.sampler.settings import Outcome, SamplerReport, SamplerSettings
+from surrogym_client.sampler.worker import Sampler
 from surrogym_client.transport.api import Api
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import Query

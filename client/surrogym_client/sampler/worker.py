@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import socket
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypeVar, get_args
+from typing import TypeVar, get_args
 
 import numpy as np
 
@@ -25,11 +23,13 @@ from surrogym_client.original.protocol import (
 )
 from surrogym_client.original.rollouts import answering
 from surrogym_client.sampler.failures import Failures
-from surrogym_client.sampler.leases import AWAY, LeaseEnded, Leases
+from surrogym_client.sampler.leases import AWAY, ONE_ATTEMPT, LeaseEnded, Leases
+from surrogym_client.sampler.pipeline import Pipeline
 from surrogym_client.sampler.query_limits import check_environment, check_query
 from surrogym_client.sampler.returning import Returning
 from surrogym_client.sampler.sample_conversion import reset_seed, sample_of
-from surrogym_client.sampler.snapshots import Bounds, SnapshotFolder
+from surrogym_client.sampler.settings import Outcome, SamplerReport, SamplerSettings
+from surrogym_client.sampler.snapshots import SnapshotFolder
 from surrogym_client.surrogates.phases import ENDED
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import Retries
@@ -45,57 +45,28 @@ MOST_GONE = 1_000  # snapshots that one request reports as gone
 STOPPED = "the sampler was stopped"
 
 T = TypeVar("T")
-Outcome = Literal["answered", "failed", "dropped", "refused", "impossible"]
-
-
-def worker_name() -> str:
-    """Return a name that distinguishes this sampler from others in the ledger."""
-    return f"{socket.gethostname()}-{os.getpid()}"[:128]
 
 
 @dataclass(frozen=True)
-class SamplerSettings:
-    """Settings of a sampler.
+class _Answer:
+    """The real steps of a query. ``outcome``: if there are none."""
 
-    ``batch``: queries to claim at once. ``until_done``: stop when the design is ready or over its budget. ``once``:
-    stop after the first claim that returns queries. ``max_queries`` and ``time_limit`` (seconds): begin no query beyond
-    either of them. ``snapshots``: folder that keeps the surrogate's snapshots; None: they end with the sampler.
-    ``bounds``: of their number and size.
-    """
+    query: Query
+    taken: list[NewSample]
+    outcome: Outcome
+    error: str
 
-    name: str = field(default_factory=worker_name)
-    batch: int = 4
-    wait_seconds: float = 20.0
-    lease_seconds: float = 60.0
-    once: bool = False
-    until_done: bool = False
-    max_queries: int | None = None
-    time_limit: float | None = None
-    snapshots: Path | None = None
-    bounds: Bounds = field(default_factory=Bounds)
-
-
-@dataclass(frozen=True)
-class SamplerReport:
-    """Result of a sampler's run.
-
-    ``dropped`` counts queries whose lease ended before a real step, ``refused`` those that the environment's own
-    specification does not allow, ``impossible`` those whose snapshot can't be used. ``phase`` is the
-    design's last known phase.
-    """
-
-    answered: int
-    failed: int
-    dropped: int
-    refused: int
-    impossible: int
-    steps: int  # real steps that were sent
-    seconds: float
-    phase: Phase | None
+    @property
+    def clean(self) -> bool:
+        return bool(self.taken) and not self.error
 
 
 class Sampler:
     """Answers the queries of one surrogate with real steps.
+
+    While the environment steps, the sampler sends the answer of the query before and claims the one after. So the
+    environment waits for no request, as long as all answers are accepted. At most one query that it has stepped is not
+    acknowledged yet. A query is claimed shortly before the running step ends, and goes back if the step takes longer.
 
     If a step fails, its query is returned with the error; in a rollout, the steps before it are the answer. If the
     server does not answer, the sampler waits and keeps its samples.
@@ -146,7 +117,9 @@ class Sampler:
         self._spec: EnvironmentSpec
         self._own: EnvironmentSpec
         self._leases: Leases
+        self._pipeline = Pipeline(self._settle, self._return)
         self._started = time.monotonic()
+        self._broken_off = False  # by an error or Ctrl-C
         self._stopping = False  # not an Event, because a signal handler that sets one can deadlock
 
     def stop(self) -> None:
@@ -166,25 +139,32 @@ class Sampler:
             UnknownEnvironment: the environment can't be made, or does not fit the surrogate.
             MachineFails: the machine failed at several queries in a row.
         """
-        self._started = time.monotonic()
+        self._started, self._broken_off = time.monotonic(), False
         self._check()
         leases = Leases(self._api, self._surrogate, self._settings.lease_seconds)
-        with self._snapshots() as self._returning, leases as self._leases:
+        with self._snapshots() as self._returning, leases as self._leases, closing(self._pipeline):
             self._report_gone()
-            while not self._stopped() and (limit := self._limit()) > 0:
-                try:
-                    claimed, since = self._patiently(partial(self._claim, limit))
-                except AWAY:
-                    if self._stopped():
-                        break
-                    raise
-                self._enter(claimed.phase)
-                self._work(claimed.queries, since)
-                if self._enough(claimed):
-                    break
-                if claimed.queries and self._none_allowed(claimed):
-                    self._pause(AGAIN_SECONDS)
+            try:
+                self._answer_all()
+            except BaseException:
+                self._broken_off = True  # the answer under way is sent all the same, though not with patience
+                raise
         return self.summary()
+
+    def _answer_all(self) -> None:
+        while not self._stopped() and (limit := self._limit()) > 0:
+            try:
+                claimed = self._pipeline.next() or self._patiently(partial(self._claim, limit, self._wait_seconds()))
+            except AWAY:
+                if self._stopped():
+                    break
+                raise
+            self._enter(claimed.phase)
+            self._work(claimed.queries)
+            if self._enough(claimed):
+                break
+            if claimed.queries and self._none_allowed(claimed):
+                self._pause(AGAIN_SECONDS)
 
     def summary(self) -> SamplerReport:
         """Return the report of the work so far."""
@@ -215,24 +195,29 @@ class Sampler:
             kept = SnapshotFolder(folder / self._surrogate, self._own, self._settings.bounds)
             yield Returning(self._environment, kept, known)
 
-    def _claim(self, limit: int) -> tuple[ClaimedQueries, float]:
-        """Claim queries. Returns them with the time of the claim on the leases' clock."""
+    def _wait_seconds(self) -> float:
+        """Seconds that a claim waits for queries."""
+        s = self._settings
+        if s.until_done and (self._phase is None or self._phase in ENDED):
+            return 0.0
+        return self._within_time(min(s.wait_seconds, END_SECONDS) if s.until_done else s.wait_seconds)
+
+    def _claim(self, limit: int, wait_seconds: float, retries: Retries | None = None) -> ClaimedQueries:
         s, since = self._settings, self._leases.clock()
-        waits = not (s.until_done and (self._phase is None or self._phase in ENDED))
-        left = self._within_time(min(s.wait_seconds, END_SECONDS) if s.until_done else s.wait_seconds)
         claimed = self._api.claim(
             self._surrogate,
             s.name,
             max_queries=limit,
-            wait_seconds=left if waits else 0.0,
+            wait_seconds=wait_seconds,
             lease_seconds=s.lease_seconds,
+            retries=retries,
         )
-        return claimed, since
+        self._leases.hold(claimed.queries, since)
+        return claimed
 
-    def _work(self, queries: list[Query], since: float) -> None:
+    def _work(self, queries: list[Query]) -> None:
         """Answer queries one by one. Queries that are left after Ctrl-C or the time limit are returned to the queue."""
         left, begun = list(queries), None
-        self._leases.hold(left, since)
         try:
             while left:
                 self._failures.check([query.id for query in left])
@@ -240,14 +225,28 @@ class Sampler:
                 if self._stopped() or self._out_of_time():
                     break
                 begun = left[0]
-                self._answer(begun)
-                self._leases.release(left.pop(0))
+                self._answer(begun, last=len(left) == 1)
+                left.pop(0)
         finally:
             for query in left:
                 self._leases.release(query)
                 self._give_back(query, STOPPED, begun=query is begun)
 
-    def _answer(self, query: Query) -> None:
+    def _return(self, claimed: ClaimedQueries) -> None:
+        """Return queries to the queue that were not begun."""
+        for query in claimed.queries:
+            self._leases.release(query)
+            self._give_back(query, STOPPED, begun=False)
+
+    def _answer(self, query: Query, *, last: bool) -> None:
+        """Take the real steps of a query, and send them. ``last``: the next query has to be claimed."""
+        flows = self._returning is None and not self._settings.once  # each step may drop a snapshot of a later query
+        ahead = self._limit(running=1) if flows and last else 0
+        claim = partial(self._claim, ahead, 0.0, ONE_ATTEMPT) if ahead > 0 else None
+        answer = self._pipeline.step(partial(self._step, query), claim)
+        self._pipeline.send(partial(self._deliver, answer), clean=flows and answer.clean, last=last)
+
+    def _step(self, query: Query) -> _Answer:
         taken: list[NewSample] = []
         error = ""
         outcome: Outcome = "failed"  # if no step was taken
@@ -266,16 +265,29 @@ class Sampler:
             error = f"{type(raised).__name__}: {raised}"
         except BaseException:  # Ctrl-C: real steps that were taken are reported all the same
             self._hand_in(taken)
+            self._steps += len(taken)
             raise
+        return _Answer(query, taken, outcome, error)
+
+    def _deliver(self, answer: _Answer) -> _Answer:
+        """Send the samples of an answer, or return its query. Returns the answer as the server took it."""
         try:
-            self._hand_in(taken)
+            self._hand_in(answer.taken)
         except InvalidInput as invalid:
-            taken, outcome, error = [], "failed", str(invalid)
-        if not taken:
-            begun = bool(error) and outcome == "failed"
-            self._patiently(lambda: self._give_back(query, error or STOPPED, begun=begun), LAST_SECONDS)
+            answer = replace(answer, taken=[], outcome="failed", error=str(invalid))
+        if not answer.taken:
+            begun = bool(answer.error) and answer.outcome == "failed"
+            give_back = partial(self._give_back, answer.query, answer.error or STOPPED, begun=begun)
+            self._patiently(give_back, LAST_SECONDS)
+        return answer
+
+    def _settle(self, answer: _Answer) -> bool:
+        """Count a query whose answer was acknowledged. Returns whether it has one."""
+        self._leases.release(answer.query)
+        self._steps += len(answer.taken)
         self._report_gone()
-        self._count(query, "answered" if taken else outcome, error)
+        self._count(answer.query, "answered" if answer.taken else answer.outcome, answer.error)
+        return answer.clean
 
     def _take(self, query: Query, taken: list[NewSample]) -> None:
         """Take the real steps of a query, and append each to ``taken`` as soon as it is done."""
@@ -314,7 +326,6 @@ class Sampler:
     def _hand_in(self, samples: list[NewSample]) -> None:
         if samples:
             self._patiently(lambda: self._api.add_samples(self._surrogate, self._settings.name, samples), LAST_SECONDS)
-            self._steps += len(samples)
 
     def _patiently(self, request: Callable[[], T], once_stopped: float = 0.0) -> T:
         """Repeat a request until the server and its storage answer. Every request here is safe to repeat.
@@ -339,7 +350,7 @@ class Sampler:
                     time.sleep(pause)
 
     def _stopped(self) -> bool:
-        return self._stopping
+        return self._stopping or self._broken_off
 
     def _pause(self, seconds: float) -> None:
         """Wait for ``seconds``, or until the sampler is stopped."""
@@ -366,13 +377,14 @@ class Sampler:
         if self._report is not None:
             self._report(query, outcome, error)
 
-    def _limit(self) -> int:
+    def _limit(self, running: int = 0) -> int:
         """Number of queries to claim next; 0 if it is time to stop. Dropped queries don't count, as others answer
-        them."""
+        them. ``running``: number of queries whose steps are taken meanwhile."""
         s = self._settings
         if self._out_of_time():
             return 0
-        return s.batch if s.max_queries is None else min(s.batch, s.max_queries - self._done)
+        begun = self._done + self._pipeline.under_way + running
+        return s.batch if s.max_queries is None else min(s.batch, s.max_queries - begun)
 
     @property
     def _done(self) -> int:

@@ -34,7 +34,8 @@ class Api:
 
     Every method raises a ``SurrogymClientError``: ``ServerUnreachable`` after the retry budget, or the subclass of
     ``ProblemError`` for the server's answer. Calls that must take effect only once carry an idempotency key, which is
-    made here if none is given, so a lost reply never doubles them.
+    made here if none is given, so a lost reply never doubles them. Samples of queries need none: their leases identify
+    them.
 
     Args:
         url: the server's address; default ``SURROGYM_URL``, then http://127.0.0.1:8000.
@@ -178,8 +179,10 @@ class Api:
         max_queries: int = 1,
         wait_seconds: float = 0.0,
         lease_seconds: float = 60.0,
+        retries: Retries | None = None,
     ) -> wire.ClaimedQueries:
         """Lease queries for a sampler, and wait up to ``wait_seconds`` until there are some. The list may be empty.
+        ``retries`` replaces the connection's.
 
         A claim whose reply is lost is not sent again. Its leases expire, and the queries return to the queue.
 
@@ -195,6 +198,7 @@ class Api:
             body,
             timeout=self.connection.timeouts.request + wait_seconds,
             repeatable=False,
+            retries=retries,
         )
         if len(claimed.queries) > max_queries:
             raise ProtocolMismatch(
@@ -285,9 +289,11 @@ class Api:
         A batch of up to about 300 samples is stored whole or not at all. A larger one is sent in several requests, so
         an error may leave its first part stored; the same call with the same key then adds the rest.
         """
-        key = idempotency_key or new_key()
         batches = _batches(samples)
-        keys: list[str | None] = [key] if len(batches) == 1 else [f"{key}/{number}" for number in range(len(batches))]
+        keys: list[str | None] = [None] * len(batches)
+        if idempotency_key or any(sample.query_id is None for sample in samples):  # otherwise leases identify them
+            key = idempotency_key or new_key()
+            keys = [key] if len(batches) == 1 else [f"{key}/{number}" for number in range(len(batches))]
         added = [
             self._post(
                 wire.AddedSamples,

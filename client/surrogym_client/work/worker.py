@@ -11,7 +11,8 @@ from typing import TypeVar
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.original.errors import OriginalError
 from surrogym_client.runtime.ways_out import missing
-from surrogym_client.sampler.worker import PATIENCE, worker_name
+from surrogym_client.sampler.settings import worker_name
+from surrogym_client.sampler.worker import PATIENCE
 from surrogym_client.transport import HttpSurrogate
 from surrogym_client.transport.api import Api
 from surrogym_client.work.outbox import AWAY, Outbox, Waiting, in_one_line

@@ -37,6 +37,9 @@ class Definitions:
 
     def get(self, name: str) -> EnvironmentDefinition:
         """The definition of a surrogate. Raises ``UnknownSurrogate``."""
+        known = self._made.get(name)
+        if known is not None and known[0] == self._storage.surrogates.standing(name).id:
+            return known[1]
         return self.of(self._storage.surrogates.get(name))
 
     def of(self, record: SurrogateRecord) -> EnvironmentDefinition:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -133,10 +134,13 @@ class Designer:
         await asyncio.gather(*self._tasks.values())
 
     async def _begin_all_due(self) -> None:
-        for name in await asyncio.to_thread(self._storage.designs.due):
+        designs = self._storage.designs
+        due, hopeless = await asyncio.to_thread(lambda: (designs.due(), designs.hopeless()))
+        for name in due:
             if name not in self._tasks:
                 self._tasks[name] = asyncio.create_task(self._fit_in_turn(name))
-        await asyncio.to_thread(self._give_up_hopeless)
+        if hopeless:
+            await asyncio.to_thread(self._give_up, hopeless)
 
     async def _fit_in_turn(self, name: str) -> None:
         """Run one fit. Its errors end this fit only."""
@@ -315,10 +319,10 @@ class Designer:
         with suppress(SurrogymError):
             self._storage.designs.abort(lease, error)
 
-    def _give_up_hopeless(self) -> None:
+    def _give_up(self, hopeless: Sequence[str]) -> None:
         """Fail the designs whose initial queries were all set aside, because they have nothing to fit or to
         wait for."""
-        for name in self._storage.designs.hopeless():
+        for name in hopeless:
             with suppress(UnknownSurrogate):  # deleted meanwhile
                 set_aside = self._storage.queries.list(name, ("set_aside",))
                 error = (

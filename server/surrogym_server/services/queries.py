@@ -138,9 +138,9 @@ class QueryService:
     async def _claim(self, name: str, sampler: str, limit: int, lease_seconds: float) -> Claim:
         def claim() -> Claim:
             queries = self._storage.queries.claim(name, sampler, limit, lease_seconds)
-            record = self._storage.surrogates.get(name)
+            standing = self._storage.surrogates.standing(name)
             self._samplers.heard(name, sampler)
-            return Claim(queries, record.phase, record.paused)
+            return Claim(queries, standing.phase, standing.paused)
 
         return await asyncio.to_thread(claim)
 

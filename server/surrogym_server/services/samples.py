@@ -106,8 +106,7 @@ class SampleService:
             self._storage.queries.withdraw(name, covering)
 
     def page(self, name: str, after: int, limit: int) -> list[SampleRecord]:
-        """Up to ``limit`` samples with an id above ``after``."""
-        self._storage.surrogates.get(name)
+        """Up to ``limit`` samples with an id above ``after``. Raises ``UnknownSurrogate``."""
         return self._storage.samples.page(name, after, limit)
 
     def snapshots(self, name: str) -> dict[str, Vector]:

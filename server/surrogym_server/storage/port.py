@@ -45,6 +45,7 @@ from surrogym_server.storage.records import (
     SampleArrays,
     SampleRecord,
     SavedSession,
+    Standing,
     SurrogateRecord,
     SurrogateSummary,
     Vector,
@@ -66,6 +67,10 @@ class Surrogates(ABC):
 
     @abstractmethod
     def get(self, name: str) -> SurrogateRecord: ...
+
+    @abstractmethod
+    def standing(self, name: str) -> Standing:
+        """Return the few fields that every claim and every answer reads. Raises ``UnknownSurrogate``."""
 
     @abstractmethod
     def name_of(self, id: int) -> str:

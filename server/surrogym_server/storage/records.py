@@ -51,6 +51,15 @@ class NewSurrogate:
 
 
 @dataclass(frozen=True)
+class Standing:
+    """What changes of a surrogate, and its id."""
+
+    id: int
+    phase: Phase
+    paused: bool
+
+
+@dataclass(frozen=True)
 class SurrogateRecord:
     id: int  # never used twice, unlike a name
     name: str

@@ -11,7 +11,7 @@ import pytest
 
 from support.postgresql import Postgresql
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import announcements, open_storage
 
 PATIENCE = 60.0
 LISTENING = "FROM pg_stat_activity WHERE starts_with(query, 'LISTEN') AND datname = current_database()"
@@ -80,3 +80,17 @@ def test_a_server_that_lost_its_connection_hears_that_it_missed_something(other)
     second.close()
     second.announcements.close()
     first.announcements.announce("b")
+
+
+@pytest.mark.postgresql
+def test_announcements_soon_after_one_another_come_together_and_none_is_lost(other, monkeypatch) -> None:
+    monkeypatch.setattr(announcements, "GAP_SECONDS", 3_600.0)
+    (first, _), (_, heard) = other(), other()
+    first.announcements.announce("a")
+    assert heard.get(timeout=PATIENCE) == "a"
+    for _ in range(3):
+        first.announcements.announce("b")
+    assert heard.empty()
+    first.close()
+    assert heard.get(timeout=PATIENCE) == "b"
+    assert heard.empty()

@@ -25,7 +25,8 @@ from surrogym_client.experiments.reproduce.paper_table import per_seed, table
 from surrogym_client.original import make
 from surrogym_client.policies.files import load_policy
 from surrogym_client.runtime.versions import commit
-from surrogym_client.sampler.worker import Outcome, Sampler, SamplerSettings
+from surrogym_client.sampler.settings import Outcome, SamplerSettings
+from surrogym_client.sampler.worker import Sampler
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.training import TrainProgress, TrainSettings, train
 from surrogym_client.training.search import REFERENCE

@@ -21,6 +21,7 @@ CHANNEL = "surrogym"
 QUIET_SECONDS = 30.0  # of a connection, before the end of this server is looked for
 FIRST_DELAY, LONGEST_DELAY = 0.1, 10.0  # seconds before another try to connect
 CLOSING_SECONDS = 2.0
+GAP_SECONDS = 0.05  # between two transactions that announce; many answers of a surrogate make one announcement
 
 
 class NotifiedAnnouncements(Announcements):
@@ -64,6 +65,7 @@ class NotifiedAnnouncements(Announcements):
                 self._database.notify(CHANNEL, [f"{self._origin} {name}" for name in names])
             except Unavailable as error:  # the others look by themselves
                 logger.debug("other servers were not told of %s: %s", names, error)
+            self._ended.wait(GAP_SECONDS)
 
     def _listen(self, hear: Hear) -> None:
         import psycopg  # where it is needed: a server on SQLite starts without it

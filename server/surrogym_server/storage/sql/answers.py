@@ -18,6 +18,25 @@ from surrogym_server.storage.records import NewSample, Purpose
 from surrogym_server.storage.sql.leases import foreign_lease, set_outcome, unknown_query
 from surrogym_server.storage.sql.tables import leases, queries, samples
 
+ASKED: sa.Select[Any] = (
+    sa.select(queries.c.id, queries.c.purpose, queries.c.steps)
+    .where(queries.c.surrogate_id == sa.bindparam("owner"), queries.c.id.in_(sa.bindparam("named", expanding=True)))
+    .order_by(queries.c.id)
+    .with_for_update()
+)
+LIVE = (leases.c.outcome == "open") & (leases.c.expires > sa.bindparam("now", type_=sa.Double()))
+LEASES = sa.select(leases.c.id, leases.c.query_id, leases.c.token, leases.c.attempt, LIVE.label("live")).where(
+    leases.c.query_id.in_(sa.bindparam("asked", expanding=True))
+)
+REPORTED = sa.select(samples.c.lease_id, samples.c.step, samples.c.id, samples.c.fingerprint).where(
+    samples.c.lease_id.in_(sa.bindparam("reported", expanding=True))
+)
+ANSWER = (
+    sa.update(queries)
+    .where(queries.c.id.in_(sa.bindparam("done", expanding=True)))
+    .values(status="answered", error=None)
+)
+
 
 class Reported(NamedTuple):
     """A sample that was stored before."""
@@ -67,8 +86,7 @@ def settle(connection: Connection, answered: Iterable[Answered]) -> None:
     set_outcome(connection, list(leases_done), "answered")
     done = [one.query_id for one in leases_done.values() if one.live or not one.contested]
     if done:
-        update = sa.update(queries).where(queries.c.id.in_(done))
-        connection.execute(update.values(status="answered", error=None))
+        connection.execute(ANSWER, {"done": done})
 
 
 def _check_steps(lease: Answered, steps: set[int]) -> None:
@@ -88,23 +106,14 @@ def _check_steps(lease: Answered, steps: set[int]) -> None:
 def _lock_queries(connection: Connection, held: Row[Any], named: set[int]) -> dict[int, Row[Any]]:
     if not named:
         return {}
-    columns: list[Any] = [queries.c.id, queries.c.purpose, queries.c.steps]
-    wanted = (
-        sa.select(*columns)
-        .where(queries.c.surrogate_id == held.id, queries.c.id.in_(named))
-        .order_by(queries.c.id)
-        .with_for_update()
-    )
-    return {row.id: row for row in connection.execute(wanted)}
+    return {row.id: row for row in connection.execute(ASKED, {"owner": held.id, "named": list(named)})}
 
 
 def _leases(connection: Connection, held: Row[Any], asked: dict[int, Row[Any]]) -> dict[tuple[int, str], Answered]:
     """All leases of these queries, by query and token."""
     if not asked:
         return {}
-    live = ((leases.c.outcome == "open") & (leases.c.expires > held.now)).label("live")
-    columns = (leases.c.id, leases.c.query_id, leases.c.token, leases.c.attempt, live)
-    rows = connection.execute(sa.select(*columns).where(leases.c.query_id.in_(list(asked)))).all()
+    rows = connection.execute(LEASES, {"asked": list(asked), "now": held.now}).all()
     reported = _reported(connection, [row.id for row in rows])
     live_ids = {row.query_id: row.id for row in rows if row.live}
     return {
@@ -124,9 +133,8 @@ def _leases(connection: Connection, held: Row[Any], asked: dict[int, Row[Any]]) 
 
 def _reported(connection: Connection, lease_ids: Sequence[int]) -> dict[int, dict[int, Reported]]:
     """The samples stored under each of these leases."""
-    columns = (samples.c.lease_id, samples.c.step, samples.c.id, samples.c.fingerprint)
     reported: dict[int, dict[int, Reported]] = defaultdict(dict)
-    for lease_id, step, *stored in connection.execute(sa.select(*columns).where(samples.c.lease_id.in_(lease_ids))):
+    for lease_id, step, *stored in connection.execute(REPORTED, {"reported": lease_ids}):
         reported[lease_id][step] = Reported(*stored)
     return reported
 

@@ -19,7 +19,7 @@ from surrogym_server.errors import Unavailable
 from surrogym_server.storage import policies as port
 from surrogym_server.storage.policies import Freed
 from surrogym_server.storage.sql.damage import damaged
-from surrogym_server.storage.sql.database import Database, clock
+from surrogym_server.storage.sql.database import NOW, Database
 from surrogym_server.storage.sql.tables import blobs
 
 NAME = re.compile(r"[0-9a-f]{32}")
@@ -88,7 +88,7 @@ class RowBlobs(port.Blobs):
     def put(self, content: bytes) -> str:
         name = uuid4().hex
         with self._database.write() as connection:
-            row = sa.insert(blobs).values(name=name, created_at=clock(connection), content=content)
+            row = sa.insert(blobs).values(name=name, created_at=NOW, content=content)
             connection.execute(row)
         return name
 
@@ -107,7 +107,7 @@ class RowBlobs(port.Blobs):
 
     def older(self, seconds: float) -> set[str]:
         with self._database.read() as connection:
-            old = blobs.c.created_at < clock(connection) - seconds
+            old = blobs.c.created_at < NOW - seconds
             return set(connection.execute(sa.select(blobs.c.name).where(old)).scalars())
 
 

@@ -21,7 +21,7 @@ from surrogym_server.storage.records import (
     fingerprint,
 )
 from surrogym_server.storage.sql import surrogates as stored
-from surrogym_server.storage.sql.database import Database, clock
+from surrogym_server.storage.sql.database import NOW, Database, constant
 from surrogym_server.storage.sql.models import insert_model
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, recall, remember, touch
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
@@ -30,8 +30,28 @@ from surrogym_server.storage.sql.tables import queries, samples, surrogates
 OWN_QUERIES = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogates.c.id)
 OWN_SAMPLES = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogates.c.id)
 # Constants in the statement: once PostgreSQL plans for any status, it reads all queries, because most are answered.
-OPEN = sa.bindparam("open_statuses", OPEN_STATUSES, sa.Text(), expanding=True, literal_execute=True)
+OPEN = [constant(status) for status in OPEN_STATUSES]
 OPEN_QUERY = sa.exists(OWN_QUERIES.where(queries.c.status.in_(OPEN)))
+
+
+_EXPIRES = surrogates.c.fit_expires
+_SET_BACK = NOW + surrogates.c.fit_seconds < _EXPIRES  # the clock was, so the age of the right is unknown
+IS_DUE = sa.and_(  # the law of ``Designs.due``
+    surrogates.c.paused.is_(False),
+    surrogates.c.revision > surrogates.c.fitted_revision,
+    _EXPIRES.is_(None) | (_EXPIRES <= NOW) | _SET_BACK,
+    sa.exists(OWN_SAMPLES),
+    ~OPEN_QUERY | (surrogates.c.logged_revision > surrogates.c.fitted_revision),
+)
+DUE = sa.select(surrogates.c.name).where(IS_DUE).order_by(surrogates.c.id)
+IS_HOPELESS = sa.and_(
+    surrogates.c.phase == constant("collecting"),
+    surrogates.c.paused.is_(False),
+    sa.exists(OWN_QUERIES.where(queries.c.status == constant("set_aside"))),
+    ~OPEN_QUERY,
+    ~sa.exists(OWN_SAMPLES),
+)
+HOPELESS = sa.select(surrogates.c.name).where(IS_HOPELESS).order_by(surrogates.c.id)
 
 
 class SqlDesigns(port.Designs):
@@ -65,15 +85,11 @@ class SqlDesigns(port.Designs):
 
     def due(self) -> list[str]:
         with self._database.read() as connection:
-            wanted = sa.select(surrogates.c.name).where(_is_due(connection)).order_by(surrogates.c.id)
-            return list(connection.execute(wanted).scalars())
+            return list(connection.execute(DUE).scalars())
 
     def hopeless(self) -> list[str]:
         with self._database.read() as connection:
-            collects = (surrogates.c.phase == "collecting") & surrogates.c.paused.is_(False)
-            set_aside = sa.exists(OWN_QUERIES.where(queries.c.status == "set_aside"))
-            wanted = sa.select(surrogates.c.name).where(collects, set_aside, ~OPEN_QUERY, ~sa.exists(OWN_SAMPLES))
-            return list(connection.execute(wanted.order_by(surrogates.c.id)).scalars())
+            return list(connection.execute(HOPELESS).scalars())
 
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
         with self._database.write() as connection:
@@ -81,7 +97,7 @@ class SqlDesigns(port.Designs):
             row = connection.execute(
                 sa.select(surrogates.c.revision, surrogates.c.extra_queries, surrogates.c.checkpoint)
                 .where(surrogates.c.id == held.id)
-                .where(_is_due(connection))
+                .where(IS_DUE)
             ).one_or_none()
             if row is None:
                 return None
@@ -116,20 +132,6 @@ class SqlDesigns(port.Designs):
             seen = {} if error is None else {"fitted_revision": lease.revision}
             _update(connection, held, **stored.NO_RIGHT, **seen)
             stored.update_phase(connection, held, _phase_after(held, error), error)
-
-
-def _is_due(connection: Connection) -> sa.ColumnElement[bool]:
-    """The law of ``Designs.due`` as a condition on a row of surrogates."""
-    now, expires = clock(connection), surrogates.c.fit_expires
-    set_back = expires > now + surrogates.c.fit_seconds  # of the clock, so the age of the right is unknown
-    free = expires.is_(None) | (expires <= now) | set_back
-    return sa.and_(
-        surrogates.c.paused.is_(False),
-        surrogates.c.revision > surrogates.c.fitted_revision,
-        free,
-        sa.exists(OWN_SAMPLES),
-        ~OPEN_QUERY | (surrogates.c.logged_revision > surrogates.c.fitted_revision),
-    )
 
 
 def _lasting(expires: float, seconds: float) -> dict[str, float]:

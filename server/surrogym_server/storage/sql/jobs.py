@@ -23,7 +23,7 @@ from surrogym_server.storage.jobs import (
 )
 from surrogym_server.storage.records import fingerprint
 from surrogym_server.storage.sql import expiry
-from surrogym_server.storage.sql.database import Database, clock
+from surrogym_server.storage.sql.database import NOW, Database
 from surrogym_server.storage.sql.rows import append_event, find, hold, recall, remember
 from surrogym_server.storage.sql.tables import jobs, surrogates
 
@@ -63,7 +63,7 @@ class SqlJobs(port.Jobs):
     ) -> LeasedJob | None:
         with self._database.read() as connection:  # waiting workers don't block writers
             own = jobs.c.surrogate_id == find(connection, name)
-            waiting = (jobs.c.status == "queued") | expiry.has_ended(connection, jobs, RUNNING)
+            waiting = (jobs.c.status == "queued") | expiry.has_ended(jobs, RUNNING)
             if not connection.execute(sa.select(sa.exists().where(own, waiting))).scalar():
                 return None
         with self._database.write() as connection:
@@ -86,7 +86,7 @@ class SqlJobs(port.Jobs):
         with self._database.write() as connection:
             surrogate = find(connection, name)
             alive = (jobs.c.token == token) & (OPEN | jobs.c.lost)
-            lease = {"expires": clock(connection) + seconds, "seconds": seconds}
+            lease = {"expires": NOW + seconds, "seconds": seconds}
             running = {"status": "running", "lost": False, "finished_at": None, "error": None}
             update = sa.update(jobs).where(_own(surrogate, id), alive)
             update = update.values(**lease, **running, **({} if progress is None else vars(progress)))
@@ -133,10 +133,10 @@ class SqlJobs(port.Jobs):
 
     def sweep_expired(self) -> int:
         with self._database.read() as connection:
-            owners = sa.select(jobs.c.surrogate_id).where(expiry.has_ended(connection, jobs, RUNNING)).distinct()
+            owners = sa.select(jobs.c.surrogate_id).where(expiry.has_ended(jobs, RUNNING)).distinct()
             wanted = sa.select(surrogates.c.name).where(surrogates.c.id.in_(owners))
             names = [*connection.execute(wanted).scalars()]
-            too_long = expiry.is_too_long(connection, jobs, RUNNING)
+            too_long = expiry.is_too_long(jobs, RUNNING)
             set_back = connection.execute(sa.select(sa.exists().where(too_long))).scalar()
         if set_back:
             with self._database.write() as connection:

@@ -13,13 +13,28 @@ from surrogym_server.errors import ForeignLease, UnknownQuery
 from surrogym_server.storage.port import MAX_ATTEMPTS
 from surrogym_server.storage.records import LeasedQuery
 from surrogym_server.storage.sql import expiry
-from surrogym_server.storage.sql.database import clock
-from surrogym_server.storage.sql.rows import append_event, hold, touch, unknown_surrogate
+from surrogym_server.storage.sql.database import NOW, constant
+from surrogym_server.storage.sql.rows import NAMED, append_event, hold, touch, unknown_surrogate
 from surrogym_server.storage.sql.tables import leases, queries, surrogates
 
 EXPIRED = "no answer before the lease ended"
+NEW_LEASE = sa.insert(leases)
+LEASE_QUERIES = (
+    sa.update(queries)
+    .where(queries.c.id.in_(sa.bindparam("claimed", expanding=True)))
+    .values(status="leased", attempts=queries.c.attempts + 1, sampler=sa.bindparam("claimer"))
+)
+SET_OUTCOME = (
+    sa.update(leases).where(leases.c.id.in_(sa.bindparam("ended", expanding=True))).values(outcome=sa.bindparam("how"))
+)
 # A constant in the statement: PostgreSQL takes the index of open leases for no parameter, once it plans for any value.
-IS_OPEN = leases.c.outcome == sa.literal("open", sa.Text(), literal_execute=True)
+IS_OPEN = leases.c.outcome == constant("open")
+ENDED = sa.exists().where(leases.c.surrogate_id == surrogates.c.id, expiry.has_ended(leases, IS_OPEN))
+SHARE = (
+    sa.select(surrogates.c.id, surrogates.c.paused, NOW.label("now"), ENDED.label("has_ended"))
+    .where(NAMED)
+    .with_for_update(read=True, key_share=True)
+)
 
 
 def begin(
@@ -44,9 +59,8 @@ def begin(
         )
         for row in rows
     ]
-    connection.execute(sa.insert(leases), [_new(held, query, sampler, seconds) for query in leased])
-    update = sa.update(queries).where(queries.c.id.in_([query.id for query in leased]))
-    connection.execute(update.values(status="leased", attempts=queries.c.attempts + 1, sampler=sampler))
+    connection.execute(NEW_LEASE, [_new(held, query, sampler, seconds) for query in leased])
+    connection.execute(LEASE_QUERIES, {"claimed": [query.id for query in leased], "claimer": sampler})
     return leased
 
 
@@ -93,26 +107,20 @@ def foreign_lease(query_id: int) -> ForeignLease:
 
 
 def set_outcome(connection: Connection, lease_ids: Sequence[int], outcome: str) -> None:
-    connection.execute(sa.update(leases).where(leases.c.id.in_(lease_ids)).values(outcome=outcome))
+    connection.execute(SET_OUTCOME, {"ended": lease_ids, "how": outcome})
 
 
 def share(connection: Connection, name: str) -> Row[Any]:
-    """Keep the surrogate from being deleted, without blocking writers: (id, paused, now)."""
-    columns: list[Any] = [surrogates.c.id, surrogates.c.paused, clock(connection).label("now")]
-    share = sa.select(*columns).where(surrogates.c.name == name).with_for_update(read=True, key_share=True)
-    found = connection.execute(share).one_or_none()
+    """Keep the surrogate from being deleted, without blocking writers: (id, paused, now, has_ended).
+
+    ``has_ended``: whether leases of it have expired. They are ended then, which does block writers.
+    """
+    found = connection.execute(SHARE, {"named": name}).one_or_none()
     if found is None:
         raise unknown_surrogate(name)
-    return found
-
-
-def sweep_if_needed(connection: Connection, name: str) -> None:
-    """Lock the surrogate's row and end its expired leases, if it exists and has some."""
-    own = sa.select(surrogates.c.id).where(surrogates.c.name == name).scalar_subquery()
-    ended = expiry.has_ended(connection, leases, IS_OPEN)
-    wanted = sa.select(leases.c.id).where(leases.c.surrogate_id == own, ended).limit(1)
-    if connection.execute(wanted).one_or_none() is not None:
+    if found.has_ended:
         sweep(connection, hold(connection, name))
+    return found
 
 
 def sweep(connection: Connection, held: Row[Any]) -> int:

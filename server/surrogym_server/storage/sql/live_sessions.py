@@ -14,7 +14,7 @@ from surrogym_server.storage.live_sessions import (
     SessionLease,
     TakenSession,
 )
-from surrogym_server.storage.sql.database import Database, clock, conflict_insert
+from surrogym_server.storage.sql.database import NOW, Database, conflict_insert
 from surrogym_server.storage.sql.expiry import has_ended, shorten
 from surrogym_server.storage.sql.tables import live_sessions as live
 from surrogym_server.storage.sql.tables import surrogates
@@ -36,7 +36,7 @@ class SqlLiveSessions(LiveSessions):
                 fence=1,
                 seq=new.checkpoint.seq,
                 data=new.checkpoint.data,
-                **_lease(connection, owner, seconds),
+                **_lease(owner, seconds),
             )
             if connection.execute(insert.on_conflict_do_nothing().returning(live.c.id)).one_or_none() is None:
                 raise IdempotencyConflict("the id of this session, or the key of its opening, is taken")
@@ -50,13 +50,13 @@ class SqlLiveSessions(LiveSessions):
 
     def holder(self, id: str) -> SessionHolder | None:
         with self._database.read() as connection:
-            left = (live.c.expires - clock(connection)).label("left")
+            left = (live.c.expires - NOW).label("left")
             row = connection.execute(sa.select(live.c.owner, live.c.machine, left).where(live.c.id == id)).one_or_none()
         return None if row is None else SessionHolder(row.owner, row.left, row.machine)
 
     def renew(self, owner: str, seconds: float) -> frozenset[str]:
         with self._database.write() as connection:
-            renewed = sa.update(live).where(live.c.owner == owner).values(_lease(connection, owner, seconds))
+            renewed = sa.update(live).where(live.c.owner == owner).values(_lease(owner, seconds))
             return frozenset(connection.execute(renewed.returning(live.c.id)).scalars())
 
     def record(self, lease: SessionLease, checkpoint: Checkpoint) -> bool:
@@ -67,12 +67,12 @@ class SqlLiveSessions(LiveSessions):
 
     def take(self, id: str, owner: str, seconds: float) -> TakenSession:
         with self._database.write() as connection:
-            free = has_ended(connection, live, sa.true()) | (live.c.owner == owner)
+            free = has_ended(live, sa.true()) | (live.c.owner == owner)
             taken = sa.update(live).where(live.c.id == id, free)
-            values = {"fence": live.c.fence + 1, **_lease(connection, owner, seconds)}
+            values = {"fence": live.c.fence + 1, **_lease(owner, seconds)}
             row = connection.execute(taken.values(values).returning(*live.c)).one_or_none()
             if row is None:
-                left = sa.select((live.c.expires - clock(connection)).label("left")).where(live.c.id == id)
+                left = sa.select((live.c.expires - NOW).label("left")).where(live.c.id == id)
                 raise _not_taken(id, connection.execute(left).scalar())
         data = None if row.data is None else bytes(row.data)
         return TakenSession(
@@ -81,7 +81,7 @@ class SqlLiveSessions(LiveSessions):
 
     def release(self, lease: SessionLease) -> None:
         with self._database.write() as connection:
-            connection.execute(_held(sa.update(live), lease).values(expires=clock(connection)))
+            connection.execute(_held(sa.update(live), lease).values(expires=NOW))
 
     def remove(self, id: str) -> None:
         with self._database.write() as connection:
@@ -94,12 +94,12 @@ class SqlLiveSessions(LiveSessions):
     def sweep(self, seconds: float) -> int:
         with self._database.write() as connection:
             shorten(connection, live, sa.true())
-            forgotten = sa.delete(live).where(live.c.expires <= clock(connection) - seconds)
+            forgotten = sa.delete(live).where(live.c.expires <= NOW - seconds)
             return connection.execute(forgotten).rowcount
 
 
-def _lease(connection: Connection, owner: str, seconds: float) -> dict[str, object]:
-    return {"owner": owner, "expires": clock(connection) + seconds, "seconds": seconds}
+def _lease(owner: str, seconds: float) -> dict[str, object]:
+    return {"owner": owner, "expires": NOW + seconds, "seconds": seconds}
 
 
 def _held(update: sa.Update, lease: SessionLease) -> sa.Update:

@@ -22,7 +22,7 @@ from surrogym_server.storage.records import (
 )
 from surrogym_server.storage.sql import expiry
 from surrogym_server.storage.sql import leases as leasing
-from surrogym_server.storage.sql.database import Database, clock
+from surrogym_server.storage.sql.database import NOW, Database
 from surrogym_server.storage.sql.rows import Span, append_event, find, hold, insert_queries, recall, remember, within
 from surrogym_server.storage.sql.tables import leases, queries, surrogates
 
@@ -35,6 +35,19 @@ COLUMNS = [
 ]
 
 
+_EARLIER = queries.alias()
+NUMBER = (
+    sa.select(sa.func.count())
+    .where(_EARLIER.c.surrogate_id == sa.bindparam("owner"), _EARLIER.c.id < queries.c.id)
+    .scalar_subquery()
+)
+OLDEST_FREE: sa.Select[Any] = (
+    sa.select(*COLUMNS, NUMBER.label("number"))
+    .where(queries.c.surrogate_id == sa.bindparam("owner"), queries.c.status == "pending")
+    .order_by(queries.c.id)
+    .limit(sa.bindparam("most", type_=sa.Integer()))
+    .with_for_update(skip_locked=True)
+)
 LEAST_AUDITED = 64  # real steps of audits that every surrogate may take
 
 
@@ -67,31 +80,20 @@ class SqlQueries(port.Queries):
 
     def claim(self, name: str, sampler: str, limit: int, seconds: float) -> list[LeasedQuery]:
         with self._database.write() as connection:
-            leasing.sweep_if_needed(connection, name)
             held = leasing.share(connection, name)
             if held.paused:
                 return []
-            earlier = queries.alias()
-            number = sa.select(sa.func.count()).where(earlier.c.surrogate_id == held.id, earlier.c.id < queries.c.id)
-            columns: list[Any] = [*COLUMNS, number.scalar_subquery().label("number")]
-            oldest_free = (
-                sa.select(*columns)
-                .where(queries.c.surrogate_id == held.id, queries.c.status == "pending")
-                .order_by(queries.c.id)
-                .limit(limit)
-                .with_for_update(skip_locked=True)
-            )
-            rows = connection.execute(oldest_free).all()
+            rows = connection.execute(OLDEST_FREE, {"owner": held.id, "most": limit}).all()
             return leasing.begin(connection, held, rows, sampler, seconds)
 
     def renew(self, name: str, query_id: int, token: str, seconds: float) -> float:
         with self._database.write() as connection:
             lease = leasing.of_query(connection, find(connection, name), query_id, token)
-            live = (leases.c.outcome == "open") & (leases.c.expires > clock(connection))
+            live = (leases.c.outcome == "open") & (leases.c.expires > NOW)
             renewed = connection.execute(
                 sa.update(leases)
                 .where(leases.c.id == lease.id, live)
-                .values(expires=clock(connection) + seconds, seconds=seconds)
+                .values(expires=NOW + seconds, seconds=seconds)
                 .returning(leases.c.expires)
             ).scalar()
             if renewed is None:
@@ -125,7 +127,7 @@ class SqlQueries(port.Queries):
 
     def list(self, name: str, statuses: Sequence[QueryStatus] = (), limit: int = 10_000) -> list[QueryRecord]:
         with self._database.read() as connection:
-            wanted = _records(connection).where(queries.c.surrogate_id == find(connection, name))
+            wanted = _records().where(queries.c.surrogate_id == find(connection, name))
             if statuses:
                 wanted = wanted.where(queries.c.status.in_(statuses))
             rows = connection.execute(wanted.order_by(queries.c.id).limit(limit))
@@ -138,11 +140,11 @@ class SqlQueries(port.Queries):
 
     def sweep_expired(self) -> int:
         with self._database.read() as connection:
-            ended = expiry.has_ended(connection, leases, leasing.IS_OPEN)
+            ended = expiry.has_ended(leases, leasing.IS_OPEN)
             owners = sa.select(leases.c.surrogate_id).where(ended).distinct()
             wanted = sa.select(surrogates.c.name).where(surrogates.c.id.in_(owners))
             names = list(connection.execute(wanted).scalars())
-            too_long = expiry.is_too_long(connection, leases, leasing.IS_OPEN)
+            too_long = expiry.is_too_long(leases, leasing.IS_OPEN)
             set_back = connection.execute(sa.select(sa.exists().where(too_long))).scalar()
         if set_back:
             with self._database.write() as connection:
@@ -186,15 +188,15 @@ def _ended(query_id: int) -> LeaseExpired:
     return LeaseExpired(f"the lease of query {query_id} has ended: claim a query again")
 
 
-def _records(connection: Connection) -> sa.Select[Any]:
+def _records() -> sa.Select[Any]:
     """Queries, with the time left of their open lease. A query has at most one."""
-    left = (leases.c.expires - clock(connection)).label("lease_seconds_left")
+    left = (leases.c.expires - NOW).label("lease_seconds_left")
     is_open = (leases.c.query_id == queries.c.id) & (leases.c.outcome == "open")
     return sa.select(*COLUMNS, left).outerjoin(leases, is_open)
 
 
 def _read(connection: Connection, surrogate_id: int, query_id: int) -> QueryRecord:
-    wanted = _records(connection).where(queries.c.surrogate_id == surrogate_id, queries.c.id == query_id)
+    wanted = _records().where(queries.c.surrogate_id == surrogate_id, queries.c.id == query_id)
     row = connection.execute(wanted).one_or_none()
     if row is None:
         raise leasing.unknown_query(query_id)

@@ -13,6 +13,8 @@ from surrogym_server.storage.sql.answers import Answered
 from surrogym_server.storage.sql.rows import append_event
 from surrogym_server.storage.sql.tables import samples
 
+NEW_SAMPLES = sa.insert(samples).returning(samples.c.id, sort_by_parameter_order=True)
+
 
 def body_of(sample: NewSample) -> dict[str, Any]:
     """The content that a repeat must have. The step is compared separately, because fingerprints are older than it, as
@@ -24,8 +26,7 @@ def insert_samples(connection: Connection, held: Row[Any], sampler: str, rows: l
     """Insert rows of samples and append the event. Returns their ids in order."""
     if not rows:
         return []
-    insert = sa.insert(samples).returning(samples.c.id, sort_by_parameter_order=True)
-    ids = [int(id) for id in connection.execute(insert, rows).scalars()]
+    ids = [int(id) for id in connection.execute(NEW_SAMPLES, rows).scalars()]
     late = sum(row["late"] for row in rows)
     append_event(connection, held, "sample", sampler=sampler, ids=ids, late=late)
     return ids

@@ -53,7 +53,8 @@ class SqlSamples(port.Samples):
         logged: bool = False,
         complete: bool = True,
     ) -> AddedSamples:
-        body = fingerprint(sampler, [body_of(sample) for sample in samples], *(["logged"] if logged else []))
+        told = [body_of(sample) for sample in samples] if key else []
+        body = fingerprint(sampler, told, *(["logged"] if logged else []))  # compared only if there is a key
         with self._database.write() as connection:
             held = hold(connection, name)
             before: list[int] | None = recall(connection, held, "add_samples", key, body)

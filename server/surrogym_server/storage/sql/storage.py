@@ -25,6 +25,7 @@ from surrogym_server.storage.sql.models import SqlModels
 from surrogym_server.storage.sql.policies import SqlPolicies
 from surrogym_server.storage.sql.queries import SqlQueries
 from surrogym_server.storage.sql.readiness import Readiness
+from surrogym_server.storage.sql.sample_counts import CountedSamples
 from surrogym_server.storage.sql.samples import SqlSamples
 from surrogym_server.storage.sql.snapshots import SqlSnapshots
 from surrogym_server.storage.sql.surrogates import SqlSurrogates
@@ -34,14 +35,14 @@ class SqlStorage(Storage):
     """The port on SQLite or PostgreSQL."""
 
     def __init__(self, database: Database, blobs: Blobs) -> None:
-        self._database = database
+        self._database, counted = database, CountedSamples()
         self._readiness = Readiness(database)
-        self.surrogates = SqlSurrogates(database)
+        self.surrogates = SqlSurrogates(database, counted)
         self.designs = SqlDesigns(database)
         self.queries = SqlQueries(database)
         self.samples = SqlSamples(database)
         self.snapshots = SqlSnapshots(database)
-        self.ledger = SqlLedger(database)
+        self.ledger = SqlLedger(database, counted)
         self.models = SqlModels(database)
         self.occupancy = SqlOccupancy(database)
         self.sessions = SqlSessions(database)

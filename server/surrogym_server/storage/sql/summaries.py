@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -13,14 +12,22 @@ from sqlalchemy.engine import Connection
 
 from surrogym_server.storage.records import LedgerRecord, QueryCounts, SurrogateSummary
 from surrogym_server.storage.sql.damage import damaged
-from surrogym_server.storage.sql.ledger import ledgers, samples_by_purpose
+from surrogym_server.storage.sql.ledger import ledgers
 from surrogym_server.storage.sql.models import newest_of
+from surrogym_server.storage.sql.sample_counts import MOST_KEPT, CountedSamples, SampleCounts
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
 
 COLUMNS = [
     getattr(surrogates.c, name)
     for name in ("id", "name", "budget", "target", "phase", "paused", "round", "created_at")  # as in the record
 ]
+
+
+ANSWERED = (
+    sa.select(queries.c.surrogate_id, sa.func.count())
+    .where(queries.c.surrogate_id.in_(sa.bindparam("owners", expanding=True)), queries.c.status == "answered")
+    .group_by(queries.c.surrogate_id)
+)
 
 
 class _Named(msgspec.Struct):
@@ -41,51 +48,34 @@ OPEN_COUNTS = [
     for status in UNANSWERED
 ]
 NEWEST = sa.select(sa.func.max(samples.c.id)).where(samples.c.surrogate_id == surrogates.c.id).scalar_subquery()
-MOST_KEPT = 100_000  # surrogates
 AT_ONCE = 1_000  # surrogates of one statement
 
 
-@dataclass(frozen=True)
-class _Counts:
-    """What is counted of a surrogate's answers. ``newest`` is the id of the last sample before they were counted."""
-
-    newest: int | None
-    samples: Mapping[str, int]  # by purpose
-    answered: int  # queries
-
-
 class Counted:
-    """Numbers of samples and answered queries, kept in memory, because counting a million rows takes 0.3 s.
+    """Numbers of samples and answered queries, kept in memory.
 
-    They change only in a transaction that adds a sample. Samples of a surrogate are added one transaction after the
-    other, are never changed, and go only with their surrogate. So the numbers hold as long as the newest sample is the
-    same. Other processes may add samples too.
+    They change only in a transaction that adds a sample. So the number of answered queries holds as long as the newest
+    sample is the same.
     """
 
-    def __init__(self) -> None:
-        self._known: dict[int, _Counts] = {}
+    def __init__(self, samples: CountedSamples) -> None:
+        self._samples = samples
+        self._answered: dict[int, tuple[int | None, int]] = {}  # with the id of the newest sample before the count
 
-    def read(self, connection: Connection, newest: Mapping[int, int | None]) -> dict[int, _Counts]:
+    def read(self, connection: Connection, newest: Mapping[int, int | None]) -> dict[int, tuple[SampleCounts, int]]:
         """The numbers of each surrogate, given the id of its newest sample, which was read before."""
-        known = {id: self._known.get(id) for id in newest}
-        stale = [id for id, counts in known.items() if counts is None or counts.newest != newest[id]]
-        found = {id: counts for id, counts in known.items() if counts is not None}
+        counted = self._samples.of_many(connection, newest)
+        stale = [id for id in newest if self._answered.get(id, (-1, 0))[0] != newest[id]]
         for first in range(0, len(stale), AT_ONCE):
-            found |= _counted(connection, {id: newest[id] for id in stale[first : first + AT_ONCE]})
-        if len(self._known) > MOST_KEPT:
-            self._known = {}
-        self._known |= found
-        return found
+            self._count(connection, {id: newest[id] for id in stale[first : first + AT_ONCE]})
+        return {id: (counted[id], self._answered[id][1]) for id in newest}
 
-
-def _counted(connection: Connection, newest: Mapping[int, int | None]) -> dict[int, _Counts]:
-    by_purpose = samples_by_purpose(connection, samples.c.surrogate_id.in_(newest))
-    wanted = sa.select(queries.c.surrogate_id, sa.func.count()).where(
-        queries.c.surrogate_id.in_(newest), queries.c.status == "answered"
-    )
-    rows = connection.execute(wanted.group_by(queries.c.surrogate_id)).all()
-    answered = {int(id): int(count) for id, count in rows}
-    return {id: _Counts(last, by_purpose.get(id, {}), answered.get(id, 0)) for id, last in newest.items()}
+    def _count(self, connection: Connection, newest: Mapping[int, int | None]) -> None:
+        rows = connection.execute(ANSWERED, {"owners": list(newest)}).all()
+        answered = {int(id): int(count) for id, count in rows}
+        if len(self._answered) > MOST_KEPT:
+            self._answered = {}
+        self._answered |= {id: (last, answered.get(id, 0)) for id, last in newest.items()}
 
 
 def read_summaries(
@@ -103,12 +93,12 @@ def read_summaries(
         return []
     span = (rows[0].id, rows[-1].id)
     answers = counted.read(connection, {row.id: row[len(COLUMNS) + 1] for row in rows})
-    spent = ledgers(connection, span, {id: counts.samples for id, counts in answers.items()})
+    spent = ledgers(connection, span, {id: counts.by_purpose for id, (counts, _) in answers.items()})
     newest, none_spent = newest_of(connection, span), LedgerRecord()
     summaries = []
     for row in rows:
         id, *known, spec, _ = row[: len(COLUMNS) + 2]
-        queue = QueryCounts(answered=answers[id].answered, **{status: row._mapping[status] for status in UNANSWERED})
+        queue = QueryCounts(answered=answers[id][1], **{status: row._mapping[status] for status in UNANSWERED})
         numbers = (spent.get(id, none_spent), queue, *newest.get(id, (None, None)))
         fields: tuple[Any, ...] = (id, *known, _environment(spec), *numbers)
         summaries.append(SurrogateSummary(*fields))

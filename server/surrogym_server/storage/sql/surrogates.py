@@ -9,10 +9,11 @@ from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage import port
-from surrogym_server.storage.records import FREE, NewSurrogate, Phase, SurrogateRecord, SurrogateSummary
-from surrogym_server.storage.sql.database import Database, clock, conflict_insert
+from surrogym_server.storage.records import FREE, NewSurrogate, Phase, Standing, SurrogateRecord, SurrogateSummary
+from surrogym_server.storage.sql.database import NOW, Database, conflict_insert
 from surrogym_server.storage.sql.leases import is_unbegun, requeue_set_aside
-from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, touch, unknown_surrogate
+from surrogym_server.storage.sql.rows import NAMED, append_event, hold, insert_queries, touch, unknown_surrogate
+from surrogym_server.storage.sql.sample_counts import CountedSamples
 from surrogym_server.storage.sql.summaries import Counted, read_summaries
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
 
@@ -24,12 +25,14 @@ COLUMNS = [
         *("extra_queries", "checkpoint", "created_at"),
     )
 ]
+READ = sa.select(*COLUMNS).where(NAMED)
+STANDING = sa.select(surrogates.c.id, surrogates.c.phase, surrogates.c.paused).where(NAMED)
 
 
 class SqlSurrogates(port.Surrogates):
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, counted: CountedSamples) -> None:
         self._database = database
-        self._counted = Counted()
+        self._counted = Counted(counted)
 
     def create(self, new: NewSurrogate) -> tuple[SurrogateRecord, bool]:
         with self._database.write() as connection:
@@ -43,6 +46,13 @@ class SqlSurrogates(port.Surrogates):
     def get(self, name: str) -> SurrogateRecord:
         with self._database.read() as connection:
             return read(connection, name)
+
+    def standing(self, name: str) -> Standing:
+        with self._database.read() as connection:
+            found = connection.execute(STANDING, {"named": name}).one_or_none()
+        if found is None:
+            raise unknown_surrogate(name)
+        return Standing(*found)
 
     def name_of(self, id: int) -> str:
         with self._database.read() as connection:
@@ -106,7 +116,7 @@ class SqlSurrogates(port.Surrogates):
 
 
 def read(connection: Connection, name: str) -> SurrogateRecord:
-    row = connection.execute(sa.select(*COLUMNS).where(surrogates.c.name == name)).one_or_none()
+    row = connection.execute(READ, {"named": name}).one_or_none()
     if row is None:
         raise unknown_surrogate(name)
     return _record(row)
@@ -141,7 +151,7 @@ def _insert(connection: Connection, new: NewSurrogate) -> bool:
         extra_queries=0,
         revision=0,
         fitted_revision=0,
-        created_at=clock(connection),
+        created_at=NOW,
     )
     free = insert.on_conflict_do_nothing(index_elements=["name"]).returning(surrogates.c.id)
     return connection.execute(free).scalar() is not None
