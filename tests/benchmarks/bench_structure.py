@@ -26,6 +26,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -44,7 +45,7 @@ from surrogym_client.experiments.tasks import TASKS as DEMOS
 from surrogym_client.experiments.unseen.machine import Machine
 from surrogym_client.original import make
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
+from surrogym_server.environment.definition import REWARD, EnvironmentDefinition, wrap
 from surrogym_server.environment.features import encode, features, leading
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples, increments
@@ -373,8 +374,9 @@ def designed(name: str, seed: int, drop: bool) -> dict[str, Any]:
     nothing = Points(samples.q[:0], samples.u[:0])
     while len((made := advance(definition, samples, state, Request(BUDGET, 0.999, nothing))).q):
         samples, state = join(samples, _steps(original, made.q, made.u)), made.state
-    off = (made.model.transition(unseen.q, unseen.u).q_next - unseen.q_next) / increments(definition, unseen).std(0)
-    error = float(off.square().mean().sqrt())
+    off = made.model.transition(unseen.q, unseen.u).q_next - unseen.q_next
+    off[:, definition.angles] = wrap(off[:, definition.angles])
+    error = float((off[:, definition.moving] / increments(definition, unseen).std(0)).square().mean().sqrt())
     return {"task": name, "seed": seed, "fewer": drop, "real steps": len(samples), "error": error}
 
 
@@ -407,8 +409,10 @@ def main() -> None:
     made.add_argument("--designs", action="store_true", help="adaptive designs instead of hypercubes")
     options = started(made)
     if options.designs:
-        found = [designed(t, s, fewer) for t in options.tasks for s in options.seeds for fewer in (True, False)]
-        print("\n".join(map(str, found)))
+        found = []
+        for task, seed, drop in product(options.tasks, options.seeds, (True, False)):
+            found.append(designed(task, seed, drop))
+            print(found[-1])
         write(options.out, "structure-designs", {"rows": found})
         return
     every = []
