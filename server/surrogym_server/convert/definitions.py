@@ -122,6 +122,7 @@ def _model(design: wire.Design) -> Choice:
             "reward_jumps": not paper,
             "reward_peaks": not paper,
             "rates": not paper,
+            "drop_inputs": not paper,
             "symmetry": design.symmetry,
         }
         choice = Choice(choice.name, tuple({**preset, **dict(choice.settings)}.items()))

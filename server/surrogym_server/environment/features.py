@@ -35,7 +35,9 @@ class FeatureMap:
         after: encode the state after the step instead of the one before it; for the reward alone.
         drift: weights (C,) of q for each angle; cos and sin of the angle that they predict are inputs too.
         history: only lags that look back at most this many steps are inputs; None: all lags.
-        rates: of each feature (d,), along which the output changes the faster the further, or none; see ``gp.growth``.
+        dropped: places of features that the output does not read, counted in the map without this, ascending.
+        rates: of each feature that is left (d,), along which the output changes the faster the further, or none; see
+            ``gp.growth``.
         parity: how the output changes if every coordinate and the action change their sign: without a rule, its sign
             changes too (odd), or it stays (even).
     """
@@ -48,10 +50,12 @@ class FeatureMap:
     parity: Parity = ""
     history: int | None = None
     rates: tuple[float, ...] = ()
+    dropped: tuple[int, ...] = ()
 
     def __str__(self) -> str:
         extras = [name for name in ("lead", "after", "drift", "rates") if getattr(self, name)]
         extras += [] if self.history is None else [f"history {self.history}"]
+        extras += ["without " + " ".join(map(str, self.dropped))] if self.dropped else []
         return ", ".join([self.state, f"action {self.action}", *extras, *([self.parity] if self.parity else [])])
 
 
@@ -88,6 +92,7 @@ def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tupl
             Feature("lead", place, *scaling(definition.coordinates[index].sampling))
             for place, index in enumerate(leading(definition))
         ]
+    made = [feature for place, feature in enumerate(made) if place not in feature_map.dropped]
     for place, rate in enumerate(feature_map.rates):
         if rate and made[place].function == "affine":
             made[place] = made[place]._replace(function="grown", rate=rate)

@@ -22,6 +22,7 @@ from surrogym_server.gp.joint import Joint
 from surrogym_server.gp.kernel import Hyperparameters, Reflection, covariance
 from surrogym_server.gp.pathwise import Pathwise
 from surrogym_server.gp.posterior import LeftOut, Posterior, Sparse, condition
+from surrogym_server.gp.selection import Selection, select_inputs
 from surrogym_server.gp.serving import Output, Serving
 from surrogym_server.gp.sparse import condition_many, condition_sparse
 from surrogym_server.gp.subsets import spread
@@ -37,6 +38,7 @@ __all__ = [
     "Pathwise",
     "Posterior",
     "Reflection",
+    "Selection",
     "Serving",
     "Sparse",
     "condition",
@@ -48,5 +50,6 @@ __all__ = [
     "hyperparameter_samples",
     "noisy_explanation",
     "refine",
+    "select_inputs",
     "spread",
 ]

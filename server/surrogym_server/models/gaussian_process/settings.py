@@ -17,6 +17,7 @@ class Settings:
         symmetry: ``auto`` also compares feature maps that are their own mirror image, ``none`` does not.
         rates: whether transitions may change the faster the further along an input; see ``gp.growth``.
         reward_peaks: whether the reward may be learned by its logarithm, if it is nearly zero almost everywhere.
+        drop_inputs: whether an output may leave out inputs that it does not read; see ``gp.selection``.
     """
 
     kernel: str = "composite"
@@ -24,11 +25,12 @@ class Settings:
     symmetry: str = "auto"
     reward_peaks: bool = True
     rates: bool = True
+    drop_inputs: bool = True
 
     def __post_init__(self) -> None:
         for name, known in CHOICES.items():
             if (given := getattr(self, name)) not in known:
                 raise ValueError(f"expected {name} to be one of {', '.join(known)}, got {given!r}")
-        for name in ("reward_jumps", "reward_peaks", "rates"):
+        for name in ("reward_jumps", "reward_peaks", "rates", "drop_inputs"):
             if not isinstance(given := getattr(self, name), bool):
                 raise ValueError(f"expected {name} to be true or false, got {given!r}")

@@ -28,9 +28,10 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 from surrogym_server.models.gaussian_process.prediction.regions import TERMINATION
 from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel
 
-FORMAT = 5
+FORMAT = 6
 JUMP = "jump"  # prefix of the names of its arrays
-READABLE = (1, 2, 3, 4, 5)  # 1: a reward's timing was the definition's alone; 2: no drift; 3: no warp; 4: no rates
+# 1: a reward's timing was the definition's alone; 2: no drift; 3: no warp; 4: no rates; 5: no inputs left out
+READABLE = (1, 2, 3, 4, 5, 6)
 
 
 class GaussianProcessCodec(ModelCodec):

@@ -41,6 +41,7 @@ def output_tensors(output: OutputModel, prefix: str) -> dict[str, Tensor]:
 def require_output(definition: EnvironmentDefinition, output: OutputModel) -> None:
     """Check the shapes of an output's arrays, and that its numbers are those of a process. Raises ``InvalidInput``."""
     _require_drift(definition, output)
+    _require_dropped(definition, output)
     _require_warp(output)
     _require_rates(definition, output)
     _require_shapes(definition, output)
@@ -81,7 +82,8 @@ def read_output(
     malformed."""
     feature_map = _feature_map(entry["feature_map"])
     shorter = (None, *range(max(definition.ages)))
-    if replace(feature_map, drift=(), history=None, rates=()) not in KNOWN_MAPS or feature_map.history not in shorter:
+    plain = replace(feature_map, drift=(), history=None, rates=(), dropped=())
+    if plain not in KNOWN_MAPS or feature_map.history not in shorter:
         raise ValueError(f"unknown feature map {feature_map}")
     mirror = reflection(definition, feature_map)
     if feature_map.parity and mirror is None:
@@ -122,7 +124,9 @@ def _sparse(entry: dict[str, Any] | None) -> Sparse | None:
 
 def _feature_map(entry: dict[str, Any]) -> FeatureMap:
     drift = tuple(tuple(float(w) for w in row) for row in entry.get("drift", ()))
-    return FeatureMap(**{**entry, "drift": drift, "rates": tuple(float(rate) for rate in entry.get("rates", ()))})
+    rates = tuple(float(rate) for rate in entry.get("rates", ()))
+    dropped = tuple(int(place) for place in entry.get("dropped", ()))
+    return FeatureMap(**{**entry, "drift": drift, "rates": rates, "dropped": dropped})
 
 
 def _require_drift(definition: EnvironmentDefinition, output: OutputModel) -> None:
@@ -131,6 +135,21 @@ def _require_drift(definition: EnvironmentDefinition, output: OutputModel) -> No
     shape = (len(definition.angles), len(definition.coordinates))
     if len(drift) != shape[0] or any(len(row) != shape[1] or not all(map(math.isfinite, row)) for row in drift):
         raise InvalidInput(f"output {output.name!r}: expected a drift of shape {shape}, finite, got {drift}")
+
+
+def _require_dropped(definition: EnvironmentDefinition, output: OutputModel) -> None:
+    """Check that the features left out are some of the map's, in order, and that a process is left with one."""
+    if not (dropped := output.feature_map.dropped):
+        return
+    count = len(features(definition, replace(output.feature_map, rates=(), dropped=())))
+    ordered = list(dropped) == sorted(set(dropped))
+    if (
+        output.posterior is None
+        or not ordered
+        or len(dropped) >= count
+        or not 0 <= min(dropped) <= max(dropped) < count
+    ):
+        raise InvalidInput(f"output {output.name!r}: expected some of {count} features left out, got {dropped}")
 
 
 def _require_warp(output: OutputModel) -> None:

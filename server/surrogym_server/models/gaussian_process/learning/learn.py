@@ -11,6 +11,7 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.models.gaussian_process.censoring import saturates, stopped
 from surrogym_server.models.gaussian_process.feature_maps import candidates
 from surrogym_server.models.gaussian_process.learning.angle_prediction import learn_drift
+from surrogym_server.models.gaussian_process.learning.dropping import without_inputs
 from surrogym_server.models.gaussian_process.learning.limits import held, past_limits
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.rates import output_with_rates
@@ -63,5 +64,6 @@ def _transitions(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
         more = ~stopped(definition, index, samples.q_next)
         output = past_limits(learner, output, change[:, column], inputs, keep, more)
         used = more if output.past_limits else keep
-        outputs.append(held(learner, output, change[:, column], inputs, used, sides[:, index]))
+        output = held(learner, output, change[:, column], inputs, used, sides[:, index])
+        outputs.append(without_inputs(learner, output))
     return tuple(outputs)

@@ -1,0 +1,98 @@
+"""Inputs that a process leaves out, because it is at least as likely without them.
+
+A long length scale takes an input out of the squared exponential, but not out of the linear part, whose variance all
+inputs share, and each length scale is one number more that few points have to determine. So inputs are eliminated one
+after the other, as long as the process wins by it: each time the one without which the log evidence, priors of
+hyperparameters included, is greatest. Reference: Rasmussen and Williams (2006), section 5.1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from surrogym_server.gp.fit import Array, FitOptions, _blas, _minimum, _Objective
+from surrogym_server.gp.kernel import Hyperparameters
+from surrogym_server.gp.posterior import Posterior
+
+
+@dataclass(frozen=True)
+class Selection:
+    """A process of some of the inputs."""
+
+    kept: Tensor  # (d,) bool
+    theta: Array  # its free parameters
+    score: float  # log evidence, priors included
+    gain: float  # above that of the process with all inputs
+    hyper: Hyperparameters
+
+
+def select_inputs(posterior: Posterior, options: FitOptions, may: Tensor, odds: float) -> Selection:
+    """Select inputs of an exact process by backward elimination. Runs on the CPU.
+
+    Args:
+        posterior: the process with all inputs, and its points.
+        options: those of its fit.
+        may: (d,) bool, the inputs that it may leave out. It keeps one at least.
+        odds: log odds before any data that it leaves out one input more.
+    """
+    search = _Search(posterior, options, may)
+    with _blas().limit(limits=1):
+        whole = subset = search.whole()
+        while (less := search.without_one(subset, subset.cost + odds)) is not None:
+            subset = less
+        subset = search.fitted(subset)
+    hyper = search.objective(subset.kept).hyper(subset.theta)
+    return Selection(subset.kept, subset.theta, -subset.cost, whole.cost - subset.cost, hyper)
+
+
+@dataclass(frozen=True)
+class _Subset:
+    kept: Tensor  # (d,) bool
+    theta: Array
+    cost: float  # negative log evidence, priors included
+
+
+class _Search:
+    """Subsets of the inputs of a process."""
+
+    def __init__(self, posterior: Posterior, options: FitOptions, may: Tensor) -> None:
+        self._posterior, self._options, self._may = posterior, options, may
+
+    def objective(self, kept: Tensor) -> _Objective:
+        mirror = self._posterior.hyper.reflection
+        part = None if mirror is None else replace(mirror, signs=mirror.signs[kept])
+        return _Objective(self._posterior.x[:, kept], self._posterior.y, self._options, part)
+
+    def whole(self) -> _Subset:
+        """All inputs, with hyperparameters near those of the process, which may come from other points."""
+        kept = torch.ones_like(self._may)
+        theta = self.objective(kept).theta(self._posterior.hyper)
+        return self.fitted(_Subset(kept, theta, 0.0))
+
+    def fitted(self, subset: _Subset) -> _Subset:
+        """The subset with hyperparameters of its own."""
+        cost, theta = _minimum(self.objective(subset.kept), subset.theta)
+        return replace(subset, theta=theta, cost=cost)
+
+    def without_one(self, subset: _Subset, most: float) -> _Subset | None:
+        """The best subset with one input less, if its cost is at most ``most``. Hyperparameters are fitted again only
+        if this decides."""
+        best = min(self._each_without_one(subset), key=lambda less: less.cost, default=None)
+        if best is not None and best.cost > most:
+            best = self.fitted(best)
+        return best if best is not None and best.cost <= most else None
+
+    def _each_without_one(self, subset: _Subset) -> Iterator[_Subset]:
+        """All with one input less that can still vary, with the hyperparameters as they are."""
+        mirror, places = self._posterior.hyper.reflection, subset.kept.nonzero()[:, 0].tolist()
+        for position, place in enumerate(places):
+            kept = subset.kept.clone()
+            kept[place] = False
+            nothing = mirror is not None and mirror.parity < 0 and bool((mirror.signs[kept] > 0).all())
+            if self._may[place] and bool(kept.any()) and not nothing:
+                theta = subset.theta[torch.arange(len(subset.theta)).numpy() != position]
+                yield _Subset(kept, theta, self.objective(kept)(theta)[0])

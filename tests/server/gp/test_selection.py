@@ -1,0 +1,67 @@
+"""Inputs that a process leaves out by evidence."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from surrogym_server.gp import FitOptions, Reflection, fit, select_inputs
+from surrogym_server.gp.fit import _Objective
+
+OPTIONS, ODDS = FitOptions(), -1.0
+
+
+def points(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Five inputs, of which the values read the first and the fourth."""
+    x = 3.4 * torch.rand(count, 5, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1.7
+    y = torch.sin(1.5 * x[:, 0]) + 0.5 * x[:, 3]
+    return x, y / y.std()
+
+
+def selected(x: Tensor, y: Tensor, may: Tensor, mirror: Reflection | None = None) -> tuple[list[int], float, float]:
+    """What is kept, and the log evidence with it and with all inputs."""
+    fitted = fit(x, y, OPTIONS, reflection=mirror)
+    found = select_inputs(fitted.posterior, OPTIONS, may, ODDS)
+    assert found.hyper.lengthscale.shape == (int(found.kept.sum()),)
+    return found.kept.nonzero()[:, 0].tolist(), found.score, fitted.score
+
+
+def test_inputs_that_are_not_read_are_left_out():
+    kept, score, before = selected(*points(25), torch.ones(5, dtype=torch.bool))
+    assert kept == [0, 3]
+    assert score > before + 3
+
+
+def test_score_is_that_of_a_process_of_these_inputs_alone():
+    x, y = points(25)
+    found = select_inputs(fit(x, y, OPTIONS).posterior, OPTIONS, torch.ones(5, dtype=torch.bool), ODDS)
+    cost, _ = _Objective(x[:, found.kept], y, OPTIONS, None)(found.theta)
+    assert abs(found.score + cost) < 1e-6
+
+
+def test_inputs_that_may_not_be_left_out_stay():
+    may = torch.tensor([True, False, True, True, True])
+    assert selected(*points(25), may)[0] == [0, 1, 3]
+
+
+def test_inputs_that_are_all_read_stay():
+    x, y = points(25)
+    y = y + x[:, 1] * x[:, 2] + torch.cos(x[:, 4])
+    fitted = fit(x, y, OPTIONS)
+    found = select_inputs(fitted.posterior, OPTIONS, torch.ones(5, dtype=torch.bool), ODDS)
+    assert bool(found.kept.all())
+    assert abs(found.gain) < 0.1
+    torch.testing.assert_close(found.hyper.lengthscale, fitted.posterior.hyper.lengthscale, rtol=0.05, atol=0)
+
+
+def test_an_odd_function_keeps_an_input_whose_sign_turns():
+    x, y = points(12)
+    mirror = Reflection(torch.tensor([1.0, -1.0, 1.0, 1.0, 1.0], dtype=torch.float64), -1)
+    assert 1 in selected(x, y, torch.ones(5, dtype=torch.bool), mirror)[0]
+
+
+def test_one_input_is_kept_at_least():
+    x, _ = points(12)
+    mirror = Reflection(torch.ones(5, dtype=torch.float64), 1)
+    for reflection in (None, mirror):
+        assert selected(x, x[:, 2].square(), torch.ones(5, dtype=torch.bool), reflection)[0] == [2]
