@@ -2,13 +2,14 @@
 
 python tests/benchmarks/bench_limits.py --seeds 0 1 2
 python tests/benchmarks/bench_limits.py --seeds 300 301 302 303 304 --designs
+python tests/benchmarks/bench_limits.py --seeds 0 1 2 --two-sided
 
 Models are learned from Latin hypercubes in three ways: ``without`` samples at the valve, with those at the limit ``of
 others``, and with ``inequalities`` at an output's own limit as well. Errors are root mean squares of the next states in
 deviations of a step, on steps from anywhere in the range, on those of them that end below the valve, and on a log's.
 The fourth way, ``no rates``, has the samples of the third, and outputs without rates (see ``gp.growth``). With
 ``--designs`` the models are those of whole designs of 100 real steps, without a policy: adaptive ones in three of these
-ways, and a hypercube.
+ways, and a hypercube. With ``--two-sided`` both coordinates have two limits, as a log's mapping declares them.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from common import parser, started, write
 from torch import Tensor
 
 from support.models import gaussian_processes
-from support.reactor import example
+from support.reactor import MAPPING, example
 from support.real_steps import join
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
@@ -38,10 +39,11 @@ from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.sampling.design import DesignState, Request, advance, initial_design
 from surrogym_server.sampling.latin_hypercube import latin_hypercube
-from surrogym_shared.spec import Design
+from surrogym_shared.spec import Bounds, Design, EnvironmentSpec
 
 SIZES, UNSEEN, EPISODES, LENGTH, BUDGET = (12, 24, 50, 100), 1_500, 10, 100, 100
 REACTOR = example()
+SPEC = [REACTOR.Reactor().spec()]
 PAST_LIMITS, HELD = learning.past_limits, learning.held
 
 
@@ -58,20 +60,30 @@ WAYS = {
 }
 
 
+def bounded(spec: EnvironmentSpec) -> EnvironmentSpec:
+    """The reactor with two limits for each coordinate."""
+    limits = [Bounds(**dict(zip(("low", "high"), MAPPING["limits"][name], strict=True))) for name in ("c", "T")]
+    made = (c.model_copy(update={"bounds": b}) for c, b in zip(spec.coordinates, limits, strict=True))
+    return spec.model_copy(update={"coordinates": tuple(made)})
+
+
 def learn_by(way: str, acquisition: str = "integrated_variance", seed: int = 0) -> EnvironmentDefinition:
     """Learn in that way from now on. Returns the reactor with a design."""
     learning.past_limits, learning.held = WAYS[way]
     model = {"name": "gaussian_process", "settings": {"rates": way != "no rates"}}
     design = Design.model_validate({"acquisition": acquisition, "seed": seed, "model": model})
-    return definition_from_spec(REACTOR.Reactor().spec().model_copy(update={"design": design}))
+    return definition_from_spec(SPEC[0].model_copy(update={"design": design}))
 
 
 def main() -> None:
     made = parser(__doc__)
     made.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     made.add_argument("--designs", action="store_true", help="models of whole designs instead of hypercubes")
+    made.add_argument("--two-sided", action="store_true", help="two limits for each coordinate")
     options = started(made)
-    definition = definition_from_spec(REACTOR.Reactor().spec())
+    if options.two_sided:
+        SPEC[0] = bounded(SPEC[0])
+    definition = definition_from_spec(SPEC[0])
     anywhere = steps(*hypercube(definition, UNSEEN, 99))
     below = ~saturated(definition, anywhere.q_next)
     tests = {

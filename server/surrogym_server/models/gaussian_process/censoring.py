@@ -29,13 +29,9 @@ def usable(
 
 
 def stopped(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Tensor:
-    """Samples (n,) that ended at a bound after which coordinate ``index`` is unknown: its own bound, that of a limited
-    speed, or a wall. The limit of another coordinate, such as a relief valve's, does not make a sample useless."""
-    limits = [
-        i
-        for i in definition.moving
-        if i != index and definition.coordinates[i].stops is None and i not in leading(definition)
-    ]
+    """Samples (n,) that ended at a bound after which coordinate ``index`` is unknown: its own bound, or a wall. The
+    limit of another coordinate, such as a relief valve's, does not make a sample useless."""
+    limits = [i for i in definition.moving if i != index and definition.coordinates[i].stops is None]
     others = q_next.clone()
     others[:, limits] = math.nan
     return saturated(definition, others)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -35,6 +37,7 @@ def tank(**bounds: Bounds) -> EnvironmentDefinition:
 
 
 RELIEVED = tank(pressure=Bounds(high=VALVE))
+TWO_SIDED = tank(pressure=Bounds(low=-3 * VALVE, high=VALVE))  # as a log's mapping declares limits
 
 
 def steps(count: int, bent: bool, seed: int) -> Samples:
@@ -48,8 +51,8 @@ def steps(count: int, bent: bool, seed: int) -> Samples:
     return Samples(q, u, torch.stack([level, pressure], 1), reward, reward.bool())
 
 
-def error(samples: Samples, test: Samples) -> float:
-    off = gaussian_processes(RELIEVED, samples).transition(test.q, test.u).q_next[:, 0] - test.q_next[:, 0]
+def error(definition: EnvironmentDefinition, samples: Samples, test: Samples) -> float:
+    off = gaussian_processes(definition, samples).transition(test.q, test.u).q_next[:, 0] - test.q_next[:, 0]
     return float(off.square().mean().sqrt())
 
 
@@ -58,9 +61,24 @@ def test_level_is_better_known_with_samples_at_the_valve_of_the_pressure(monkeyp
     samples, test = steps(40, bent, 5), steps(300, bent, 1)
     model = gaussian_processes(RELIEVED, samples)
     assert [output.past_limits for output in model.transitions] == [True, False]
-    chosen = error(samples, test)
+    chosen = error(RELIEVED, samples, test)
     monkeypatch.setattr(learning, "past_limits", lambda _, output, *others: output)  # noqa: ARG005
-    assert chosen < share * error(samples, test)
+    assert chosen < share * error(RELIEVED, samples, test)
+
+
+def test_a_lower_limit_that_no_sample_reaches_changes_nothing_of_it():
+    """With two limits the pressure is a coordinate whose next value others may read."""
+    samples, test = steps(40, False, 5), steps(300, False, 1)
+    assert gaussian_processes(TWO_SIDED, samples).transitions[0].past_limits
+    assert error(TWO_SIDED, samples, test) == pytest.approx(error(RELIEVED, samples, test), rel=0.1)
+
+
+def test_an_output_that_follows_a_limited_speed_reads_its_next_value():
+    found = steps(60, False, 5)
+    follows = replace(found, q_next=torch.stack([found.q[:, 0] + 0.3 * found.q_next[:, 1], found.q_next[:, 1]], 1))
+    output = gaussian_processes(TWO_SIDED, follows).transitions[0]
+    assert output.feature_map.lead
+    assert not output.past_limits
 
 
 def test_a_process_of_inducing_points_is_judged_by_the_residuals_of_its_samples(monkeypatch):
@@ -89,12 +107,13 @@ def test_samples_that_met_no_limit_are_all_there_is():
     assert not any(output.past_limits for output in gaussian_processes(RELIEVED, below).transitions)
 
 
-def test_own_limit_a_limited_speed_and_a_wall_leave_samples_out():
+def test_own_limit_and_a_wall_leave_samples_out():
     at_valve = torch.tensor([[0.0, VALVE], [0.0, 0.0]], dtype=torch.float64)
     assert stopped(RELIEVED, 1, at_valve).tolist() == [True, False]
     assert stopped(RELIEVED, 0, at_valve).tolist() == [False, False]
-    limited = tank(pressure=Bounds(low=-VALVE, high=VALVE))
-    assert stopped(limited, 0, at_valve).tolist() == [True, False]
+    assert stopped(TWO_SIDED, 0, at_valve).tolist() == [False, False]
+    walled = tank(pressure=Bounds(low=-VALVE, high=VALVE, stops="level"))
+    assert stopped(walled, 0, at_valve).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("bent", [False, True])

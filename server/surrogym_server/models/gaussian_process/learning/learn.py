@@ -58,11 +58,11 @@ def _transitions(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
     for column, index in enumerate(definition.moving):
         maps = learner.allowed(candidates(definition, follows=index not in lead, drift=drift))
         inputs = {m: encode(definition, m, samples.q, samples.u, samples.q_next[:, lead]) for m in maps}
-        keep_lead = ~saturates(definition, index, samples.q_next) | ~keep.any()
+        keep_lead = ~saturates(definition, index, samples.q_next) | keep
         name = definition.coordinates[index].name
-        output = output_with_rates(learner, name, change[:, column], inputs, keep, keep_lead | keep)
+        output = output_with_rates(learner, name, change[:, column], inputs, keep, keep_lead)
         more = ~stopped(definition, index, samples.q_next)
-        output = past_limits(learner, output, change[:, column], inputs, keep, more)
+        output = past_limits(learner, output, change[:, column], inputs, keep, keep_lead, more)
         used = more if output.past_limits else keep
         output = held(learner, output, change[:, column], inputs, used, sides[:, index])
         outputs.append(without_inputs(learner, output))

@@ -43,22 +43,24 @@ def past_limits(
     target: Tensor,
     inputs: Mapping[FeatureMap, Tensor],
     keep: Tensor,
+    keep_lead: Tensor,
     more: Tensor,
 ) -> OutputModel:
-    """The output, learned from samples ``keep`` (n,) with targets (n,), or from ``more`` (n,) as well."""
-    also = more & ~keep
-    if not bool(also.any()) or output.feature_map.lead:
+    """The output, learned from samples ``keep`` (n,) with targets (n,), or with a map that reads the lead from
+    ``keep_lead`` (n,). Or from those of ``more`` (n,) as well, without the lead."""
+    learned = keep_lead if output.feature_map.lead else keep
+    if not bool((more & ~keep).any()):
         return output
     plain = {m: x for m, x in inputs.items() if not m.lead}
-    every = keep | more
-    wider = output_with_rates(learner, output.name + WIDER, target, plain, every, every)
+    wide, every = keep | more, learned | more
+    wider = output_with_rates(learner, output.name + WIDER, target, plain, wide, wide)
     if wider.posterior is None:
         return output
     wider = replace(wider, name=output.name, past_limits=True)
     if output.posterior is None:
         return wider
-    wide = _error(wider, target, inputs_of(wider, inputs), every, every)
-    return wider if wide < _error(output, target, inputs_of(output, inputs), keep, every) else output
+    found = _error(wider, target, inputs_of(wider, inputs), wide, every)
+    return wider if found < _error(output, target, inputs_of(output, inputs), learned, every) else output
 
 
 def held(
