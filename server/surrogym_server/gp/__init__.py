@@ -24,11 +24,12 @@ from surrogym_server.gp.pathwise import Pathwise
 from surrogym_server.gp.posterior import LeftOut, Posterior, Sparse, condition
 from surrogym_server.gp.selection import Selection, select_inputs
 from surrogym_server.gp.serving import Output, Serving
-from surrogym_server.gp.sparse import condition_many, condition_sparse
+from surrogym_server.gp.sparse import Censored, condition_many, condition_sparse
 from surrogym_server.gp.subsets import spread
 
 __all__ = [
     "NOISE_FLOOR",
+    "Censored",
     "FitOptions",
     "Fitted",
     "Hyperparameters",

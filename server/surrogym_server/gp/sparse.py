@@ -20,7 +20,8 @@ References: Fine and Scheinberg (2001) for the choice of Z; Seeger, Williams, La
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -30,25 +31,55 @@ from surrogym_server.gp.posterior import BLOCK, LeftOut, Posterior, Sparse, cond
 
 MAX_EXACT = 2_000  # a process with more points is sparse
 INDUCING = 1_000
-COMPARED = 2
+NOISES = (1.0, 1e2)  # times the noise variance that was fitted
 SHARE = 1e-12  # least share that all other points have in a prediction
 EXPLAINED, BELOW_NOISE = 1e-10, 1e-3  # of the prior's and the noise variance: least variance to choose
 
 
-def condition_many(hypers: Sequence[Hyperparameters], x: Tensor, y: Tensor) -> Posterior:
+@dataclass(frozen=True)
+class Censored:
+    """Points of which only a side is known: side * f(x) is at least side * y."""
+
+    x: Tensor  # (k, d)
+    y: Tensor  # (k,)
+    side: Tensor  # (k,) 1 or -1
+
+    def log_probability(self, posterior: Posterior) -> float:
+        """Log probability of all sides, each by itself."""
+        mean, variance = posterior.mean_and_variance(self.x)
+        over = self.side * (mean - self.y) / (variance + posterior.hyper.noise_variance).sqrt()
+        return float(torch.special.log_ndtr(over).sum())
+
+    def misfit(self, posterior: Posterior) -> float:
+        """Sum of squares of what the mean falls short of y on the side."""
+        return float((self.side * (self.y - posterior.mean(self.x))).clamp_min(0).square().sum())
+
+
+def condition_many(
+    hypers: Sequence[Hyperparameters], x: Tensor, y: Tensor, censored: Censored | None = None
+) -> Posterior:
     """Condition a process on x (n, d) and y (n,). Up to ``MAX_EXACT`` points this is exact, with the last
     hyperparameters.
 
-    With more points it uses inducing points, and those of the last ``COMPARED`` hyperparameters that predict left-out
-    points best: hyperparameters fitted to a subset may miss rare points, so all points decide. R&W (2006), section
-    5.4.2.
+    With more points it uses inducing points, and all points decide, because hyperparameters fitted to a subset may miss
+    rare points. Each point is predicted from the others, and ``censored`` points are predicted as well. The density
+    decides how large the noise is: inducing points leave errors that the fitted noise does not know. The mean squared
+    error decides between the hyperparameters, each with its best noise. R&W (2006), section 5.4.2.
 
     Raises:
         NumericalFailure: as ``condition``.
     """
     if len(y) <= MAX_EXACT:
         return condition(hypers[-1], x, y)
-    return max((condition_sparse(hyper, x, y) for hyper in hypers[-COMPARED:]), key=lambda p: p.left_out.log_density)
+    judged = censored or Censored(x[:0], y[:0], y[:0])
+
+    def density(posterior: Posterior) -> float:
+        return len(y) * posterior.left_out.log_density + judged.log_probability(posterior)
+
+    def misfit(posterior: Posterior) -> float:
+        return len(y) * posterior.left_out.error**2 + judged.misfit(posterior)
+
+    return min((max(_with_noises(hyper, x, y), key=density) for hyper in hypers), key=misfit)
 
 
 def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
@@ -57,7 +88,19 @@ def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
     Raises:
         NumericalFailure: as ``condition``.
     """
-    chosen, known, left = _pivots(hyper, x)  # (m,), V (m, n), (n,)
+    return _projected(hyper, x, y, _pivots(hyper, x))
+
+
+def _with_noises(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Iterator[Posterior]:
+    """The same inducing points with several noise variances."""
+    pivots = _pivots(hyper, x)
+    for noise in NOISES:
+        yield _projected(replace(hyper, noise_variance=noise * hyper.noise_variance), x, y, pivots)
+
+
+def _projected(hyper: Hyperparameters, x: Tensor, y: Tensor, pivots: tuple[Tensor, Tensor, Tensor]) -> Posterior:
+    """The process through the inducing points of ``_pivots``."""
+    chosen, known, left = pivots  # (m,), V (m, n), (n,)
     inducing = x[chosen]
     lower = known[:, chosen].T.tril()
     noise = hyper.noise_variance

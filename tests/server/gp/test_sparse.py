@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.gp import (
+    Censored,
     Hyperparameters,
     Output,
     Pathwise,
@@ -89,13 +90,38 @@ def test_a_process_is_exact_up_to_a_number_of_points(
     assert (condition_many([hyper], x[:points], y[:points]).sparse is None) == exact
 
 
-def test_of_two_sparse_processes_the_one_is_kept_that_foretells_all_points(
+def test_noise_that_is_too_small_is_seen_by_all_points(
     drawn: tuple[Hyperparameters, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(sparse, "MAX_EXACT", 60)
     hyper, x, y = drawn
-    sure = replace(hyper, noise_variance=NOISE / 100)
-    assert condition_many([hyper, sure], x, y).hyper is condition_many([sure, hyper], x, y).hyper is hyper
+    for fitted in (NOISE, NOISE / 100):
+        found = condition_many([replace(hyper, noise_variance=fitted)], x, y)
+        assert found.hyper.noise_variance == pytest.approx(NOISE)
+
+
+def test_of_sparse_processes_the_one_is_kept_that_foretells_all_points(
+    drawn: tuple[Hyperparameters, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sparse, "MAX_EXACT", 60)
+    hyper, x, y = drawn
+    rough = replace(hyper, lengthscale=hyper.lengthscale / 20)
+    for order in ([hyper, rough], [rough, hyper]):
+        assert condition_many(order, x, y).hyper.lengthscale is hyper.lengthscale
+
+
+def test_points_of_which_a_side_is_known_judge_sparse_processes(
+    drawn: tuple[Hyperparameters, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+):
+    """Both foretell the points alike, with a linear part slightly better. Beyond them it leads away."""
+    monkeypatch.setattr(sparse, "MAX_EXACT", 60)
+    hyper, x, y = drawn
+    flat = replace(hyper, linear_variance=1e-9)
+    beyond = torch.tensor([[0.0, 6.0], [0.5, 7.0]], dtype=torch.float64)
+    at_most = Censored(beyond, beyond.new_ones(2), -beyond.new_ones(2))
+    for order in ([hyper, flat], [flat, hyper]):
+        assert condition_many(order, x, y).hyper.linear_variance == hyper.linear_variance
+        assert condition_many(order, x, y, at_most).hyper.linear_variance == flat.linear_variance
 
 
 def test_leave_one_out_is_of_the_points_not_of_the_inducing_ones(drawn: tuple[Hyperparameters, Tensor, Tensor]):

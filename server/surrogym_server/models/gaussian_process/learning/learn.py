@@ -60,10 +60,11 @@ def _transitions(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
         inputs = {m: encode(definition, m, samples.q, samples.u, samples.q_next[:, lead]) for m in maps}
         keep_lead = ~saturates(definition, index, samples.q_next) | keep
         name = definition.coordinates[index].name
-        output = output_with_rates(learner, name, change[:, column], inputs, keep, keep_lead)
+        target, side = change[:, column], sides[:, index]
+        output = output_with_rates(learner, name, target, inputs, keep, keep_lead, side)
         more = ~stopped(definition, index, samples.q_next)
-        output = past_limits(learner, output, change[:, column], inputs, keep, keep_lead, more)
+        output = past_limits(learner, output, target, inputs, keep, keep_lead, more, side)
         used = more if output.past_limits else keep
-        output = held(learner, output, change[:, column], inputs, used, sides[:, index])
+        output = held(learner, output, target, inputs, used, side)
         outputs.append(without_inputs(learner, output))
     return tuple(outputs)

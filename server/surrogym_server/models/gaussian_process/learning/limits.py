@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import Joint, Posterior, condition_many
+from surrogym_server.gp import Joint, Posterior, condition_sparse
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.rates import inputs_of, output_with_rates
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
@@ -45,15 +45,16 @@ def past_limits(
     keep: Tensor,
     keep_lead: Tensor,
     more: Tensor,
+    side: Tensor,
 ) -> OutputModel:
     """The output, learned from samples ``keep`` (n,) with targets (n,), or with a map that reads the lead from
-    ``keep_lead`` (n,). Or from those of ``more`` (n,) as well, without the lead."""
+    ``keep_lead`` (n,). Or from those of ``more`` (n,) as well, without the lead. ``side`` is that of ``held``."""
     learned = keep_lead if output.feature_map.lead else keep
     if not bool((more & ~keep).any()):
         return output
     plain = {m: x for m, x in inputs.items() if not m.lead}
     wide, every = keep | more, learned | more
-    wider = output_with_rates(learner, output.name + WIDER, target, plain, wide, wide)
+    wider = output_with_rates(learner, output.name + WIDER, target, plain, wide, wide, side)
     if wider.posterior is None:
         return output
     wider = replace(wider, name=output.name, past_limits=True)
@@ -90,7 +91,7 @@ def held(
             break
         more = keep.index_fill(0, violated, value=True)
         if output.posterior.sparse is None:
-            again = output_with_rates(learner, name + HELD, target, plain, more, more)
+            again = output_with_rates(learner, name + HELD, target, plain, more, more, side)
         else:
             again = _with_samples(output, target, inputs, more)
         found = replace(again, name=name, past_limits=past)
@@ -127,7 +128,7 @@ def _with_samples(
     long, and a few more of them change no hyperparameter."""
     assert output.posterior is not None
     x = inputs_of(output, inputs)[keep]
-    posterior = condition_many([output.posterior.hyper], x, output.standardised(target[keep], x))
+    posterior = condition_sparse(output.posterior.hyper, x, output.standardised(target[keep], x))
     return replace(output, posterior=posterior)
 
 

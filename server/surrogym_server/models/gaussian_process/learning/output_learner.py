@@ -11,7 +11,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import FitOptions, Fitted, Posterior, condition_many, fit, refine, spread, subsets
+from surrogym_server.gp import Censored, FitOptions, Fitted, Posterior, condition_many, fit, refine, spread, subsets
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE
@@ -41,12 +41,20 @@ class OutputLearner:
         return tuple(m for m in maps if self.settings.symmetry == "auto" or not m.parity)
 
     def output(
-        self, name: str, target: Tensor, inputs: Mapping[FeatureMap, Tensor], keep: Tensor, keep_lead: Tensor
+        self,
+        name: str,
+        target: Tensor,
+        inputs: Mapping[FeatureMap, Tensor],
+        keep: Tensor,
+        keep_lead: Tensor,
+        side: Tensor | None = None,
     ) -> OutputModel:
         """Fit one output's targets (n,) with each of the feature maps ``inputs`` (n, d), and return the best.
 
         ``keep`` (n,) marks the samples that count. Maps that read the lead may use more, ``keep_lead``. All are
         compared on the same points. The maps with all lags are compared first, and then the histories of the best one.
+        ``side`` (n,) is 1 for a sample that ended at the output's own upper limit, -1 at the lower, else 0. Of those
+        that do not count, these help to choose hyperparameters if the samples are many.
         """
         centre, scale = float(target[keep].mean()), float(target[keep].std(correction=0))
         if scale <= max(CONSTANT * abs(centre), SMALLEST):
@@ -67,7 +75,9 @@ class OutputLearner:
         more = bool(best.lead) and bool((keep_lead & ~keep).any())
         used = keep_lead if more else keep
         if int(used.sum()) > subsets.FEW:
-            posterior = self.refined(name, best, inputs[best][used], y[used], chosen.theta)
+            rest = None if side is None else ((side != 0) & ~used)
+            at_limit = None if side is None else Censored(inputs[best][rest], y[rest], side[rest])
+            posterior = self.refined(name, best, inputs[best][used], y[used], chosen.theta, at_limit)
         elif more:
             posterior = self._fit(name, best, inputs[best][used], y[used], "|all").posterior
         else:
@@ -85,11 +95,17 @@ class OutputLearner:
         return replace(fitted, score=fitted.score * len(y) / len(rows))
 
     def refined(
-        self, name: str, feature_map: FeatureMap, x: Tensor, y: Tensor, theta: NDArray[np.float64]
+        self,
+        name: str,
+        feature_map: FeatureMap,
+        x: Tensor,
+        y: Tensor,
+        theta: NDArray[np.float64],
+        at_limit: Censored | None = None,
     ) -> Posterior:
         """The process of all points x (n, d), y (n,), with the hyperparameters of a subset."""
         mirror = reflection(self.definition, feature_map)
-        return condition_many(refine(x, y, self.options(name), theta, mirror), x, y)
+        return condition_many(refine(x, y, self.options(name), theta, mirror), x, y, at_limit)
 
     def options(self, name: str) -> FitOptions:
         """Dynamics tend to be near linear, and costs to be quadratic."""

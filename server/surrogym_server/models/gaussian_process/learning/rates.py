@@ -27,9 +27,10 @@ def output_with_rates(
     inputs: Mapping[FeatureMap, Tensor],
     keep: Tensor,
     keep_lead: Tensor,
+    side: Tensor,
 ) -> OutputModel:
     """Fit one output as ``OutputLearner.output`` does. Then its best map may get rates."""
-    output = learner.output(name, target, inputs, keep, keep_lead)
+    output = learner.output(name, target, inputs, keep, keep_lead, side)
     may = _may_have_rates(learner, output, inputs, keep)
     if not bool(may.any()):
         return output
