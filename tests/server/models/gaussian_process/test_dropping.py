@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from support.models import gaussian_processes
+from support.predictions import WAYS, check_compiled, check_processes
 from support.real_steps import random_steps
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
@@ -17,13 +18,11 @@ from surrogym_server.environment.features import FeatureMap, features
 from surrogym_server.environment.samples import Samples
 from surrogym_server.errors import InvalidInput
 from surrogym_server.gp import Hyperparameters, condition
-from surrogym_server.models.abilities import PredictedSteps
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.gaussian_process.codec.outputs import require_output
 from surrogym_server.models.gaussian_process.learning import dropping
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
-from surrogym_server.models.gaussian_process.prediction.lookahead import process_inputs
 from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
@@ -103,32 +102,12 @@ def test_preset_paper_leaves_nothing_out():
 
 
 def test_predictions_are_those_of_the_processes(model, points):
-    moved = model.transition(*points, deviations=True)
-    for column, output in enumerate(model.transitions):
-        x = process_inputs(model.definition, output, PredictedSteps(*points, points[0]))
-        mean, deviation = output.mean_and_deviation(x)
-        torch.testing.assert_close(moved.q_next[:, column] - points[0][:, column], mean, rtol=1e-6, atol=1e-9)
-        torch.testing.assert_close(moved.deviation[:, column], deviation, rtol=1e-4, atol=1e-7)
+    check_processes(model, points)
 
 
-@pytest.mark.parametrize("how", ["mean", "particles", "functions"])
+@pytest.mark.parametrize("how", WAYS)
 def test_compiled_steps_are_the_same(model, points, how):
-    compiled = model.compiled()
-    if compiled is None:
-        pytest.skip("steps can't be compiled here")
-    generator, rows, given = torch.Generator().manual_seed(0), len(points[0]), {}
-    if how == "particles":
-        given = {n: torch.randn(rows, 10, generator=generator, dtype=torch.float64) for n in ("noise", "process")}
-    if how == "functions":
-        given = {"paths": model.draw(torch.randn(rows, model.path_size, generator=generator, dtype=torch.float64))}
-        ours = model.transition_along(given["paths"], *points, deviations=True)
-    else:
-        ours = model.transition(*points, deviations=True, **given)
-    arrays = {name: given[name].numpy() if name in given else None for name in ("noise", "process", "paths")}
-    theirs = compiled(*(p.numpy() for p in points), **arrays, deviations=True, reward_deviation=False)
-    torch.testing.assert_close(torch.from_numpy(theirs.q_next), ours.q_next, rtol=1e-7, atol=1e-8)
-    torch.testing.assert_close(torch.from_numpy(theirs.reward), ours.reward, rtol=1e-7, atol=1e-8)
-    torch.testing.assert_close(torch.from_numpy(theirs.deviation[:, :10]), ours.deviation, rtol=1e-4, atol=1e-7)
+    check_compiled(model, points, how)
 
 
 def test_functions_with_uncertain_hyperparameters_read_the_same(model, points):

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from support.models import gaussian_processes, learn
+from support.predictions import WAYS, check_compiled, check_processes
 from support.real_steps import random_steps
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
@@ -87,33 +88,12 @@ def test_small_changes_are_foretold_better_with_rates(model):
 
 
 def test_predictions_are_those_of_the_processes(model, points):
-    moved = model.transition(*points, deviations=True)
-    for column, output in enumerate(model.transitions):
-        x = process_inputs(model.definition, output, PredictedSteps(*points, points[0]))
-        mean, deviation = output.mean_and_deviation(x)
-        torch.testing.assert_close(moved.q_next[:, column] - points[0][:, column], mean, rtol=1e-6, atol=1e-9)
-        torch.testing.assert_close(moved.deviation[:, column], deviation, rtol=1e-4, atol=1e-7)
+    check_processes(model, points)
 
 
-@pytest.mark.parametrize("how", ["mean", "particles", "functions"])
+@pytest.mark.parametrize("how", WAYS)
 def test_compiled_steps_are_the_same(model, points, how):
-    compiled = model.compiled()
-    if compiled is None:
-        pytest.skip("steps can't be compiled here")
-    generator = torch.Generator().manual_seed(0)
-    rows, given = len(points[0]), {}
-    if how == "particles":
-        given = {n: torch.randn(rows, 2, generator=generator, dtype=torch.float64) for n in ("noise", "process")}
-    if how == "functions":
-        given = {"paths": model.draw(torch.randn(rows, model.path_size, generator=generator, dtype=torch.float64))}
-    if how == "functions":
-        ours = model.transition_along(given["paths"], *points, deviations=True)
-    else:
-        ours = model.transition(*points, deviations=True, **given)
-    arrays = {name: given[name].numpy() if name in given else None for name in ("noise", "process", "paths")}
-    theirs = compiled(*(p.numpy() for p in points), **arrays, deviations=True, reward_deviation=False)
-    torch.testing.assert_close(torch.from_numpy(theirs.q_next), ours.q_next, rtol=1e-7, atol=1e-8)
-    torch.testing.assert_close(torch.from_numpy(theirs.deviation[:, :2]), ours.deviation, rtol=1e-4, atol=1e-7)
+    check_compiled(model, points, how)
 
 
 def test_drawn_functions_spread_as_the_deviations_say(model, points):
