@@ -43,7 +43,6 @@ from surrogym_shared.spec import Bounds, Design, EnvironmentSpec
 
 SIZES, UNSEEN, EPISODES, LENGTH, BUDGET = (12, 24, 50, 100), 1_500, 10, 100, 100
 REACTOR = example()
-SPEC = [REACTOR.Reactor().spec()]
 PAST_LIMITS, HELD = learning.past_limits, learning.held
 
 
@@ -67,12 +66,14 @@ def bounded(spec: EnvironmentSpec) -> EnvironmentSpec:
     return spec.model_copy(update={"coordinates": tuple(made)})
 
 
-def learn_by(way: str, acquisition: str = "integrated_variance", seed: int = 0) -> EnvironmentDefinition:
-    """Learn in that way from now on. Returns the reactor with a design."""
+def learn_by(
+    spec: EnvironmentSpec, way: str, acquisition: str = "integrated_variance", seed: int = 0
+) -> EnvironmentDefinition:
+    """Learn in that way from now on. Returns the environment with a design."""
     learning.past_limits, learning.held = WAYS[way]
     model = {"name": "gaussian_process", "settings": {"rates": way != "no rates"}}
     design = Design.model_validate({"acquisition": acquisition, "seed": seed, "model": model})
-    return definition_from_spec(SPEC[0].model_copy(update={"design": design}))
+    return definition_from_spec(spec.model_copy(update={"design": design}))
 
 
 def main() -> None:
@@ -81,9 +82,9 @@ def main() -> None:
     made.add_argument("--designs", action="store_true", help="models of whole designs instead of hypercubes")
     made.add_argument("--two-sided", action="store_true", help="two limits for each coordinate")
     options = started(made)
-    if options.two_sided:
-        SPEC[0] = bounded(SPEC[0])
-    definition = definition_from_spec(SPEC[0])
+    spec = REACTOR.Reactor().spec()
+    spec = bounded(spec) if options.two_sided else spec
+    definition = definition_from_spec(spec)
     anywhere = steps(*hypercube(definition, UNSEEN, 99))
     below = ~saturated(definition, anywhere.q_next)
     tests = {
@@ -92,7 +93,7 @@ def main() -> None:
         "log": samples_of(REACTOR.operate(EPISODES, LENGTH, seed=1)),
     }
     rows = []
-    for case, model, samples in (designed if options.designs else learned)(options.seeds):
+    for case, model, samples in (designed if options.designs else learned)(spec, options.seeds):
         row = {**case, "samples": len(samples), "below_valve": int((~saturated(definition, samples.q_next)).sum())}
         for where, test in tests.items():
             off = model.transition(test.q, test.u).q_next - test.q_next
@@ -114,16 +115,16 @@ def hypercube(definition: EnvironmentDefinition, count: int, seed: int) -> tuple
     return latin_hypercube(definition, count, np.random.default_rng(seed))
 
 
-def learned(seeds: list[int]) -> Iterator[tuple[dict[str, Any], GaussianProcessModel, Samples]]:
+def learned(spec: EnvironmentSpec, seeds: list[int]) -> Iterator[tuple[dict[str, Any], GaussianProcessModel, Samples]]:
     """Models of hypercubes."""
     for size in SIZES:
         for seed in seeds:
-            samples = steps(*hypercube(learn_by("inequalities"), size, seed))
+            samples = steps(*hypercube(learn_by(spec, "inequalities"), size, seed))
             for way in WAYS:
-                yield {"seed": seed, "with": way}, gaussian_processes(learn_by(way), samples), samples
+                yield {"seed": seed, "with": way}, gaussian_processes(learn_by(spec, way), samples), samples
 
 
-def designed(seeds: list[int]) -> Iterator[tuple[dict[str, Any], GaussianProcessModel, Samples]]:
+def designed(spec: EnvironmentSpec, seeds: list[int]) -> Iterator[tuple[dict[str, Any], GaussianProcessModel, Samples]]:
     """Models of whole designs."""
     for seed in seeds:
         for way, acquisition in (
@@ -132,7 +133,7 @@ def designed(seeds: list[int]) -> Iterator[tuple[dict[str, Any], GaussianProcess
             ("inequalities", "integrated_variance"),
             ("inequalities", "latin_hypercube"),
         ):
-            definition = learn_by(way, acquisition, seed)
+            definition = learn_by(spec, way, acquisition, seed)
             samples, state = steps(*initial_design(definition, BUDGET)), DesignState()
             nothing = Points(samples.q[:0], samples.u[:0])
             while len((made := advance(definition, samples, state, Request(BUDGET, 0.999, nothing))).q):
