@@ -10,14 +10,13 @@ from torch import Tensor
 from surrogym_server.environment.features import features
 from surrogym_server.errors import NumericalFailure
 from surrogym_server.gp import Posterior, Selection, condition, select_inputs, spread, subsets
-from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
+from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner, is_unexplained
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
 ODDS = -1.0  # log odds of each input that is left out, before any data
 WIN = 2.0  # log odds for each sample by which fewer inputs must win: below, some made predictions too sure
 LESS = 0.5  # share of the leave-one-out error with all inputs that may be left
 FEWEST = 20  # samples: of fewer, some gave such odds to wrong inputs
-EXPLAINED = 0.01  # of the targets' deviation: if each sample is foretold as well by the others, no input is left out
 
 
 def without_inputs(learner: OutputLearner, output: OutputModel) -> OutputModel:
@@ -39,17 +38,15 @@ def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
     """Inputs of an output, (d,) bool, that may be left out.
 
     The next value of a limited speed may not: it seems to say nothing new until a sample ends at the limit. Nor may an
-    input with a rate. No input may be left out in three cases: there are too few samples to tell, the process explains
-    its samples already, or the samples are so many that inducing points represent them.
+    input with a rate. No input may be left out if there are too few samples to tell, or if nothing is left to explain.
     """
     read = features(learner.definition, output.feature_map)
     may = torch.tensor([feature.function not in ("lead", "grown") for feature in read])
     posterior = output.posterior
     none = torch.zeros_like(may)
-    if posterior is None or posterior.sparse is not None or not learner.settings.drop_inputs:
+    if posterior is None or not learner.settings.drop_inputs:
         return none
-    enough = len(posterior.y) >= FEWEST and posterior.left_out.error > EXPLAINED
-    return may if enough else none
+    return may if len(posterior.y) >= FEWEST and is_unexplained(posterior) else none
 
 
 def _with_fewer(learner: OutputLearner, output: OutputModel, posterior: Posterior, found: Selection) -> OutputModel:

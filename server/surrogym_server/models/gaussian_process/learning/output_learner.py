@@ -24,6 +24,7 @@ from surrogym_server.models.port import Warm
 LEAD_ODDS, ALONE_ODDS, PARITY_ODDS, PLACE_ODDS = 3.0, -6.0, -3.0, 3.0
 CONSTANT = 1e-9  # an output whose deviation is below this share of its own size never varied
 SMALLEST = 1e-100  # deviation of an output: squares of a smaller one underflow
+EXPLAINED = 0.01  # of the targets' deviation: a process that foretells its samples as well needs no other structure
 PEAK = "reward peak"  # the logarithm of a reward
 
 
@@ -113,6 +114,15 @@ class OutputLearner:
         if self.settings.kernel == "squared_exponential":
             options = FitOptions(linear=False)
         return replace(options, noise_floor=PEAK_NOISE) if name == PEAK else options
+
+
+def is_unexplained(posterior: Posterior) -> bool:
+    """Whether other structures of a process are worth a search.
+
+    They are not if it foretells each sample well from the others. They are not with thousands of samples either, where
+    inducing points stand for the samples.
+    """
+    return posterior.sparse is None and posterior.left_out.error > EXPLAINED
 
 
 def _with_whole_history(inputs: Mapping[FeatureMap, Tensor]) -> list[FeatureMap]:

@@ -11,12 +11,11 @@ from torch import Tensor
 from surrogym_server.environment.features import FeatureMap, features
 from surrogym_server.errors import NumericalFailure
 from surrogym_server.gp import fit_growing, spread, subsets
-from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
+from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner, is_unexplained
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.tensors.bending import EDGE, amplitude, bend
 
 ODDS = -3.0  # log odds of each rate before any data
-EXPLAINED = 0.01  # of the targets' deviation: if each sample is foretold as well by the others, no rates are tried
 FEWEST = 8  # samples for each rate: fewer leave a rate uncertain, and predictions with it are too sure
 
 
@@ -52,17 +51,16 @@ def _may_have_rates(
 ) -> Tensor:
     """Inputs of an output, (d,) bool, that may have a rate.
 
-    No input may have one in three cases: there are too few samples to determine it, the process explains its samples
-    already, or the samples are so many that inducing points represent them.
+    No input may have one if there are too few samples to determine it, or if nothing is left to explain.
     """
     plain, posterior = output.feature_map, output.posterior
     kinds = torch.tensor([feature.function == "affine" for feature in features(learner.definition, plain)])
     none = torch.zeros_like(kinds)
-    if posterior is None or posterior.sparse is not None or not learner.settings.rates or plain.lead or plain.parity:
+    if posterior is None or not learner.settings.rates or plain.lead or plain.parity:
         return none
     may = kinds & (inputs[plain][keep].abs() <= EDGE).all(0)
     enough = int(keep.sum()) >= FEWEST * int(may.sum())
-    return may if enough and posterior.left_out.error > EXPLAINED else none
+    return may if enough and is_unexplained(posterior) else none
 
 
 def _grown(
