@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import io
 import platform
-import tarfile
 import tempfile
 import time
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -30,7 +30,7 @@ class TaskFailed(Exception):
 
 @dataclass(frozen=True)
 class _Ran:
-    """What a task left: a result or the reason why there is none, and its folder as a tar archive."""
+    """What a task left: a result or the reason why there is none, and its folder as a zip archive."""
 
     result: Any
     reason: str
@@ -127,15 +127,18 @@ def _there(work: Callable[[Path], Any], begun: bytes, expected: Mapping[str, str
 
 
 def _packed(folder: Path, part: str) -> bytes:
-    """A part of a folder as a tar archive; empty if it does not exist."""
-    archive = io.BytesIO()
-    if (folder / part).exists():
-        with tarfile.open(fileobj=archive, mode="w:gz", compresslevel=1) as tar:
-            tar.add(folder / part, arcname=part)
+    """A part of a folder as a zip archive; empty if it does not exist."""
+    archive, begin = io.BytesIO(), folder / part
+    if begin.exists():
+        with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as packed:
+            for path in (begin, *begin.rglob("*")):
+                if path != folder:
+                    packed.write(path, path.relative_to(folder))
     return archive.getvalue()
 
 
 def _unpack(archive: bytes, folder: Path) -> None:
+    """Write an archive's files below the folder; ``zipfile`` keeps them there, whatever their names are."""
     if archive:
-        with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
-            tar.extractall(folder, filter="data")
+        with zipfile.ZipFile(io.BytesIO(archive)) as packed:
+            packed.extractall(folder)
