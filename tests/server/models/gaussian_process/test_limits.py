@@ -12,6 +12,7 @@ from support.models import gaussian_processes
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
+from surrogym_server.errors import InvalidInput
 from surrogym_server.gp import sparse
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.gaussian_process.censoring import stopped
@@ -156,6 +157,31 @@ def test_a_process_with_inequalities_foretells_where_the_limit_is_reached(monkey
     short_without, error_without = short_and_error()
     assert short < 0.05 < 0.1 < short_without
     assert error < error_without
+
+
+def test_a_value_beyond_the_limit_is_no_leave_one_out_error():
+    """A point that observes a limit says that the value is at least as large."""
+    pressure = gaussian_processes(RELIEVED, kettle(40, 5)).transitions[1]
+    sides, posterior = torch.tensor(pressure.at_limit), pressure.posterior
+    foretold, _ = posterior.leave_one_out()
+    off = pressure.scale * pressure.amplitude(posterior.x) * (foretold - posterior.y)
+    beyond = (sides == 1) & (off > 0)
+    assert bool(beyond.any())
+    expected = float(off.masked_fill(beyond, 0.0).square().mean().sqrt())
+    assert pressure.leave_one_out().error == pytest.approx(expected, rel=1e-12)
+    assert pressure.leave_one_out().error < 0.1 * replace(pressure, at_limit=()).leave_one_out().error
+
+
+def test_points_at_limits_survive_storage_and_are_checked():
+    model = gaussian_processes(RELIEVED, kettle(30, 0))
+    loaded = from_bytes(RELIEVED, to_bytes(model))
+    assert [o.at_limit for o in loaded.transitions] == [o.at_limit for o in model.transitions]
+    assert [any(o.at_limit) for o in loaded.transitions] == [False, True]
+    for sides in ((1, 0), (2,) * len(model.transitions[1].at_limit)):
+        malformed = replace(model.transitions[1], at_limit=sides)
+        stored = to_bytes(replace(model, transitions=(model.transitions[0], malformed)))
+        with pytest.raises(InvalidInput, match="expected a side"):
+            from_bytes(RELIEVED, stored)
 
 
 def test_samples_at_a_limit_that_the_process_foretells_change_nothing(monkeypatch):

@@ -44,6 +44,7 @@ def require_output(definition: EnvironmentDefinition, output: OutputModel) -> No
     _require_dropped(definition, output)
     _require_warp(output)
     _require_rates(definition, output)
+    _require_at_limit(definition, output)
     _require_shapes(definition, output)
     _require_numbers(output)
 
@@ -60,6 +61,7 @@ def output_header(output: OutputModel) -> dict[str, Any]:
         "posterior": None,
         "warp": None if output.warp is None else asdict(output.warp),
         "past_limits": output.past_limits,
+        "at_limit": output.at_limit,
     }
     if (posterior := output.posterior) is not None:
         hyper = posterior.hyper
@@ -106,7 +108,8 @@ def read_output(
     centre, scale = float(entry["centre"]), float(entry["scale"])
     name, left_out, warp = str(entry["name"]), int(entry["left_out"]), _warp(entry.get("warp"))
     past_limits = bool(entry.get("past_limits", False))
-    return OutputModel(name, feature_map, posterior, centre, scale, left_out, scores, warp, past_limits)
+    at_limit = tuple(int(side) for side in entry.get("at_limit", ()))
+    return OutputModel(name, feature_map, posterior, centre, scale, left_out, scores, warp, past_limits, at_limit)
 
 
 def _warp(entry: dict[str, Any] | None) -> Warp | None:
@@ -178,6 +181,15 @@ def _require_rates(definition: EnvironmentDefinition, output: OutputModel) -> No
         raise InvalidInput(f"output {output.name!r}: expected rates of a transition's features, got {rates}")
     if not bool((1 + output.posterior.x * torch.tensor(rates, dtype=torch.float64) > 0).all()):
         raise InvalidInput(f"output {output.name!r}: expected an amplitude above 0 at all points")
+
+
+def _require_at_limit(definition: EnvironmentDefinition, output: OutputModel) -> None:
+    """Check that only a transition has points at a limit, and that each point has a side, or none has one."""
+    if not (sides := output.at_limit):
+        return
+    count = 0 if output.posterior is None else len(output.posterior.y)
+    if output.name not in definition.outputs[:-1] or len(sides) != count or not set(sides) <= {-1, 0, 1}:
+        raise InvalidInput(f"output {output.name!r}: expected a side, -1, 0 or 1, for each of {count} points")
 
 
 def _require_numbers(output: OutputModel) -> None:

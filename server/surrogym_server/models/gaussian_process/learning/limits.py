@@ -94,11 +94,17 @@ def held(
             again = output_with_rates(learner, name + HELD, target, plain, more, more, side)
         else:
             again = _with_samples(output, target, inputs, more)
-        found = replace(again, name=name, past_limits=past)
+        found = replace(again, name=name, past_limits=past, at_limit=_sides(again, side[more]))
         if _misfit(found, target, inputs, more, side) > WORSE * _misfit(output, target, inputs, keep, side):
             break
         output, keep = found, more
     return output
+
+
+def _sides(output: OutputModel, side: Tensor) -> tuple[int, ...]:
+    """``side`` (n,) of an exact process' points. Inducing points are no samples, so they have none."""
+    exact = output.posterior is not None and output.posterior.sparse is None
+    return tuple(side.int().tolist()) if exact else ()
 
 
 def _misfit(

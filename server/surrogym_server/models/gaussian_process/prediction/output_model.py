@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import NOISE_FLOOR, FitOptions, Posterior, noisy_explanation
+from surrogym_server.gp import NOISE_FLOOR, FitOptions, LeftOut, Posterior, noisy_explanation
 from surrogym_server.models.abilities import LeaveOneOutErrors
 from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE, Warp
 from surrogym_server.tensors.bending import amplitude
@@ -32,6 +33,7 @@ class OutputModel:
     scores: tuple[tuple[str, float], ...] = ()  # evidence of every candidate feature map
     warp: Warp | None = None
     past_limits: bool = False  # whether it was learned from samples that ended at a limit of another coordinate
+    at_limit: tuple[int, ...] = ()  # for each point: 1 or -1 if it observes the upper or lower limit; () if none does
 
     def mean(self, x: Tensor) -> Tensor:
         """Posterior mean at features x (m, d), in the output's unit, (m,)."""
@@ -91,16 +93,32 @@ class OutputModel:
         return noise if self.warp is None else noise * self.warp.size
 
     def leave_one_out(self) -> LeaveOneOutErrors:
-        """Leave-one-out errors of the process. An output that never varied has none."""
+        """Leave-one-out errors of the process. An output that never varied has none.
+
+        A point that observes a limit is an inequality: a value beyond the limit is no error.
+        """
         if self.posterior is None:
             return LeaveOneOutErrors(0.0, 1.0, 1.0)
-        found = self.posterior.left_out
+        found = self._left_out(self.posterior)
         error = self.scale * found.error
         if self.feature_map.rates:
             error = self._left_out_grown(found.error)
         if self.warp is not None:
             error = self._left_out_warped(self.warp, error)
         return LeaveOneOutErrors(error, found.within_one, found.within_two)
+
+    def _left_out(self, posterior: Posterior) -> LeftOut:
+        if posterior.sparse is not None:
+            return posterior.left_out
+        foretold, variance = self._foretold(posterior)
+        return LeftOut.of(foretold - posterior.y, variance)
+
+    def _foretold(self, posterior: Posterior) -> tuple[Tensor, Tensor]:
+        """Each y of an exact process from the others, within its limit, and the variance, (n,) each."""
+        mean, variance = posterior.leave_one_out()
+        side = torch.tensor(self.at_limit or [0] * len(mean))
+        beyond = side * (mean - posterior.y) > 0
+        return torch.where(beyond, posterior.y, mean), variance
 
     @property
     def _typical_amplitude(self) -> float:
@@ -114,7 +132,7 @@ class OutputModel:
         assert self.posterior is not None
         if self.posterior.sparse is not None:
             return self.scale * self._typical_amplitude * error
-        mean, _ = self.posterior.leave_one_out()
+        mean, _ = self._foretold(self.posterior)
         off = self.scale * self.amplitude(self.posterior.x) * (mean - self.posterior.y)
         return float(off.square().mean().sqrt())
 
@@ -123,7 +141,7 @@ class OutputModel:
         assert self.posterior is not None
         if self.posterior.sparse is not None:
             return error * warp.size
-        mean, _ = self.posterior.leave_one_out()
+        mean, _ = self._foretold(self.posterior)
         foretold, seen = (warp.value(self.centre + self.scale * y) for y in (mean, self.posterior.y))
         return float((foretold - seen).square().mean().sqrt())
 
