@@ -15,6 +15,7 @@ from support.noting import NotingSamplers, Tally, create, finished, noting_sampl
 from surrogym_client.training import TrainProgress, TrainResult, TrainSettings, train
 from surrogym_client.transport import Api, HttpSurrogate, Retries
 
+SAMPLERS, TRAININGS = 4, 3  # that work at once
 STEPS = 4_096  # of one training
 SECONDS = 900.0  # longest time without progress, and of a request: a cluster is built again meanwhile
 
@@ -59,7 +60,7 @@ class Trainings(threading.Thread):
 
 @dataclass
 class Designs:
-    """Designs that follow one another, with two samplers each. Each is judged at its end.
+    """Designs that follow one another, with four samplers each. Each is judged at its end.
 
     Args:
         api, url: the server, and its address for samplers.
@@ -84,7 +85,7 @@ class Designs:
         self.name = f"{self.prefix}-{next(self._numbers)}"
         create(self.api, self.name, self.budget)
         self.samplers = self._stack.enter_context(
-            noting_samplers(self.url, self.name, self.folder / self.name, count=2, lease_seconds=60.0)
+            noting_samplers(self.url, self.name, self.folder / self.name, count=SAMPLERS, lease_seconds=60.0)
         )
 
     def acknowledged(self) -> int:
@@ -136,10 +137,10 @@ class Load:
 
 @contextmanager
 def load(api: Api, url: str, folder: Path, prefix: str, budget: int) -> Iterator[Load]:
-    """Two samplers, a training of the surrogate ``pendulum``, and one of the newest design that has ended."""
+    """Four samplers, a training of the surrogate ``pendulum``, and two of the newest design that has ended."""
     designs = Designs(api, url, folder, prefix, budget)
     trainings = [Trainings(url, folder / "settled", lambda: "pendulum")]
-    trainings.append(Trainings(url, folder / "newest", lambda: designs.taught))
+    trainings += [Trainings(url, folder / f"newest-{n}", lambda: designs.taught) for n in range(1, TRAININGS)]
     designs.begin()
     for one in trainings:
         one.start()
