@@ -15,6 +15,9 @@ from support.server import ServerProcess
 
 PAGES = Path(__file__).parents[2] / "docs" / "how-to"
 PRINTED_URL = "http://127.0.0.1:8000"
+READERS_FUNCTIONS = (
+    "read_sensors, send = lambda: [1.0, 0.0, 0.0], lambda action: None\n"  # that files.md leaves to them
+)
 
 
 def programs(page: str) -> list[str]:
@@ -81,9 +84,10 @@ def test_the_lines_of_the_terminal_page_work(
 def test_a_policy_leaves_for_other_programs(server: ServerProcess, tmp_path: Path) -> None:
     train = ["train", "pendulum", "--steps", "512", "--num-envs", "16", "--quiet", "--server", server.url]
     run(tmp_path, "-m", "surrogym_client", *train)
-    for file, program in zip(("policy.onnx", "policy.pt2"), programs("files.md")[2:], strict=True):
+    for file in ("policy.onnx", "policy.pt2"):
         run(tmp_path, "-m", "surrogym_client", "export-policy", "policy.zip", "--out", file)
-        run(tmp_path, "-c", program)
+    for program in programs("files.md")[2:]:
+        run(tmp_path, "-c", READERS_FUNCTIONS + program)
     evaluate = ["evaluate", "policy.onnx", "--env", "Pendulum-v1", "--episodes", "2", "--json", "--server", server.url]
     assert json.loads(run(tmp_path, "-m", "surrogym_client", *evaluate))["episodes"] == 2
 
