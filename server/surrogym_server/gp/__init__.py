@@ -15,7 +15,7 @@ beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 ========  ======================  =========================================================
 """
 
-from surrogym_server.gp.fit import NOISE_FLOOR, FitOptions, Fitted, fit, noisy_explanation, refine
+from surrogym_server.gp.fit import NOISE_FLOOR, FitOptions, Fitted, fit, noisy_explanation, refine, refine_where_hard
 from surrogym_server.gp.growth import fit_growing
 from surrogym_server.gp.hyperparameter_samples import hyperparameter_samples
 from surrogym_server.gp.joint import Joint
@@ -51,6 +51,7 @@ __all__ = [
     "hyperparameter_samples",
     "noisy_explanation",
     "refine",
+    "refine_where_hard",
     "select_inputs",
     "spread",
 ]

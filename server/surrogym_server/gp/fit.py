@@ -22,12 +22,14 @@ from torch import Tensor
 
 from surrogym_server.gp.kernel import Hyperparameters, Polynomial, Reflection
 from surrogym_server.gp.posterior import Posterior, condition
+from surrogym_server.gp.sparse import hardest
 from surrogym_server.gp.subsets import FEW, SOME, spread
 
 NOISE_FLOOR = 1e-8  # of the output's variance
 NOISY = 1e-2  # noise of a start from noise, of the output's variance
 MANY_POINTS = 24
 REFINEMENTS = ((1_000, 20), (2_000, 10))  # most points of further searches, and iterations: each begins near its end
+HARD, HARD_ITERATIONS = 1_000, 20  # points of a search where a process errs most, and its iterations
 SHORTER = 0.5  # logarithm of the second start's length scales, below the first's
 
 Array = NDArray[np.float64]
@@ -99,6 +101,21 @@ def refine(
                 objective = _Objective(x[rows], y[rows], replace(options, max_iterations=iterations), reflection)
                 found.append(_minimum(objective, found[-1])[1])
     return tuple(objective.hyper(theta) for theta in found)
+
+
+def refine_where_hard(posterior: Posterior, x: Tensor, y: Tensor, options: FitOptions) -> Hyperparameters:
+    """Refine the hyperparameters of a process of many points x (n, d), y (n,) on the points that are hard for it.
+
+    Points drawn evenly say little about a small region where the function is steep, because few of them lie there. The
+    noise of the start is what the process errs at the hard points.
+    """
+    rows = hardest(posterior, x, y, HARD)
+    error = float((y[rows] - posterior.mean(x[rows])).square().mean())
+    start = replace(posterior.hyper, noise_variance=max(error, options.noise_floor))
+    objective = _Objective(x[rows], y[rows], replace(options, max_iterations=HARD_ITERATIONS), start.reflection)
+    with _blas().limit(limits=1):
+        _, theta = _minimum(objective, objective.theta(start))
+    return objective.hyper(theta)
 
 
 def noisy_explanation(posterior: Posterior, options: FitOptions) -> float:

@@ -56,7 +56,11 @@ class Censored:
 
 
 def condition_many(
-    hypers: Sequence[Hyperparameters], x: Tensor, y: Tensor, censored: Censored | None = None
+    hypers: Sequence[Hyperparameters],
+    x: Tensor,
+    y: Tensor,
+    censored: Censored | None = None,
+    earlier: Posterior | None = None,
 ) -> Posterior:
     """Condition a process on x (n, d) and y (n,). Up to ``MAX_EXACT`` points this is exact, with the last
     hyperparameters.
@@ -64,7 +68,8 @@ def condition_many(
     With more points it uses inducing points, and all points decide, because hyperparameters fitted to a subset may miss
     rare points. Each point is predicted from the others, and ``censored`` points are predicted as well. The density
     decides how large the noise is: inducing points leave errors that the fitted noise does not know. The mean squared
-    error decides between the hyperparameters, each with its best noise. R&W (2006), section 5.4.2.
+    error decides between the hyperparameters, each with its best noise. R&W (2006), section 5.4.2. An ``earlier``
+    process through inducing points for the same x and y is compared with them.
 
     Raises:
         NumericalFailure: as ``condition``.
@@ -79,7 +84,8 @@ def condition_many(
     def misfit(posterior: Posterior) -> float:
         return len(y) * posterior.left_out.error**2 + judged.misfit(posterior)
 
-    return min((max(_with_noises(hyper, x, y), key=density) for hyper in hypers), key=misfit)
+    found = [max(_with_noises(hyper, x, y), key=density) for hyper in hypers]
+    return min(found if earlier is None else [earlier, *found], key=misfit)
 
 
 def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
@@ -89,6 +95,17 @@ def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
         NumericalFailure: as ``condition``.
     """
     return _projected(hyper, x, y, _pivots(hyper, x))
+
+
+def hardest(posterior: Posterior, x: Tensor, y: Tensor, most: int) -> Tensor:
+    """Numbers of ``most`` of the points x (n, d), y (n,) that are hard for a process of them, (most,).
+
+    Half are those that the others explain least, in the order of the pivoted Cholesky. The others have the largest
+    residuals.
+    """
+    apart, _, _ = _pivots(posterior.hyper, x, most // 2)
+    off = (y - posterior.mean(x)).abs().index_fill(0, apart, -1.0)
+    return torch.cat([apart, off.topk(min(most, len(y)) - len(apart)).indices])
 
 
 def _with_noises(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Iterator[Posterior]:
@@ -134,11 +151,14 @@ def _left_out(known: Tensor, solid: Tensor, residual: Tensor, noise: float, left
     return residual / others, noise / others + left
 
 
-def _pivots(hyper: Hyperparameters, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Points in the order of their choice (m,), the rows V (m, n), and the variance that they leave at each (n,)."""
+def _pivots(hyper: Hyperparameters, x: Tensor, most: int | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """Points in the order of their choice (m,), the rows V (m, n), and the variance that they leave at each (n,).
+
+    At most ``most`` points are chosen, by default ``INDUCING``.
+    """
     left, prior = variance(hyper, x), float(variance(hyper, x).mean())
     enough = max(BELOW_NOISE * hyper.noise_variance, EXPLAINED * prior)
-    rows, chosen = x.new_empty(min(INDUCING, len(x)), len(x)), []
+    rows, chosen = x.new_empty(min(INDUCING if most is None else most, len(x)), len(x)), []
     for count in range(len(rows)):
         pivot = int(left.argmax())
         if count and float(left[pivot]) <= enough:

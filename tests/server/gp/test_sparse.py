@@ -124,6 +124,27 @@ def test_points_of_which_a_side_is_known_judge_sparse_processes(
         assert condition_many(order, x, y, at_most).hyper.linear_variance == flat.linear_variance
 
 
+def test_an_earlier_process_stays_where_none_foretells_better(
+    drawn: tuple[Hyperparameters, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sparse, "MAX_EXACT", 60)
+    hyper, x, y = drawn
+    rough = replace(hyper, lengthscale=hyper.lengthscale / 20)
+    good, bad = condition_many([hyper], x, y), condition_many([rough], x, y)
+    assert condition_many([rough], x, y, earlier=good) is good
+    assert condition_many([hyper], x, y, earlier=bad).hyper.lengthscale is hyper.lengthscale
+
+
+def test_hardest_points_lie_apart_or_have_the_largest_residuals(drawn: tuple[Hyperparameters, Tensor, Tensor]):
+    hyper, x, y = drawn
+    lone = torch.cat([x, torch.tensor([[6.0, 6.0]], dtype=torch.float64)])
+    off = torch.cat([y, y.new_zeros(1)]).index_add(0, torch.tensor([7, 250]), y.new_tensor([5.0, -5.0]))
+    found = sparse.hardest(condition_sparse(hyper, lone, off), lone, off, 20).tolist()
+    assert len(set(found)) == 20
+    assert 400 in found[:10]
+    assert {7, 250} <= set(found)
+
+
 def test_leave_one_out_is_of_the_points_not_of_the_inducing_ones(drawn: tuple[Hyperparameters, Tensor, Tensor]):
     exact, through = condition(*drawn).left_out, condition_sparse(*drawn).left_out
     assert through.error == pytest.approx(exact.error, rel=1e-3)

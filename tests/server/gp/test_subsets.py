@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import numpy as np
 import pytest
 import torch
 
-from surrogym_server.gp import FitOptions, condition, fit, refine, spread, subsets
+from surrogym_server.gp import (
+    FitOptions,
+    condition,
+    condition_sparse,
+    fit,
+    refine,
+    refine_where_hard,
+    spread,
+    subsets,
+)
 from surrogym_server.gp.fit import _minimum, _Objective
 
 
@@ -52,3 +62,21 @@ def test_more_points_resolve_what_few_explain_as_noise():
     _, alone = _minimum(_Objective(x, y, FitOptions(), None), found)
     assert math.exp(alone[-1]) > 0.1
     assert refine(x, y, FitOptions(), found)[-1].noise_variance < 1e-4
+
+
+def test_hard_points_teach_what_a_steep_region_needs(monkeypatch: pytest.MonkeyPatch):
+    """One in 25 points lies where the function is steep, and as many points drawn evenly hardly meet it."""
+    monkeypatch.setattr(sys.modules[refine_where_hard.__module__], "HARD", 60)
+    x = 3.4 * torch.rand(1_500, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 1.7
+    y, options = steep(x), FitOptions()
+    few = spread(len(y), 60)
+    even = condition_sparse(fit(x[few], y[few], options).posterior.hyper, x, y)
+    hard = condition_sparse(refine_where_hard(even, x, y, options), x, y)
+    at = torch.linspace(-1.7, 1.7, 500, dtype=torch.float64)[:, None]
+    errors = [float((one.mean(at) - steep(at)).square().mean().sqrt()) for one in (even, hard)]
+    assert errors[1] < 0.3 * errors[0]
+    assert hard.left_out.error < even.left_out.error
+
+
+def steep(x: torch.Tensor) -> torch.Tensor:
+    return 0.3 * x[:, 0] + torch.tanh(40 * (x[:, 0] - 1.6))

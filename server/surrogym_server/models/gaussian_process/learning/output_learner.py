@@ -11,7 +11,18 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import Censored, FitOptions, Fitted, Posterior, condition_many, fit, refine, spread, subsets
+from surrogym_server.gp import (
+    Censored,
+    FitOptions,
+    Fitted,
+    Posterior,
+    condition_many,
+    fit,
+    refine,
+    refine_where_hard,
+    spread,
+    subsets,
+)
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE
@@ -25,6 +36,7 @@ LEAD_ODDS, ALONE_ODDS, PARITY_ODDS, PLACE_ODDS = 3.0, -6.0, -3.0, 3.0
 CONSTANT = 1e-9  # an output whose deviation is below this share of its own size never varied
 SMALLEST = 1e-100  # deviation of an output: squares of a smaller one underflow
 EXPLAINED = 0.01  # of the targets' deviation: a process that foretells its samples as well needs no other structure
+FORETOLD = 0.001  # of the targets' deviation: many samples that are foretold as well need no other hyperparameters
 PEAK = "reward peak"  # the logarithm of a reward
 
 
@@ -104,9 +116,16 @@ class OutputLearner:
         theta: NDArray[np.float64],
         at_limit: Censored | None = None,
     ) -> Posterior:
-        """The process of all points x (n, d), y (n,), with the hyperparameters of a subset."""
-        mirror = reflection(self.definition, feature_map)
-        return condition_many(refine(x, y, self.options(name), theta, mirror), x, y, at_limit)
+        """The process of all points x (n, d), y (n,), with the hyperparameters of a subset.
+
+        Hyperparameters of the hard points are tried too, if the points are many and the others foretell them worse than
+        ``FORETOLD``.
+        """
+        mirror, options = reflection(self.definition, feature_map), self.options(name)
+        found = condition_many(refine(x, y, options, theta, mirror), x, y, at_limit)
+        if found.sparse is None or found.left_out.error <= FORETOLD:
+            return found
+        return condition_many([refine_where_hard(found, x, y, options)], x, y, at_limit, earlier=found)
 
     def options(self, name: str) -> FitOptions:
         """Dynamics tend to be near linear, and costs to be quadratic."""
