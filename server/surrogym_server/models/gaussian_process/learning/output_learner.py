@@ -36,7 +36,6 @@ LEAD_ODDS, ALONE_ODDS, PARITY_ODDS, PLACE_ODDS = 3.0, -6.0, -3.0, 3.0
 CONSTANT = 1e-9  # an output whose deviation is below this share of its own size never varied
 SMALLEST = 1e-100  # deviation of an output: squares of a smaller one underflow
 EXPLAINED = 0.01  # of the targets' deviation: a process that foretells its samples as well needs no other structure
-FORETOLD = 0.001  # of the targets' deviation: many samples that are foretold as well need no other hyperparameters
 PEAK = "reward peak"  # the logarithm of a reward
 
 
@@ -118,12 +117,11 @@ class OutputLearner:
     ) -> Posterior:
         """The process of all points x (n, d), y (n,), with the hyperparameters of a subset.
 
-        Hyperparameters of the hard points are tried too, if the points are many and the others foretell them worse than
-        ``FORETOLD``.
+        Hyperparameters of the hard points are tried too, if the points are many and not foretold well from the others.
         """
         mirror, options = reflection(self.definition, feature_map), self.options(name)
         found = condition_many(refine(x, y, options, theta, mirror), x, y, at_limit)
-        if found.sparse is None or found.left_out.error <= FORETOLD:
+        if found.sparse is None or found.left_out.error <= EXPLAINED:
             return found
         return condition_many([refine_where_hard(found, x, y, options)], x, y, at_limit, earlier=found)
 
