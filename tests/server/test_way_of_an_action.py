@@ -14,6 +14,7 @@ import pytest
 from support.way import Way
 from surrogym_client.original import classic
 from surrogym_server.app import create_app
+from surrogym_server.engine import sessions
 from surrogym_server.engine.design_job import DesignJob, run_design_job
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
@@ -22,7 +23,8 @@ from surrogym_shared import compiled, frames
 
 MOST_FILES = 12
 MODEL = "prediction/compiled/step.py"
-STEPS = 40  # until a session is known to be quick
+STEPS = 2  # until the time of a session's step is known
+INLINE_SECONDS = 3_600.0  # a step is taken in the thread that is watched, however busy the machine is
 ACTIONS = {"json": 0.1234567, "binary": 0.2345678, "stream": 0.3456789}  # found again by their value
 
 Send = Callable[[Any], Awaitable[None]]
@@ -38,7 +40,8 @@ def model(pendulum_definition: EnvironmentDefinition, pendulum_samples: Samples)
 
 
 @pytest.mark.skipif(not compiled.available(), reason="without numba steps take the way of torch")
-def test_an_action_passes_few_files_and_each_once(tmp_path: Path, model: bytes):
+def test_an_action_passes_few_files_and_each_once(tmp_path: Path, model: bytes, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sessions, "INLINE_SECONDS", INLINE_SECONDS)
     ways = asyncio.run(watched(tmp_path, model))
     for transport, way in ways.items():
         begin = next(i for i, file in enumerate(way.files) if file.startswith("surrogym_server/api/stepping/"))
