@@ -155,6 +155,17 @@ def test_the_cluster_has_one_image_and_opens_no_port_but_the_proxys() -> None:
     assert "docker/front.sh /usr/local/bin/front.sh" in last("cluster", "COPY")
 
 
+def test_ray_has_the_options_that_it_is_started_with() -> None:
+    scripts = pytest.importorskip("ray.scripts.scripts")
+    known = {option for parameter in scripts.start.params for option in parameter.opts}
+    commands = [SERVICES[name]["command"] for name in ("ray-head", "ray-node")]
+    script = (COMPOSE.parent / "front.sh").read_text(encoding="utf-8")
+    commands.append(["ray", "start", *script.partition("ray start")[2].partition("exec")[0].split()])
+    for program, command, *words in commands:
+        assert (program, command) == ("ray", "start")
+        assert {word for word in words if word.startswith("--")} <= known
+
+
 def test_no_other_program_goes_before_a_step_of_a_session_host() -> None:
     assert SERVICES["ray-node"]["environment"]["RAY_worker_niceness"] == "0"
 
