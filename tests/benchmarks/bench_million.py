@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import httpx
 import sqlalchemy as sa
-from bench_samples_page import request, show, summary
+from bench_samples_page import children, ran_and_waited, request, show, summary
 from common import parser, started, write
 
 from support.million import APART, FIRST, fill
@@ -35,6 +35,7 @@ from surrogym_server.storage.sql import open_storage
 
 SURROGATES, SAMPLES, SESSIONS, CHECKPOINT = 200, 1_000_000, 1_000, 16_384
 QUICK = (20, 20_000, 100)
+LARGE = 156 * 1_000 * 2 * 8  # bytes of 156 lanes of 1,000 particles with two coordinates
 
 
 def quantiles(seconds: list[float]) -> dict[str, float]:
@@ -152,6 +153,17 @@ def of_storage(storage: Storage, names: list[str], count: int) -> dict[str, dict
     return {what: timed(call, count) for what, call in calls.items()}
 
 
+def of_large_checkpoint(storage: Storage, postmaster: int, count: int) -> dict[str, float]:
+    """PostgreSQL's processor time for the checkpoint of a session with many particles."""
+    data = random.Random(0).randbytes(LARGE)  # doubles of particles can't be compressed either
+    lease, ran = SessionLease("session-7.1", "1 host", 1), []
+    for number in range(count):
+        before = {pid: ran_and_waited(pid)[0] for pid in children(postmaster)}
+        storage.live_sessions.record(lease, Checkpoint(number, data))
+        ran.append(sum(max(0.0, ran_and_waited(pid)[0] - ms) for pid, ms in before.items()))
+    return {"ms median": statistics.median(ran), "calls": count}
+
+
 def plans(url: str, names: list[str]) -> list[str]:
     """The statements that only read, with their plans."""
     storage = open_storage(url)
@@ -214,6 +226,7 @@ def main() -> None:
         hosts.ending.set()
         hosts.join()
         report |= {"renewal of half of the sessions": quantiles(hosts.renewals), "checkpoint": quantiles(hosts.records)}
+        report["processor time, 2.5 MB checkpoint"] = of_large_checkpoint(storage, postgresql.pid, 20)
         for what, figures in report.items():
             print(f"{what:34}" + "  ".join(f"{key} {value:8.1f}" for key, value in figures.items()))
         show("ms of a page of 1,000 samples", parts)

@@ -16,10 +16,15 @@ class Costs:
 
     claim: float = 4.4e-3
     answer: float = 8.5e-3
-    checkpoint: float = 0.6e-3
+    checkpoint: float = 0.6e-3  # of 16 KiB
+    checkpoint_mib: float = 6.0e-3  # of each MiB more: processor time, without the disk
     renewal: float = 9.0e-3 / 500  # of one session, in one statement for 500
     host_request: float = 1.8e-3  # that the engine adds to a step of one lane
     gpu_particle: float = 1.0e-9  # ASSUMED, of one particle's step with 100 samples; it was not measured
+
+
+COORDINATES = 2  # of a particle, each a double
+DATABASE_CORES = 16  # ASSUMED, of PostgreSQL
 
 
 @dataclass(frozen=True)
@@ -34,12 +39,14 @@ class Use:
 
 
 def lanes(costs: Costs, lanes: int, particles: int, gpus: int, steps: float) -> list[Use]:
-    """Lanes with particles, stepped ``steps`` times a second. Each GPU has one session."""
+    """Lanes with particles, stepped ``steps`` times a second. Each GPU has one session, recorded once a second."""
+    mib = lanes * particles * COORDINATES * 8 / gpus / 2**20
+    recording = costs.checkpoint + mib * costs.checkpoint_mib + costs.renewal / 2
     return [
         Use("GPUs", gpus, steps * lanes * particles * costs.gpu_particle),
         Use("session hosts, one process for each GPU", gpus, steps * gpus * costs.host_request),
         Use("front servers, 2 processes", 2, steps * gpus * costs.host_request),
-        Use("database, checkpoints", 1, gpus * (costs.checkpoint + costs.renewal / 2)),
+        Use(f"cores of the database, checkpoints of {mib:.1f} MiB", DATABASE_CORES, gpus * recording),
     ]
 
 
@@ -54,12 +61,12 @@ def samplers(costs: Costs, samplers: int, step: float, fronts: int) -> list[Use]
 
 
 def sessions(costs: Costs, sessions: int, steps: float, hosts: int, fronts: int) -> list[Use]:
-    """Sessions of one lane, each stepped ``steps`` times a second."""
+    """Sessions of one lane, each stepped ``steps`` times a second and recorded once a second."""
+    recording = costs.checkpoint + costs.renewal / 2
     return [
         Use(f"session hosts, {hosts} processes", hosts, sessions * steps * costs.host_request / 2),
         Use(f"front servers, {fronts} processes", fronts, sessions * steps * costs.host_request / 2),
-        Use("database, checkpoints one after the other on each host", hosts, sessions * costs.checkpoint),
-        Use("database, renewals each 2 s", hosts, sessions * costs.renewal / 2),
+        Use("cores of the database, checkpoints and renewals", DATABASE_CORES, sessions * recording),
     ]
 
 
