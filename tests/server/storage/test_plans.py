@@ -56,12 +56,26 @@ Read = Callable[[Storage], object]
 def test_pages_and_claims_read_their_rows_by_an_index(
     filled: str, storage: Storage, read: Read, words: tuple[str, ...], indexes: set[tuple[str, str]]
 ):
-    [(statement, parameters)] = [sent for sent in statements(storage, read) if all(word in sent[0] for word in words)]
-    engine = sa.create_engine(filled.replace("postgresql:", "postgresql+psycopg:"), poolclass=sa.NullPool)
+    [sent] = [sent for sent in statements(storage, read) if all(word in sent[0] for word in words)]
+    assert scans(filled, *sent) == indexes
+
+
+def test_a_list_of_surrogates_reads_the_large_tables_by_their_indexes(filled: str, storage: Storage):
+    """The first list counts the samples for the ledgers. Later ones count those that are new."""
+    assert storage.surrogates.summaries()
+    found = [scan for sent in statements(storage, lambda s: s.surrogates.summaries()) for scan in scans(filled, *sent)]
+    large = {(table, index) for table, index in found if table in ("samples", "queries", "leases")}
+    assert {table for table, _ in large} == {"samples", "queries", "leases"}
+    assert "Seq Scan" not in {index for _, index in large}
+
+
+def scans(url: str, statement: str, parameters: Any) -> set[tuple[str, str]]:
+    """The tables that a statement reads, each with the index, or with the kind of scan where there is none."""
+    engine = sa.create_engine(url.replace("postgresql:", "postgresql+psycopg:"), poolclass=sa.NullPool)
     with engine.connect() as connection:
         explained = connection.exec_driver_sql(f"EXPLAIN (FORMAT JSON) {statement}", parameters).scalar_one()
-    scans = [node for node in nodes(explained[0]["Plan"]) if "Relation Name" in node]
-    assert {(node["Relation Name"], node.get("Index Name", node["Node Type"])) for node in scans} == indexes
+    read = [node for node in nodes(explained[0]["Plan"]) if "Relation Name" in node]
+    return {(node["Relation Name"], node.get("Index Name", node["Node Type"])) for node in read}
 
 
 def statements(storage: Storage, read: Read) -> list[tuple[str, Any]]:
