@@ -15,7 +15,16 @@ beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 ========  ======================  =========================================================
 """
 
-from surrogym_server.gp.fit import NOISE_FLOOR, FitOptions, Fitted, fit, noisy_explanation, refine, refine_where_hard
+from surrogym_server.gp.fit import (
+    MOST_NOISE,
+    NOISE_FLOOR,
+    FitOptions,
+    Fitted,
+    fit,
+    noisy_explanation,
+    refine,
+    refine_where_hard,
+)
 from surrogym_server.gp.growth import fit_growing
 from surrogym_server.gp.hyperparameter_samples import hyperparameter_samples
 from surrogym_server.gp.joint import Joint
@@ -28,6 +37,7 @@ from surrogym_server.gp.sparse import Censored, condition_many, condition_sparse
 from surrogym_server.gp.subsets import spread
 
 __all__ = [
+    "MOST_NOISE",
     "NOISE_FLOOR",
     "Censored",
     "FitOptions",

@@ -25,7 +25,7 @@ from surrogym_server.gp.posterior import Posterior, condition
 from surrogym_server.gp.sparse import hardest
 from surrogym_server.gp.subsets import FEW, SOME, spread
 
-NOISE_FLOOR = 1e-8  # of the output's variance
+NOISE_FLOOR, MOST_NOISE = 1e-8, 2.0  # bounds of the noise, of the output's variance
 NOISY = 1e-2  # noise of a start from noise, of the output's variance
 MANY_POINTS = 24
 REFINEMENTS = ((1_000, 20), (2_000, 10))  # most points of further searches, and iterations: each begins near its end
@@ -50,6 +50,7 @@ class FitOptions:
     quadratic_prior: tuple[float, float] = (-2.0, 2.0)
     noise_prior: tuple[float, float] = (math.log(1e-7), 6.0)
     noise_floor: float = NOISE_FLOOR
+    most_noise: float = MOST_NOISE
     max_iterations: int = 100
 
 
@@ -216,7 +217,7 @@ class _Objective:
         size = len(self.prior)
         self.lower, self.upper = np.full(size, math.log(1e-8)), np.full(size, math.log(1e4))
         self.lower[:d], self.upper[:d] = math.log(0.02), math.log(1e3)
-        self.lower[-1], self.upper[-1] = math.log(options.noise_floor), math.log(2.0)
+        self.lower[-1], self.upper[-1] = math.log(options.noise_floor), math.log(options.most_noise)
         self.default_start = self.prior[:, 0].copy()
         self.default_start[-1] = math.log(1e-4)
         self.constant = 0.5 * n * math.log(2 * math.pi) + float(np.log(self.prior[:, 1]).sum())

@@ -13,18 +13,19 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_server.gp.fit import NOISE_FLOOR, FitOptions, _blas, _Objective
+from surrogym_server.gp.fit import MOST_NOISE, NOISE_FLOOR, FitOptions, _blas, _minimum, _Objective
 from surrogym_server.gp.kernel import Hyperparameters
 from surrogym_server.gp.posterior import Posterior
 
 BURN_IN, THINNING = 30, 10  # updates before the first sample, and between samples
+SHORTER = (0.0, 1.0, 2.0)  # logarithms of length scales, below those of the fit
 NARROWEST = 1e-6  # radians; theta stays where it is when no other angle is left
 
 Array = NDArray[np.float64]
 
 
 def hyperparameter_samples(
-    posterior: Posterior, count: int, seed: int, noise_floor: float = NOISE_FLOOR
+    posterior: Posterior, count: int, seed: int, noise_floor: float = NOISE_FLOOR, most_noise: float = MOST_NOISE
 ) -> tuple[Hyperparameters, ...]:
     """Draw ``count`` hyperparameters from their posterior given the points of a process. A pure function of its
     arguments.
@@ -34,21 +35,34 @@ def hyperparameter_samples(
         count: number of samples.
         seed: of the chain.
         noise_floor: that of the fit: the least variance of the noise, as a share of the output's variance.
+        most_noise: the largest variance of the noise. If the process has more, the chain starts at the likeliest
+            hyperparameters with so little.
     """
     hyper = posterior.hyper
     options = FitOptions(
-        linear=hyper.linear_variance > 0, quadratic=hyper.quadratic_variance > 0, noise_floor=noise_floor
+        hyper.linear_variance > 0, hyper.quadratic_variance > 0, noise_floor=noise_floor, most_noise=most_noise
     )
     evidence = _Objective(posterior.x, posterior.y, options, hyper.reflection)
     chain = _Chain(evidence, np.random.default_rng(seed))
     theta, found = evidence.theta(hyper), []
     with _blas().limit(limits=1):
+        if hyper.noise_variance > most_noise:
+            theta = _with_less_noise(evidence, theta)
         level = chain.log_likelihood(theta)
         for update in range(1, BURN_IN + THINNING * count + 1):
             theta, level = chain.update(theta, level)
             if update > BURN_IN and (update - BURN_IN) % THINNING == 0:
                 found.append(evidence.hyper(theta))
     return tuple(found)
+
+
+def _with_less_noise(evidence: _Objective, theta: Array) -> Array:
+    """The likeliest theta within the bounds of ``evidence``, by searches from ever shorter length scales, because what
+    noise explained has to vary within short distances."""
+    starts = [theta.copy() for _ in SHORTER]
+    for start, shorter in zip(starts, SHORTER, strict=True):
+        start[: evidence.d] -= shorter
+    return min((_minimum(evidence, start) for start in starts), key=lambda pair: pair[0])[1]
 
 
 class _Chain:

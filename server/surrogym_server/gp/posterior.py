@@ -101,6 +101,14 @@ class Posterior:
         precision = torch.cholesky_inverse(self.factor).diagonal()
         return self.y - self.weights / precision, 1 / precision
 
+    @property
+    def noise_seen(self) -> float | None:
+        """Variance of the noise that the results of equal points show; None if no points are equal."""
+        equal = (self.x[:, None] == self.x).all(-1).triu(1)
+        if not bool(equal.any()):
+            return None
+        return 0.5 * float((self.y[:, None] - self.y)[equal].square().mean())
+
     def extend(self, x: Tensor, y: Tensor) -> Posterior:
         """Condition on one more point, x (d,) and y (), in O(n^2): a new row of the factor."""
         k = covariance(self.hyper, x[None], self.x)

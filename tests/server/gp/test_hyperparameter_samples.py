@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from surrogym_server.gp import FitOptions, fit, hyperparameter_samples
+from surrogym_server.gp import FitOptions, condition, fit, hyperparameter_samples
 from surrogym_server.gp.fit import _Objective
 
 
@@ -52,3 +52,16 @@ def test_samples_are_a_pure_function_of_points_and_seed():
     first, again, other = (hyperparameter_samples(posterior, 2, seed) for seed in (1, 1, 2))
     assert [h.noise_variance for h in first] == [h.noise_variance for h in again]
     assert [h.noise_variance for h in first] != [h.noise_variance for h in other]
+
+
+def test_a_thin_layer_is_in_the_functions_if_noise_may_not_explain_it():
+    """A kink between points looks like noise: functions with it pass far from the points, in narrow intervals."""
+    x = torch.linspace(-1.7, 1.7, 25, dtype=torch.float64)[:, None]
+    y = torch.where(x[:, 0].abs() < 0.15, 1.5, 0.0) + x[:, 0]
+    y = (y - y.mean()) / y.std(correction=0)
+    noisy = fit(x, y, FitOptions(), np.log([5.0, 1.0, 1.0, 0.2])).posterior
+    limit = 1e-4
+    assert noisy.hyper.noise_variance > 100 * limit
+    for hyper in hyperparameter_samples(noisy, 8, seed=0, most_noise=limit):
+        assert hyper.noise_variance <= limit
+        assert float((condition(hyper, x, y).mean(x) - y).abs().max()) < 0.1

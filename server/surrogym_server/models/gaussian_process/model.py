@@ -241,7 +241,7 @@ class GaussianProcessModel(
         here = to_device(self, CPU)
         models = [
             to_device(replace(here, transitions=tuple(outputs[:-1]), reward=outputs[-1]), self.definition.device)
-            for outputs in uncertain_outputs(here.outputs)
+            for outputs in uncertain_outputs(here.outputs, repeatable=self.definition.max_rollout is None)
         ]
         return FunctionsOfSeveral(tuple(models)) if models else self
 

@@ -11,9 +11,15 @@ from support.plane import drifting, plane
 from support.real_steps import random_steps
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import CompiledSteps, FunctionDraws
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
-from surrogym_server.models.gaussian_process.prediction.several import MODELS, MOST_POINTS, FunctionsOfSeveral
+from surrogym_server.models.gaussian_process.prediction.several import (
+    MODELS,
+    MOST_POINTS,
+    NEGLIGIBLE,
+    FunctionsOfSeveral,
+)
 from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE
 
 ROWS = 24
@@ -100,3 +106,29 @@ def test_functions_of_a_learned_logarithm_keep_its_noise_floor():
     several = hidden.uncertain_functions
     assert isinstance(several, FunctionsOfSeveral)
     assert max(one.reward.posterior.hyper.noise_variance for one in several.models) < 10 * PEAK_NOISE
+
+
+def shaken(repeats: int) -> Samples:
+    """Steps of the plane whose x is shaken by noise. The first of them are repeated."""
+    steps = drifting(lambda q, _: -q.square().sum(-1), 24)
+    rows = torch.cat([torch.arange(24), torch.arange(repeats)])
+    noise = torch.randn(len(rows), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    q_next = steps.q_next[rows] + 0.02 * torch.stack([noise, 0 * noise], -1)
+    return Samples(steps.q[rows], steps.u[rows], q_next, steps.reward[rows], steps.terminated[rows])
+
+
+@pytest.mark.parametrize(
+    ("spec", "repeats", "kept"),
+    [
+        pytest.param(plane(), 0, False, id="no step was repeated"),
+        pytest.param(plane(), 4, True, id="repeated steps show it"),
+        pytest.param(plane().model_copy(update={"query": "rollout", "max_rollout": 20}), 0, True, id="none can be"),
+    ],
+)
+def test_functions_have_no_noise_that_repeated_steps_do_not_show(spec, repeats, kept):
+    known = gaussian_processes(definition_from_spec(spec), shaken(repeats))
+    assert known.transitions[0].posterior.hyper.noise_variance > NEGLIGIBLE
+    several = known.uncertain_functions
+    assert isinstance(several, FunctionsOfSeveral)
+    noises = [one.transitions[0].posterior.hyper.noise_variance for one in several.models]
+    assert min(noises) > NEGLIGIBLE if kept else max(noises) <= NEGLIGIBLE

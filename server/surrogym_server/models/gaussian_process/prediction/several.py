@@ -3,6 +3,11 @@
 A single optimum treats a length scale as certain, which five samples can't determine. So a function is drawn in two
 steps: one of the models, with equal probability, and a function of its processes. A drawn function consists of the
 number of its model and the weights that this model draws.
+
+A drawn function has no noise. So if a process explains its samples by noise that repeated steps don't show, its misfit
+would be in no function. The hyperparameters of such a process are drawn without this noise: the functions pass through
+the samples, and vary as much as the samples ask for. Where no step can be repeated nothing tells the two apart, and
+noise stays noise.
 """
 
 from __future__ import annotations
@@ -17,23 +22,25 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import NumericalFailure
-from surrogym_server.gp import Hyperparameters, Posterior, condition, hyperparameter_samples
+from surrogym_server.gp import MOST_NOISE, Hyperparameters, Posterior, condition, hyperparameter_samples
 from surrogym_server.models.abilities import ArraySteps, ArrayTransition, CompiledSteps, FunctionDraws
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.port import Transition
 
 MODELS = 8
 MOST_POINTS = 128  # of a process with sampled hyperparameters; more points determine them well enough
+NEGLIGIBLE = 0.01**2  # variance of the noise, of the output's variance; misfit as small does no harm
+AT_MOST = 3.0**2  # largest ratio of learned noise to the variance of repeated steps, which may be few
 
 Floats = NDArray[np.float64]
 
 
-def uncertain_outputs(outputs: Sequence[OutputModel]) -> list[list[OutputModel]]:
+def uncertain_outputs(outputs: Sequence[OutputModel], *, repeatable: bool) -> list[list[OutputModel]]:
     """Copy the outputs (O,) ``MODELS`` times, on the CPU, with sampled hyperparameters for processes with few points.
-    Empty if no process has so few."""
+    Empty if no process has so few. ``repeatable``: whether steps can be repeated to test noise."""
     if not any(_uncertain(output) for output in outputs):
         return []
-    columns = [_sampled(output, seed) for seed, output in enumerate(outputs)]
+    columns = [_sampled(output, seed, repeatable) for seed, output in enumerate(outputs)]
     return [list(row) for row in zip(*columns, strict=True)]
 
 
@@ -42,12 +49,18 @@ def _uncertain(output: OutputModel) -> bool:
     return posterior is not None and posterior.sparse is None and len(posterior.y) <= MOST_POINTS
 
 
-def _sampled(output: OutputModel, seed: int) -> list[OutputModel]:
+def _sampled(output: OutputModel, seed: int, repeatable: bool) -> list[OutputModel]:
     posterior = output.posterior
     if posterior is None or not _uncertain(output):
         return [output] * MODELS
-    hypers = hyperparameter_samples(posterior, MODELS, seed, output.noise_floor)
+    most = NEGLIGIBLE if repeatable and _misfits(posterior) else MOST_NOISE
+    hypers = hyperparameter_samples(posterior, MODELS, seed, output.noise_floor, most)
     return [replace(output, posterior=_conditioned(posterior, hyper)) for hyper in hypers]
+
+
+def _misfits(posterior: Posterior) -> bool:
+    """Whether a process has learned noise that no equal points show."""
+    return posterior.hyper.noise_variance > max(NEGLIGIBLE, AT_MOST * (posterior.noise_seen or 0.0))
 
 
 def _conditioned(posterior: Posterior, hyper: Hyperparameters) -> Posterior:
