@@ -12,6 +12,7 @@ import pytest
 from surrogym_client.policies.evidence import Audit, Promise
 from surrogym_client.training import audited
 from surrogym_client.training.audited import MOST_AUDITS, AuditedTraining
+from surrogym_client.training.closed_loop import LoopSettings
 from surrogym_client.training.handover import AuditSettings, Handover
 from surrogym_client.training.settings import TrainResult, TrainSettings
 
@@ -110,3 +111,26 @@ def test_promises_that_fall_again_and_again_end(monkeypatch, tmp_path: Path) -> 
     trainings, _, handover = run(monkeypatch, tmp_path, *[found(95.6, -21.6)] * MOST_AUDITS)
     assert trainings.made == MOST_AUDITS
     assert handover.promise.median == -21.6
+
+
+@pytest.mark.parametrize(("unspent", "improved"), [(0, []), (1, [12]), (2, [12, 12])])
+def test_a_failed_audit_takes_the_steps_of_rounds_that_took_none(
+    monkeypatch, tmp_path: Path, unspent: int, improved: list[int]
+) -> None:
+    """The budget has none left: the loop raises it by a round's steps, and it took none where the model seemed sure."""
+    api, ledger = Mock(), Mock(total=24)
+    api.surrogate.return_value = Mock(budget_left=0, ledger=ledger, fidelity=None)
+    api.improve.side_effect = lambda _name, queries, **_: setattr(ledger, "total", ledger.total + queries)
+    trainings = Trainings([found(95.6, 94.0, passed=False)] * MOST_AUDITS)
+    loop = Mock(unspent=unspent, train=lambda: trainings.train(None, tmp_path / "p.zip", TrainSettings(), None))
+    monkeypatch.setattr(audited, "ClosedLoop", lambda *_: loop)
+    monkeypatch.setattr(audited, "train", trainings.train)
+    monkeypatch.setattr(audited, "hand_over", trainings.hand_over)
+    monkeypatch.setattr(audited, "visit", lambda *_: None)
+    monkeypatch.setattr(audited, "wait_for_design", lambda *_, **__: api.surrogate())
+    monkeypatch.setattr(AuditedTraining, "_subject", lambda *_: None)
+    monkeypatch.setattr(AuditedTraining, "_best", lambda _self, result: result)
+    settings, rounds = TrainSettings(algorithm="fastppo"), LoopSettings(queries=12, rounds=3)
+    AuditedTraining(api, "plane", Mock(), tmp_path / "p.zip", settings, rounds, AuditSettings()).train()
+    assert [call.args[1] for call in api.improve.call_args_list] == improved
+    assert trainings.made == 1 + len(improved)

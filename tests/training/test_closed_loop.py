@@ -98,9 +98,11 @@ def test_rounds_end_when_the_visited_region_is_known_or_design_ready(
         with sampling(own_server.url, name, spec), HttpSurrogate(own_server.url, name) as port:
             wait_for_design(api, name, 60)
             improve = LoopSettings(queries=3, rounds=2, patience_seconds=60)
-            result = ClosedLoop(api, name, port, tmp_path / "p.zip", settings, improve, seen.append).train()
+            loop = ClosedLoop(api, name, port, tmp_path / "p.zip", settings, improve, seen.append)
+            result = loop.train()
         view = api.surrogate(name)
     assert view.ledger.total == real_steps
+    assert loop.unspent == (2 if rounds == 1 else 0), "rounds that a ready design does not need are not unspent"
     assert view.ledger.initial == initial
     assert result.virtual_steps == 400 + rounds * VISIT, "the steps asked for are those of all trainings"
     assert result.path.exists()

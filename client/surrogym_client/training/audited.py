@@ -30,14 +30,15 @@ from surrogym_shared.wire import SurrogateView
 MOST_AUDITS = 3  # audits of one training at most; each takes its own real steps
 
 
-@dataclass(frozen=True)
+@dataclass
 class AuditedTraining:
     """Train a policy, audit it, and hand it over.
 
-    If an audit fails and the budget has steps left, they are taken where the policy goes, the training continues, and
-    the policy is audited again. The training also continues if the model that has learned from an audit promises
-    clearly less than the training imagined, or than the model before, unless the user limited the virtual steps. This
-    takes no step of the budget. In all other cases the policy is handed over, also with a failed audit.
+    If an audit fails and the budget has steps left, or rounds that the model seemed not to need, their steps are taken
+    where the policy goes, the training continues, and the policy is audited again. The training also continues if the
+    model that has learned from an audit promises clearly less than the training imagined, or than the model before,
+    unless the user limited the virtual steps. This takes no step of the budget. In all other cases the policy is handed
+    over, also with a failed audit.
 
     Attributes:
         api: the server.
@@ -61,6 +62,7 @@ class AuditedTraining:
     progress: Callable[[TrainProgress], None] | None = None
     waiting: Callable[[SurrogateView], None] | None = None
     candidates: Candidates = field(default_factory=Candidates, init=False)
+    _unspent: int = field(default=0, init=False)  # rounds of the closed loop that took no real step
 
     def train(self) -> tuple[TrainResult, Handover]:
         """Train and audit, and train further if the audit fails or lowers the promise clearly.
@@ -92,7 +94,9 @@ class AuditedTraining:
             self.api, self.name, self.port, self.out, self.settings, self.rounds, self.progress, self.waiting
         )
         loop.candidates = self.candidates
-        return self._best(loop.train())
+        result = loop.train()
+        self._unspent = loop.unspent
+        return self._best(result)
 
     def _best(self, result: TrainResult) -> TrainResult:
         """Return the policy that is best in the model of all real steps so far."""
@@ -117,12 +121,14 @@ class AuditedTraining:
         return longer and disappointed(audit, result.untrained, result.imagined_return)
 
     def _asked_more(self, result: TrainResult, taken: int, number: int) -> bool:
-        """Spend the rest of the budget where the policy goes.
+        """Spend the rest of the budget, or a round that took no real step, where the policy goes.
 
         Returns whether the budget's real steps are now more than ``taken``.
         """
         view = self.api.surrogate(self.name)
-        wanted = min(self.rounds.queries if self.rounds else AUDIT_STEPS, view.budget_left)
+        round_ = self.rounds.queries if self.rounds else AUDIT_STEPS
+        wanted = round_ if self._unspent else min(round_, view.budget_left)
+        self._unspent = max(self._unspent - 1, 0)
         if wanted > 0:
             checkpoint = f"seed {self.settings.seed}, audit {number}, round {view.round}"
             visit(self.port, result, self.settings, checkpoint)

@@ -65,6 +65,7 @@ class ClosedLoop:
         waiting: called each time the surrogate is polled, while a sampler answers a round's queries.
         trained: results of the trainings so far.
         candidates: policies of these trainings.
+        unspent: number of rounds that took no real step, because the model was certain where the policy went.
     """
 
     api: Api
@@ -77,6 +78,7 @@ class ClosedLoop:
     waiting: Callable[[SurrogateView], None] | None = None
     trained: list[TrainResult] = field(default_factory=list, init=False)
     candidates: Candidates = field(default_factory=Candidates)
+    unspent: int = field(default=0, init=False)
     _visited: int = field(default=0, init=False)  # virtual steps that collected occupancies
     _known: list[float | None] = field(
         default_factory=list, init=False
@@ -127,6 +129,7 @@ class ClosedLoop:
         self._known.append(index)
         self._region_known = index is not None and index >= view.target
         if self._region_known:
+            self.unspent = self.rounds.rounds - len(self._known) + 1
             return False
         self.api.improve(self.name, self.rounds.queries, checkpoint=checkpoint)
         patience = self.rounds.patience_seconds
