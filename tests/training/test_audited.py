@@ -113,12 +113,15 @@ def test_promises_that_fall_again_and_again_end(monkeypatch, tmp_path: Path) -> 
     assert handover.promise.median == -21.6
 
 
-@pytest.mark.parametrize(("unspent", "improved"), [(0, []), (1, [12]), (2, [12, 12])])
+@pytest.mark.parametrize(
+    ("role", "unspent", "improved"), [("admin", 0, []), ("admin", 1, [12]), ("admin", 2, [12, 12]), ("trainer", 2, [])]
+)
 def test_a_failed_audit_takes_the_steps_of_rounds_that_took_none(
-    monkeypatch, tmp_path: Path, unspent: int, improved: list[int]
+    monkeypatch, tmp_path: Path, role: str, unspent: int, improved: list[int]
 ) -> None:
     """The budget has none left: the loop raises it by a round's steps, and it took none where the model seemed sure."""
     api, ledger = Mock(), Mock(total=24)
+    api.access.return_value.role = role
     api.surrogate.return_value = Mock(budget_left=0, ledger=ledger, fidelity=None)
     api.improve.side_effect = lambda _name, queries, **_: setattr(ledger, "total", ledger.total + queries)
     trainings = Trainings([found(95.6, 94.0, passed=False)] * MOST_AUDITS)

@@ -123,11 +123,13 @@ class AuditedTraining:
     def _asked_more(self, result: TrainResult, taken: int, number: int) -> bool:
         """Spend the rest of the budget, or a round that took no real step, where the policy goes.
 
-        Returns whether the budget's real steps are now more than ``taken``.
+        Only a token of role admin may raise the budget for such a round. Returns whether the budget's real steps are
+        now more than ``taken``.
         """
         view = self.api.surrogate(self.name)
         round_ = self.rounds.queries if self.rounds else AUDIT_STEPS
-        wanted = round_ if self._unspent else min(round_, view.budget_left)
+        left = round_ if self._unspent and self.api.access().role == "admin" else view.budget_left
+        wanted = min(round_, left)
         self._unspent = max(self._unspent - 1, 0)
         if wanted > 0:
             checkpoint = f"seed {self.settings.seed}, audit {number}, round {view.round}"

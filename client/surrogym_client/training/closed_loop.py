@@ -65,7 +65,8 @@ class ClosedLoop:
         waiting: called each time the surrogate is polled, while a sampler answers a round's queries.
         trained: results of the trainings so far.
         candidates: policies of these trainings.
-        unspent: number of rounds that took no real step, because the model was certain where the policy went.
+        unspent: number of rounds that took no real step, because the design was ready, or the model was certain where
+            the policy went.
     """
 
     api: Api
@@ -121,6 +122,7 @@ class ClosedLoop:
         round may follow."""
         view = self.api.surrogate(self.name)
         if view.phase == "ready":
+            self.unspent = self.rounds.rounds - len(self._known)
             return False
         self._learn(self._part, self._whole, replace(self.settings, prolong=False))
         checkpoint = f"seed {self.settings.seed}, round {view.round}"
