@@ -48,7 +48,14 @@ export function ledgerTable() {
   return { element: section("ledger", "Ledger", "Every real step, by purpose.", place), show: render };
 }
 
-const HYPER = ["inputs", "kernel", "lengthscale", "signal_variance", "linear_variance", "quadratic_variance", "noise_variance", "jitter", "scale", "points", "left_out"];
+const HYPER = ["inputs", "kernel", "features", "features_left_out", "rates", "lengthscale", "signal_variance", "linear_variance", "quadratic_variance", "noise_variance", "jitter", "scale", "points", "left_out"];
+
+function hyper(value) {
+  if (typeof value === "number") return number(value);
+  if (typeof value !== "object") return String(value);
+  if (!Array.isArray(value)) return Object.entries(value).map(([name, one]) => `${name}: ${number(one)}`).join(", ") || "none";
+  return (typeof value[0] === "number" ? vector(value) : value.join(", ")) || "none";
+}
 
 function model(record) {
   const { fidelity } = record;
@@ -57,7 +64,7 @@ function model(record) {
   const rows = fidelity.outputs.map((output) => [output.name, output.structure, percent(output.confidence_index), percent(output.coverage), number(output.leave_one_out_error), number(output.tolerance)]);
   const parts = (record.description.outputs ?? []).map((output) => h("div", {}, h("h4", {}, output.name), h("dl", { class: "hyper" },
     HYPER.filter((name) => output[name] !== undefined).flatMap((name) => [h("dt", {}, name.replaceAll("_", " ")),
-      h("dd", {}, Array.isArray(output[name]) ? vector(output[name]) : typeof output[name] === "number" ? number(output[name]) : String(output[name]))]))));
+      h("dd", {}, hyper(output[name]))]))));
   return h("details", { class: "model" }, head,
     table(`Outputs of version ${record.version}`, [["output", ""], ["structure", ""], ["confidence", "num"], ["coverage", "num"], ["leave-one-out", "num"], ["tolerance", "num"]], rows, ""), h("div", { class: "outputs" }, parts));
 }

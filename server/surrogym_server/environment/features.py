@@ -84,6 +84,24 @@ class Feature(NamedTuple):
     rate: float = 0.0  # "grown"
 
 
+def feature_names(definition: EnvironmentDefinition, feature_map: FeatureMap) -> list[str]:
+    """What each feature of a map reads, in order, for people."""
+    entries = (*definition.coordinate_names, *(f"action {place}" for place in range(definition.action.size)))
+    names = []
+    for function, entry, centre, *_ in features(definition, feature_map):
+        if function == "observed":
+            names.append(definition.observation_names[entry])
+        elif function == "lead":
+            names.append(f"next {definition.coordinate_names[leading(definition)[entry]]}")
+        elif function in ("affine", "grown"):
+            names.append(entries[entry])
+        elif function == "equal":
+            names.append(f"{entries[entry]} = {centre:g}")
+        else:
+            names.append(f"{function.replace('turned_', 'next ')} {entries[entry]}")
+    return names
+
+
 def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tuple[Feature, ...]:
     """The features of a map, in order."""
     made = [] if feature_map.state == "none" else _of_point(definition, feature_map)

@@ -114,7 +114,7 @@ class GaussianProcessModel(
     @property
     def description(self) -> dict[str, Any]:
         """Structure and hyperparameters of every output, for people."""
-        outputs = [describe(o) for o in self.outputs]
+        outputs = [describe(self.definition, o) for o in self.outputs]
         if self.definition.declared_reward is not None:
             outputs[-1]["kernel"] = "declared"
         ending = {} if self.ending is None else {"termination": self.ending.description}

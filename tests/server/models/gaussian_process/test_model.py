@@ -10,9 +10,10 @@ from support.real_steps import random_steps
 from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import wrap
-from surrogym_server.environment.features import encode
+from surrogym_server.environment.features import FeatureMap, encode
 from surrogym_server.environment.step_rules import settle
 from surrogym_server.gp import serving
+from surrogym_server.models.gaussian_process.prediction.description import describe
 from surrogym_server.virtual.single_step import predict_points
 
 
@@ -147,3 +148,15 @@ def test_a_model_describes_itself_for_people(pendulum_model):
     assert list(outputs) == ["theta", "speed", "reward"]
     assert outputs["speed"]["points"] + outputs["speed"]["left_out"] == pendulum_model.samples
     assert len(outputs["reward"]["lengthscale"]) in (3, 4, 5)
+    assert len(outputs["reward"]["features"]) == len(outputs["reward"]["lengthscale"])
+    assert set(outputs["speed"]["features"]) <= {"cos theta", "sin theta", "wrapped theta", "speed", "action 0"}
+    assert outputs["speed"]["rates"] == {}
+
+
+def test_a_description_names_features_left_out_and_rates(pendulum_model):
+    speed = pendulum_model.transitions[1]
+    feature_map = FeatureMap("cos_sin", dropped=(1,), rates=(0.0, 0.4, 0.0))
+    described = describe(pendulum_model.definition, replace(speed, feature_map=feature_map))
+    assert described["features"] == ["cos theta", "speed", "action 0"]
+    assert described["features_left_out"] == ["sin theta"]
+    assert described["rates"] == {"speed": 0.4}

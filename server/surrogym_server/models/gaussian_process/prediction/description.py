@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.features import FeatureMap, feature_names
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
 
-def describe(output: OutputModel) -> dict[str, Any]:
-    """Structure and hyperparameters of an output, as JSON."""
+def describe(definition: EnvironmentDefinition, output: OutputModel) -> dict[str, Any]:
+    """Structure and hyperparameters of an output, as JSON. ``features`` has the order of ``lengthscale``."""
     described: dict[str, Any] = {
         "name": output.name,
         "inputs": str(output.feature_map),
@@ -25,6 +28,7 @@ def describe(output: OutputModel) -> dict[str, Any]:
         hyper = output.posterior.hyper
         described |= {
             "kernel": hyper.kernel,
+            **_inputs(definition, output.feature_map),
             "points": len(output.posterior.y),
             "lengthscale": hyper.lengthscale.tolist(),
             "signal_variance": hyper.signal_variance,
@@ -41,6 +45,14 @@ def describe(output: OutputModel) -> dict[str, Any]:
                 "unexplained_deviation": output.scale * math.sqrt(prior) * sparse.unexplained,
             }
     return described
+
+
+def _inputs(definition: EnvironmentDefinition, feature_map: FeatureMap) -> dict[str, Any]:
+    """Names of the features, of those left out, and the rate of each feature that has one."""
+    names = feature_names(definition, feature_map)
+    every = feature_names(definition, replace(feature_map, rates=(), dropped=()))
+    rates = {name: rate for name, rate in zip(names, feature_map.rates, strict=False) if rate}
+    return {"features": names, "features_left_out": [every[place] for place in feature_map.dropped], "rates": rates}
 
 
 def structure(output: OutputModel) -> str:
