@@ -323,6 +323,7 @@ class Design:
             extra_queries=self._extra,
             occupancy=self._visited,
             threads=self._threads,
+            previous=None if self._result is None else self._result.model,
         )
 
     def _arrays(self) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.bool_]]:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ from surrogym_server.engine.fidelity import fidelity_fields
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
+from surrogym_server.errors import InvalidInput
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.guard import plugin_calls
 from surrogym_server.sampling.design import (
@@ -31,6 +33,7 @@ from surrogym_server.sampling.design import (
     judge_model,
 )
 from surrogym_server.sampling.limits import reached_limits
+from surrogym_server.sampling.prequential import KEPT, continued, predicted
 from surrogym_server.sampling.rollouts import Rollout
 from surrogym_server.sampling.tolerances import usual_tolerances
 
@@ -61,6 +64,8 @@ class DesignJob:
     threads: int = 1
     logged: int = 0  # number of samples from logs, which don't count towards the budget
     audited: int = 0  # number of samples from audits, which don't count either
+    previous: bytes | None = None  # model of the round before, which predicts the samples that are new to it
+    chosen: NDArray[np.bool_] | None = None  # (n,) samples that are worth a prediction; None: all
 
 
 @dataclass(frozen=True)
@@ -144,7 +149,8 @@ def judge_stored(job: DesignJob, stored: bytes) -> DesignResult:
     started = time.perf_counter()
     model, samples = from_bytes(job.definition, stored), _samples(job)
     usual = job.state.get("usual") or usual_tolerances(job.definition, model.scales.tolist())
-    judged = judge_model(model, samples, usual, _request(job), job.state.get("round", 0))
+    state = DesignState.from_json(job.state)
+    judged = judge_model(model, samples, usual, _request(job), state.round, state.predictions)
     return DesignResult(
         model=stored,
         description=model.description,
@@ -160,8 +166,25 @@ def judge_stored(job: DesignJob, stored: bytes) -> DesignResult:
 
 def _decide(job: DesignJob) -> tuple[Decision, Samples]:
     samples = _samples(job)
-    decision = advance(job.definition, samples, DesignState.from_json(job.state), _request(job))
+    decision = advance(job.definition, samples, _with_predictions(job, samples), _request(job))
     return decision, samples
+
+
+def _with_predictions(job: DesignJob, samples: Samples) -> DesignState:
+    """The job's state, with predictions of the last new samples by the previous model. Without them if it is a model of
+    other samples, for example an imported one."""
+    state = DesignState.from_json(job.state)
+    if job.previous is None:
+        return state
+    with suppress(InvalidInput), plugin_calls(job.definition):
+        model = from_bytes(job.definition, job.previous)
+        if model.digest == samples.at(torch.arange(min(model.samples, len(samples)))).digest:
+            chosen = (
+                torch.ones(len(job.reward), dtype=torch.bool) if job.chosen is None else torch.from_numpy(job.chosen)
+            )
+            new = chosen[_known(job)].index_fill(0, torch.arange(model.samples), value=False).nonzero()[-KEPT:, 0]
+            return replace(state, predictions=continued(state.predictions, predicted(model, samples.at(new))))
+    return state
 
 
 def _samples(job: DesignJob) -> Samples:

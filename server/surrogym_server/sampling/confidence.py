@@ -16,6 +16,7 @@ from surrogym_server.environment.points import Points
 from surrogym_server.models.abilities import LeaveOneOut, LeaveOneOutErrors, offers
 from surrogym_server.models.guard import require_shapes
 from surrogym_server.models.port import DynamicsModel
+from surrogym_server.sampling.prequential import PrequentialScores
 from surrogym_server.sampling.regions import Region, regions_of
 
 SUREST = 1e9  # largest ratio of tolerance to deviation; larger ones are clipped to it
@@ -32,6 +33,7 @@ class OutputConfidence:
     noise: float = 0.0  # of a single step, established by repeated or by consecutive steps, in the output's unit
     sensor_noise: float = 0.0  # deviation of one measurement, if most of the noise is the sensor's
     region: Region | None = None  # where most of the doubt is
+    prequential: PrequentialScores | None = None  # of samples that were predicted before they were learned from
 
 
 def deviations(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:

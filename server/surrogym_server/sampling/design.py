@@ -25,6 +25,7 @@ from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.sampling.noise import SLACK, established_noise, to_repeat, widened
 from surrogym_server.sampling.peaks import highest
+from surrogym_server.sampling.prequential import Predictions, from_pairs, pairs_of, scores_of
 from surrogym_server.sampling.rollouts import Aim, Rollout, first_rollouts, plan_round
 from surrogym_server.sampling.serial import noise_of_sensors, sensor_noise
 from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
@@ -44,17 +45,19 @@ class DesignState:
     warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # what a fit passes to the next one
     ended_with: tuple[float, ...] = ()  # steps of the budget, budget, target and tolerances at the end of the design
     ranges: tuple[float, ...] = ()  # of the targets, from which each tolerance was computed
+    predictions: Predictions = ()  # the last ones of each output, of samples that were then learned from
 
     def to_json(self) -> dict[str, Any]:
         warm = {key: array.tolist() for key, array in self.warm.items()}
         ended, ranges = list(self.ended_with), list(self.ranges)
-        return {"round": self.round, "usual": list(self.usual), "ranges": ranges, WARM: warm, "ended_with": ended}
+        fields = {"round": self.round, "usual": list(self.usual), "ranges": ranges, WARM: warm, "ended_with": ended}
+        return fields | {"predictions": pairs_of(self.predictions)}
 
     @classmethod
     def from_json(cls, state: dict[str, Any]) -> DesignState:
         warm = {key: np.array(array) for key, array in state.get(WARM, {}).items()}
         usual, ended, ranges = (tuple(state.get(name, ())) for name in ("usual", "ended_with", "ranges"))
-        return cls(state.get("round", 0), usual, warm, ended, ranges)
+        return cls(state.get("round", 0), usual, warm, ended, ranges, from_pairs(state.get("predictions", [])))
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,7 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     learned = learn(definition, samples, state.warm)
     frozen = frozen_tolerances(definition, samples, Usual(state.usual, state.ranges))
     usual = frozen.tolerances
-    judged = judge_model(learned.model, samples, usual, request, state.round)
+    judged = judge_model(learned.model, samples, usual, request, state.round, state.predictions)
     confidences, tolerances, verdict = judged.confidences, judged.tolerances, judged.verdict
     now = (
         float(len(samples) - request.free),
@@ -147,7 +150,7 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     if verdict == "continue" and not len(chosen) and not rollouts:
         verdict = "over_budget"  # the rest of the budget is pending, or no distinct query is left
     ended = now if verdict != "continue" and not len(chosen) and not rollouts else ()
-    new_state = DesignState(state.round + 1, usual, learned.warm, ended, frozen.ranges)
+    new_state = DesignState(state.round + 1, usual, learned.warm, ended, frozen.ranges, state.predictions)
     return Decision(learned.model, confidences, tolerances, new_state, verdict, chosen.q, chosen.u, rollouts)
 
 
@@ -163,7 +166,12 @@ class Judged:
 
 
 def judge_model(
-    model: DynamicsModel, samples: Samples, usual: Sequence[float], request: Request, round_: int
+    model: DynamicsModel,
+    samples: Samples,
+    usual: Sequence[float],
+    request: Request,
+    round_: int,
+    predictions: Predictions = (),
 ) -> Judged:
     """Judge a model by its definition's tolerances, or else by the ``usual`` ones (O,). Raises ``PluginFailed``."""
     definition = model.definition
@@ -178,8 +186,13 @@ def judge_model(
         require_deviations(model, deviation)
         judged = confidences_of(model, points, deviation, tolerances)
     confidences = tuple(
-        replace(c, noise=float(w), sensor_noise=0.0 if one is None else one.deviation)
-        for c, w, one in zip(judged, noise, sensors, strict=True)
+        replace(
+            c,
+            noise=float(w),
+            sensor_noise=0.0 if one is None else one.deviation,
+            prequential=scores_of(predictions[i], tolerances[i]) if predictions else None,
+        )
+        for i, (c, w, one) in enumerate(zip(judged, noise, sensors, strict=True))
     )
     candidates = candidates_of(model, points, request.states, _rng(definition, f"visited {round_}"))
     reserved = ending(model, samples, candidates.points)

@@ -18,6 +18,7 @@ from surrogym_server.errors import (
     Damaged,
     InvalidInput,
     LeaseExpired,
+    NoModel,
     NotInstalled,
     PluginFailed,
     SurrogymError,
@@ -45,6 +46,7 @@ RENEWALS_PER_LEASE = 3
 ATTEMPTS = 5  # of a fit whose process died, or whose result could not be stored
 LONG_SECONDS = 60.0  # the log names a fit that takes longer, and other fits start beside it
 MOST_PASSED = 3  # long fits that don't count towards ``fit_workers``; each is a process
+UNCHOSEN = ("initial", "logged")  # purposes of samples that nobody chose to test a model
 PAUSE_SECONDS = 1.0  # between checks whether a fit is still wanted
 
 
@@ -290,7 +292,16 @@ class Designer:
             threads=self._threads,
             logged=logged,
             audited=audited,
+            previous=self._previous(name),
+            chosen=np.array([purpose not in UNCHOSEN for purpose in samples.purpose], dtype=np.bool_),
         )
+
+    def _previous(self, name: str) -> bytes | None:
+        """The newest model; None if there is none, or if it is damaged."""
+        try:
+            return self._storage.models.blob(name)
+        except (NoModel, Damaged):
+            return None
 
     def _commit(self, lease: FitLease, result: DesignResult) -> None:
         model = NewModel(

@@ -51,6 +51,25 @@ class DoubtfulRegion(Reply):
     share: float = Field(description="share of the output's doubt over the Monte Carlo set that lies there")
 
 
+class PrequentialScores(Reply):
+    """How well an output's samples were predicted before the model learned from them: the last 20 at most.
+
+    Each sample that the design, an audit or a person chose after the first fit is predicted by the last model, with the
+    deviation at the optimum of the hyperparameters and the learned noise. An error within the tolerance counts as
+    inside every interval. The design chooses samples where the model is uncertain, so they are no fair sample of its
+    errors. These scores are reported, and no verdict depends on them.
+    """
+
+    predictions: int = Field(description="number of samples that were predicted")
+    within_50: float = Field(description="share of them in the central 50 % interval, or within the tolerance")
+    within_80: float = Field(description="the same for the 80 % interval")
+    within_90: float = Field(description="the same for the 90 % interval")
+    interval_score: float = Field(
+        description="mean interval score (Gneiting and Raftery 2007, eq. 43) of the 90 % intervals, which are at least "
+        "as wide as the tolerance, divided by the tolerance; lower is better, and 2 is the least"
+    )
+
+
 class OutputFidelity(Reply):
     """How well the model predicts one output."""
 
@@ -88,6 +107,10 @@ class OutputFidelity(Reply):
     )
     region: DoubtfulRegion | None = Field(
         default=None, description="where most of the doubt is; null if no range of a single input has most of it"
+    )
+    prequential: PrequentialScores | None = Field(
+        default=None,
+        description="scores of samples that were predicted before they were learned from; null if there are none",
     )
 
 
