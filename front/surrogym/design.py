@@ -226,7 +226,8 @@ class Design:
         result, arrays = self._last(), self._arrays()
         samples = RealSamples(*arrays, truncated=np.array([step.truncated for step in self._samples], dtype=np.bool_))
         tolerances = {output["name"]: output["tolerance"] for output in result.fidelity["outputs"]}
-        file = SurrogateFile(name, self._spec_to_save(), result.model, samples, tolerances)
+        predictions = self._state.get("predictions", [])
+        file = SurrogateFile(name, self._spec_to_save(), result.model, samples, tolerances, predictions=predictions)
         Path(path).write_bytes(file.to_bytes())
 
     @classmethod
@@ -264,6 +265,8 @@ class Design:
         usual = [tolerance for tolerance in known if tolerance is not None]
         if len(usual) == len(known):
             self._state = self._state | {"usual": usual}
+        if len(file.predictions) == len(known):
+            self._state = self._state | {"predictions": file.predictions}
         self._result = judge_stored(self._job(), file.model)
         if self._result.verdict == "continue":
             self._phase = "sampling"

@@ -3,8 +3,8 @@ pickles.
 
 The file is safetensors: eight bytes with the length of a JSON header, the header, then arrays as raw bytes. The model's
 arrays and metadata are stored as the server exports them. In addition there are ``samples.*`` arrays and, as metadata
-``surrogate``, format, name, specification, tolerances and ledger. So any reader of safetensors can open the file, and
-the server reads ``model`` as an exported model.
+``surrogate``, format, name, specification, tolerances, ledger and predictions of new samples. So any reader of
+safetensors can open the file, and the server reads ``model`` as an exported model.
 
 Shapes: n samples, C coordinates, F action entries.
 """
@@ -76,6 +76,9 @@ class SurrogateFile:
     samples: RealSamples
     tolerances: dict[str, float] = field(default_factory=dict)  # by output, as used to judge the model
     ledger: dict[str, int] = field(default_factory=dict)  # real steps by purpose, on the server that exported the file
+    predictions: list[list[list[float]]] = field(
+        default_factory=list
+    )  # [error, deviation] of each new sample, by output
 
     def to_bytes(self) -> bytes:
         """Return the contents of the file.
@@ -98,6 +101,7 @@ class SurrogateFile:
             "spec": self.spec.model_dump(mode="json"),
             "tolerances": self.tolerances,
             "ledger": self.ledger,
+            "predictions": self.predictions,
         }
         header[METADATA] = header.get(METADATA, {}) | {OWN: json.dumps(own)}
         return _joined(header, b"".join(parts))
@@ -125,6 +129,7 @@ class SurrogateFile:
             name = _name(own["name"])
             tolerances = {str(output): float(value) for output, value in own.get("tolerances", {}).items()}
             ledger = {str(purpose): int(steps) for purpose, steps in own.get("ledger", {}).items()}
+            predictions = [[_pair(pair) for pair in output] for output in own.get("predictions", [])]
         except NotASurrogateFile:
             raise
         except ValidationError as error:
@@ -134,7 +139,7 @@ class SurrogateFile:
         except UNREADABLE as error:
             raise NotASurrogateFile(f"expected a surrogate's file, got {len(data)} bytes: {error!r}") from error
         _require_shapes(spec, samples)
-        return cls(name, spec, model, samples, tolerances, ledger)
+        return cls(name, spec, model, samples, tolerances, ledger, predictions)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -185,6 +190,14 @@ def _array(entry: Any, body: bytes) -> NDArray[Any]:
         raise ValueError(f"an array of shape {shape} in {stop - start} bytes")
     raw = np.frombuffer(body[start:stop], dtype=np.uint8 if dtype == np.bool_ else dtype).reshape(shape)
     return raw.astype(np.bool_ if dtype == np.bool_ else np.float64)
+
+
+def _pair(given: Any) -> list[float]:
+    """Return the error and the deviation of a prediction. Raises one of ``UNREADABLE`` if they are invalid."""
+    error, deviation = (float(one) for one in given)
+    if not math.isfinite(error) or not 0 <= deviation < math.inf:
+        raise ValueError(f"a prediction with the error {error} and the deviation {deviation}")
+    return [error, deviation]
 
 
 def _name(given: object) -> str:

@@ -7,7 +7,9 @@ import json
 import pytest
 
 from support.scripted_server import lost_reply, reply, scripted_server
+from support.teaching import teach
 from support.terminal import on_terminal
+from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
 from surrogym_shared import wire
 
@@ -88,6 +90,20 @@ def test_a_lost_server_is_reported_and_polled(surrogym, looks, monkeypatch):
 def test_watching_nothing_known_ends_at_once(on_server):
     said = on_server("status", "nobody", "--watch")
     assert (said.code, said.out) == (1, "")
+
+
+def test_new_samples_are_shown_with_the_intervals_that_they_were_predicted_in(on_server, server_process, name):
+    with Api(server_process.url) as api:
+        teach(api, name, pendulum(), queries=8, initial=5)
+    lines = on_server("status", name).out.splitlines()
+    at = next(i for i, line in enumerate(lines) if line.startswith("new samples, predicted before"))
+    assert lines[at + 1].split("  ")[0] == "output"
+    seen = on_server("status", name, "--json").json
+    scored = [output for output in seen["fidelity"]["outputs"] if output["prequential"]]
+    assert [line.split()[:2] for line in lines[at + 2 : at + 2 + len(scored)]] == [
+        [output["name"], str(output["prequential"]["predictions"])] for output in scored
+    ]
+    assert max(output["prequential"]["predictions"] for output in scored) == seen["ledger"]["adaptive"] > 0
 
 
 def test_on_a_narrow_terminal_nothing_is_cut_and_ctrl_c_ends_it(pendulum_server):

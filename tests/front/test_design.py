@@ -63,6 +63,11 @@ def test_its_queries_equal_those_of_a_server(server_process: ServerProcess):
         (*q.coordinates, *q.actions[0]) for q in queries
     ]
     assert design.fidelity["confidence_index"] == model.fidelity.confidence_index
+    scores = [output.prequential for output in model.fidelity.outputs]
+    assert [output["prequential"] for output in design.fidelity["outputs"]] == [
+        one and one.model_dump() for one in scores
+    ]
+    assert max(one.predictions for one in scores if one is not None) == BUDGET - INITIAL
 
 
 def test_the_next_round_waits_for_the_answers_of_this_one():

@@ -19,6 +19,7 @@ from surrogym_client.report.known import Known
 from surrogym_client.report.maps import Cut, cuts
 from surrogym_client.report.page import page
 from surrogym_client.transport import Api
+from surrogym_shared.wire import PrequentialScores
 
 SVG = "data:image/svg+xml;base64,"
 Both = tuple[Known, list[Cut]]
@@ -79,6 +80,19 @@ def test_it_says_what_is_known(known: Both) -> None:
     assert models[0].data_hash[:12] in read.texts
     assert f"{view.ledger.total} taken, {view.budget} allowed" in read.texts
     assert not {"over_budget", "from_log"} & set(re.findall(r"\w+", " ".join(read.texts)))
+
+
+def test_scores_of_new_samples_have_a_table_where_there_are_any(known: Both) -> None:
+    title = "New samples, predicted before the model learned from them: shares in intervals, or within the tolerance"
+    assert title not in Page(page(*known)).texts
+    *before, model = known[0].models
+    first, *others = model.fidelity.outputs
+    scores = PrequentialScores(predictions=17, within_50=0.4, within_80=0.7, within_90=0.8125, interval_score=3.375)
+    outputs = [first.model_copy(update={"prequential": scores}), *others]
+    scored = model.model_copy(update={"fidelity": model.fidelity.model_copy(update={"outputs": outputs})})
+    read = Page(page(replace(known[0], models=[*before, scored]), known[1]))
+    assert title in read.texts
+    assert {"17", "0.8125", "3.375"} <= set(read.texts)
 
 
 def test_the_encoding_of_angles_is_shown_only_where_there_are_angles(known: Both) -> None:

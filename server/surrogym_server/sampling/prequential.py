@@ -53,9 +53,9 @@ def scores_of(predictions: Sequence[Prediction], tolerance: float) -> Prequentia
     error = torch.tensor([p.error for p in predictions], dtype=torch.float64)
     deviation = torch.tensor([p.deviation for p in predictions], dtype=torch.float64)
     half = [(_normal_quantile(level) * deviation).clamp_min(tolerance) for level in LEVELS]
-    within = (float((error.abs() <= one).double().mean()) for one in half)
+    within_50, within_80, within_90 = (float((error.abs() <= one).double().mean()) for one in half)
     score = interval_score(-half[-1], half[-1], error, LEVELS[-1]) / tolerance
-    return PrequentialScores(len(predictions), *within, float(score.mean()))
+    return PrequentialScores(len(predictions), within_50, within_80, within_90, float(score.mean()))
 
 
 def interval_score(low: Tensor, high: Tensor, value: Tensor, level: float) -> Tensor:

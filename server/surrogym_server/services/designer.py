@@ -270,6 +270,7 @@ class Designer:
         logged, audited = (samples.purpose.count(purpose) for purpose in ("logged", "audit"))
         spoken = len(samples.reward) - logged - audited + sum(query.steps for query in pending)
         steps = [query for query in pending if query.kind == "step"]
+        chosen = np.array([purpose not in UNCHOSEN for purpose in samples.purpose], dtype=np.bool_)
         visited = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
         definition = self._definitions.for_design(name).with_tolerances(record.tolerances)
         return DesignJob(
@@ -292,8 +293,8 @@ class Designer:
             threads=self._threads,
             logged=logged,
             audited=audited,
-            previous=self._previous(name),
-            chosen=np.array([purpose not in UNCHOSEN for purpose in samples.purpose], dtype=np.bool_),
+            previous=self._previous(name) if chosen.any() else None,
+            chosen=chosen,
         )
 
     def _previous(self, name: str) -> bytes | None:

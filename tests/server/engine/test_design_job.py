@@ -11,7 +11,7 @@ import torch
 from support.real_steps import answer
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.engine.design_job import DesignJob, initial_queries, run_design_job
+from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
 from surrogym_server.models.files import from_bytes
 from surrogym_shared.spec import Design
 from surrogym_shared.wire import Fidelity
@@ -69,3 +69,57 @@ def test_pending_queries_and_occupancy_are_passed_on(job):
     assert len(run_design_job(pending).query_coordinates) == 1
     visited = replace(hungry, occupancy=np.random.default_rng(0).normal([1, -3], [0.5, 1.5], (100, 2)))
     assert not np.array_equal(run_design_job(visited).query_coordinates, run_design_job(hungry).query_coordinates)
+
+
+def answered(job: DesignJob, result: DesignResult) -> DesignJob:
+    """The job of the next round, with the answers to the queries of the last one."""
+    steps = answer(SPEC, torch.from_numpy(result.query_coordinates), torch.from_numpy(result.query_action))
+    fields = {"coordinates": steps.q, "action": steps.u, "next_coordinates": steps.q_next}
+    joined = {
+        name: np.concatenate([getattr(job, name), new.numpy()])
+        for name, new in (fields | {"reward": steps.reward, "terminated": steps.terminated}).items()
+    }
+    return replace(job, **joined, state=json.loads(json.dumps(result.state)), previous=result.model)
+
+
+def scored(result: DesignResult) -> list[int]:
+    """How many samples each output's scores are of."""
+    outputs = Fidelity.model_validate(result.fidelity).outputs
+    return [0 if output.prequential is None else output.prequential.predictions for output in outputs]
+
+
+def test_new_samples_are_predicted_by_the_model_before(job):
+    """Over two rounds, as the scores are cumulative. No answer of this design ends at a limit."""
+    first = run_design_job(replace(job, extra_queries=3))
+    assert scored(first) == [0, 0, 0]
+    following = answered(job, first)
+    second = run_design_job(replace(following, extra_queries=2))
+    new = len(first.query_coordinates)
+    assert scored(second) == [new] * 3
+    third = run_design_job(answered(following, second))
+    assert scored(third) == [new + len(second.query_coordinates)] * 3
+    error, deviation = second.state["predictions"][0][0]
+    model = from_bytes(job.definition, first.model)
+    point = (torch.from_numpy(a[len(job.reward) :][:1]) for a in (following.coordinates, following.action))
+    truth = following.next_coordinates[len(job.reward), 0] - following.coordinates[len(job.reward), 0]
+    assert error == pytest.approx(truth - float(model.means(*point)[0, 0]), abs=1e-9)
+    assert deviation > 0
+
+
+def test_scores_change_neither_the_model_nor_the_queries(job):
+    following = answered(job, run_design_job(replace(job, extra_queries=3)))
+    scores, none = (run_design_job(replace(following, extra_queries=2, previous=p)) for p in (following.previous, None))
+    assert scored(none) == [0, 0, 0]
+    assert scores.model == none.model
+    assert scores.verdict == none.verdict
+    np.testing.assert_array_equal(scores.query_coordinates, none.query_coordinates)
+
+
+def test_only_chosen_samples_are_predicted_and_only_by_a_model_of_the_samples_before(job):
+    following = answered(job, run_design_job(replace(job, extra_queries=3)))
+    chosen = np.arange(len(following.reward)) != len(following.reward) - 1
+    new = len(following.reward) - len(job.reward)
+    assert scored(run_design_job(replace(following, chosen=chosen))) == [new - 1] * 3
+    other = run_design_job(replace(job, coordinates=job.coordinates + 0.01)).model
+    assert scored(run_design_job(replace(following, previous=other))) == [0, 0, 0]
+    assert scored(run_design_job(replace(following, previous=b"damaged"))) == [0, 0, 0]

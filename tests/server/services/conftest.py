@@ -13,7 +13,7 @@ from surrogym_server.engine.design_job import initial_queries
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import NewSample, NewSurrogate
+from surrogym_server.storage.records import NewSurrogate
 from surrogym_server.storage.sql import open_storage
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -43,8 +43,5 @@ def definitions(storage: Storage) -> Definitions:
 @pytest.fixture
 def answered(storage: Storage) -> Storage:
     """Its initial queries are answered: a fit is due."""
-    for query in storage.queries.claim(NAME, "tester", 100, 60):
-        step = pendulum.real_step(list(query.coordinates), list(query.action))
-        sample = NewSample(**step, query_id=query.id, lease_token=query.token)
-        storage.samples.add(NAME, "tester", [sample])
+    pendulum.answer_open(storage, NAME)
     return storage

@@ -135,6 +135,20 @@ def test_the_job_has_what_the_design_knows(answered: Storage, designer, runner: 
     job = runner.jobs[0]
     assert (len(job.reward), job.extra_queries, job.budget) == (pendulum.INITIAL, 2, pendulum.BUDGET)
     np.testing.assert_array_equal(job.occupancy, np.ones((3, 2)))
+    assert (job.previous, job.chosen.tolist()) == (None, [False] * pendulum.INITIAL)
+
+
+def test_answers_are_scored_before_they_are_learned_and_the_scores_are_stored(
+    answered: Storage, designer, runner: Runner
+):
+    fit_all(designer)
+    assert {output["prequential"] for output in answered.models.get(NAME).fidelity["outputs"]} == {None}
+    taken = pendulum.answer_open(answered, NAME)
+    fit_all(designer)
+    assert runner.jobs[-1].previous == answered.models.blob(NAME, 1)
+    stored = answered.models.get(NAME, 2).fidelity["outputs"]
+    assert max(output["prequential"]["predictions"] for output in stored) == taken > 0
+    assert len(answered.surrogates.get(NAME).state["predictions"]) == len(stored)
 
 
 def test_a_budget_lowered_after_a_request_for_queries_holds(answered: Storage, designer, runner: Runner):
