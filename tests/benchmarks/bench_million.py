@@ -1,9 +1,9 @@
 """What requests cost in a PostgreSQL database with 200 surrogates, a million samples and 1,000 open sessions.
 
-A server of its own answers one client over HTTP, while two owners renew and record the sessions, as
-hosts of a cluster do. The times of pages of 1,000 samples are divided as in ``bench_samples_page.py``, which shows what
-their slowest hundredth waits for.
-The plan of each statement is written to a file.
+A server of its own answers one client over HTTP. Meanwhile two owners renew and record 1,000 sessions in the database,
+as hosts of a cluster do, and another client steps one of 1,000 more that are open in the server, 100 times a second.
+The times of pages of 1,000 samples are divided as in ``bench_samples_page.py``, which shows what their slowest
+hundredth waits for. The plan of each statement is written to a file.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import httpx
+import numpy as np
 import sqlalchemy as sa
 from bench_samples_page import children, ran_and_waited, request, show, summary
 from common import parser, started, write
@@ -29,12 +30,17 @@ from common import parser, started, write
 from support.million import APART, FIRST, fill
 from support.postgresql import running_postgresql
 from support.server import running_server
+from support.teaching import teach
+from surrogym_client.original.classic import pendulum
+from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_server.storage.live_sessions import Checkpoint, SessionLease
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
+from surrogym_shared.wire import OpenSession
 
 SURROGATES, SAMPLES, SESSIONS, CHECKPOINT = 200, 1_000_000, 1_000, 16_384
 QUICK = (20, 20_000, 100)
+TAUGHT, STEPS_A_SECOND = "taught", 100  # the surrogate of the server's sessions
 LARGE = 156 * 1_000 * 2 * 8  # bytes of 156 lanes of 1,000 particles with two coordinates
 
 
@@ -56,6 +62,25 @@ def timed(call: Callable[[], Any], count: int) -> dict[str, float]:
         call()
         taken.append(time.perf_counter() - start)
     return quantiles(taken)
+
+
+class Trainer(threading.Thread):
+    """Opens sessions of one lane in the server and steps one of them at a time, at most ``STEPS_A_SECOND``."""
+
+    def __init__(self, url: str, sessions: int) -> None:
+        super().__init__(daemon=True)
+        self.port, self.ending = HttpSurrogate(url, TAUGHT, transport="binary"), threading.Event()
+        self.steps: list[float] = []
+        self.sessions = [self.port.open(OpenSession(seed=seed)).id for seed in range(sessions)]
+        for session in self.sessions:
+            self.port.reset(session)
+
+    def run(self) -> None:
+        action = np.zeros((1, 1), dtype=np.float32)
+        while not self.ending.wait(1 / STEPS_A_SECOND):
+            start = time.perf_counter()
+            self.port.step(random.choice(self.sessions), action)
+            self.steps.append(time.perf_counter() - start)
 
 
 class Hosts(threading.Thread):
@@ -214,17 +239,25 @@ def main() -> None:
         names = [FIRST, *(f"{FIRST}-{number}" for number in range(1, surrogates))]
         hosts = Hosts(storage, sessions)
         hosts.start()
+        of_server = ("--log-level", "warning", "--database", url)
         with (
-            running_server(Path(folder), "--log-level", "warning", "--database", url) as server,
+            running_server(Path(folder), *of_server, SURROGYM_MAX_SESSIONS=str(sessions)) as server,
             httpx.Client(base_url=server.url, timeout=120) as client,
         ):
+            with Api(server.url) as api:
+                teach(api, TAUGHT, pendulum(), queries=12)
+            trainer = Trainer(server.url, sessions)
+            trainer.start()
             report = requests(client, names, samples, count)
             path = partial(page_of, names, samples, 1_000)
             pages = [request(client, server.process.pid, postgresql.pid, path) for _ in range(5 * count)]
             parts = {f"{len(pages):,} pages": summary(pages)}
+            trainer.ending.set()
+            trainer.join()
         report |= of_storage(storage, names, max(10, count // 4))
         hosts.ending.set()
         hosts.join()
+        report["step of a session"] = quantiles(trainer.steps)
         report |= {"renewal of half of the sessions": quantiles(hosts.renewals), "checkpoint": quantiles(hosts.records)}
         report["processor time, 2.5 MB checkpoint"] = of_large_checkpoint(storage, postgresql.pid, 20)
         for what, figures in report.items():

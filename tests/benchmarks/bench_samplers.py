@@ -2,7 +2,8 @@
 
 Each sampler is a process with an environment that sleeps 50 ms in each step. Queries made by hand keep the queue full,
 so that no fit is due. The rate is counted in the ledger, over a window that begins after each sampler has answered.
-The processor time of server and samplers in this window is divided by the samples, and shows the first bottleneck.
+The processor time of server and samplers in this window is divided by the samples, and shows the first bottleneck. With
+``--synchronous normal`` the commits of SQLite do not wait for the disk, which tells whether the disk is one.
 """
 
 from __future__ import annotations
@@ -118,9 +119,10 @@ def pids_of(server: ServerProcess, postmaster: int | None) -> list[int]:
     return found
 
 
-def measured(database: str, postmaster: int | None, counts: Sequence[int], window: float) -> dict[str, Any]:
+def measured(storage: tuple[str, str], postmaster: int | None, counts: Sequence[int], window: float) -> dict[str, Any]:
+    """The rates of a server with that option of its storage."""
     report: dict[str, Any] = {}
-    options = ("--log-level", "warning", *(("--database", database) if postmaster else ()))
+    options = ("--log-level", "warning", *storage)
     with TemporaryDirectory() as folder, running_server(Path(folder), *options) as server:
         for batch in BATCHES:
             alone = None
@@ -142,14 +144,16 @@ def measured(database: str, postmaster: int | None, counts: Sequence[int], windo
 def main() -> None:
     made = parser(__doc__)
     made.add_argument("--database", choices=("SQLite", "PostgreSQL"), help="only this one")
+    made.add_argument("--synchronous", choices=("full", "normal"), default="full", help="of SQLite")
     options = started(made)
     counts, window = (QUICK_COUNTS, QUICK_WINDOW) if options.quick else (COUNTS, WINDOW)
     report = {}
     if options.database != "PostgreSQL":
-        report["SQLite"] = measured("", None, counts, window)
+        report["SQLite"] = measured(("--synchronous", options.synchronous), None, counts, window)
     if options.database != "SQLite":
         with running_postgresql() as postgresql:
-            report["PostgreSQL"] = measured(postgresql.new_database(), postgresql.pid, counts, window)
+            storage = ("--database", postgresql.new_database())
+            report["PostgreSQL"] = measured(storage, postgresql.pid, counts, window)
     write(options.out, "samplers", report)
 
 
