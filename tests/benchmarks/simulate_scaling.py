@@ -16,9 +16,9 @@ class Costs:
 
     claim: float = 4.4e-3
     answer: float = 8.5e-3
-    checkpoint: float = 0.6e-3  # of 16 KiB
-    checkpoint_mib: float = 6.0e-3  # of each MiB more: processor time, without the disk
-    renewal: float = 9.0e-3 / 500  # of one session, in one statement for 500
+    checkpoint: float = 0.8e-3  # of 16 KiB
+    checkpoint_mib: float = 3.8e-3  # of each MiB more: processor time, without the disk
+    renewal: float = 9.9e-3 / 500  # of one session, in one statement for 500
     host_request: float = 1.8e-3  # that the engine adds to a step of one lane
     gpu_particle: float = 1.0e-9  # ASSUMED, of one particle's step with 100 samples; it was not measured
 
