@@ -65,8 +65,6 @@ class ClosedLoop:
         waiting: called each time the surrogate is polled, while a sampler answers a round's queries.
         trained: results of the trainings so far.
         candidates: policies of these trainings.
-        unspent: number of rounds that took no real step, because the design was ready, or the model was certain where
-            the policy went.
     """
 
     api: Api
@@ -79,7 +77,6 @@ class ClosedLoop:
     waiting: Callable[[SurrogateView], None] | None = None
     trained: list[TrainResult] = field(default_factory=list, init=False)
     candidates: Candidates = field(default_factory=Candidates)
-    unspent: int = field(default=0, init=False)
     _visited: int = field(default=0, init=False)  # virtual steps that collected occupancies
     _known: list[float | None] = field(
         default_factory=list, init=False
@@ -122,7 +119,6 @@ class ClosedLoop:
         round may follow."""
         view = self.api.surrogate(self.name)
         if view.phase == "ready":
-            self.unspent = self.rounds.rounds - len(self._known)
             return False
         self._learn(self._part, self._whole, replace(self.settings, prolong=False))
         checkpoint = f"seed {self.settings.seed}, round {view.round}"
@@ -131,7 +127,6 @@ class ClosedLoop:
         self._known.append(index)
         self._region_known = index is not None and index >= view.target
         if self._region_known:
-            self.unspent = self.rounds.rounds - len(self._known) + 1
             return False
         self.api.improve(self.name, self.rounds.queries, checkpoint=checkpoint)
         patience = self.rounds.patience_seconds
@@ -155,6 +150,12 @@ class ClosedLoop:
             lost_episodes=sum(result.lost_episodes for result in self.trained),
             visited_confidence=tuple(self._known),
         )
+
+    @property
+    def unspent(self) -> int:
+        """Number of rounds that took no real step, because the design was ready, or the model was certain where the
+        policy went."""
+        return self.rounds.rounds - len(self._known) + int(self._region_known)
 
     @property
     def _steps(self) -> int:
