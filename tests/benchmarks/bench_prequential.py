@@ -27,7 +27,7 @@ import torch
 from common import parser, started, write
 from scipy.stats import binom
 
-from support.real_steps import join
+from support.real_steps import join, samples_of
 from surrogym_client.experiments.tasks import EVERY_TASK
 from surrogym_client.original import make
 from surrogym_server.convert import definition_from_spec
@@ -38,14 +38,14 @@ from surrogym_server.models.gaussian_process.prediction.several import Functions
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.design import Decision, DesignState, Request, advance, initial_design
 from surrogym_server.sampling.latin_hypercube import random_points
-from surrogym_server.sampling.prequential import Prediction, Predictions, continued, predicted, scores_of
+from surrogym_server.sampling.prequential import Prediction, Predictions, continued, half_width, predicted, scores_of
 from surrogym_shared.spec import EnvironmentSpec
 
 TASKS = ("pendulum", "cartpole", "mountaincar", "stick-slip", "swingup", "acrobot")
 BUDGET = {"pendulum": 20, "cartpole": 20, "mountaincar": 20}  # of designs that end before; others have their task's
 FRESH, FRESH_SEED = 300, 40_000
 FEWEST, RIGHT, LEVEL = 5, 0.85, 0.9
-HALF = 1.6448536269514722  # of the central 90 % interval, in deviations
+HALF = half_width(LEVEL)  # in deviations
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,7 @@ class Machine:
 
     def answer(self, q: torch.Tensor, u: torch.Tensor) -> Samples:
         steps = [self._original.step_from(*point) for point in zip(q.numpy(), u.numpy(), strict=True)]
-        arrays = (np.array([getattr(s, name) for s in steps], dtype=float) for name in ("coordinates", "action"))
-        q_next = np.array([s.next_coordinates for s in steps], dtype=float)
-        reward, ended = np.array([float(s.reward) for s in steps]), np.array([bool(s.terminated) for s in steps])
-        return Samples(*map(torch.from_numpy, (*arrays, q_next, reward, ended)))
+        return samples_of(steps)
 
 
 def rows_of(task: str, seed: int, *, judged: bool) -> list[Row]:

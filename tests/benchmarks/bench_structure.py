@@ -62,13 +62,13 @@ from surrogym_server.models.gaussian_process.learning.output_learner import EXPL
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.sampling.design import DesignState, Request, advance, initial_design
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
+from surrogym_server.sampling.prequential import half_width
 from surrogym_shared.spec import Design, Reward
 
 SIZES, UNSEEN, UNSEEN_SEED, BUDGET = (10, 20, 40, 100), 500, 99, 100
 CHOSEN = 3.0  # nats of evidence by which a structure other than fewer inputs must win
 AS_IT_IS = "as it is"
 FLOOR = 0.01  # of the output's deviation on unseen steps
-Z90 = 1.6448536269514722  # half width of the 90 % interval, in deviations
 MOST_FOR_PRODUCTS = 8  # inputs; more have too many pairs
 SETTINGS = {
     "reward_jumps": False,
@@ -155,7 +155,7 @@ class Case:
         off = (mean - self.truth) * self.factor
         variance = variance * self.factor**2 + FLOOR**2
         density = -0.5 * (off.square() / variance + (2 * math.pi * variance).log())
-        covered = (off.abs() <= Z90 * variance.sqrt()).double()
+        covered = (off.abs() <= half_width(0.9) * variance.sqrt()).double()
         return {
             "error": float(off.square().mean().sqrt()),
             "density": float(density.mean()),

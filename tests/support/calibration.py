@@ -8,15 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from surrogym_client.experiments.reproduce.statistics import interval_score
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.models.abilities import FunctionDraws
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.latin_hypercube import random_points
+from surrogym_server.sampling.prequential import LEVELS
 from surrogym_shared.spec import EnvironmentSpec
 
 Array = np.ndarray
-LEVELS = (0.5, 0.8, 0.9)
 HORIZON = 10
 
 
@@ -53,8 +54,7 @@ class Calibration:
         counted = ~small | ((high - low) / 2 > tolerance)
         right = {level: small | ((truth >= a) & (truth <= b)) for level, (a, b) in ends.items()}
         low, high = np.minimum(low, middle - tolerance), np.maximum(high, middle + tolerance)
-        missed = np.maximum(low - truth, 0) + np.maximum(truth - high, 0)
-        score = (high - low + 2 / (1 - LEVELS[-1]) * missed) / tolerance
+        score = interval_score(low, high, truth, LEVELS[-1]) / tolerance
         shares = tuple(float(right[level][counted].mean()) if counted.any() else np.nan for level in LEVELS)
         return cls(shares, float(score.mean()), float(counted.mean()))
 

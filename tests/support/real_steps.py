@@ -21,10 +21,10 @@ def answer(spec: EnvironmentSpec, q: Tensor, u: Tensor) -> Samples:
     original = GymnasiumEnvironment(spec)
     steps = [original.step_from(*point) for point in zip(q.numpy(), u.numpy(), strict=True)]
     original.close()
-    return _samples(steps)
+    return samples_of(steps)
 
 
-def _samples(steps: Sequence[RealStep]) -> Samples:
+def samples_of(steps: Sequence[RealStep]) -> Samples:
     return Samples(
         q=torch.tensor(np.array([s.coordinates for s in steps])),
         u=torch.tensor(np.array([s.action for s in steps])),
@@ -44,7 +44,7 @@ def roll(spec: EnvironmentSpec, actions: Tensor, seed: int) -> Samples:
         if steps[-1].terminated:
             break
     original.close()
-    return _samples(steps)
+    return samples_of(steps)
 
 
 def random_steps(spec: EnvironmentSpec, count: int, seed: int) -> Samples:

@@ -9,9 +9,9 @@ with uncertain hyperparameters would take a second of every round.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import torch
 from torch import Tensor
@@ -52,10 +52,15 @@ def scores_of(predictions: Sequence[Prediction], tolerance: float) -> Prequentia
         return None
     error = torch.tensor([p.error for p in predictions], dtype=torch.float64)
     deviation = torch.tensor([p.deviation for p in predictions], dtype=torch.float64)
-    half = [(_normal_quantile(level) * deviation).clamp_min(tolerance) for level in LEVELS]
+    half = [(half_width(level) * deviation).clamp_min(tolerance) for level in LEVELS]
     within_50, within_80, within_90 = (float((error.abs() <= one).double().mean()) for one in half)
     score = interval_score(-half[-1], half[-1], error, LEVELS[-1]) / tolerance
     return PrequentialScores(len(predictions), within_50, within_80, within_90, float(score.mean()))
+
+
+def half_width(level: float) -> float:
+    """Half the width of the central interval of a standard normal number that holds with ``level``."""
+    return NormalDist().inv_cdf((1 + level) / 2)
 
 
 def interval_score(low: Tensor, high: Tensor, value: Tensor, level: float) -> Tensor:
@@ -100,11 +105,6 @@ def pairs_of(predictions: Predictions) -> list[list[list[float]]]:
 def from_pairs(pairs: Sequence[Sequence[Sequence[float]]]) -> Predictions:
     """The predictions that ``pairs_of`` wrote."""
     return tuple(tuple(Prediction(*pair) for pair in output) for output in pairs)
-
-
-def _normal_quantile(level: float) -> float:
-    """Half the width of the central interval of a standard normal number."""
-    return math.sqrt(2) * float(torch.special.erfinv(torch.tensor(level, dtype=torch.float64)))
 
 
 def _noise(model: DynamicsModel, like: Tensor) -> Tensor:

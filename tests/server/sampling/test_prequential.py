@@ -1,4 +1,4 @@
-"""Prequential scores: the interval score against quantile losses and a closed form, and what is left out of them."""
+"""Scores of predictions of new samples agree with quantile losses and a closed form, and leave out what they should."""
 
 import numpy as np
 import pytest
