@@ -116,7 +116,7 @@ class OutputModel:
     def _foretold(self, posterior: Posterior) -> tuple[Tensor, Tensor]:
         """Each y of an exact process from the others, within its limit, and the variance, (n,) each."""
         mean, variance = posterior.leave_one_out()
-        side = torch.tensor(self.at_limit or [0] * len(mean))
+        side = mean.new_tensor(self.at_limit or [0] * len(mean))
         beyond = side * (mean - posterior.y) > 0
         return torch.where(beyond, posterior.y, mean), variance
 
