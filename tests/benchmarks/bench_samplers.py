@@ -3,7 +3,8 @@
 Each sampler is a process with an environment that sleeps 50 ms in each step. Queries made by hand keep the queue full,
 so that no fit is due. The rate is counted in the ledger, over a window that begins after each sampler has answered.
 The processor time of server and samplers in this window is divided by the samples, and shows the first bottleneck. With
-``--synchronous normal`` the commits of SQLite do not wait for the disk, which tells whether the disk is one.
+``--synchronous normal`` the commits of SQLite do not wait for the disk. If the rate stays the same, the disk is not the
+bottleneck.
 """
 
 from __future__ import annotations
@@ -119,17 +120,19 @@ def pids_of(server: ServerProcess, postmaster: int | None) -> list[int]:
     return found
 
 
-def measured(storage: tuple[str, str], postmaster: int | None, counts: Sequence[int], window: float) -> dict[str, Any]:
+def measured(
+    storage: tuple[str, str], postmaster: int | None, counts: Sequence[int], batches: Sequence[int], window: float
+) -> dict[str, Any]:
     """The rates of a server with that option of its storage."""
     report: dict[str, Any] = {}
     options = ("--log-level", "warning", *storage)
     with TemporaryDirectory() as folder, running_server(Path(folder), *options) as server:
-        for batch in BATCHES:
-            alone = None
+        for batch in batches:
+            alone = None  # rate for each sampler of the first number
             for count in counts:
                 name = f"samplers-{batch}-{count}"
                 found = rate(server.url, lambda: pids_of(server, postmaster), name, count, batch, window)
-                alone = alone or found.samples_per_second
+                alone = alone or found.samples_per_second / count
                 linear = found.samples_per_second / (count * alone)
                 report[f"{count} samplers, batch {batch}"] = vars(found) | {"of linear": linear}
                 print(
@@ -144,16 +147,19 @@ def measured(storage: tuple[str, str], postmaster: int | None, counts: Sequence[
 def main() -> None:
     made = parser(__doc__)
     made.add_argument("--database", choices=("SQLite", "PostgreSQL"), help="only this one")
+    made.add_argument("--samplers", type=int, nargs="+", help="numbers of them; shares are of the first one's rate")
+    made.add_argument("--claims", type=int, nargs="+", default=BATCHES, help="queries of one claim")
     made.add_argument("--synchronous", choices=("full", "normal"), default="full", help="of SQLite")
     options = started(made)
     counts, window = (QUICK_COUNTS, QUICK_WINDOW) if options.quick else (COUNTS, WINDOW)
+    counts = options.samplers or counts
     report = {}
     if options.database != "PostgreSQL":
-        report["SQLite"] = measured(("--synchronous", options.synchronous), None, counts, window)
+        report["SQLite"] = measured(("--synchronous", options.synchronous), None, counts, options.claims, window)
     if options.database != "SQLite":
         with running_postgresql() as postgresql:
             storage = ("--database", postgresql.new_database())
-            report["PostgreSQL"] = measured(storage, postgresql.pid, counts, window)
+            report["PostgreSQL"] = measured(storage, postgresql.pid, counts, options.claims, window)
     write(options.out, "samplers", report)
 
 
