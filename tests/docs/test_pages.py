@@ -94,5 +94,14 @@ def test_python_parses_and_its_imports_work(page: Path) -> None:
                 assert [alias.name for alias in node.names if not hasattr(module, alias.name)] == []
 
 
+@each_page
+def test_rows_of_a_table_have_the_cells_of_its_header(page: Path) -> None:
+    """No row is cut off or runs into the text behind it."""
+    text = re.sub(r"^```.*?^```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+        assert len({line.replace(r"\|", "").rstrip().strip("|").count("|") for line in table.splitlines()}) == 1, table
+        assert all(line.rstrip().endswith("|") for line in table.splitlines()), table
+
+
 def test_there_are_pages() -> None:
     assert {"README.md", "docs/architecture.md", "docs/http-api.md", "docs/notation.md"} <= set(NAMES)
