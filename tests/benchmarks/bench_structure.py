@@ -2,6 +2,7 @@
 
 python tests/benchmarks/bench_structure.py --fewer --seeds 106 107 108
 python tests/benchmarks/bench_structure.py --seeds 100 --sizes 10 20 40
+python tests/benchmarks/bench_structure.py --seeds 100 101 --sizes 10 20 40 --structures ratios
 python tests/benchmarks/bench_structure.py --designs --tasks chain rooms --seeds 110 111 112
 
 Models are learned from Latin hypercubes of 13 tasks: the nine of the efficiency study, the reactor, the fermenter, a
@@ -69,7 +70,8 @@ SIZES, UNSEEN, UNSEEN_SEED, BUDGET = (10, 20, 40, 100), 500, 99, 100
 CHOSEN = 3.0  # nats of evidence by which a structure other than fewer inputs must win
 AS_IT_IS = "as it is"
 FLOOR = 0.01  # of the output's deviation on unseen steps
-MOST_FOR_PRODUCTS = 8  # inputs; more have too many pairs
+SUMS = ("additive", "state + action")
+PAIRS, MOST_FOR_PAIRS = ("products", "ratios"), 8  # inputs; more have too many pairs
 SETTINGS = {
     "reward_jumps": False,
     "reward_peaks": False,
@@ -260,28 +262,35 @@ class Sum:
         return -value, case.scores(mean, variance)
 
 
+def _ratios(z: Tensor) -> Tensor:
+    """Each input, from the lower end of its range, through each input plus a tenth of its range (n, d^2)."""
+    above = (z / 12**0.5 + 0.5).clamp_min(0)
+    return (above[:, :, None] / (above[:, None] + 0.1)).flatten(1)
+
+
 FEATURES: dict[str, Callable[[Tensor], Tensor]] = {
     "tanh": lambda z: (2 * z).tanh(),
     "z/(1+|z|)": lambda z: z / (1 + z.abs()),
     "|z|": lambda z: z.abs(),
     "products": lambda z: torch.stack([z[:, i] * z[:, j] for i in range(z.shape[1]) for j in range(i)], 1),
+    "ratios": _ratios,
 }
 
 
-def structures(case: Case, posterior: Posterior, score: float, *, fewer_alone: bool) -> Iterator[dict[str, Any]]:
-    """Rows of every structure of one output."""
+def structures(case: Case, posterior: Posterior, score: float, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Rows of fewer inputs and of the named structures of one output."""
     d = case.x.shape[1]
     yield {"structure": AS_IT_IS, "gain": 0.0, **case.judged(case.hyper)}
     yield from fewer(case, posterior)
-    if fewer_alone:
-        return
     state = [[j for j in range(d) if bool(case.action[j]) == of_action] for of_action in (False, True)]
-    for name, groups in (("additive", [[j] for j in range(d)]), ("state + action", state)):
-        if all(groups):
+    for name, groups in zip(SUMS, ([[j] for j in range(d)], state), strict=True):
+        if name in names and all(groups):
             evidence, scores = Sum(case, groups).found()
             yield {"structure": name, "gain": evidence - score, "chosen": evidence - score > CHOSEN, **scores}
     for name, more in FEATURES.items():
-        if name != "products" or 2 <= d <= MOST_FOR_PRODUCTS:
+        if (name in PAIRS and not 2 <= d <= MOST_FOR_PAIRS) or (name == "ratios" and case.mirror is not None):
+            continue
+        if name in names:
             wider = case.further(more)
             found = wider.fitted()
             row = wider.judged(found.posterior.hyper)
@@ -336,7 +345,7 @@ def case_of(
     return made, -value
 
 
-def rows_of(name: str, sizes: Sequence[int], seeds: Sequence[int], *, fewer_alone: bool) -> Iterator[dict[str, Any]]:
+def rows_of(name: str, sizes: Sequence[int], seeds: Sequence[int], names: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Rows of every output of a task."""
     original = _tasks()[name]()
     design = Design.model_validate({"model": {"name": "gaussian_process", "settings": SETTINGS}})
@@ -356,10 +365,7 @@ def rows_of(name: str, sizes: Sequence[int], seeds: Sequence[int], *, fewer_alon
                 where = {"task": name, "n": size, "seed": seed, "output": output.name, "map": str(output.feature_map)}
                 shown = {**where, "inputs": found[0].x.shape[1], "left_out": output.posterior.left_out.error}
                 try:
-                    yield from (
-                        {**shown, **row}
-                        for row in structures(found[0], output.posterior, found[1], fewer_alone=fewer_alone)
-                    )
+                    yield from ({**shown, **row} for row in structures(found[0], output.posterior, found[1], names))
                 except NumericalFailure:
                     continue
 
@@ -406,6 +412,8 @@ def main() -> None:
     made.add_argument("--tasks", nargs="+", choices=_tasks(), default=list(_tasks()))
     made.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     made.add_argument("--sizes", type=int, nargs="+", default=list(SIZES))
+    names = [*SUMS, *FEATURES]
+    made.add_argument("--structures", nargs="+", choices=names, default=names, help="beside fewer inputs")
     made.add_argument("--fewer", action="store_true", help="fewer inputs alone, no other structure")
     made.add_argument("--designs", action="store_true", help="adaptive designs instead of hypercubes")
     options = started(made)
@@ -419,7 +427,7 @@ def main() -> None:
     every = []
     for task in options.tasks:
         begun = time.perf_counter()
-        rows = list(rows_of(task, options.sizes, options.seeds, fewer_alone=options.fewer))
+        rows = list(rows_of(task, options.sizes, options.seeds, [] if options.fewer else options.structures))
         every += rows
         write(options.out, f"structure-{task}", {"rows": rows})
         print(f"{task}: {len(rows)} rows, {time.perf_counter() - begun:.0f} s")
