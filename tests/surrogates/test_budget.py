@@ -41,6 +41,17 @@ def test_rounds_within_the_budget_are_announced(guarded: ServerProcess, owned: s
     assert words == f"up to 8 more real steps (2 rounds of 4); the budget of {owned!r} has 8 of 12 real steps left"
 
 
+def test_rounds_of_a_ready_design_wait_for_a_failed_audit(
+    guarded: ServerProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Api(guarded.url, TOKENS["admin"]) as api:
+        name = "ready"
+        api.create_surrogate(name, pendulum().model_copy(update={"design": Design(initial=4, budget=12)}))
+        view = api.surrogate(name).model_copy(update={"phase": "ready"})
+        monkeypatch.setattr(api, "surrogate", lambda _: view)
+        assert words_of_rounds(api, name, queries=3, rounds=3).endswith("no real steps, unless an audit fails")
+
+
 def test_rounds_beyond_the_budget_need_the_right_to_raise_it(guarded: ServerProcess, owned: str) -> None:
     with Api(guarded.url, TOKENS["train"]) as api, pytest.raises(BudgetTooSmall, match=rf"{owned} --budget 13\b"):
         words_of_rounds(api, owned, queries=3, rounds=3)

@@ -18,7 +18,7 @@ def words_of_rounds(api: Api, name: str, queries: int, rounds: int) -> str:
     """
     view = api.surrogate(name)
     if view.phase == "ready":
-        return f"the design of {name!r} is ready: no more real steps are needed"
+        return f"the design of {name!r} is ready: its rounds take no real steps, unless an audit fails"
     needed = queries * rounds
     left = f"the budget of {name!r} has {view.budget_left} of {view.budget} real steps left"
     if needed <= view.budget_left:
