@@ -92,6 +92,7 @@ OTHERWISE = {
     "docs/results/peers.md": "tests/cli/test_reproduce_peers.py and tests/experiments/peers",
     "docs/results/trust.md": "tests/cli runs its study, in short",
     "docs/results/trust-third.md": "tests/cli runs its study, in short",
+    "docs/results/trust-fourth.md": "tests/cli runs its study, in short",
     "docs/results/trust-again.md": "tests/cli runs its study, in short",
     "docs/results/acquisition.md": "tests/cli runs its studies, in short",
     "docs/results/paper.md": "tests/cli runs its studies, in short",
