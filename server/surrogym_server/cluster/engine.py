@@ -11,7 +11,7 @@ from typing import Any, cast
 from zlib import crc32
 
 import ray
-from ray.exceptions import GetTimeoutError, RayActorError, RayError
+from ray.exceptions import RayActorError, RayError
 
 from surrogym_server.cluster.host import HostSettings, Refused
 from surrogym_server.engine.port import SessionEngine
@@ -21,7 +21,7 @@ from surrogym_server.engine.tallies import Counts, Durations, SessionActivity
 from surrogym_server.errors import IdempotencyConflict, Overloaded, Unavailable, UnknownSession
 from surrogym_server.storage.live_sessions import LiveSessions
 
-COUNTING_SECONDS, ANSWERING_SECONDS, TAKING_SECONDS = 10.0, 5.0, 60.0  # longest waits for a host
+ANSWERING_SECONDS, TAKING_SECONDS = 5.0, 60.0  # longest waits for a host
 MOVES = 3  # hosts that one request tries while its session changes hosts
 REMEMBERED = 10_000  # sessions whose present host is remembered, because it is not the one in their id
 
@@ -103,14 +103,11 @@ class RayEngine(SessionEngine):
     def counts(self) -> Counts:
         """Return the counts of all hosts that answer, added together."""
         asked = [host.counts.remote() for host in self._hosts]
+        answers, _ = ray.wait(asked, num_returns=len(asked), timeout=ANSWERING_SECONDS)
         found: list[Counts] = []
-        for answer in asked:
-            try:
-                found.append(ray.get(answer, timeout=COUNTING_SECONDS))
-            except GetTimeoutError as error:
-                raise Unavailable("a session host does not answer now: try again later") from error
-            except RayError:  # it has died, and holds nothing
-                continue
+        for answer in answers:
+            with suppress(RayError):  # it has died, and holds nothing
+                found.append(ray.get(answer))
         return _together(found)
 
     async def sweep(self) -> None:

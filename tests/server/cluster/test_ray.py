@@ -143,6 +143,21 @@ def test_an_opening_is_refused_when_its_host_stops_answering(
     asyncio.run(stopped())
 
 
+def test_a_host_that_has_stopped_is_left_out_of_the_counts(
+    case: EngineCase, database: str, monkeypatch: pytest.MonkeyPatch
+):
+    """The view of each surrogate has them, also in the answer to a request that has created it."""
+    monkeypatch.setattr("surrogym_server.cluster.engine.ANSWERING_SECONDS", 1.0)
+    sessions = [asyncio.run(case.opened()) for _ in range(HOSTS)]
+    held, before = sessions[0].rpartition(".")[2], case.engine.counts().sessions[NAME]
+    [stopped] = [host for host in asyncio.run(about(database)) if str(host.number) == held]
+    os.kill(stopped.pid, signal.SIGSTOP)
+    try:
+        assert 0 < case.engine.counts().sessions[NAME] < before
+    finally:
+        os.kill(stopped.pid, signal.SIGCONT)
+
+
 def test_a_session_of_another_pool_is_refused_with_the_reason(
     settings: Settings, case: EngineCase, storage: Storage, postgresql: Postgresql
 ):
