@@ -225,17 +225,28 @@ class RayEngine(SessionEngine):
                     raise _Gone from None
 
     async def _reply(self, host: int, operation: str, *arguments: Any) -> Any:
-        """Wait for a host's reply as long as the host answers at all. Raises like the engine, and ``Unavailable``."""
+        try:
+            return await self._heard(host, operation, *arguments)
+        except _Gone as gone:
+            raise Unavailable(f"session host {host} {gone}: try again later") from gone
+
+    async def _heard(self, host: int, operation: str, *arguments: Any) -> Any:
+        """Wait for a host's reply as long as the host answers at all.
+
+        Raises:
+            _Gone: the host died, or does not answer; says which.
+            SurrogymError: the host refused the request.
+        """
         asked = self._hosts[host].ask.remote(operation, *arguments)
         while True:
             try:
                 async with asyncio.timeout(self._patience):
                     return _said(await cast(Awaitable[Any], asked))
             except RayActorError as error:
-                raise Unavailable(f"session host {host} has ended and is started again: try again later") from error
+                raise _Gone("has ended and is started again") from error
             except TimeoutError:
                 if not await self._lives(host):
-                    raise Unavailable(f"session host {host} does not answer now: try again later") from None
+                    raise _Gone("does not answer now") from None
 
     async def _ask_all(self, operation: str, *arguments: Any) -> list[Any]:
         """Return the replies of all hosts that answer."""
@@ -245,7 +256,10 @@ class RayEngine(SessionEngine):
     async def _asked(self, host: int, operation: str, *arguments: Any) -> Any:
         if not await self._lives(host):
             return _Gone()
-        return await self._reply(host, operation, *arguments)
+        try:
+            return await self._heard(host, operation, *arguments)
+        except _Gone as gone:
+            return gone
 
 
 def _number(owner: str) -> int:

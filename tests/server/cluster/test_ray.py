@@ -143,7 +143,7 @@ def test_an_opening_is_refused_when_its_host_stops_answering(
     asyncio.run(stopped())
 
 
-def test_a_host_that_has_stopped_is_left_out_of_the_counts(
+def test_a_host_that_has_stopped_is_left_out_of_what_is_shown(
     case: EngineCase, database: str, monkeypatch: pytest.MonkeyPatch
 ):
     """The view of each surrogate has them, also in the answer to a request that has created it."""
@@ -151,9 +151,19 @@ def test_a_host_that_has_stopped_is_left_out_of_the_counts(
     sessions = [asyncio.run(case.opened()) for _ in range(HOSTS)]
     held, before = sessions[0].rpartition(".")[2], case.engine.counts().sessions[NAME]
     [stopped] = [host for host in asyncio.run(about(database)) if str(host.number) == held]
+    lives, asked = case.engine._lives, set[int]()  # type: ignore[attr-defined]
+
+    async def lived(host: int) -> bool:
+        first = host not in asked
+        asked.add(host)
+        return first or bool(await lives(host))
+
+    monkeypatch.setattr(case.engine, "_patience", 0.5)
+    monkeypatch.setattr(case.engine, "_lives", lived)  # as if the host had stopped after it answered
     os.kill(stopped.pid, signal.SIGSTOP)
     try:
         assert 0 < case.engine.counts().sessions[NAME] < before
+        assert sessions[0] not in [one.session.id for one in asyncio.run(case.engine.activity(NAME))]
     finally:
         os.kill(stopped.pid, signal.SIGCONT)
 
