@@ -52,8 +52,12 @@ class Settings(BaseModel):
     ray_address: Annotated[str, Field(min_length=1, description="of the cluster; auto finds it")] = "auto"
     ray_hosts: Annotated[int, Field(ge=1, le=1_000, description="processes that hold sessions, each with a CPU")] = 2
     ray_fit_gpus: Annotated[float, Field(ge=0, description="of the cluster's GPUs, for each fit")] = 0.0
-    ray_checkpoint_seconds: Annotated[float, Field(gt=0, description="between checkpoints of a session")] = 1.0
-    ray_lease_seconds: Annotated[float, Field(ge=1, description="after which the sessions of a dead host go on")] = 10.0
+    ray_checkpoint_seconds: Annotated[
+        float, Field(ge=0.01, le=3_600, description="between checkpoints of a session")
+    ] = 1.0
+    ray_lease_seconds: Annotated[
+        float, Field(ge=1, le=3_600, description="after which the sessions of a dead host go on")
+    ] = 10.0
     session_idle_seconds: Annotated[float, Field(gt=0)] = 3_600.0
     fit_seconds: Annotated[float, Field(gt=0, description="of one fit; one that takes longer is ended")] = 3_600.0
     fit_workers: Annotated[int, Field(ge=1, le=256, description="fits at once, each in a process")] = 1

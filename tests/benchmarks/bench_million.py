@@ -89,6 +89,7 @@ class Hosts(threading.Thread):
     def __init__(self, storage: Storage, sessions: int) -> None:
         super().__init__(daemon=True)
         self.live, self.sessions, self.ending = storage.live_sessions, sessions, threading.Event()
+        self.ids = [[f"session-{n}.{owner}" for n in range(owner, sessions, 2)] for owner in range(2)]
         self.renewals: list[float] = []
         self.records: list[float] = []
 
@@ -98,7 +99,7 @@ class Hosts(threading.Thread):
             begun = time.perf_counter()
             for owner in range(2):
                 start = time.perf_counter()
-                self.live.renew(f"{owner} host", 1e6)
+                self.live.renew(f"{owner} host", self.ids[owner], 1e6)
                 self.renewals.append(time.perf_counter() - start)
             for number in random.sample(range(self.sessions), min(200, self.sessions)):
                 start = time.perf_counter()

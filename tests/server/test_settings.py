@@ -64,6 +64,13 @@ def test_tokens_come_with_roles(tmp_path: Path):
         ({"SURROGYM_TOKEN": "short"}, "at least 8 characters, got 5"),
         ({"SURROGYM_TOKENS": "king:some-long-token"}, "one of read, train, sample, admin before the colon"),
         ({"SURROGYM_TOKEN_FILE": "/no/such/file"}, "'/no/such/file' can't be read"),
+        ({"SURROGYM_RAY_LEASE_SECONDS": "inf"}, "setting ray_lease_seconds: .*less than or equal to 3600"),
+        ({"SURROGYM_RAY_LEASE_SECONDS": "0.5"}, "setting ray_lease_seconds: .*greater than or equal to 1"),
+        (
+            {"SURROGYM_RAY_CHECKPOINT_SECONDS": "1e-9"},
+            "setting ray_checkpoint_seconds: .*greater than or equal to 0.01",
+        ),
+        ({"SURROGYM_RAY_CHECKPOINT_SECONDS": "inf"}, "setting ray_checkpoint_seconds: .*less than or equal to 3600"),
         ({"SURROGYM_LOG_LEVEL": "loud"}, "setting log_level: .*'info'"),
     ],
 )

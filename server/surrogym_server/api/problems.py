@@ -125,6 +125,13 @@ def problem_response(
     return response_of(_problem(code, detail, status=status, **members), headers)
 
 
+def closing_reply(code: Code, detail: str, status: int | None = None) -> bytes:
+    """The whole reply with a problem body, after which the connection is closed; for requests that reach no app."""
+    reply = problem_response(code, detail, status=status, headers={"connection": "close"})
+    lines = b"".join(name + b": " + value + b"\r\n" for name, value in reply.raw_headers)
+    return b"HTTP/1.1 %d \r\n%s\r\n%s" % (reply.status_code, lines, bytes(reply.body))
+
+
 def documented(*codes: Code) -> dict[int | str, dict[str, Any]]:
     """The error replies of a route, for OpenAPI."""
     by_status: dict[int, list[str]] = {}

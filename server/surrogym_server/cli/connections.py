@@ -8,7 +8,7 @@ from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
-from surrogym_server.api.problems import problem_response
+from surrogym_server.api.problems import closing_reply
 from surrogym_shared.codes import Code
 
 MAX_HEADERS = 100
@@ -150,9 +150,7 @@ class Patient(HttpToolsProtocol):
         if self._working is not None:  # its answer would go to a closed connection
             self._working.disconnected = True
             self._working.message_event.set()
-        reply = problem_response(code, detail, status=status, headers={"connection": "close"})
-        lines = b"".join(name + b": " + value + b"\r\n" for name, value in reply.raw_headers)
-        self.transport.write(b"HTTP/1.1 %d \r\n%s\r\n%s" % (reply.status_code, lines, bytes(reply.body)))
+        self.transport.write(closing_reply(code, detail, status))
         self.transport.close()
 
 

@@ -11,9 +11,9 @@ from typing import Any, cast
 from zlib import crc32
 
 import ray
-from ray.exceptions import GetTimeoutError, RayActorError, RayError
+from ray.exceptions import RayActorError, RayError
 
-from surrogym_server.cluster.host import Refused
+from surrogym_server.cluster.host import HostSettings, Refused
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance, Array, Open, Reply, Restore, Saved, SessionInfo, Visited
 from surrogym_server.engine.session import digest_of
@@ -21,7 +21,7 @@ from surrogym_server.engine.tallies import Counts, Durations, SessionActivity
 from surrogym_server.errors import IdempotencyConflict, Overloaded, Unavailable, UnknownSession
 from surrogym_server.storage.live_sessions import LiveSessions
 
-COUNTING_SECONDS, ANSWERING_SECONDS, TAKING_SECONDS = 10.0, 5.0, 60.0  # longest waits for a host
+ANSWERING_SECONDS, TAKING_SECONDS = 5.0, 60.0  # longest waits for a host
 MOVES = 3  # hosts that one request tries while its session changes hosts
 REMEMBERED = 10_000  # sessions whose present host is remembered, because it is not the one in their id
 
@@ -40,26 +40,21 @@ class RayEngine(SessionEngine):
         hosts: actor handles of ``SessionHost``, by number.
         machines: kind of machine of each host, as ``machine_kind`` returns it.
         store: records of the sessions in the database.
-        idle_seconds: seconds without a request after which a session expires; the hosts' own setting.
-        lease_seconds: seconds of a host's lease of a session; the hosts' own setting.
+        settings: those of the hosts.
     """
 
     lasting = True
     replay = 10_000  # requests; a checkpoint may be some seconds old, and a session takes many requests in a second
 
     def __init__(
-        self,
-        hosts: Sequence[Any],
-        machines: Sequence[str],
-        store: LiveSessions,
-        idle_seconds: float,
-        lease_seconds: float,
+        self, hosts: Sequence[Any], machines: Sequence[str], store: LiveSessions, settings: HostSettings
     ) -> None:
-        self.idle_seconds = idle_seconds
+        self.idle_seconds = settings.idle_seconds
+        self._pool = settings.pool
         self._hosts = tuple(hosts)
         self._machines = tuple(machines)
         self._store = store
-        self._patience = lease_seconds / 2
+        self._patience = settings.pace.lease_seconds / 2
         self._turns = itertools.count()
         self._places: OrderedDict[str, int] = OrderedDict()
 
@@ -108,14 +103,11 @@ class RayEngine(SessionEngine):
     def counts(self) -> Counts:
         """Return the counts of all hosts that answer, added together."""
         asked = [host.counts.remote() for host in self._hosts]
+        answers, _ = ray.wait(asked, num_returns=len(asked), timeout=ANSWERING_SECONDS)
         found: list[Counts] = []
-        for answer in asked:
-            try:
-                found.append(ray.get(answer, timeout=COUNTING_SECONDS))
-            except GetTimeoutError as error:
-                raise Unavailable("a session host does not answer now: try again later") from error
-            except RayError:  # it has died, and holds nothing
-                continue
+        for answer in answers:
+            with suppress(RayError):  # it has died, and holds nothing
+                found.append(ray.get(answer))
         return _together(found)
 
     async def sweep(self) -> None:
@@ -161,8 +153,13 @@ class RayEngine(SessionEngine):
             raise error if isinstance(error, UnknownSession) else unknown
         if holder.seconds_left <= 0:
             return self._remember(session, await self._taken(session, asked, holder.machine))
+        if _pool(holder.owner) != self._pool:
+            raise Unavailable(
+                f"session {session!r} belongs for {holder.seconds_left:.1f} s more to session hosts that this front "
+                "server does not use: expected the same Ray cluster and the same --database at all front servers"
+            )
         host = _number(holder.owner)
-        if host == asked or host >= len(self._hosts):  # the host belonged to an earlier, larger pool
+        if host == asked:
             raise Unavailable(
                 f"session host {host} has ended, and another one takes session {session!r} in "
                 f"{holder.seconds_left:.1f} s: try again later"
@@ -229,9 +226,27 @@ class RayEngine(SessionEngine):
 
     async def _reply(self, host: int, operation: str, *arguments: Any) -> Any:
         try:
-            return _said(await cast(Awaitable[Any], self._hosts[host].ask.remote(operation, *arguments)))
-        except RayActorError as error:
-            raise Unavailable(f"session host {host} has ended and is started again: try again later") from error
+            return await self._heard(host, operation, *arguments)
+        except _Gone as gone:
+            raise Unavailable(f"session host {host} {gone}: try again later") from gone
+
+    async def _heard(self, host: int, operation: str, *arguments: Any) -> Any:
+        """Wait for a host's reply as long as the host answers at all.
+
+        Raises:
+            _Gone: the host died, or does not answer; says which.
+            SurrogymError: the host refused the request.
+        """
+        asked = self._hosts[host].ask.remote(operation, *arguments)
+        while True:
+            try:
+                async with asyncio.timeout(self._patience):
+                    return _said(await cast(Awaitable[Any], asked))
+            except RayActorError as error:
+                raise _Gone("has ended and is started again") from error
+            except TimeoutError:
+                if not await self._lives(host):
+                    raise _Gone("does not answer now") from None
 
     async def _ask_all(self, operation: str, *arguments: Any) -> list[Any]:
         """Return the replies of all hosts that answer."""
@@ -241,12 +256,20 @@ class RayEngine(SessionEngine):
     async def _asked(self, host: int, operation: str, *arguments: Any) -> Any:
         if not await self._lives(host):
             return _Gone()
-        return await self._reply(host, operation, *arguments)
+        try:
+            return await self._heard(host, operation, *arguments)
+        except _Gone as gone:
+            return gone
 
 
 def _number(owner: str) -> int:
     """Return the number of the host from its name as an owner of leases."""
-    return int(owner.partition(" ")[0])
+    return int(owner.split()[0])
+
+
+def _pool(owner: str) -> str:
+    """Return the pool of the host from its name as an owner of leases."""
+    return owner.split()[1]
 
 
 def _said(reply: Any) -> Any:

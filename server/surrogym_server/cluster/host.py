@@ -58,7 +58,11 @@ def versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class HostSettings:
-    """Settings that all hosts of a pool are started with."""
+    """Settings that all hosts of a pool are started with.
+
+    ``pool`` tells pools apart that use one database. The front server that starts the first host draws it. It is no
+    setting of a user's, so it does not count when settings are compared.
+    """
 
     hosts: int
     database: str = field(repr=False)  # it may hold a password
@@ -68,6 +72,7 @@ class HostSettings:
     device: str
     threads: int
     pace: Pace
+    pool: str = field(default_factory=lambda: uuid4().hex, compare=False)
 
     @classmethod
     def of(cls, settings: Settings) -> HostSettings:
@@ -180,5 +185,6 @@ def recorded_engine(
         record = storage.surrogates.get(storage.surrogates.name_of(id))
         return record.name, definitions.of(record)
 
-    leases = Leases(storage.live_sessions, f"{number} {uuid4().hex}", machine, settings.pace, inner.end, clock)
+    owner = f"{number} {settings.pool} {uuid4().hex}"
+    leases = Leases(storage.live_sessions, owner, machine, settings.pace, inner.end, clock)
     return RecordedEngine(inner, storage.live_sessions, leases, Surroundings(surrogate, models.refresh))

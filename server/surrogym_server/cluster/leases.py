@@ -105,9 +105,9 @@ class Leases:
             await asyncio.to_thread(self._store.release, held.lease)
 
     async def remove(self, id: str) -> None:
-        """Delete the record of a session."""
-        self._held.pop(id, None)
+        """Delete the record of a session. If that fails, ``remove_all_but`` tries again."""
         await asyncio.to_thread(self._store.remove, id)
+        self._held.pop(id, None)
 
     async def remove_all_but(self, alive: Sequence[str]) -> None:
         """Delete the records of this owner's sessions whose ids are not in ``alive``."""
@@ -119,7 +119,7 @@ class Leases:
         before, began = dict(self._held), self._clock()
         if not before:
             return
-        kept = await asyncio.to_thread(self._store.renew, self._owner, self._pace.lease_seconds)
+        kept = await asyncio.to_thread(self._store.renew, self._owner, before.keys(), self._pace.lease_seconds)
         for id, held in before.items():
             if id in kept:
                 held.until = began + self._pace.lease_seconds

@@ -105,14 +105,16 @@ def _of_hosts(wanted: HostSettings, store: LiveSessions) -> SessionEngine:
 
     pool = pool_name(wanted.database)
     first = _host(pool, 0, wanted)
-    _require_same(wanted, _about([first], wanted))  # before any other is started
-    hosts = [first, *(_host(pool, number, wanted) for number in range(1, wanted.hosts))]
+    about_first = _about([first], wanted)
+    _require_same(wanted, about_first)  # before any other is started
+    settings = about_first[0].settings
+    hosts = [first, *(_host(pool, number, settings) for number in range(1, settings.hosts))]
     found = _about(hosts, wanted)
     _require_same(wanted, found)
     for number, host in enumerate(found):
         logger.info("session host %d: process %d on %s", number, host.pid, host.node)
     machines = [host.machine for host in found]
-    return RayEngine(hosts, machines, store, wanted.idle_seconds, wanted.pace.lease_seconds)
+    return RayEngine(hosts, machines, store, settings)
 
 
 def _about(hosts: Sequence[Any], wanted: HostSettings) -> list[HostInfo]:
@@ -160,7 +162,7 @@ def _require_same(wanted: HostSettings, found: Sequence[HostInfo]) -> None:
                 raise InvalidInput(
                     f"engine ray: expected {name} {theirs}, which the session hosts run, got {name} {mine.get(name)}"
                 )
-        for field in fields(HostSettings):
+        for field in (field for field in fields(HostSettings) if field.compare):
             theirs, ours = getattr(host.settings, field.name), getattr(wanted, field.name)
             if theirs != ours:
                 told = f"{theirs}, got {ours}" if field.repr else "another one"

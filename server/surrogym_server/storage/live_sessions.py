@@ -7,6 +7,7 @@ at its last checkpoint. When the lease has ended, another process may take the s
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 
@@ -83,8 +84,12 @@ class LiveSessions(ABC):
         """Return who has a session; None if there is no such session."""
 
     @abstractmethod
-    def renew(self, owner: str, seconds: float) -> frozenset[str]:
-        """Extend all leases of an owner to ``seconds`` from now, and return the ids of its sessions."""
+    def renew(self, owner: str, ids: Collection[str], seconds: float) -> frozenset[str]:
+        """Extend an owner's leases of these sessions to ``seconds`` from now, and return the ids of those it has.
+
+        The owner names its sessions, because the database may know of more: the answer to ``add`` or ``take`` may be
+        lost with the connection. Nobody steps such a session, so its lease has to end.
+        """
 
     @abstractmethod
     def record(self, lease: SessionLease, checkpoint: Checkpoint) -> bool:

@@ -9,7 +9,7 @@ import httpx
 import pytest
 from fastapi.routing import APIRoute
 
-from support.hostile import connected, read_all, resident_mib
+from support.hostile import KEY, connected, read_all, resident_mib
 from support.server import ServerProcess, running_server
 from surrogym_server.api import events, metrics, models, queries, samples, service, sessions, surrogates
 from surrogym_server.api.door import DEFAULT_JSON_BYTES, Door, door_of
@@ -184,3 +184,19 @@ def test_the_limits_of_a_head_are_those_that_it_says(guarded: ServerProcess, lin
     assert reply.split()[1] == status
     if status == b"431":
         assert b"at most 100 headers and 65536 bytes" in reply
+
+
+@pytest.mark.parametrize(
+    ("id", "line"),
+    [("a" * 20_000, ""), ("none", "x-a: " + "a" * 20_000), ("none", "content-length: 5"), ("none", "a: \x80")],
+    ids=["long id", "long header", "body", "not ASCII"],
+)
+def test_a_handshake_that_opens_no_stream_is_answered(guarded: ServerProcess, id: str, line: str):
+    """The library that reads handshakes has limits of its own; such a connection would stay open without a reply."""
+    upgrade = ["upgrade: websocket", "connection: upgrade", "sec-websocket-version: 13", f"sec-websocket-key: {KEY}"]
+    lines = [f"GET /v1/sessions/{id}/stream HTTP/1.1", "host: 127.0.0.1", *upgrade, *([line] if line else []), "", ""]
+    with connected(guarded.url, seconds=20.0) as caller:
+        caller.sendall("\r\n".join(lines).encode("latin-1"))
+        reply = read_all(caller)
+    assert int(reply.split()[1]) in (400, 401), reply
+    assert b"application/problem+json" in reply

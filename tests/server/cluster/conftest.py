@@ -1,19 +1,27 @@
-"""A surrogate with a model, in whatever database a test has."""
+"""A surrogate with a model, in whatever database a test has; and an engine of a real Ray cluster on PostgreSQL."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
 
 import pytest
 
+from support.postgresql import Postgresql, running_postgresql
 from surrogym_client.original import classic
+from surrogym_server.cluster import pool
 from surrogym_server.convert import stored_definition
 from surrogym_server.engine.design_job import DesignJob, run_design_job
+from surrogym_server.engine.port import SessionEngine
 from surrogym_server.environment.samples import Samples
+from surrogym_server.settings import Settings
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewModel, NewSurrogate
+from surrogym_server.storage.sql import open_storage
+from surrogym_server.testing import EngineCase
 
-NAME = "pendulum"
+NAME, HOSTS = "pendulum", 2
+LEASE = 6.0  # a busy machine may keep a host from renewing for some seconds
 
 
 @pytest.fixture(scope="session")
@@ -37,3 +45,54 @@ def fill(model: NewModel) -> Callable[[Storage], int]:
         return record.id
 
     return store
+
+
+@pytest.fixture(scope="module")
+def postgresql() -> Iterator[Postgresql]:
+    with running_postgresql() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def database(postgresql: Postgresql, fill: Callable[[Storage], int]) -> str:
+    """A PostgreSQL database with one surrogate that has a model."""
+    url = postgresql.new_database()
+    storage = open_storage(url)
+    fill(storage)
+    storage.close()
+    return url
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """Of a Ray cluster that this process begins."""
+    ray = pytest.importorskip("ray")
+    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
+    begun = ray.init(
+        "local", num_cpus=HOSTS + 1, namespace=pool.NAMESPACE, include_dashboard=False, log_to_driver=False
+    )
+    yield str(begun.address_info["gcs_address"])
+    ray.shutdown()
+
+
+@pytest.fixture(scope="module")
+def storage(database: str) -> Iterator[Storage]:
+    opened = open_storage(database)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="module")
+def settings(database: str, address: str) -> Settings:
+    fast = {"ray_lease_seconds": LEASE, "ray_checkpoint_seconds": 0.1}
+    return Settings.model_validate({"database": database, "engine": "ray", "ray_address": address, **fast})
+
+
+@pytest.fixture(scope="module")
+def engine(settings: Settings, storage: Storage) -> SessionEngine:
+    return pool.connect(settings, storage.live_sessions)
+
+
+@pytest.fixture
+def case(engine: SessionEngine, storage: Storage) -> EngineCase:
+    return EngineCase(engine, NAME, storage.surrogates.get(NAME).id, stored_definition(classic.pendulum()))

@@ -16,83 +16,31 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+import sqlalchemy as sa
 
 from support import pendulum
 from support.alternating import alternating
-from support.postgresql import Postgresql, running_postgresql
+from support.postgresql import Postgresql
 from support.server import ServerProcess, running_server
 from surrogym_client.diagnosis.conformance import conformance, leases, sessions
-from surrogym_client.original import classic
 from surrogym_client.transport import HttpSurrogate, Transport
 from surrogym_server.cluster import pool
 from surrogym_server.cluster.host import Refused
-from surrogym_server.convert import stored_definition
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance, Reply, Reset
 from surrogym_server.errors import InvalidInput, SeqConflict, Unavailable
 from surrogym_server.settings import Settings
 from surrogym_server.storage.live_sessions import SessionHolder
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import open_storage
 from surrogym_server.testing import LAWS_OF_ENGINES, EngineCase
 from surrogym_shared.wire import OpenSession
 
 ray = pytest.importorskip("ray")
 
-NAME, HOSTS = "pendulum", 2
-LEASE = 6.0  # a busy machine may keep a host from renewing for some seconds
+NAME, HOSTS, LEASE = "pendulum", 2, 6.0  # of conftest.py
+PACE = {"SURROGYM_RAY_LEASE_SECONDS": str(LEASE), "SURROGYM_RAY_CHECKPOINT_SECONDS": "0.1"}
 
 pytestmark = [pytest.mark.postgresql, pytest.mark.timeout(600), pytest.mark.filterwarnings("ignore::FutureWarning:ray")]
-
-
-@pytest.fixture(scope="module")
-def postgresql() -> Iterator[Postgresql]:
-    with running_postgresql() as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def database(postgresql: Postgresql, fill: Callable[[Storage], int]) -> str:
-    """A PostgreSQL database with one surrogate that has a model."""
-    url = postgresql.new_database()
-    storage = open_storage(url)
-    fill(storage)
-    storage.close()
-    return url
-
-
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    """Of a Ray cluster that this process begins."""
-    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
-    begun = ray.init(
-        "local", num_cpus=HOSTS + 1, namespace=pool.NAMESPACE, include_dashboard=False, log_to_driver=False
-    )
-    yield str(begun.address_info["gcs_address"])
-    ray.shutdown()
-
-
-@pytest.fixture(scope="module")
-def storage(database: str) -> Iterator[Storage]:
-    opened = open_storage(database)
-    yield opened
-    opened.close()
-
-
-@pytest.fixture(scope="module")
-def settings(database: str, address: str) -> Settings:
-    fast = {"ray_lease_seconds": LEASE, "ray_checkpoint_seconds": 0.1}
-    return Settings.model_validate({"database": database, "engine": "ray", "ray_address": address, **fast})
-
-
-@pytest.fixture(scope="module")
-def engine(settings: Settings, storage: Storage) -> SessionEngine:
-    return pool.connect(settings, storage.live_sessions)
-
-
-@pytest.fixture
-def case(engine: SessionEngine, storage: Storage) -> EngineCase:
-    return EngineCase(engine, NAME, storage.surrogates.get(NAME).id, stored_definition(classic.pendulum()))
 
 
 @pytest.mark.parametrize("law", LAWS_OF_ENGINES, ids=lambda law: law.__name__)
@@ -160,6 +108,85 @@ def test_a_request_that_takes_long_is_waited_for(
     asyncio.run(waited())
 
 
+@pytest.mark.long
+def test_an_opening_is_refused_when_its_host_stops_answering(
+    case: EngineCase, postgresql: Postgresql, database: str, monkeypatch: pytest.MonkeyPatch
+):
+    """The host stops while it waits for the database, which a lock holds up. The repeat opens one session."""
+    monkeypatch.setattr(case.engine, "_patience", 0.5)
+    monkeypatch.setattr("surrogym_server.cluster.engine.ANSWERING_SECONDS", 1.0)
+
+    async def stopped() -> None:
+        hosts = await about(database)
+        with postgresql.connect(str(sa.make_url(database).database)) as other, other.transaction():
+            other.execute("LOCK TABLE live_sessions IN SHARE MODE")
+            opening = asyncio.create_task(case.engine.open(case.asked(key="stopped")))
+            while not other.execute("SELECT 1 FROM pg_locks WHERE NOT granted").fetchone():
+                await asyncio.sleep(0.01)
+            for host in hosts:
+                os.kill(host.pid, signal.SIGSTOP)
+        try:
+            async with asyncio.timeout(60):
+                with pytest.raises(Unavailable, match=r"session host \d does not answer now"):
+                    await opening
+        finally:
+            for host in hosts:
+                os.kill(host.pid, signal.SIGCONT)
+        async with asyncio.timeout(60):
+            while True:
+                with suppress(Unavailable):
+                    first, second = [await case.engine.open(case.asked(key="stopped")) for _ in range(2)]
+                    break
+                await asyncio.sleep(0.1)
+        assert first.id == second.id
+
+    asyncio.run(stopped())
+
+
+def test_a_host_that_has_stopped_is_left_out_of_what_is_shown(
+    case: EngineCase, database: str, monkeypatch: pytest.MonkeyPatch
+):
+    """The view of each surrogate has them, also in the answer to a request that has created it."""
+    monkeypatch.setattr("surrogym_server.cluster.engine.ANSWERING_SECONDS", 1.0)
+    sessions = [asyncio.run(case.opened()) for _ in range(HOSTS)]
+    held, before = sessions[0].rpartition(".")[2], case.engine.counts().sessions[NAME]
+    [stopped] = [host for host in asyncio.run(about(database)) if str(host.number) == held]
+    lives, asked = case.engine._lives, set[int]()  # type: ignore[attr-defined]
+
+    async def lived(host: int) -> bool:
+        first = host not in asked
+        asked.add(host)
+        return first or bool(await lives(host))
+
+    monkeypatch.setattr(case.engine, "_patience", 0.5)
+    monkeypatch.setattr(case.engine, "_lives", lived)  # as if the host had stopped after it answered
+    os.kill(stopped.pid, signal.SIGSTOP)
+    try:
+        assert 0 < case.engine.counts().sessions[NAME] < before
+        assert sessions[0] not in [one.session.id for one in asyncio.run(case.engine.activity(NAME))]
+    finally:
+        os.kill(stopped.pid, signal.SIGCONT)
+
+
+def test_a_session_of_another_pool_is_refused_with_the_reason(
+    settings: Settings, case: EngineCase, storage: Storage, postgresql: Postgresql
+):
+    """A front server that writes the database's address in another way has session hosts of its own."""
+    database = f"{settings.database}/"  # of the folder of PostgreSQL's socket
+    other = pool.connect(settings.model_copy(update={"database": database, "ray_hosts": 1}), storage.live_sessions)
+
+    async def asked() -> None:
+        session = await case.opened(key="of one pool")
+        for request in (other.describe(session), other.open(case.asked(key="of one pool"))):
+            with pytest.raises(Unavailable, match="expected the same Ray cluster and the same --database"):
+                await request
+
+    try:
+        asyncio.run(asked())
+    finally:
+        ray.kill(ray.get_actor(f"session host 0 of {pool.pool_name(database)}"))
+
+
 @dataclass(frozen=True)
 class Found:
     number: int
@@ -208,12 +235,8 @@ def fronts(
 ) -> Iterator[list[str]]:
     """Addresses of two front servers."""
     options = ("--database", database, "--engine", "ray", "--ray-address", address)
-    environment = {"SURROGYM_RAY_LEASE_SECONDS": str(LEASE), "SURROGYM_RAY_CHECKPOINT_SECONDS": "0.1"}
     folders = [tmp_path_factory.mktemp(name) for name in ("first", "second")]
-    with (
-        running_server(folders[0], *options, **environment) as first,
-        running_server(folders[1], *options, **environment) as second,
-    ):
+    with running_server(folders[0], *options, **PACE) as first, running_server(folders[1], *options, **PACE) as second:
         yield [first.url, second.url]
 
 
@@ -269,8 +292,7 @@ def test_any_front_server_goes_on_with_a_session(fronts: list[str]):
 def server(database: str, address: str, engine: SessionEngine, tmp_path: Path) -> Iterator[ServerProcess]:
     """A front server."""
     options = ("--database", database, "--engine", "ray", "--ray-address", address)
-    environment = {"SURROGYM_RAY_LEASE_SECONDS": str(LEASE), "SURROGYM_RAY_CHECKPOINT_SECONDS": "0.1"}
-    with running_server(tmp_path, *options, **environment) as running:
+    with running_server(tmp_path, *options, **PACE) as running:
         yield running
 
 

@@ -21,6 +21,7 @@ from surrogym_server.convert import stored_definition
 from surrogym_server.engine.requests import Advance, Reply
 from surrogym_server.engine.sessions import Limits
 from surrogym_server.errors import Overloaded, SeqConflict, Unavailable, UnknownSession
+from surrogym_server.storage.live_sessions import SessionLease
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
 from surrogym_server.testing import LAWS_OF_ENGINES, EngineCase
@@ -302,6 +303,56 @@ def test_an_opening_under_one_key_at_two_hosts_opens_one_session(host, storage: 
         assert second.engine._inner.sessions() == []
 
     asyncio.run(opened())
+
+
+def test_a_session_whose_recording_was_not_confirmed_is_free_after_its_lease(host, storage: Storage, monkeypatch):
+    """The database has it under the host's name, and the host lost the answer, with the connection."""
+
+    async def opened() -> None:
+        first, second = host(), host()
+        await first.case.opened()
+        add = storage.live_sessions.add
+        monkeypatch.setattr(storage.live_sessions, "add", unconfirmed(add))
+        await refused(Unavailable, first.engine.open(first.case.asked(key="once")))
+        monkeypatch.setattr(storage.live_sessions, "add", add)
+        known = storage.live_sessions.opened(first.case.surrogate_id, "once")
+        assert known is not None
+        holder = storage.live_sessions.holder(known[0])
+        assert holder is not None
+        storage.live_sessions.release(SessionLease(known[0], holder.owner, 1))
+        await first.leases.renew()
+        assert (await second.engine.take(known[0])).seq == 0
+
+    asyncio.run(opened())
+
+
+def test_a_record_that_could_not_be_deleted_is_deleted_later(host, storage: Storage, monkeypatch):
+    """The session ended while the database was away. Its record would keep the key of its opening."""
+
+    async def ended() -> None:
+        one = host()
+        session = await one.case.opened()
+        remove = storage.live_sessions.remove
+        monkeypatch.setattr(storage.live_sessions, "remove", away)
+        one.engine._inner.end(session)  # as a session that was idle for too long
+        await refused(Unavailable, one.engine.sweep())
+        monkeypatch.setattr(storage.live_sessions, "remove", remove)
+        await one.engine.sweep()
+        assert storage.live_sessions.holder(session) is None
+
+    asyncio.run(ended())
+
+
+def unconfirmed(add: Callable[..., SessionLease]) -> Callable[..., SessionLease]:
+    def committed(*arguments: Any) -> SessionLease:
+        add(*arguments)
+        return away()
+
+    return committed
+
+
+def away(*_: object) -> Any:
+    raise Unavailable("the database can't be used now: the connection was lost")
 
 
 async def refused(kind: type[Exception], asked: Awaitable[object], match: str | None = None) -> None:

@@ -53,7 +53,7 @@ def test_an_owner_whose_lease_was_replaced_changes_nothing(storage: Storage, add
     old = add(seconds=SHORT)
     until(lambda: seconds_left(storage, "s") < 0)
     new = storage.live_sessions.take("s", "b", LONG).lease
-    assert storage.live_sessions.renew("a", LONG) == frozenset()
+    assert storage.live_sessions.renew("a", ["s"], LONG) == frozenset()
     assert not storage.live_sessions.record(old, Checkpoint(99, b"late"))
     storage.live_sessions.release(old)
     assert seconds_left(storage, "s") > 0
@@ -66,9 +66,17 @@ def test_a_lease_that_nobody_replaced_is_renewed_after_its_end(storage: Storage,
     add("t", seconds=SHORT)
     add("u", owner="b")
     until(lambda: seconds_left(storage, "s") < 0 and seconds_left(storage, "t") < 0)
-    assert storage.live_sessions.renew("a", LONG) == {"s", "t"}
+    assert storage.live_sessions.renew("a", ["s", "t", "u", "never"], LONG) == {"s", "t"}
     with pytest.raises(Unavailable):
         storage.live_sessions.take("s", "b", LONG)
+
+
+def test_a_lease_that_its_owner_does_not_name_ends(storage: Storage, add) -> None:
+    """The answer to ``add`` was lost with the connection: the owner never heard of its session."""
+    add("s", seconds=SHORT)
+    ids = [f"id'{number}" for number in range(70_000)]  # more than a statement may have parameters
+    assert storage.live_sessions.renew("a", ids, LONG) == frozenset()
+    assert seconds_left(storage, "s") <= SHORT
 
 
 def test_a_released_session_is_free_at_once(storage: Storage, add) -> None:
@@ -116,7 +124,7 @@ def test_a_removed_session_is_unknown(storage: Storage, surrogate: int, add) -> 
     assert add("s", key="once").fence == 1, "its id and key are free again"
     storage.live_sessions.remove_all_of(surrogate + 1)
     storage.live_sessions.remove_all_of(surrogate)
-    assert storage.live_sessions.renew("a", LONG) == frozenset()
+    assert storage.live_sessions.renew("a", ["s", "t"], LONG) == frozenset()
 
 
 def test_sessions_go_with_their_surrogate(storage: Storage, make, add) -> None:

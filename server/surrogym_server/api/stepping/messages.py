@@ -10,7 +10,9 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.frames import CloseCode
 from websockets.protocol import State
 
+from surrogym_server.api.problems import closing_reply
 from surrogym_server.api.stepping.stream import EXTENSION, Prompt
+from surrogym_shared.codes import Code
 from surrogym_shared.messages import MASKED, WHOLE_BINARY, Extent, FrameSplitter, apply_mask, header
 
 MAX_FRAMES = 256  # of a WebSocket in one read, and fragments of one message
@@ -65,6 +67,8 @@ class PromptMessages(WebSocketsSansIOProtocol):
     def data_received(self, data: bytes) -> None:
         if not self.handshake_initiated or self._oversized:  # the handshake comes whole, from the HTTP protocol
             super().data_received(data)
+            if not self.handshake_initiated:
+                self._refuse_handshake()
             return
         whole = self._frames.split(data)
         if len(whole) > MAX_FRAMES or len(self.frames) > MAX_FRAMES:
@@ -97,6 +101,15 @@ class PromptMessages(WebSocketsSansIOProtocol):
             raise ClientDisconnected
         await super().send(message)
         self.handshake_complete |= self.close_sent  # by a refusal, for which uvicorn would log an error otherwise
+
+    def _refuse_handshake(self) -> None:
+        """Answer a handshake that the library can't read. uvicorn would leave the connection open without a reply."""
+        wrong = self.conn.handshake_exc
+        why = "it is not whole" if wrong is None else wrong.__cause__ or wrong
+        self.transport.write(
+            closing_reply(Code.INVALID_REQUEST, f"expected a request that opens a stream, got none: {why}", 400)
+        )
+        self.transport.close()
 
     def _take(self, answer: Prompt) -> None:
         self._answer = answer

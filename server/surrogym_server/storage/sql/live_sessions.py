@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
@@ -54,9 +56,12 @@ class SqlLiveSessions(LiveSessions):
             row = connection.execute(sa.select(live.c.owner, live.c.machine, left).where(live.c.id == id)).one_or_none()
         return None if row is None else SessionHolder(row.owner, row.left, row.machine)
 
-    def renew(self, owner: str, seconds: float) -> frozenset[str]:
+    def renew(self, owner: str, ids: Collection[str], seconds: float) -> frozenset[str]:
+        # in the text of the statement, because the number of its parameters is limited
+        wanted = sa.bindparam("ids", list(ids), sa.Text(), expanding=True, literal_execute=True)
         with self._database.write() as connection:
-            renewed = sa.update(live).where(live.c.owner == owner).values(_lease(owner, seconds))
+            held = sa.update(live).where(live.c.owner == owner, live.c.id.in_(wanted))
+            renewed = held.values(_lease(owner, seconds))
             return frozenset(connection.execute(renewed.returning(live.c.id)).scalars())
 
     def record(self, lease: SessionLease, checkpoint: Checkpoint) -> bool:
