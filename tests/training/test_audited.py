@@ -113,6 +113,36 @@ def test_promises_that_fall_again_and_again_end(monkeypatch, tmp_path: Path) -> 
     assert handover.promise.median == -21.6
 
 
+def rounds_taken(
+    monkeypatch: pytest.MonkeyPatch,
+    folder: Path,
+    *,
+    passed: bool,
+    unspent: int,
+    role: str = "admin",
+    phase: str = "over_budget",
+    certain: float | None = 1.0,
+) -> tuple[list[int], int]:
+    """Run audits that all end alike, with a budget that has none left. Returns the real steps of each round that was
+    taken after an audit, and the number of trainings."""
+    api, ledger = Mock(), Mock(total=24)
+    api.access.return_value.role = role
+    api.surrogate.return_value = Mock(budget_left=0, ledger=ledger, fidelity=None, phase=phase, target=0.999)
+    api.improve.side_effect = lambda _name, queries, **_: setattr(ledger, "total", ledger.total + queries)
+    trainings = Trainings([found(95.6, 94.0, passed=passed)] * MOST_AUDITS)
+    loop = Mock(unspent=unspent, train=lambda: trainings.train(None, folder / "p.zip", TrainSettings(), None))
+    monkeypatch.setattr(audited, "ClosedLoop", lambda *_: loop)
+    monkeypatch.setattr(audited, "train", trainings.train)
+    monkeypatch.setattr(audited, "hand_over", trainings.hand_over)
+    monkeypatch.setattr(audited, "visit", lambda *_: (0, certain))
+    monkeypatch.setattr(audited, "wait_for_design", lambda *_, **__: api.surrogate())
+    monkeypatch.setattr(AuditedTraining, "_subject", lambda *_: None)
+    monkeypatch.setattr(AuditedTraining, "_best", lambda _self, result: result)
+    settings, rounds = TrainSettings(algorithm="fastppo"), LoopSettings(queries=12, rounds=3)
+    AuditedTraining(api, "plane", Mock(), folder / "p.zip", settings, rounds, AuditSettings()).train()
+    return [call.args[1] for call in api.improve.call_args_list], trainings.made
+
+
 @pytest.mark.parametrize(
     ("role", "unspent", "improved"), [("admin", 0, []), ("admin", 1, [12]), ("admin", 2, [12, 12]), ("trainer", 2, [])]
 )
@@ -120,20 +150,23 @@ def test_a_failed_audit_takes_the_steps_of_rounds_that_took_none(
     monkeypatch, tmp_path: Path, role: str, unspent: int, improved: list[int]
 ) -> None:
     """The budget has none left: the loop raises it by a round's steps, and it took none where the model seemed sure."""
-    api, ledger = Mock(), Mock(total=24)
-    api.access.return_value.role = role
-    api.surrogate.return_value = Mock(budget_left=0, ledger=ledger, fidelity=None)
-    api.improve.side_effect = lambda _name, queries, **_: setattr(ledger, "total", ledger.total + queries)
-    trainings = Trainings([found(95.6, 94.0, passed=False)] * MOST_AUDITS)
-    loop = Mock(unspent=unspent, train=lambda: trainings.train(None, tmp_path / "p.zip", TrainSettings(), None))
-    monkeypatch.setattr(audited, "ClosedLoop", lambda *_: loop)
-    monkeypatch.setattr(audited, "train", trainings.train)
-    monkeypatch.setattr(audited, "hand_over", trainings.hand_over)
-    monkeypatch.setattr(audited, "visit", lambda *_: None)
-    monkeypatch.setattr(audited, "wait_for_design", lambda *_, **__: api.surrogate())
-    monkeypatch.setattr(AuditedTraining, "_subject", lambda *_: None)
-    monkeypatch.setattr(AuditedTraining, "_best", lambda _self, result: result)
-    settings, rounds = TrainSettings(algorithm="fastppo"), LoopSettings(queries=12, rounds=3)
-    AuditedTraining(api, "plane", Mock(), tmp_path / "p.zip", settings, rounds, AuditSettings()).train()
-    assert [call.args[1] for call in api.improve.call_args_list] == improved
-    assert trainings.made == 1 + len(improved)
+    taken, made = rounds_taken(monkeypatch, tmp_path, passed=False, unspent=unspent, role=role)
+    assert (taken, made) == (improved, 1 + len(improved))
+
+
+@pytest.mark.parametrize(
+    ("unspent", "phase", "certain", "improved"),
+    [
+        (3, "over_budget", 0.9, [12, 12]),
+        (1, "over_budget", 0.9, [12]),
+        (0, "over_budget", 0.9, []),
+        (3, "over_budget", 0.9995, []),
+        (3, "over_budget", None, []),
+        (3, "ready", 0.9, []),
+    ],
+)
+def test_a_passed_audit_takes_them_if_the_model_is_no_longer_certain_where_the_policy_goes(
+    monkeypatch, tmp_path: Path, unspent: int, phase: str, certain: float | None, improved: list[int]
+) -> None:
+    taken, made = rounds_taken(monkeypatch, tmp_path, passed=True, unspent=unspent, phase=phase, certain=certain)
+    assert (taken, made) == (improved, 1 + len(improved))
