@@ -44,9 +44,9 @@ def designed(bump: HiddenBump, spec: EnvironmentSpec) -> tuple[surrogym.Design, 
     return design, met
 
 
-def real_return(bump: HiddenBump, policy: Path) -> float:
+def real_return(bump: HiddenBump, policy: Path, algorithm: str) -> float:
     """Mean return of a policy in the original environment."""
-    spec, act, rng = bump.spec(), load_policy(policy, "fastppo"), np.random.default_rng(10_000)
+    spec, act, rng = bump.spec(), load_policy(policy, algorithm), np.random.default_rng(10_000)
     low, high = np.array([(c.low, c.high) for c in spec.start.values()]).T  # type: ignore[union-attr]
     x, total = rng.uniform(low, high, (EPISODES, bump.dimensions)), np.zeros(EPISODES)
     for _ in range(spec.time_limit or 0):
@@ -70,7 +70,7 @@ def trained(bump: HiddenBump, port: SurrogatePort, steps: int | None) -> tuple[f
     with TemporaryDirectory() as folder:
         path = Path(folder) / "policy.zip"
         result = train(port, path, TrainSettings(algorithm="fastppo", seed=bump.seed, total_steps=steps))
-        return real_return(bump, path), float(result.imagined_return or 0.0)
+        return real_return(bump, path, result.algorithm), float(result.imagined_return or 0.0)
 
 
 def run(options: argparse.Namespace, dimensions: int, seed: int) -> dict[str, Any]:

@@ -1,10 +1,12 @@
 """The audit's judgement: right models pass, wrong ones fail, and errors within the tolerance are no fault."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.stats
 
-from surrogym_client.evaluation.audit import Compared, chi_squared, differences, judge, places
+from surrogym_client.evaluation.audit import Compared, chi_squared, differences, gaps, judge, places
 from surrogym_client.original.classic import pendulum
 from surrogym_client.policies.evidence import Promise
 
@@ -100,6 +102,32 @@ def test_few_visited_states_give_as_many_places():
     q = np.zeros((3, 2))
     assert sorted(places(pendulum(), q, np.zeros((3, 1)), 8, np.random.default_rng(0))) == [0, 1, 2]
     assert len(places(pendulum(), q + 1e3, np.zeros((3, 1)), 8, np.random.default_rng(0))) == 0
+
+
+def test_gaps_are_the_widest_of_single_inputs():
+    """Samples everywhere but beyond a speed of 4, and with small torques alone. Angles have no end, so no gap there."""
+    rng = np.random.default_rng(0)
+    q, u = rng.uniform([-np.pi, -8], [np.pi, 8], (1_000, 2)), rng.uniform(-2, 2, (1_000, 1))
+    samples = rng.uniform([-3.1, -8], [3.1, 4], (100, 2)), rng.uniform(-2, 0, (100, 1))
+    first, second = gaps(pendulum(), q, u, samples, 2)
+    assert u[first, 0] > 1.98, "half of the torques"
+    assert q[second, 1] > 7.9, "a quarter of the speeds"
+
+
+def test_gaps_keep_to_what_can_be_set_and_are_as_many_as_asked_for():
+    q, u = np.array([[0.0, 0.0], [0.1, 2.0], [0.0, 80.0]]), np.zeros((3, 1))
+    samples = np.array([[0.0, 0.1]]), np.zeros((1, 1))
+    assert gaps(pendulum(), q, u, samples, 1) == [1]
+    assert sorted(gaps(pendulum(), q, u, samples, 2)) == [0, 1]
+    assert len(gaps(pendulum(), q, u, samples, 0)) == 0
+
+
+def test_errors_of_rewards_off_the_way_do_not_add_up_over_an_episode():
+    errors = np.zeros((8, 1))
+    errors[6:] = 8.0  # 2 a step in the mean: twice what may add up
+    beside = Compared(["reward"], errors, np.zeros((8, 1)), np.array([10.0]), length=200)
+    assert not judge(beside, PROMISE, PROMISE, UNTRAINED).passed
+    assert judge(replace(beside, elsewhere=2), PROMISE, PROMISE, UNTRAINED).passed
 
 
 def test_angles_differ_by_the_shorter_way():

@@ -109,6 +109,35 @@ def test_a_machine_that_has_changed_fails_the_audit(line: Place) -> None:
     assert handover.promise.median < handover.audit.before.median - 10, "the model has learned what is paid now"
 
 
+class Slope(Line):
+    """The line, paid by how far left it is. Once it is changed, nothing is paid far right, where no policy goes."""
+
+    changed = False
+
+    def step_from(self, coordinates: np.ndarray, action: np.ndarray) -> RealStep:
+        step, x = super().step_from(coordinates, action), float(coordinates[0])
+        return replace(step, reward=0.0 if self.changed and x > 0.6 else 1 - x)
+
+
+def test_a_ready_design_is_audited_in_the_gaps_of_its_samples_too(server_process: ServerProcess) -> None:
+    with placed(server_process.url, SPEC, Slope()) as place:
+        assert place.api.surrogate(place.name).phase == "ready"
+        handover = hand_over(place.subject(), AUDIT)
+        assert handover.trusted, handover.reason
+        assert handover.reason == "6 real steps on the policy's way and 2 far from all samples agree with the model"
+
+
+def test_what_is_wrong_in_a_gap_fails_the_audit_of_a_ready_design(server_process: ServerProcess) -> None:
+    """The promise is right: the policy does not go there, perhaps because of what the model has wrong."""
+    with placed(server_process.url, SPEC, Slope()) as place:
+        place.environment.changed = True
+        handover = hand_over(place.subject(), AUDIT)
+        assert handover.audit is not None
+        assert handover.audit.elsewhere == 2
+        assert handover.audit.faults[0].startswith("reward: errors of")
+        assert not handover.trusted
+
+
 def test_without_a_sampler_an_audit_is_given_up(
     pendulum_server: ServerProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:

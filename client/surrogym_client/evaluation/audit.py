@@ -34,6 +34,7 @@ class Compared:
         expected: error (O,) that the model allows in addition: its tolerance, or its leave-one-out error if that is
             larger, which includes the noise; for the reward at least the error that matters for the return.
         misplaced: number of steps whose termination was predicted wrongly.
+        elsewhere: number of steps off the policy's way; they come last.
         length: mean number of steps of an episode; 0 if unknown.
         noise: standard deviation of the noise of a single step (O,), included in ``expected``; empty without noise.
     """
@@ -43,6 +44,7 @@ class Compared:
     deviations: Array
     expected: Array
     misplaced: int = 0
+    elsewhere: int = 0
     length: float = 0.0
     noise: Array = field(default_factory=lambda: np.zeros(0))
 
@@ -103,11 +105,13 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
             "steps"
         )
     if "reward" in compared.names and compared.length:
-        missing = float(compared.errors[:, list(compared.names).index("reward")].mean()) * compared.length
+        on_way = compared.errors[: n - compared.elsewhere, list(compared.names).index("reward")]
+        missing = float(on_way.mean()) * compared.length if len(on_way) else 0.0
         if abs(missing) > BIAS * earned(before, floor):
             faults.append(f"rewards would differ from the prediction by {missing:.4g} over a whole episode")
     return Audit(
         steps=n,
+        elsewhere=compared.elsewhere,
         passed=not faults,
         faults=tuple(faults),
         errors=dict(zip(compared.names, actual.tolist(), strict=True)),
@@ -162,6 +166,26 @@ def places(spec: EnvironmentSpec, q: Array, u: Array, count: int, rng: np.random
         farthest = int(np.argmax(nearest))
         chosen.append(farthest)
         nearest = np.minimum(nearest, np.linalg.norm(at - at[farthest], axis=1))
+    found: NDArray[np.intp] = settable[chosen]
+    return found
+
+
+def gaps(spec: EnvironmentSpec, q: Array, u: Array, samples: tuple[Array, Array], count: int) -> NDArray[np.intp]:
+    """Choose at most ``count`` of the states q (m, C) and actions u (m, F) in the widest gaps of single inputs.
+
+    A gap is a coordinate's or an action's distance from the nearest of the samples, states (n, C) and actions (n, F),
+    as a share of the range of q and u. A wall or a threshold behind such a gap is in no sample, wherever they are else.
+    """
+    settable = np.flatnonzero(_settable(spec, q))
+    at, known = np.concatenate([q, u], 1)[settable], np.concatenate(samples, 1)
+    circles = np.array([c.kind == "angle" for c in spec.coordinates] + [False] * u.shape[1])
+    ranges = np.where(circles, 2 * np.pi, np.ptp(at, axis=0))
+    ranges[ranges == 0] = np.inf
+    chosen: list[int] = []
+    while len(chosen) < min(count, len(settable)):
+        off = np.abs(at[:, None] - np.concatenate([known, at[chosen]])[None])
+        off = np.where(circles, np.minimum(off, np.abs(2 * np.pi - off)), off)
+        chosen.append(int(np.argmax((off.min(1) / ranges).max(1))))
     found: NDArray[np.intp] = settable[chosen]
     return found
 

@@ -54,6 +54,7 @@ class Audit(BaseModel):
 
     Attributes:
         steps: number of real steps.
+        elsewhere: how many of them were taken in gaps of the samples, off the policy's way.
         passed: whether the promise stands.
         faults: what was wrong, one sentence each; empty if the audit passed.
         errors: root mean square of the prediction errors of each output, in the output's unit.
@@ -66,6 +67,7 @@ class Audit(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
     steps: int
+    elsewhere: int = 0
     passed: bool
     faults: tuple[str, ...] = ()
     errors: dict[str, float] = {}

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import Lanes, session_request
-from surrogym_client.evaluation.audit import AUDIT_STEPS, earned, judge, places
+from surrogym_client.evaluation.audit import AUDIT_STEPS, earned, gaps, judge, places
 from surrogym_client.evaluation.comparing import compared
 from surrogym_client.evaluation.imagined import WHOLE
 from surrogym_client.evaluation.outside import Outside, outside_of
 from surrogym_client.evaluation.promise import UNNOTICED, promise_of
 from surrogym_client.evaluation.ranges import range_left
+from surrogym_client.evaluation.uncontrolled import baseline
 from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.protocol import LONGEST_EPISODE
 from surrogym_client.policies.evidence import Audit, Promise
@@ -28,6 +29,8 @@ from surrogym_shared.wire import SurrogateView
 
 WAY_LANES = 16  # virtual episodes whose states an audit chooses from
 MOST_OF_A_WAY = 200  # steps of an episode that are compared with a log
+ELSEWHERE = 4  # of a ready design: one in so many steps of an audit is taken in a gap of the samples
+ANYWHERE = 1_024  # points of the sampling range that such steps are chosen from
 WIDE = 0.5  # share of the gain over an untrained policy: a promise with a wider lower half is not trusted
 NO_SAMPLER = "no sampler is connected"
 
@@ -122,7 +125,7 @@ def take(
     api, name, spec = subject.api, subject.name, subject.port.spec()
     view = api.surrogate(name)
     q, u = way_of(subject, WAY_LANES, spec.time_limit or LONGEST_EPISODE)
-    wanted = _asked(subject, settings, q, u)
+    wanted, elsewhere = _asked(subject, settings, q, u, claims=view.phase == "ready")
     try:
         wait_for_answers(api, name, wanted, settings.patience_seconds, progress)
     except BaseException:
@@ -132,39 +135,59 @@ def take(
     samples = [sample for sample in answers if spec.known(sample.coordinates)]
     if not samples:
         return None
+    samples.sort(key=lambda sample: sample.query_id in elsewhere)
     wait_for_design(api, name, settings.patience_seconds, progress, after_round=view.round)
     after, length = subject.promise(), len(q) / WAY_LANES
     matters = UNNOTICED * earned(before, subject.floor) / length
-    beside = replace(compared(api, spec, view, samples, matters), length=length)
+    off_way = sum(sample.query_id in elsewhere for sample in samples)
+    beside = replace(compared(api, spec, view, samples, matters), length=length, elsewhere=off_way)
     return judge(beside, before, after, subject.floor).model_copy(update={"range_left": range_left(spec, q)})
 
 
-def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array) -> set[int]:
-    """Add the queries of an audit, at some of the states q (m, C) with their actions u (m, F).
+def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, claims: bool) -> tuple[set[int], set[int]]:
+    """Add the queries of an audit, at some of the states q (m, C) of the policy's way with their actions u (m, F).
 
-    If the environment can't be set to a state, the query is one episode's sequence of actions. Returns the queries'
-    numbers.
+    If the design ``claims`` to know the whole sampling range, one query in ``ELSEWHERE`` is in a gap of its samples
+    instead: what the model got wrong there may have kept the policy away. If the environment can't be set to a state,
+    the query is one episode's sequence of actions. Returns the queries' numbers, and those off the policy's way.
     """
-    spec = subject.port.spec()
+    spec, rng = subject.port.spec(), np.random.default_rng(settings.seed)
     if spec.query == "rollout":
         steps = settings.steps + spec.unknown_steps
         _, actions = way_of(subject, 1, min(steps, spec.max_rollout or steps))
         queries = subject.api.add_queries(subject.name, rollouts=[actions.tolist()], audit=True)
-        return {query.id for query in queries}
-    chosen = places(spec, q, u, settings.steps, np.random.default_rng(settings.seed))
+        return {query.id for query in queries}, set()
+    elsewhere = settings.steps // ELSEWHERE if claims else 0
+    chosen = places(spec, q, u, settings.steps - elsewhere, rng)
     if not len(chosen):
-        return set()
-    queries = subject.api.add_queries(subject.name, q[chosen].tolist(), u[chosen].tolist(), audit=True)
-    return {query.id for query in queries}
+        return set(), set()
+    off_q, off_u = _in_gaps(subject, elsewhere)
+    states, actions = np.concatenate([q[chosen], off_q]), np.concatenate([u[chosen], off_u])
+    queries = subject.api.add_queries(subject.name, states.tolist(), actions.tolist(), audit=True)
+    numbers = [query.id for query in queries]
+    return set(numbers), set(numbers[len(chosen) :])
 
 
-def way_of(subject: Subject, episodes: int, steps: int) -> tuple[Array, Array]:
-    """Return the states (m, C) and actions (m, F) of a policy in whole virtual episodes from the declared starts.
+def _in_gaps(subject: Subject, count: int) -> tuple[Array, Array]:
+    """Return states (count, C) of the sampling range and random actions (count, F), far from all samples."""
+    spec = subject.port.spec()
+    random = replace(subject, predict=baseline(spec, "random", subject.seed))
+    q, u = way_of(random, ANYWHERE, 1, start_box=1.0)
+    known = [sample for sample in subject.api.samples(subject.name) if spec.known(sample.coordinates)]
+    samples = np.array([s.coordinates for s in known]), np.array([s.action for s in known])
+    chosen = gaps(spec, q, u, samples, count)
+    return q[chosen], u[chosen]
+
+
+def way_of(subject: Subject, episodes: int, steps: int, start_box: float = 0.0) -> tuple[Array, Array]:
+    """Return the states (m, C) and actions (m, F) of a policy in whole virtual episodes.
+
+    They begin at the declared starts; a share ``start_box`` of them begins anywhere in the sampling range.
 
     Each episode follows a drawn function of its own. Actions are in the original environment's units.
     """
     spec = subject.port.spec()
-    options = {**subject.session, **WHOLE, "variant": "pathwise", "seed": subject.seed}
+    options = {**subject.session, **WHOLE, "start_box": start_box, "variant": "pathwise", "seed": subject.seed}
     lanes = Lanes(subject.port, session_request(episodes, "same_step", options))
     states, actions, running = [], [], np.ones(episodes, dtype=bool)
     try:
@@ -175,7 +198,7 @@ def way_of(subject: Subject, episodes: int, steps: int) -> tuple[Array, Array]:
             actions.append(decode_actions(spec, action, episodes)[running])
             step = lanes.step(action)
             if step.lost is not None:
-                return way_of(subject, episodes, steps)
+                return way_of(subject, episodes, steps, start_box)
             observation = step.result.observation
             running &= ~(step.result.terminated | step.result.truncated)
             if not running.any():
@@ -200,7 +223,11 @@ def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
         return False, f"the audit failed: {audit.faults[0]}"
     if (wide := _too_wide(audit.after, floor)) is not None:
         return False, wide
-    return True, f"{audit.steps} real steps on the policy's way agree with the model"
+    on_way = f"{audit.steps - audit.elsewhere} real steps on the policy's way"
+    return (
+        True,
+        f"{on_way}{f' and {audit.elsewhere} far from all samples' * bool(audit.elsewhere)} agree with the model",
+    )
 
 
 def _unaudited(subject: Subject, promise: Promise, why: str) -> Handover:
