@@ -161,8 +161,10 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, cla
     chosen = places(spec, q, u, settings.steps - elsewhere, rng)
     if not len(chosen):
         return set(), set()
-    off_q, off_u = _in_gaps(subject, elsewhere)
-    states, actions = np.concatenate([q[chosen], off_q]), np.concatenate([u[chosen], off_u])
+    points = [(q[chosen], u[chosen])]
+    if elsewhere:
+        points.append(_in_gaps(subject, elsewhere))
+    states, actions = (np.concatenate(parts) for parts in zip(*points, strict=True))
     queries = subject.api.add_queries(subject.name, states.tolist(), actions.tolist(), audit=True)
     numbers = [query.id for query in queries]
     return set(numbers), set(numbers[len(chosen) :])
