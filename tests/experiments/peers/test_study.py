@@ -47,6 +47,18 @@ def test_a_cell_ends_with_the_round_that_reaches_the_target(peers, tmp_path):
     assert not PeerCell("cartpole", "balancing", 0, episodes=2).done(tmp_path)  # other settings
 
 
+def test_a_cell_of_other_settings_of_the_method_is_run_again(peers, monkeypatch):
+    class Tuned(Balancing):
+        def __init__(self, gain: float) -> None:
+            self.gain = gain
+
+    found = []
+    for gain in (0.3, 0.3, 0.5):
+        monkeypatch.setitem(METHODS, "balancing", Method("", lambda gain=gain: Tuned(gain), budget=100))
+        found.append(PeerCell("cartpole", "balancing", 0).specification)
+    assert found[0] == found[1] != found[2]
+
+
 def test_a_cell_ends_at_its_budget_within_a_round(peers, tmp_path):
     points = run_cell(PeerCell("cartpole", "balancing", 0, budget=7, episodes=1), tmp_path)
     assert [(p.round, p.real_steps, p.ended) for p in points] == [(1, 5, ""), (2, 7, BUDGET)]

@@ -48,8 +48,14 @@ class PeerCell:
 
     @property
     def specification(self) -> str:
-        """Hash of what is asked, without the seed."""
-        asked = {"task": asdict(task_of(self.task)), "method": self.method, "minutes": self.minutes}
+        """Hash of what is asked, the method's settings included, without the seed."""
+        settings = {name: repr(value) for name, value in vars(METHODS[self.method].make()).items()}
+        asked = {
+            "task": asdict(task_of(self.task)),
+            "method": self.method,
+            "settings": settings,
+            "minutes": self.minutes,
+        }
         return fingerprint(asked | {"real_steps": self.real_steps, "episodes": self.judged})
 
     def file(self, folder: Path) -> Path:
