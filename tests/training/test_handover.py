@@ -124,7 +124,10 @@ def test_a_ready_design_is_audited_in_the_gaps_of_its_samples_too(server_process
         assert place.api.surrogate(place.name).phase == "ready"
         handover = hand_over(place.subject(), AUDIT)
         assert handover.trusted, handover.reason
-        assert handover.reason == "6 real steps on the policy's way and 2 far from all samples agree with the model"
+        assert (
+            handover.reason
+            == "6 real steps on the policy's way and 2 in the widest gaps of the samples agree with the model"
+        )
 
 
 def test_what_is_wrong_in_a_gap_fails_the_audit_of_a_ready_design(server_process: ServerProcess) -> None:

@@ -151,6 +151,8 @@ def command(
     if filmed is not None:
         summary["video"] = str(filmed)
     more = [] if found is None else found.in_words(card.spec)
+    if card.promise is not None and settings.declared and promise is None:
+        more = [f"{settings.episodes} episodes are too few to judge the promise: take {FEWEST_TO_JUDGE} or more", *more]
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
 
 

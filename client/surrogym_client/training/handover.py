@@ -225,11 +225,10 @@ def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
         return False, f"the audit failed: {audit.faults[0]}"
     if (wide := _too_wide(audit.after, floor)) is not None:
         return False, wide
-    on_way = f"{audit.steps - audit.elsewhere} real steps on the policy's way"
-    return (
-        True,
-        f"{on_way}{f' and {audit.elsewhere} far from all samples' * bool(audit.elsewhere)} agree with the model",
-    )
+    where = f"{audit.steps - audit.elsewhere} real steps on the policy's way"
+    if audit.elsewhere:
+        where += f" and {audit.elsewhere} in the widest gaps of the samples"
+    return True, f"{where} agree with the model"
 
 
 def _unaudited(subject: Subject, promise: Promise, why: str) -> Handover:
