@@ -22,8 +22,8 @@ def promise(median: float, low: float | None = None, high: float | None = None) 
     return Promise(median=median, low=low, high=high, functions=32, episodes=256)
 
 
-def found(before: float, after: float, passed: bool = True) -> Handover:
-    audit = Audit(steps=8, passed=passed, before=promise(before, -32, 102), after=promise(after))
+def found(before: float, after: float, passed: bool = True, low: float | None = None) -> Handover:
+    audit = Audit(steps=8, passed=passed, before=promise(before, -32, 102), after=promise(after, low))
     return Handover(audit.after, audit, passed, "because")
 
 
@@ -122,6 +122,7 @@ def rounds_taken(
     role: str = "admin",
     phase: str = "over_budget",
     certain: float | None = 1.0,
+    low: float | None = None,
 ) -> tuple[list[int], int]:
     """Run audits that all end alike, with a budget that has none left. Returns the real steps of each round that was
     taken after an audit, and the number of trainings."""
@@ -129,7 +130,7 @@ def rounds_taken(
     api.access.return_value.role = role
     api.surrogate.return_value = Mock(budget_left=0, ledger=ledger, fidelity=None, phase=phase, target=0.999)
     api.improve.side_effect = lambda _name, queries, **_: setattr(ledger, "total", ledger.total + queries)
-    trainings = Trainings([found(95.6, 94.0, passed=passed)] * MOST_AUDITS)
+    trainings = Trainings([found(95.6, 94.0, passed, low)] * MOST_AUDITS)
     loop = Mock(unspent=unspent, train=lambda: trainings.train(None, folder / "p.zip", TrainSettings(), None))
     monkeypatch.setattr(audited, "ClosedLoop", lambda *_: loop)
     monkeypatch.setattr(audited, "train", trainings.train)
@@ -169,4 +170,21 @@ def test_a_passed_audit_takes_them_if_the_model_is_no_longer_certain_where_the_p
     monkeypatch, tmp_path: Path, unspent: int, phase: str, certain: float | None, improved: list[int]
 ) -> None:
     taken, made = rounds_taken(monkeypatch, tmp_path, passed=True, unspent=unspent, phase=phase, certain=certain)
+    assert (taken, made) == (improved, 1 + len(improved))
+
+
+@pytest.mark.parametrize(
+    ("low", "unspent", "phase", "improved"),
+    [
+        (74.0, 3, "over_budget", [12, 12]),
+        (74.0, 3, "ready", [12, 12]),
+        (74.0, 0, "over_budget", []),
+        (76.0, 3, "over_budget", []),
+    ],
+)
+def test_a_passed_audit_takes_them_if_the_promise_is_wide(
+    monkeypatch, tmp_path: Path, low: float, unspent: int, phase: str, improved: list[int]
+) -> None:
+    """94 is promised, beyond an untrained policy's 0. A fifth of that is 18.8."""
+    taken, made = rounds_taken(monkeypatch, tmp_path, passed=True, unspent=unspent, phase=phase, low=low)
     assert (taken, made) == (improved, 1 + len(improved))

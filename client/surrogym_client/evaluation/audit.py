@@ -18,6 +18,7 @@ ALARM = 0.01  # probability that the test of output errors fails for a right mod
 MISPLACED_ENDS = 2  # an audit fails if the model predicted the termination of this many steps wrongly
 SLACK = 0.1  # share of the gain over an untrained policy by which a promise may leave its former interval
 BIAS = 0.2  # share of the same gain that reward errors may add up to in an episode
+UNSURE = 0.2  # share of the same gain: real steps may narrow a promise whose lower half is wider
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -135,6 +136,11 @@ def disappointed(audit: Audit, floor: float | None, imagined: float | None = Non
     before = audit.before.median if imagined is None else max(audit.before.median, imagined)
     lost = before - audit.after.median
     return lost > SLACK * max(earned(audit.before, floor), earned(audit.after, floor))
+
+
+def unsure(audit: Audit, floor: float | None) -> bool:
+    """Whether the promise after an audit is wide: its lower half is more than a fifth of the gain over ``floor``."""
+    return audit.after.median - audit.after.low > UNSURE * earned(audit.after, floor)
 
 
 def earned(promise: Promise, floor: float | None) -> float:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from surrogym_client.evaluation.audit import AUDIT_STEPS, disappointed
+from surrogym_client.evaluation.audit import AUDIT_STEPS, disappointed, unsure
 from surrogym_client.policies.evidence import Audit
 from surrogym_client.policies.files import load_policy
 from surrogym_client.surrogates.waiting import wait_for_design
@@ -34,12 +34,12 @@ MOST_AUDITS = 3  # audits of one training at most; each takes its own real steps
 class AuditedTraining:
     """Train a policy, audit it, and hand it over.
 
-    If an audit fails and the budget has steps left, or rounds that the model seemed not to need, their steps are taken
-    where the policy goes, the training continues, and the policy is audited again. Such a round is also taken if the
-    model that has learned from a passed audit is no longer certain there. The training also continues if the
-    model that has learned from an audit promises clearly less than the training imagined, or than the model before,
-    unless the user limited the virtual steps. This takes no step of the budget. In all other cases the policy is handed
-    over, also with a failed audit.
+    If an audit fails and the budget has steps left, or rounds that the model seemed not to need, their steps are
+    taken where the policy goes, the training continues, and the policy is audited again. Such a round is also taken
+    after a passed audit if the promise is wide, or if the model that has learned from it is no longer certain
+    there. The training also continues if the model that has learned from an audit promises clearly less than the
+    training imagined, or than the model before, unless the user limited the virtual steps. This takes no step of
+    the budget. In all other cases the policy is handed over, also with a failed audit.
 
     Attributes:
         api: the server.
@@ -116,19 +116,21 @@ class AuditedTraining:
     def _to_be_trained_on(self, audit: Audit | None, result: TrainResult, taken: int, number: int) -> bool:
         if audit is None:
             return False
-        if (not audit.passed or self._unspent) and self._asked_more(result, taken, number, failed=not audit.passed):
+        needed = not audit.passed or (self._unspent > 0 and unsure(audit, result.untrained))
+        if (needed or self._unspent) and self._asked_more(result, taken, number, needed=needed):
             return True
         longer = prolongs(self.settings, self.port.spec())
         return longer and disappointed(audit, result.untrained, result.imagined_return)
 
-    def _asked_more(self, result: TrainResult, taken: int, number: int, *, failed: bool) -> bool:
+    def _asked_more(self, result: TrainResult, taken: int, number: int, *, needed: bool) -> bool:
         """Spend the rest of the budget, or a round that took no real step, where the policy goes.
 
-        After an audit that did not fail, it is spent only if the model is not certain there. Only a token of role admin
-        may raise the budget for such a round. Returns whether the budget's real steps are now more than ``taken``.
+        Unless they are ``needed`` anyway, the steps are only taken if the model is not certain there. Only a token of
+        role admin may raise the budget for such a round. Returns whether the budget's real steps are now more than
+        ``taken``.
         """
         view = self.api.surrogate(self.name)
-        if not failed and view.phase == "ready":
+        if not needed and view.phase == "ready":
             return False
         round_ = self.rounds.queries if self.rounds else AUDIT_STEPS
         left = round_ if self._unspent and self.api.access().role == "admin" else view.budget_left
@@ -136,7 +138,7 @@ class AuditedTraining:
         if wanted > 0:
             checkpoint = f"seed {self.settings.seed}, audit {number}, round {view.round}"
             _, index = visit(self.port, result, self.settings, checkpoint)
-            if not failed and (index is None or index >= view.target):
+            if not needed and (index is None or index >= view.target):
                 return False
             self._unspent = max(self._unspent - 1, 0)
             self.api.improve(self.name, wanted, checkpoint=checkpoint)
