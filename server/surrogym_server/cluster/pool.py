@@ -16,7 +16,7 @@ from surrogym_server.engine.port import Compute, SessionEngine
 from surrogym_server.errors import InvalidInput, Unavailable
 from surrogym_server.settings import Settings
 from surrogym_server.storage.live_sessions import LiveSessions
-from surrogym_shared.ray_address import require_cluster, send_token
+from surrogym_shared.ray_address import no_cluster, require_cluster, send_token
 
 logger = logging.getLogger(__name__)
 
@@ -58,9 +58,7 @@ def connect(settings: Settings, store: LiveSessions) -> SessionEngine:
     try:
         ray.init(settings.ray_address, namespace=NAMESPACE, ignore_reinit_error=True, **quiet)
     except ConnectionError as error:
-        raise InvalidInput(
-            f"engine ray: expected a cluster at {settings.ray_address!r}, got none: ray start --head begins one"
-        ) from error
+        raise InvalidInput(f"engine ray: {no_cluster(settings.ray_address)}") from error
     except RuntimeError as error:  # Ray compares its own version and Python's
         said = " ".join(str(error).split())
         if "ersion mismatch" in said:
