@@ -159,7 +159,8 @@ class RaySamplers:
         self._ray: Any = ray
         self._step_limit = plan.step_limit
         self.errors: list[str] = []
-        self.takes = ", ".join(f"{name}={amount:g}" for name, amount in {"CPU": 1.0, **resources}.items())
+        self._needs = {"CPU": 1.0, **resources}
+        self.takes = amounts(self._needs)
         options = {**_options(resources), "max_restarts": -1, "max_concurrency": 4}
         made: Any = ray.remote(SamplerActor).options(**options)
         self._members: list[_Member] = []
@@ -181,6 +182,11 @@ class RaySamplers:
     def waiting(self) -> int:
         """Number of samplers that have not begun yet."""
         return sum(not member.reports for member in self._running)
+
+    def lacking(self) -> dict[str, float]:
+        """Return what the cluster has free of each resource that it has too little of for one sampler."""
+        free: dict[str, float] = self._ray.available_resources()
+        return {name: free.get(name, 0.0) for name, amount in self._needs.items() if free.get(name, 0.0) < amount}
 
     @property
     def restarts(self) -> int:
@@ -261,6 +267,11 @@ def _noted(member: _Member, look: Look) -> list[Line]:
         lines.insert(0, Line(f"{member.name} {begun} on {look.host}, process {look.process}", again))
     member.reports[look.start] = look.report
     return lines
+
+
+def amounts(resources: Mapping[str, float]) -> str:
+    """Return resources in the form of ``--ray-resources``."""
+    return ", ".join(f"{name}={amount:g}" for name, amount in resources.items())
 
 
 def _options(resources: Mapping[str, float]) -> dict[str, Any]:
