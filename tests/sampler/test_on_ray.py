@@ -96,6 +96,12 @@ def test_a_sampler_whose_environment_fails_ends_with_its_error(plan: SamplerPlan
     assert ended.look.report.steps == 0
 
 
+def test_a_module_that_a_machine_lacks_comes_with_the_option_that_brings_it(plan: SamplerPlan):
+    ended = SamplerActor(replace(plan, environment="no_such_module:Cart")).run()
+    assert "No module named 'no_such_module'; " in str(ended.error)
+    assert "--runtime-env FILE, a YAML file with working_dir: ." in str(ended.error)
+
+
 def test_a_machine_with_another_version_takes_no_step(plan: SamplerPlan):
     ended = SamplerActor(replace(plan, version="0.0.1")).run()
     assert str(ended.error).startswith("expected surrogym 0.0.1 on every machine of the cluster, got ")

@@ -24,6 +24,10 @@ from surrogym_shared.wire import Query
 IDLE_SECONDS = 5.0  # of one claim: a sampler that is to stop ends after it
 LOOK_SECONDS = 1.0  # between two looks at the samplers
 STOP_SECONDS = 15.0  # in addition to the limit of a step, for samplers that were told to stop
+NO_MODULE = "No module named "
+WITHOUT_CODE = (
+    "; install it on each machine of the cluster, or bring it by --runtime-env FILE, a YAML file with working_dir: ."
+)
 NOTHING = SamplerReport(answered=0, failed=0, dropped=0, refused=0, impossible=0, steps=0, seconds=0.0, phase=None)
 
 
@@ -104,7 +108,7 @@ class SamplerActor:
                     self._sampler.stop()
                 self._sampler.run()
         except (SurrogymClientError, OriginalError) as error:
-            return Ended(self.look(), str(error))
+            return Ended(self.look(), f"{error}{WITHOUT_CODE if NO_MODULE in str(error) else ''}")
         return Ended(self.look())
 
     def look(self) -> Look:
