@@ -56,9 +56,10 @@ def test_session_hosts_have_the_niceness_that_docs_and_manifests_start_ray_with(
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_session_goes_on_at_another_host_when_its_own_died_or_stopped(
-    how: signal.Signals, case: EngineCase, storage: Storage, database: str
+    how: signal.Signals, case: EngineCase, storage: Storage, database: str, caplog: pytest.LogCaptureFixture
 ):
     """What was done since the last checkpoint is asked for again. A host that wakes has lost the session."""
+    caplog.set_level("INFO")
 
     async def moved() -> None:
         session = await case.opened()
@@ -71,6 +72,9 @@ def test_a_session_goes_on_at_another_host_when_its_own_died_or_stopped(
         holder = storage.live_sessions.holder(session)
         assert holder is not None
         assert not holder.owner.startswith(f"{number} ")
+        away = "has ended and is started again" if how is signal.SIGKILL else "does not answer now"
+        assert caplog.text.count(f"session host {number} {away}") == 1
+        assert f"session {session} goes on at session host {holder.owner.split()[0]}" in caplog.text
         after = [await case.engine.advance(request) for request in requests[7:]]
         if how is signal.SIGSTOP:
             os.kill(died.pid, signal.SIGCONT)
