@@ -373,28 +373,28 @@ def test_an_unsuitable_cluster_is_refused_in_one_sentence(
     assert "\n" not in str(refused.value)
 
 
+def test_hosts_that_wait_for_room_are_logged_with_the_reason(
+    settings: Settings,
+    storage: Storage,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+):
+    """A host that waits for a GPU, which the cluster lacks, stands for one that waits for a CPU."""
+    monkeypatch.setattr(pool, "QUIET_SECONDS", 0.5)
+    monkeypatch.setattr(pool, "STARTING_SECONDS", 1.0)
+    database = f"{settings.database}//"
+    try:
+        with pytest.raises(Unavailable, match="each takes one of the cluster's CPUs and one of its GPUs"):
+            pool.connect(settings.model_copy(update={"database": database, "device": "cuda"}), storage.live_sessions)
+    finally:
+        ray.kill(ray.get_actor(f"session host 0 of {pool.pool_name(database)}"))
+    assert "waiting for 1 session hosts to start, for 1 s at most" in caplog.text
+    assert f"of {HOSTS + 1} CPUs and 0 of 0 GPUs" in caplog.text
+
+
 def test_other_versions_than_the_hosts_run_are_refused(
     settings: Settings, engine: SessionEngine, storage: Storage, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(pool, "versions", lambda: {"Python": "2.7"})
     with pytest.raises(InvalidInput, match=r"expected Python 3\..*, which the session hosts run, got Python 2\.7"):
         pool.connect(settings, storage.live_sessions)
-
-
-def test_a_cluster_of_another_ray_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch):
-    """Ray compares its version and Python's itself, in several lines."""
-
-    def init(*_: object, **__: object) -> None:
-        raise RuntimeError("Version mismatch: The cluster was started with:\n    Ray: 2.50.0\n    Python: 3.11.2\n")
-
-    monkeypatch.setattr(ray, "init", init)
-    settings = Settings(database="postgresql+psycopg://here/there", engine="ray")
-    with pytest.raises(InvalidInput, match=r"expected a cluster of the same versions: .* Ray: 2\.50\.0") as refused:
-        pool.connect(settings, None)  # type: ignore[arg-type]
-    assert "\n" not in str(refused.value)
-
-
-def test_without_ray_one_sentence_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(pool, "find_spec", lambda _: None)
-    with pytest.raises(InvalidInput, match=r"pip install 'surrogym\[ray\]'"):
-        pool.check(Settings(database="postgresql+psycopg://here/there", engine="ray"))
