@@ -120,11 +120,12 @@ def _about(hosts: Sequence[Any], wanted: HostSettings) -> list[HostInfo]:
     import ray
 
     asked = [host.about.remote() for host in hosts]
-    _, waiting = ray.wait(asked, num_returns=len(asked), timeout=QUIET_SECONDS)
+    quiet = min(QUIET_SECONDS, STARTING_SECONDS)
+    _, waiting = ray.wait(asked, num_returns=len(asked), timeout=quiet)
     if waiting:
         _tell_waiting(len(waiting), wanted.device)
     try:
-        found: list[HostInfo] = ray.get(asked, timeout=STARTING_SECONDS - QUIET_SECONDS)
+        found: list[HostInfo] = ray.get(asked, timeout=STARTING_SECONDS - quiet)
     except ray.exceptions.GetTimeoutError as error:
         raise Unavailable(
             f"engine ray: expected {wanted.hosts} session hosts within {STARTING_SECONDS:g} s, got fewer: each takes "
