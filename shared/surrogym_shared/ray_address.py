@@ -35,4 +35,10 @@ def require_cluster(address: str) -> None:
     try:
         socket.create_connection((host, int(port)), KNOCKING_SECONDS).close()
     except (OSError, OverflowError) as error:
-        raise ValueError(f"expected a cluster at {address!r}, got none: {error}") from error
+        raise ValueError(no_cluster(address, str(getattr(error, "strerror", None) or error))) from error
+
+
+def no_cluster(address: str, reason: str = "") -> str:
+    """Return the sentence for an address without a cluster, with what to do about it."""
+    why = f" ({reason})" if reason else ""
+    return f"expected a cluster at {address!r}, got none{why}; begin one with RAY_worker_niceness=0 ray start --head"

@@ -26,7 +26,11 @@ def line(server_process):
         (("--runtime-env", "env.yaml"), "--runtime-env: expected --on-ray N with it, got none"),
         (("--on-ray", "2", "--ray-resources", "CPU=-1"), "--ray-resources: expected NAME=AMOUNT"),
         (("--on-ray", "2", "--ray-resources", "robot"), "--ray-resources: expected NAME=AMOUNT"),
-        (("--on-ray", "2", "--ray-address", "127.0.0.1:9"), "the cluster at '127.0.0.1:9' can't be used"),
+        (
+            ("--on-ray", "2", "--ray-address", "127.0.0.1:9"),
+            "error: --on-ray: expected a cluster at '127.0.0.1:9', got none (Connection refused); begin one with "
+            "RAY_worker_niceness=0 ray start --head",
+        ),
         (("--on-ray", "2", "--runtime-env", "env.yaml"), "--runtime-env: expected names with values in env.yaml"),
     ],
 )

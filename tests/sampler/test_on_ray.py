@@ -96,6 +96,12 @@ def test_a_sampler_whose_environment_fails_ends_with_its_error(plan: SamplerPlan
     assert ended.look.report.steps == 0
 
 
+def test_a_module_that_a_machine_lacks_comes_with_the_option_that_brings_it(plan: SamplerPlan):
+    ended = SamplerActor(replace(plan, environment="no_such_module:Cart")).run()
+    assert "No module named 'no_such_module'; " in str(ended.error)
+    assert "--runtime-env FILE, a YAML file with working_dir: ." in str(ended.error)
+
+
 def test_a_machine_with_another_version_takes_no_step(plan: SamplerPlan):
     ended = SamplerActor(replace(plan, version="0.0.1")).run()
     assert str(ended.error).startswith("expected surrogym 0.0.1 on every machine of the cluster, got ")
@@ -109,6 +115,24 @@ def test_samplers_that_find_no_room_are_mentioned_and_the_time_limit_ends_them(
     begun = time.monotonic()
     run_samplers(samplers, 1.5, said.append, said.append)
     assert time.monotonic() - begun < PATIENCE
-    assert said == ["1 of 1 samplers have not started yet; each takes CPU=1, robot=1"]
+    assert said == ["1 of 1 samplers have not started yet; each takes CPU=1, robot=1, and the cluster has robot=0 free"]
     assert samplers.report().steps == 0
     assert capfd.readouterr().out == ""  # it may be read as JSON
+
+
+def test_without_a_free_cpu_a_way_out_is_named_and_ctrl_c_speaks_of_no_running_step(
+    cluster: None, plan: SamplerPlan, monkeypatch: pytest.MonkeyPatch
+):
+    """Session hosts may have taken all CPUs of a small machine."""
+    monkeypatch.setattr("surrogym_client.cli.sampling_on_ray.ROOM_SECONDS", 0.5)
+    samplers, said = RaySamplers(plan, 1, {"CPU": 3.0}), []
+
+    def interrupt(text):
+        said.append(text)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_samplers(samplers, None, said.append, interrupt)
+    [words] = said
+    assert words.startswith("1 of 1 samplers have not started yet; each takes CPU=3, and the cluster has CPU=")
+    assert "--ray-resources CPU=0 takes none, and a smaller --ray-hosts of the server leaves more" in words

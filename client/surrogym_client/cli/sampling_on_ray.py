@@ -90,13 +90,24 @@ def run_samplers(
             if not told and seconds >= ROOM_SECONDS and samplers.waiting:
                 told = True
                 waiting = f"{samplers.waiting} of {samplers.running} samplers have not started yet"
-                say(f"{waiting}; each takes {samplers.takes}")
+                say(f"{waiting}; each takes {samplers.takes}{_reason(samplers.lacking())}")
     except KeyboardInterrupt:
-        say(f"waiting for the running steps of {samplers.running} samplers; Ctrl-C again ends them at once")
+        if begun_samplers := samplers.running - samplers.waiting:
+            say(f"waiting for the running steps of {begun_samplers} samplers; Ctrl-C again ends them at once")
         samplers.stop()
         raise
     finally:
         samplers.end()
+
+
+def _reason(lacking: dict[str, float]) -> str:
+    """Return why samplers wait for room, and what to do about it."""
+    from surrogym_client.sampler.on_ray import amounts
+
+    if not lacking:
+        return ""
+    way_out = "; --ray-resources CPU=0 takes none, and a smaller --ray-hosts of the server leaves more"
+    return f", and the cluster has {amounts(lacking)} free{way_out if 'CPU' in lacking else ''}"
 
 
 def result_of(samplers: RaySamplers) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from importlib.util import find_spec
 from typing import Any
 
-from surrogym_shared.ray_address import require_cluster, send_token
+from surrogym_shared.ray_address import no_cluster, require_cluster, send_token
 
 
 class NoCluster(Exception):
@@ -31,9 +31,15 @@ def connect(address: str, runtime_env: Mapping[str, Any] | None = None) -> None:
 
     try:
         require_cluster(address)
+    except ValueError as error:
+        raise NoCluster(f"--on-ray: {error}") from error
+    try:
         quiet: dict[str, Any] = {"log_to_driver": False, "configure_logging": False}
         ray.init(address, ignore_reinit_error=True, runtime_env=dict(runtime_env or {}), **quiet)
-    except (ConnectionError, ValueError, TypeError, RuntimeError) as error:
+    except ConnectionError as error:
+        said = "" if address == "auto" else " ".join(str(error).split())
+        raise NoCluster(f"--on-ray: {no_cluster(address, said)}") from error
+    except (ValueError, TypeError, RuntimeError) as error:
         raise NoCluster(
             f"--on-ray: the cluster at {address!r} can't be used: {' '.join(str(error).split())}"
         ) from error

@@ -24,6 +24,10 @@ from surrogym_shared.wire import Query
 IDLE_SECONDS = 5.0  # of one claim: a sampler that is to stop ends after it
 LOOK_SECONDS = 1.0  # between two looks at the samplers
 STOP_SECONDS = 15.0  # in addition to the limit of a step, for samplers that were told to stop
+NO_MODULE = "No module named "
+WITHOUT_CODE = (
+    "; install it on each machine of the cluster, or bring it by --runtime-env FILE, a YAML file with working_dir: ."
+)
 NOTHING = SamplerReport(answered=0, failed=0, dropped=0, refused=0, impossible=0, steps=0, seconds=0.0, phase=None)
 
 
@@ -104,7 +108,7 @@ class SamplerActor:
                     self._sampler.stop()
                 self._sampler.run()
         except (SurrogymClientError, OriginalError) as error:
-            return Ended(self.look(), str(error))
+            return Ended(self.look(), f"{error}{WITHOUT_CODE if NO_MODULE in str(error) else ''}")
         return Ended(self.look())
 
     def look(self) -> Look:
@@ -159,7 +163,8 @@ class RaySamplers:
         self._ray: Any = ray
         self._step_limit = plan.step_limit
         self.errors: list[str] = []
-        self.takes = ", ".join(f"{name}={amount:g}" for name, amount in {"CPU": 1.0, **resources}.items())
+        self._needs = {"CPU": 1.0, **resources}
+        self.takes = amounts(self._needs)
         options = {**_options(resources), "max_restarts": -1, "max_concurrency": 4}
         made: Any = ray.remote(SamplerActor).options(**options)
         self._members: list[_Member] = []
@@ -181,6 +186,11 @@ class RaySamplers:
     def waiting(self) -> int:
         """Number of samplers that have not begun yet."""
         return sum(not member.reports for member in self._running)
+
+    def lacking(self) -> dict[str, float]:
+        """Return what the cluster has free of each resource that it has too little of for one sampler."""
+        free: dict[str, float] = self._ray.available_resources()
+        return {name: free.get(name, 0.0) for name, amount in self._needs.items() if free.get(name, 0.0) < amount}
 
     @property
     def restarts(self) -> int:
@@ -261,6 +271,11 @@ def _noted(member: _Member, look: Look) -> list[Line]:
         lines.insert(0, Line(f"{member.name} {begun} on {look.host}, process {look.process}", again))
     member.reports[look.start] = look.report
     return lines
+
+
+def amounts(resources: Mapping[str, float]) -> str:
+    """Return resources in the form of ``--ray-resources``."""
+    return ", ".join(f"{name}={amount:g}" for name, amount in resources.items())
 
 
 def _options(resources: Mapping[str, float]) -> dict[str, Any]:

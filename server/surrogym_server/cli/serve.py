@@ -5,9 +5,10 @@ from __future__ import annotations
 import gc
 import os
 import sys
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -126,6 +127,8 @@ def serve(
         _refuse_workers()
         given = {name: value for name, value in context.params.items() if name not in OF_THE_COMMAND}
         settings = read_settings(os.environ, **given)
+        if settings.engine != "ray":
+            _refuse_options_of_ray(given)
         with progress("serve", quiet=quiet or not sys.stderr.isatty()) as update:
             update(None, "importing torch")
             from surrogym_server.cli import runner  # neither --help nor a refusal should wait for it
@@ -141,6 +144,13 @@ def serve(
         raise typer.Exit(1) from None
     finally:
         gc.enable()
+
+
+def _refuse_options_of_ray(given: Mapping[str, Any]) -> None:
+    """Raise ``InvalidInput`` for an option of the command that the engine would ignore. Variables may stay set."""
+    for name in ("ray_address", "ray_hosts"):
+        if given[name] is not None:
+            raise InvalidInput(f"--{name.replace('_', '-')}: expected --engine ray with it, got the engine local")
 
 
 def _refuse_workers() -> None:

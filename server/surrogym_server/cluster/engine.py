@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import logging
 from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Sequence
 from contextlib import suppress
@@ -21,7 +22,10 @@ from surrogym_server.engine.tallies import Counts, Durations, SessionActivity
 from surrogym_server.errors import IdempotencyConflict, Overloaded, Unavailable, UnknownSession
 from surrogym_server.storage.live_sessions import LiveSessions
 
+logger = logging.getLogger(__name__)
+
 ANSWERING_SECONDS, TAKING_SECONDS = 5.0, 60.0  # longest waits for a host
+ENDED, SILENT = "has ended and is started again", "does not answer now"
 MOVES = 3  # hosts that one request tries while its session changes hosts
 REMEMBERED = 10_000  # sessions whose present host is remembered, because it is not the one in their id
 
@@ -57,6 +61,7 @@ class RayEngine(SessionEngine):
         self._patience = settings.pace.lease_seconds / 2
         self._turns = itertools.count()
         self._places: OrderedDict[str, int] = OrderedDict()
+        self._away: set[int] = set()  # hosts whose end or silence was logged
 
     async def open(self, request: Open) -> SessionInfo:
         key, turn = request.opening.key, next(self._turns)
@@ -181,6 +186,9 @@ class RayEngine(SessionEngine):
             with suppress(Overloaded, TimeoutError):
                 async with asyncio.timeout(TAKING_SECONDS):
                     await self._reply(host, "take", session)
+                logger.info(
+                    "session %s goes on at session host %d: the lease of its last host has ended", session, host
+                )
                 return host
         raise Unavailable(f"no session host can take session {session!r} now: try again later")
 
@@ -199,9 +207,22 @@ class RayEngine(SessionEngine):
         try:
             async with asyncio.timeout(ANSWERING_SECONDS):
                 await cast(Awaitable[None], self._hosts[host].ping.remote())
-        except (RayActorError, TimeoutError):
+        except RayActorError:
+            self._note_away(host, ENDED)
             return False
+        except TimeoutError:
+            self._note_away(host, SILENT)
+            return False
+        if host in self._away:
+            self._away.discard(host)
+            logger.info("session host %d answers again", host)
         return True
+
+    def _note_away(self, host: int, what: str) -> None:
+        """Log that a host is away, once until it answers again."""
+        if host not in self._away:
+            self._away.add(host)
+            logger.warning("session host %d %s: its sessions go on at another one when its lease has ended", host, what)
 
     async def _answer(self, session: str, host: int, operation: str, *arguments: Any) -> Any:
         """Wait for a host's reply as long as the session belongs to that host.
@@ -216,6 +237,7 @@ class RayEngine(SessionEngine):
                 async with asyncio.timeout(self._patience):
                     return _said(await cast(Awaitable[Any], asked))
             except RayActorError as error:
+                self._note_away(host, ENDED)
                 raise _Gone from error
             except TimeoutError:
                 holder = await asyncio.to_thread(self._store.holder, session)
@@ -243,10 +265,11 @@ class RayEngine(SessionEngine):
                 async with asyncio.timeout(self._patience):
                     return _said(await cast(Awaitable[Any], asked))
             except RayActorError as error:
-                raise _Gone("has ended and is started again") from error
+                self._note_away(host, ENDED)
+                raise _Gone(ENDED) from error
             except TimeoutError:
                 if not await self._lives(host):
-                    raise _Gone("does not answer now") from None
+                    raise _Gone(SILENT) from None
 
     async def _ask_all(self, operation: str, *arguments: Any) -> list[Any]:
         """Return the replies of all hosts that answer."""

@@ -16,12 +16,13 @@ from surrogym_server.engine.port import Compute, SessionEngine
 from surrogym_server.errors import InvalidInput, Unavailable
 from surrogym_server.settings import Settings
 from surrogym_server.storage.live_sessions import LiveSessions
-from surrogym_shared.ray_address import require_cluster, send_token
+from surrogym_shared.ray_address import no_cluster, require_cluster, send_token
 
 logger = logging.getLogger(__name__)
 
 NAMESPACE = "surrogym"
 STARTING_SECONDS = 180.0
+QUIET_SECONDS = 10.0  # after which hosts that have not started are mentioned
 
 
 def check(settings: Settings) -> None:
@@ -58,9 +59,7 @@ def connect(settings: Settings, store: LiveSessions) -> SessionEngine:
     try:
         ray.init(settings.ray_address, namespace=NAMESPACE, ignore_reinit_error=True, **quiet)
     except ConnectionError as error:
-        raise InvalidInput(
-            f"engine ray: expected a cluster at {settings.ray_address!r}, got none: ray start --head begins one"
-        ) from error
+        raise InvalidInput(f"engine ray: {no_cluster(settings.ray_address)}") from error
     except RuntimeError as error:  # Ray compares its own version and Python's
         said = " ".join(str(error).split())
         if "ersion mismatch" in said:
@@ -120,17 +119,43 @@ def _of_hosts(wanted: HostSettings, store: LiveSessions) -> SessionEngine:
 def _about(hosts: Sequence[Any], wanted: HostSettings) -> list[HostInfo]:
     import ray
 
+    asked = [host.about.remote() for host in hosts]
+    quiet = min(QUIET_SECONDS, STARTING_SECONDS)
+    _, waiting = ray.wait(asked, num_returns=len(asked), timeout=quiet)
+    if waiting:
+        _tell_waiting(len(waiting), wanted.device)
     try:
-        found: list[HostInfo] = ray.get([host.about.remote() for host in hosts], timeout=STARTING_SECONDS)
+        found: list[HostInfo] = ray.get(asked, timeout=STARTING_SECONDS - quiet)
     except ray.exceptions.GetTimeoutError as error:
         raise Unavailable(
             f"engine ray: expected {wanted.hosts} session hosts within {STARTING_SECONDS:g} s, got fewer: each takes "
-            f"one of the cluster's CPUs{' and one of its GPUs' if _gpus_of_host(wanted.device) else ''}"
+            f"{_taken_by_host(wanted.device)}"
         ) from error
     except ray.exceptions.RayError as error:
         last = str(error).strip().splitlines()[-1]
         raise Unavailable(f"engine ray: a session host can't start: {last.strip()}") from error
     return found
+
+
+def _taken_by_host(device: str) -> str:
+    return f"one of the cluster's CPUs{' and one of its GPUs' if _gpus_of_host(device) else ''}"
+
+
+def _tell_waiting(count: int, device: str) -> None:
+    import ray
+
+    untyped: Any = ray
+    free: dict[str, float] = untyped.available_resources()
+    total: dict[str, float] = untyped.cluster_resources()
+    names = ("CPU", "GPU") if _gpus_of_host(device) else ("CPU",)
+    logger.warning(
+        "waiting for %d session hosts to start, for %g s at most: each takes %s, and free are %s; another --database, "
+        "or another way to write its address, has session hosts of its own",
+        count,
+        STARTING_SECONDS,
+        _taken_by_host(device),
+        " and ".join(f"{free.get(name, 0.0):g} of {total.get(name, 0.0):g} {name}s" for name in names),
+    )
 
 
 def pool_name(database: str) -> str:

@@ -56,9 +56,10 @@ def test_session_hosts_have_the_niceness_that_docs_and_manifests_start_ray_with(
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_session_goes_on_at_another_host_when_its_own_died_or_stopped(
-    how: signal.Signals, case: EngineCase, storage: Storage, database: str
+    how: signal.Signals, case: EngineCase, storage: Storage, database: str, caplog: pytest.LogCaptureFixture
 ):
     """What was done since the last checkpoint is asked for again. A host that wakes has lost the session."""
+    caplog.set_level("INFO")
 
     async def moved() -> None:
         session = await case.opened()
@@ -71,6 +72,9 @@ def test_a_session_goes_on_at_another_host_when_its_own_died_or_stopped(
         holder = storage.live_sessions.holder(session)
         assert holder is not None
         assert not holder.owner.startswith(f"{number} ")
+        away = "has ended and is started again" if how is signal.SIGKILL else "does not answer now"
+        assert caplog.text.count(f"session host {number} {away}") == 1
+        assert f"session {session} goes on at session host {holder.owner.split()[0]}" in caplog.text
         after = [await case.engine.advance(request) for request in requests[7:]]
         if how is signal.SIGSTOP:
             os.kill(died.pid, signal.SIGCONT)
@@ -369,28 +373,28 @@ def test_an_unsuitable_cluster_is_refused_in_one_sentence(
     assert "\n" not in str(refused.value)
 
 
+def test_hosts_that_wait_for_room_are_logged_with_the_reason(
+    settings: Settings,
+    storage: Storage,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+):
+    """A host that waits for a GPU, which the cluster lacks, stands for one that waits for a CPU."""
+    monkeypatch.setattr(pool, "QUIET_SECONDS", 0.5)
+    monkeypatch.setattr(pool, "STARTING_SECONDS", 1.0)
+    database = f"{settings.database}//"
+    try:
+        with pytest.raises(Unavailable, match="each takes one of the cluster's CPUs and one of its GPUs"):
+            pool.connect(settings.model_copy(update={"database": database, "device": "cuda"}), storage.live_sessions)
+    finally:
+        ray.kill(ray.get_actor(f"session host 0 of {pool.pool_name(database)}"))
+    assert "waiting for 1 session hosts to start, for 1 s at most" in caplog.text
+    assert f"of {HOSTS + 1} CPUs and 0 of 0 GPUs" in caplog.text
+
+
 def test_other_versions_than_the_hosts_run_are_refused(
     settings: Settings, engine: SessionEngine, storage: Storage, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(pool, "versions", lambda: {"Python": "2.7"})
     with pytest.raises(InvalidInput, match=r"expected Python 3\..*, which the session hosts run, got Python 2\.7"):
         pool.connect(settings, storage.live_sessions)
-
-
-def test_a_cluster_of_another_ray_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch):
-    """Ray compares its version and Python's itself, in several lines."""
-
-    def init(*_: object, **__: object) -> None:
-        raise RuntimeError("Version mismatch: The cluster was started with:\n    Ray: 2.50.0\n    Python: 3.11.2\n")
-
-    monkeypatch.setattr(ray, "init", init)
-    settings = Settings(database="postgresql+psycopg://here/there", engine="ray")
-    with pytest.raises(InvalidInput, match=r"expected a cluster of the same versions: .* Ray: 2\.50\.0") as refused:
-        pool.connect(settings, None)  # type: ignore[arg-type]
-    assert "\n" not in str(refused.value)
-
-
-def test_without_ray_one_sentence_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(pool, "find_spec", lambda _: None)
-    with pytest.raises(InvalidInput, match=r"pip install 'surrogym\[ray\]'"):
-        pool.check(Settings(database="postgresql+psycopg://here/there", engine="ray"))

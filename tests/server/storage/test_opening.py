@@ -265,8 +265,15 @@ def test_a_folder_that_can_not_be_made_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.postgresql
 def test_a_postgresql_that_is_not_there_is_unavailable(tmp_path: Path) -> None:
-    with pytest.raises(Unavailable):
+    with pytest.raises(Unavailable, match="check that PostgreSQL runs, and the address in --database"):
         open_storage(f"postgresql://postgres@/x?host={tmp_path}")
+
+
+@pytest.mark.postgresql
+def test_a_postgresql_database_that_does_not_exist_comes_with_what_makes_it(postgresql: Postgresql) -> None:
+    missing = sa.make_url(postgresql.new_database()).set(database="nowhere").render_as_string()
+    with pytest.raises(Unavailable, match='"nowhere" does not exist; createdb nowhere makes it, or check --database'):
+        open_storage(missing)
 
 
 @pytest.mark.parametrize(("options", "synchronous"), [((), 2), (("full",), 2), (("normal",), 1)])

@@ -258,6 +258,11 @@ UNUSABLE = (sa.exc.OperationalError, sa.exc.InternalError, sa.exc.InterfaceError
 UNSTORABLE = (sa.exc.DataError, OverflowError, UnicodeEncodeError)
 
 
+def never_connected(error: BaseException | None) -> bool:
+    """Whether an error of PostgreSQL is that of a connection, and not of a statement, which has a code."""
+    return isinstance(error, sa.exc.OperationalError) and getattr(error.orig, "sqlstate", None) is None
+
+
 def _reason(error: Exception) -> str:
     """The driver's message, without the position in a statement that no person typed."""
     said = str(getattr(error, "orig", None) or error)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from surrogym_server.errors import Damaged
+from surrogym_server.errors import Damaged, Unavailable
 from surrogym_server.storage.announcements import Alone
 from surrogym_server.storage.policies import Blobs
 from surrogym_server.storage.port import Storage
@@ -14,7 +14,7 @@ from surrogym_server.storage.records import Synchronous
 from surrogym_server.storage.sql.announcements import NotifiedAnnouncements
 from surrogym_server.storage.sql.blobs import FolderBlobs, RowBlobs
 from surrogym_server.storage.sql.checks import check_pages, check_tables
-from surrogym_server.storage.sql.database import Database, connect
+from surrogym_server.storage.sql.database import Database, connect, never_connected
 from surrogym_server.storage.sql.designs import SqlDesigns
 from surrogym_server.storage.sql.jobs import SqlJobs
 from surrogym_server.storage.sql.ledger import SqlLedger
@@ -81,11 +81,21 @@ def open_storage(url: str, synchronous: Synchronous = "full", files: Path | None
     database = connect(url, synchronous)
     try:
         _bring_up(database)
-    except BaseException:
+    except BaseException as error:
         database.close()
+        if isinstance(error, Unavailable) and never_connected(error.__cause__) and database.notifies:
+            raise Unavailable(f"{error}; {_way_out(url, str(error))}") from error
         raise
     folder = files or _beside(url)
     return SqlStorage(database, RowBlobs(database) if folder is None else FolderBlobs(folder))
+
+
+def _way_out(url: str, said: str) -> str:
+    """Return what to do about a PostgreSQL database that can't be opened."""
+    name = sa.make_url(url).database
+    if f'database "{name}" does not exist' in said:
+        return f"createdb {name} makes it, or check --database"
+    return "check that PostgreSQL runs, and the address in --database"
 
 
 def _beside(url: str) -> Path | None:
