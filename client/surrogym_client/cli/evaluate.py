@@ -150,9 +150,7 @@ def command(
     summary |= {"promise_kept": _kept(promise, result), "version": version, "disagreements": found and found.as_json()}
     if filmed is not None:
         summary["video"] = str(filmed)
-    more = [] if found is None else found.in_words(card.spec)
-    if card.promise is not None and settings.declared and promise is None:
-        more = [f"{settings.episodes} episodes are too few to judge the promise: take {FEWEST_TO_JUDGE} or more", *more]
+    more = _too_few(card, settings) + ([] if found is None else found.in_words(card.spec))
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
 
 
@@ -348,6 +346,13 @@ def _settings(settings: EvaluationSettings) -> dict[str, Any]:
 def _kept(promise: Promise | None, result: Evaluation) -> bool | None:
     """Whether the mean return is at least the 5 % quantile of the promise; None without a promise."""
     return None if promise is None else bool(result.returns.mean() >= promise.low)
+
+
+def _too_few(card: PolicyCard, settings: EvaluationSettings) -> list[str]:
+    """Return a sentence if there is a promise, and the episodes are too few to judge it."""
+    if card.promise is None or not settings.declared or settings.episodes >= FEWEST_TO_JUDGE:
+        return []
+    return [f"{settings.episodes} episodes are too few to judge the promise: take {FEWEST_TO_JUDGE} or more"]
 
 
 def _words(reports: Sequence[tuple[Controller, Evaluation]], promise: Promise | None) -> str:
