@@ -6,8 +6,9 @@ import asyncio
 import itertools
 import logging
 from collections import Counter, OrderedDict
-from collections.abc import Awaitable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any, cast
 from zlib import crc32
 
@@ -231,32 +232,30 @@ class RayEngine(SessionEngine):
             _Gone: the host died, does not answer, or has lost the session.
             SurrogymError: the host refused the request.
         """
-        asked = self._hosts[host].ask.remote(operation, *arguments)
-        while True:
-            try:
-                async with asyncio.timeout(self._patience):
-                    return _said(await cast(Awaitable[Any], asked))
-            except RayActorError as error:
-                self._note_away(host, ENDED)
-                raise _Gone from error
-            except TimeoutError:
-                holder = await asyncio.to_thread(self._store.holder, session)
-                if holder is None or _number(holder.owner) != host:
-                    raise _Gone from None
-                if holder.seconds_left <= 0 and not await self._lives(host):  # a host that is only late still answers
-                    raise _Gone from None
+        return await self._heard(host, partial(self._has_left, session, host), operation, *arguments)
+
+    async def _has_left(self, session: str, host: int) -> bool:
+        """Whether a session has left a host. A host that is only late still answers."""
+        holder = await asyncio.to_thread(self._store.holder, session)
+        if holder is None or _number(holder.owner) != host:
+            return True
+        return holder.seconds_left <= 0 and await self._is_silent(host)
+
+    async def _is_silent(self, host: int) -> bool:
+        return not await self._lives(host)
 
     async def _reply(self, host: int, operation: str, *arguments: Any) -> Any:
+        """Wait for a host's reply as long as the host answers at all."""
         try:
-            return await self._heard(host, operation, *arguments)
+            return await self._heard(host, partial(self._is_silent, host), operation, *arguments)
         except _Gone as gone:
             raise Unavailable(f"session host {host} {gone}: try again later") from gone
 
-    async def _heard(self, host: int, operation: str, *arguments: Any) -> Any:
-        """Wait for a host's reply as long as the host answers at all.
+    async def _heard(self, host: int, is_gone: Callable[[], Awaitable[bool]], operation: str, *arguments: Any) -> Any:
+        """Wait for a host's reply, and ask ``is_gone`` each time that it does not come in half a lease.
 
         Raises:
-            _Gone: the host died, or does not answer; says which.
+            _Gone: the host died, or ``is_gone``; says which.
             SurrogymError: the host refused the request.
         """
         asked = self._hosts[host].ask.remote(operation, *arguments)
@@ -268,7 +267,7 @@ class RayEngine(SessionEngine):
                 self._note_away(host, ENDED)
                 raise _Gone(ENDED) from error
             except TimeoutError:
-                if not await self._lives(host):
+                if await is_gone():
                     raise _Gone(SILENT) from None
 
     async def _ask_all(self, operation: str, *arguments: Any) -> list[Any]:
@@ -280,7 +279,7 @@ class RayEngine(SessionEngine):
         if not await self._lives(host):
             return _Gone()
         try:
-            return await self._heard(host, operation, *arguments)
+            return await self._heard(host, partial(self._is_silent, host), operation, *arguments)
         except _Gone as gone:
             return gone
 
