@@ -138,9 +138,9 @@ def disappointed(audit: Audit, floor: float | None, imagined: float | None = Non
     return lost > SLACK * max(earned(audit.before, floor), earned(audit.after, floor))
 
 
-def unsure(audit: Audit, floor: float | None) -> bool:
-    """Whether the promise after an audit is wide: its lower half is more than a fifth of the gain over ``floor``."""
-    return audit.after.median - audit.after.low > UNSURE * earned(audit.after, floor)
+def wider(promise: Promise, share: float, floor: float | None) -> bool:
+    """Whether the lower half of a promise is wider than ``share`` of the gain over an untrained policy of ``floor``."""
+    return not promise.median - promise.low <= share * earned(promise, floor)
 
 
 def earned(promise: Promise, floor: float | None) -> float:
@@ -180,28 +180,35 @@ def gaps(spec: EnvironmentSpec, q: Array, u: Array, samples: tuple[Array, Array]
     """Choose at most ``count`` of the states q (m, C) and actions u (m, F) in the widest gaps of single inputs.
 
     A gap is a coordinate's or an action's distance from the nearest of the samples, states (n, C) and actions (n, F),
-    as a share of the range of q and u. A wall or a threshold behind such a gap is in no sample, wherever they are else.
+    as a share of the range of q and u. No sample can show a wall or a threshold behind such a gap.
     """
     settable = np.flatnonzero(_settable(spec, q))
-    at, known = np.concatenate([q, u], 1)[settable], np.concatenate(samples, 1)
-    circles = np.array([c.kind == "angle" for c in spec.coordinates] + [False] * u.shape[1])
-    ranges = np.where(circles, 2 * np.pi, np.ptp(at, axis=0))
+    q, u = q[settable], u[settable]
+    circles = [coordinate.kind == "angle" for coordinate in spec.coordinates]
+    ranges = np.concatenate([np.where(circles, 2 * np.pi, np.ptp(q, axis=0)), np.ptp(u, axis=0)])
     ranges[ranges == 0] = np.inf
+
+    def away(states: Array, actions: Array) -> Array:
+        """Distance (m, C + F) of each input from the nearest of these points."""
+        off = differences(spec, q[:, None], states[None]), u[:, None] - actions[None]
+        nearest: Array = np.abs(np.concatenate(off, 2)).min(1)
+        return nearest
+
     chosen: list[int] = []
+    nearest = away(*samples)
     while len(chosen) < min(count, len(settable)):
-        off = np.abs(at[:, None] - np.concatenate([known, at[chosen]])[None])
-        off = np.where(circles, np.minimum(off, np.abs(2 * np.pi - off)), off)
-        chosen.append(int(np.argmax((off.min(1) / ranges).max(1))))
+        chosen.append(int(np.argmax((nearest / ranges).max(1))))
+        nearest = np.minimum(nearest, away(q[chosen[-1:]], u[chosen[-1:]]))
     found: NDArray[np.intp] = settable[chosen]
     return found
 
 
 def differences(spec: EnvironmentSpec, real: Array, predicted: Array) -> Array:
-    """Real minus predicted coordinates, (n, C). Angles differ by the shorter way."""
+    """Real minus predicted coordinates, (..., C). Angles differ by the shorter way."""
     difference = real - predicted
     for index, coordinate in enumerate(spec.coordinates):
         if coordinate.kind == "angle":
-            difference[:, index] = (difference[:, index] + np.pi) % (2 * np.pi) - np.pi
+            difference[..., index] = (difference[..., index] + np.pi) % (2 * np.pi) - np.pi
     return difference
 
 

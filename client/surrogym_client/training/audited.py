@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from surrogym_client.evaluation.audit import AUDIT_STEPS, disappointed, unsure
+from surrogym_client.evaluation.audit import AUDIT_STEPS, UNSURE, disappointed, wider
 from surrogym_client.policies.evidence import Audit
 from surrogym_client.policies.files import load_policy
 from surrogym_client.surrogates.waiting import wait_for_design
@@ -116,7 +116,7 @@ class AuditedTraining:
     def _to_be_trained_on(self, audit: Audit | None, result: TrainResult, taken: int, number: int) -> bool:
         if audit is None:
             return False
-        needed = not audit.passed or (self._unspent > 0 and unsure(audit, result.untrained))
+        needed = not audit.passed or (self._unspent > 0 and wider(audit.after, UNSURE, result.untrained))
         if (needed or self._unspent) and self._asked_more(result, taken, number, needed=needed):
             return True
         longer = prolongs(self.settings, self.port.spec())

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import Lanes, session_request
-from surrogym_client.evaluation.audit import AUDIT_STEPS, earned, gaps, judge, places
+from surrogym_client.evaluation.audit import AUDIT_STEPS, earned, gaps, judge, places, wider
 from surrogym_client.evaluation.comparing import compared
 from surrogym_client.evaluation.imagined import WHOLE
 from surrogym_client.evaluation.outside import Outside, outside_of
@@ -29,7 +29,7 @@ from surrogym_shared.wire import SurrogateView
 
 WAY_LANES = 16  # virtual episodes whose states an audit chooses from
 MOST_OF_A_WAY = 200  # steps of an episode that are compared with a log
-ELSEWHERE = 4  # of a ready design: one in so many steps of an audit is taken in a gap of the samples
+ELSEWHERE = 4  # an audit of a ready design takes one of every four steps in a gap of the samples
 ANYWHERE = 1_024  # points of the sampling range that such steps are chosen from
 WIDE = 0.5  # share of the gain over an untrained policy: a promise with a wider lower half is not trusted
 NO_SAMPLER = "no sampler is connected"
@@ -171,7 +171,7 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, cla
 
 
 def _in_gaps(subject: Subject, count: int) -> tuple[Array, Array]:
-    """Return states (count, C) of the sampling range and random actions (count, F), far from all samples."""
+    """Return states (count, C) and actions (count, F) of the ranges, in the widest gaps of the samples."""
     spec = subject.port.spec()
     random = replace(subject, predict=baseline(spec, "random", subject.seed))
     q, u = way_of(random, ANYWHERE, 1, start_box=1.0)
@@ -250,7 +250,7 @@ def _without(view: SurrogateView, promise: Promise, floor: float | None, why: st
 
 def _too_wide(promise: Promise, floor: float | None) -> str | None:
     """Return why a promise is too wide to be trusted; None if it is not."""
-    if floor is None or promise.median - promise.low <= WIDE * abs(promise.median - floor):
+    if floor is None or not wider(promise, WIDE, floor):
         return None
     return (
         f"the promise, from {promise.low:.4g} to {promise.high:.4g}, is too wide compared with the gain over an "
