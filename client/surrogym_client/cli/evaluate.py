@@ -144,13 +144,13 @@ def command(
         _keep(policy, reports, settings, quiet=output.quiet)
     filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if video else None
     version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
-    promise = card.promise if settings.declared and settings.episodes >= FEWEST_TO_JUDGE else None
-    found = differences.between(ledger, service.server, token, result, settings, promise, quiet=output.quiet)
+    promise = card.promise if settings.declared else None
+    judged = promise if settings.episodes >= FEWEST_TO_JUDGE else None
+    found = differences.between(ledger, service.server, token, result, settings, judged, quiet=output.quiet)
     summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference)}
-    summary |= {"promise_kept": _kept(promise, result), "version": version, "disagreements": found and found.as_json()}
-    if filmed is not None:
-        summary["video"] = str(filmed)
-    more = _too_few(card, settings) + ([] if found is None else found.in_words(card.spec))
+    summary |= {"promise_kept": _kept(judged, result), "version": version, "disagreements": found and found.as_json()}
+    summary |= {} if filmed is None else {"video": str(filmed)}
+    more = [] if found is None else found.in_words(card.spec)
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
 
 
@@ -348,13 +348,6 @@ def _kept(promise: Promise | None, result: Evaluation) -> bool | None:
     return None if promise is None else bool(result.returns.mean() >= promise.low)
 
 
-def _too_few(card: PolicyCard, settings: EvaluationSettings) -> list[str]:
-    """Return a sentence if there is a promise, and the episodes are too few to judge it."""
-    if card.promise is None or not settings.declared or settings.episodes >= FEWEST_TO_JUDGE:
-        return []
-    return [f"{settings.episodes} episodes are too few to judge the promise: take {FEWEST_TO_JUDGE} or more"]
-
-
 def _words(reports: Sequence[tuple[Controller, Evaluation]], promise: Promise | None) -> str:
     from surrogym_client.cli.columns import columns
 
@@ -366,5 +359,8 @@ def _words(reports: Sequence[tuple[Controller, Evaluation]], promise: Promise | 
     table = columns([[*(["actions of"] if several else []), *names], *rows])
     if promise is None:
         return table
+    episodes = len(reports[0][1].returns)
+    if episodes < FEWEST_TO_JUDGE:
+        return f"{table}\n{episodes} episodes are too few to judge the promise: take {FEWEST_TO_JUDGE} or more"
     kept = "kept: the mean return is at least" if _kept(promise, reports[0][1]) else "broken: the mean return is below"
     return f"{table}\nthe promise of {promise.low:.4g} to {promise.high:.4g} was {kept} its lower end"
