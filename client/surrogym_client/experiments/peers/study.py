@@ -48,7 +48,7 @@ class PeerCell:
 
     @property
     def specification(self) -> str:
-        """Hash of what is asked, the method's settings included, without the seed."""
+        """Hash of the task, the method, its settings and the limits. The seed is not in it."""
         settings = {name: repr(value) for name, value in vars(METHODS[self.method].make()).items()}
         asked = {
             "task": asdict(task_of(self.task)),
@@ -64,7 +64,8 @@ class PeerCell:
 
     def points(self, folder: Path) -> list[Point]:
         """Its points so far, of a run with the same settings."""
-        return [p for p in read_records(self.file(folder), Point) if p.specification == self.specification]
+        specification = self.specification
+        return [p for p in read_records(self.file(folder), Point) if p.specification == specification]
 
     def done(self, folder: Path) -> bool:
         """Whether it has been run to its end, without an error."""
