@@ -165,14 +165,6 @@ class OutputOutlook(ABC):
         """Assume that the candidate ``index`` has been sampled as well."""
 
 
-@dataclass(frozen=True)
-class Reference:
-    """r points that the design wants to know, with the model's predictions there."""
-
-    steps: PredictedSteps  # r
-    weights: Tensor  # (r,) add up to 1
-
-
 class PathOutlook(ABC):
     """Forecast of one output along b predicted paths of T steps."""
 
@@ -190,12 +182,6 @@ class PathOutlook(ABC):
         The steps have weights (b, T), and the tolerance is in the output's unit. A step is evaluated given those before
         it, so a repeated state adds little.
         """
-
-    def insight(self, weight: Tensor, tolerance: float, reference: Reference) -> Tensor | None:  # noqa: ARG002
-        """Return the information of the steps up to each one about the output at a reference point, on average, in
-        nats, (b, T); None if the model can't tell. Weights and tolerance are as for ``information``.
-        """
-        return None
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,6 @@ class PathView:
     weight: Tensor  # (b, T) at least 0; depends on where the step lies and how well it can be predicted
     _deviation: Callable[[], Tensor]
     _information: Callable[[], Tensor]
-    _insight: Callable[[], Tensor | None] = lambda: None
 
     @cached_property
     def deviation(self) -> Tensor:
@@ -72,12 +71,6 @@ class PathView:
     def information(self) -> Tensor:
         """Information about the output in the beginning of each path, up to each step, in nats, (b, T)."""
         return self._information()
-
-    @cached_property
-    def insight(self) -> Tensor | None:
-        """Information about the output at a reference point, on average, in the beginning of each path, up to each
-        step, in nats, (b, T). None without a reference, or if the model can't tell."""
-        return self._insight()
 
 
 class Acquisition(ABC):
@@ -119,9 +112,6 @@ class IntegratedVariance(Acquisition):
 
     def value(self, candidates: CandidateView) -> Tensor:
         return candidates.variance_reduction
-
-    def path_value(self, paths: PathView) -> Tensor:
-        return paths.information if paths.insight is None else paths.insight
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
-from surrogym_server.models.abilities import PredictedSteps, Reference
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.latin_hypercube import random_points
@@ -18,7 +17,6 @@ from surrogym_server.sampling.occupancy import log_occupancy
 
 MAX_CANDIDATES = 4_096  # of each kind; covariances with the reference are held for all of them
 REFERENCE = 256  # points of each kind
-PLANNED = 128  # reference points of a plan, which is compared with hundreds of others
 OCCUPIED = 0.75  # share of the visited states in the reference; the rest is the whole sampling range
 
 
@@ -52,14 +50,6 @@ def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, r
     reads = acquisition_of(model.definition.design.acquisition).reads_probability
     log_p = input_probability(model, points, states) if reads else points.q.new_zeros(len(points))
     return Candidates(points, log_p, reference, weights / weights.sum())
-
-
-def reference_of(model: DynamicsModel, candidates: Candidates) -> Reference:
-    """Up to ``PLANNED`` of the reference points, with predictions, for plans of several steps."""
-    every = -(-len(candidates.reference) // PLANNED)
-    points, weights = candidates.reference[::every], candidates.weights[::every]
-    steps = PredictedSteps(points.q, points.u, model.transition(points.q, points.u).q_next)
-    return Reference(steps, weights / weights.sum())
 
 
 def with_more(candidates: Candidates, points: Points) -> tuple[Candidates, Tensor]:

@@ -19,7 +19,7 @@ from surrogym_server.models.guard import learn, plugin_calls, require_deviations
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.batch import choose
-from surrogym_server.sampling.candidates import Candidates, candidates_of, reference_of, with_more
+from surrogym_server.sampling.candidates import Candidates, candidates_of, with_more
 from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
 from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
@@ -144,9 +144,7 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
             chosen = _choose(learned.model, samples, candidates, confidences, tolerances, verdict, request, reserved)
     else:
         rng = _rng(definition, f"rollouts {state.round}")
-        rollouts = _plan(
-            learned.model, samples, candidates, confidences, tolerances, verdict, request, rng, reserved is not None
-        )
+        rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, reserved is not None)
     if verdict == "continue" and not len(chosen) and not rollouts:
         verdict = "over_budget"  # the rest of the budget is pending, or no distinct query is left
     ended = now if verdict != "continue" and not len(chosen) and not rollouts else ()
@@ -287,7 +285,6 @@ def _choose(
 def _plan(
     model: DynamicsModel,
     samples: Samples,
-    candidates: Candidates,
     confidences: tuple[OutputConfidence, ...],
     tolerances: tuple[float, ...],
     verdict: Verdict,
@@ -308,8 +305,7 @@ def _plan(
         steps = min(room, max(len(below), len(samples) // 8) if model.definition.snapshots else usual)
     longest = model.definition.max_rollout or 1
     ended = bool(samples.terminated.any())
-    reference = reference_of(model, candidates) if model.definition.snapshots else None
-    aim = Aim(below, tolerances, longest, reference, request.snapshots, request.states, ending, ended)
+    aim = Aim(below, tolerances, longest, request.snapshots, request.states, ending, ended)
     return tuple(plan_round(model, aim, steps, request.pending_rollouts, rng))
 
 

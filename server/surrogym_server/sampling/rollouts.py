@@ -20,7 +20,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.distributions import scaling
-from surrogym_server.models.abilities import PathOutlook, PredictedSteps, Reference
+from surrogym_server.models.abilities import PathOutlook, PredictedSteps
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import PathView, path_value_of
 from surrogym_server.sampling.endings import edge_in_doubt, in_doubt
@@ -43,7 +43,6 @@ class Aim:
     columns: Sequence[int]  # numbers of the outputs to learn
     tolerances: Sequence[float]  # of every output
     longest: int  # actions in a sequence
-    reference: Reference | None = None  # where the outputs shall become known; None: along the paths alone
     snapshots: Tensor | None = None  # (s, C) states at which a sequence may begin, besides a reset
     states: Tensor | None = None  # (v, C) visited by policies: information is weighted by their density
     ending: bool = False  # look first for an end of the episode, or an edge of the reward, if one is within reach
@@ -195,14 +194,8 @@ def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
 
 def _view(output: PathOutlook, weight: Tensor, aim: Aim, column: int) -> PathView:
     """Build an acquisition's view of one output along paths, whose steps have the weights (b, T)."""
-    tolerance, reference = aim.tolerances[column], aim.reference
-    return PathView(
-        tolerance,
-        weight,
-        lambda: output.deviation,
-        lambda: output.information(weight, tolerance),
-        lambda: None if reference is None else output.insight(weight, tolerance, reference),
-    )
+    tolerance = aim.tolerances[column]
+    return PathView(tolerance, weight, lambda: output.deviation, lambda: output.information(weight, tolerance))
 
 
 def _worth(model: DynamicsModel, aim: Aim, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:

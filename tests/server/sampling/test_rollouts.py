@@ -17,7 +17,7 @@ from surrogym_server.engine.design_job import DesignJob, run_design_job
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.abilities import PredictedSteps, Reference
+from surrogym_server.models.abilities import PredictedSteps
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.lookahead import process_inputs
 from surrogym_server.sampling.confidence import deviations
@@ -303,28 +303,6 @@ def test_steps_with_unknown_lags_count_and_are_not_learned_from():
     result = run_design_job(job)
     assert result.fidelity["samples"] == 6
     assert 0 < sum(map(len, result.query_rollouts)) <= 2 or result.phase == "over_budget"
-
-
-def test_insight_is_what_a_path_says_of_the_reference(model: GaussianProcessModel, aim: Aim):
-    """Against conditioning the joint covariance of path and reference on the path, step by step."""
-    paths = predict_paths(model, start_points(model.definition, 1, rng()), torch.ones(1, 4, 1, dtype=torch.float64))
-    q, u = start_points(model.definition, 5, rng(1)), torch.zeros(5, 1, dtype=torch.float64)
-    there = PredictedSteps(q, u, model.transition(q, u).q_next)
-    shares = torch.tensor([0.5, 0.2, 0.1, 0.1, 0.1], dtype=torch.float64)
-    posterior, tolerance = model.reward.posterior, aim.tolerances[2] / model.reward.scale
-    assert posterior is not None
-    along = PredictedSteps(paths.q[0], paths.u[0], paths.q_next[0])
-    x = torch.cat([process_inputs(model.definition, model.reward, steps) for steps in (along, there)])
-    joint, expected = posterior.joint_covariance(x[None])[0], []
-    for t in range(1, 5):
-        told = torch.linalg.solve(joint[:t, :t] + tolerance**2 * torch.eye(t), joint[:t, 4:])
-        left = joint[4:, 4:].diagonal() - (joint[:t, 4:] * told).sum(0)
-        before = joint[4:, 4:].diagonal()
-        expected.append(float(shares @ (0.5 * ((before + tolerance**2) / (left + tolerance**2)).log())))
-    output = model.along(PredictedSteps(paths.q, paths.u, paths.q_next), 2)
-    assert output is not None
-    got = output.insight(torch.ones(1, 4, dtype=torch.float64), aim.tolerances[2], Reference(there, shares))
-    torch.testing.assert_close(got[0], torch.tensor(expected, dtype=torch.float64), rtol=1e-6, atol=1e-9)
 
 
 def test_a_plan_begins_at_the_snapshot_from_where_it_learns_more(model: GaussianProcessModel, aim: Aim):

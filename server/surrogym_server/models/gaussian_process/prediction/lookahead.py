@@ -23,7 +23,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import encode, leading
 from surrogym_server.gp import Joint
-from surrogym_server.models.abilities import OutputOutlook, PathOutlook, PredictedSteps, Reference
+from surrogym_server.models.abilities import OutputOutlook, PathOutlook, PredictedSteps
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
 BLOCK = 4_000_000  # numbers in a matrix of covariances at once
@@ -100,24 +100,6 @@ class ProcessAlongPaths(PathOutlook):
         ratio = (output.scale / tolerance) ** 2
         return torch.cat([_log_determinants(ratio * output.posterior.joint_covariance(b), w) for b, w in blocks])
 
-    def insight(self, weight: Tensor, tolerance: float, reference: Reference) -> Tensor:
-        """sum_r w_r 1/2 log((s_r + tau^2) / (s_r(t) + tau^2)): s_r is the variance at a reference point now, s_r(t) it
-        after the first t steps, each observed with a noise of the deviation tau."""
-        output, x = self.output, self.x.flatten(0, 1)
-        assert output.posterior is not None
-        there = process_inputs(self.definition, output, reference.steps)
-        slopes = [slope_at(output, points) for points in (x, there)]
-        along, at = (1.0 if slope is None else slope for slope in slopes)
-        ratio = (output.scale / tolerance) ** 2
-        joint = Joint.of(output.posterior, torch.cat([x, there]))
-        weight = weight * (along.reshape(weight.shape) if isinstance(along, Tensor) else along)
-        shared = ratio * at * joint.between(slice(len(x)), slice(len(x), None)).reshape(*weight.shape, -1)
-        known = torch.linalg.solve_triangular(
-            _factor(ratio * output.posterior.joint_covariance(self.x), weight), weight[:, :, None] * shared, upper=False
-        )
-        share = known.square().cumsum(1) / (1 + ratio * joint.variance[len(x) :] * at**2)
-        return -0.5 * torch.log1p(-share.clamp_max(1 - ROUNDING)) @ reference.weights
-
 
 def process_inputs(definition: EnvironmentDefinition, output: OutputModel, steps: PredictedSteps) -> Tensor:
     """Inputs of one output's process along steps (..., C): (..., d)."""
@@ -142,12 +124,6 @@ def as_if_answered(output: OutputModel, x: Tensor) -> OutputModel:
 
 def _log_determinants(covariance: Tensor, weight: Tensor) -> Tensor:
     """1/2 log det(1 + W S W) of all leading parts of S (b, T, T), W of diagonal weight (b, T): (b, T)."""
-    halves: Tensor = _factor(covariance, weight).diagonal(dim1=-2, dim2=-1).log().cumsum(-1)
-    return halves
-
-
-def _factor(covariance: Tensor, weight: Tensor) -> Tensor:
-    """Cholesky factor of 1 + W S W, S (b, T, T), W of diagonal weight (b, T): (b, T, T)."""
     one = torch.eye(weight.shape[1], dtype=weight.dtype)
     factor: Tensor = torch.linalg.cholesky(one + weight[:, :, None] * covariance * weight[:, None, :])
-    return factor
+    return factor.diagonal(dim1=-2, dim2=-1).log().cumsum(-1)
