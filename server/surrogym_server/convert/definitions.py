@@ -85,10 +85,10 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
     design, paper = spec.design, spec.design.preset == "paper"
     if paper:  # 10 (D + F), section 3.1
         initial = 10 * (len(spec.observation) + spec.action.size)
-    elif spec.query == "step":
+    elif spec.query == "step" or spec.snapshots:
         initial = max(4, len(spec.coordinates) + spec.action.size)
     else:
-        initial = (2 if spec.snapshots else 4) * (len(spec.coordinates) + spec.action.size)
+        initial = 4 * (len(spec.coordinates) + spec.action.size)
     if design.initial is not None:
         initial = design.initial
     if design.budget:

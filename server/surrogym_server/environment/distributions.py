@@ -21,6 +21,10 @@ class Uniform:
         """The value with a share p of the distribution below it."""
         return self.low + (self.high - self.low) * p
 
+    def log_density(self, value: Tensor) -> Tensor:
+        """Logarithm of the density within the limits, less its largest."""
+        return torch.zeros_like(value)
+
 
 @dataclass(frozen=True)
 class Normal:
@@ -38,6 +42,10 @@ class Normal:
         value: Tensor = self.mean + self.std * torch.special.ndtri(below + (above - below) * p)
         return torch.clamp(value, self.low, self.high)
 
+    def log_density(self, value: Tensor) -> Tensor:
+        """Logarithm of the density within the limits, less its largest, if the limits hold the mean."""
+        return -0.5 * ((value - self.mean) / self.std).square()
+
 
 @dataclass(frozen=True)
 class Fixed:
@@ -54,6 +62,10 @@ class Fixed:
     def quantile(self, p: Tensor) -> Tensor:
         """The value, for any p."""
         return torch.full_like(p, self.value)
+
+    def log_density(self, value: Tensor) -> Tensor:
+        """0, for any value."""
+        return torch.zeros_like(value)
 
 
 Distribution = Uniform | Normal | Fixed

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -22,6 +23,7 @@ from surrogym_server.sampling.batch import choose
 from surrogym_server.sampling.candidates import Candidates, candidates_of, with_more
 from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
 from surrogym_server.sampling.endings import ending
+from surrogym_server.sampling.excursions import excursion
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.sampling.noise import SLACK, established_noise, to_repeat, widened
 from surrogym_server.sampling.peaks import highest
@@ -46,18 +48,20 @@ class DesignState:
     ended_with: tuple[float, ...] = ()  # steps of the budget, budget, target and tolerances at the end of the design
     ranges: tuple[float, ...] = ()  # of the targets, from which each tolerance was computed
     predictions: Predictions = ()  # the last ones of each output, of samples that were then learned from
+    tested_at: int = 0  # number of samples when the model became sure and an excursion was planned; 0: it is not sure
 
     def to_json(self) -> dict[str, Any]:
         warm = {key: array.tolist() for key, array in self.warm.items()}
         ended, ranges = list(self.ended_with), list(self.ranges)
         fields = {"round": self.round, "usual": list(self.usual), "ranges": ranges, WARM: warm, "ended_with": ended}
-        return fields | {"predictions": pairs_of(self.predictions)}
+        return fields | {"predictions": pairs_of(self.predictions), "tested_at": self.tested_at}
 
     @classmethod
     def from_json(cls, state: dict[str, Any]) -> DesignState:
         warm = {key: np.array(array) for key, array in state.get(WARM, {}).items()}
         usual, ended, ranges = (tuple(state.get(name, ())) for name in ("usual", "ended_with", "ranges"))
-        return cls(state.get("round", 0), usual, warm, ended, ranges, from_pairs(state.get("predictions", [])))
+        predictions, tested_at = from_pairs(state.get("predictions", [])), state.get("tested_at", 0)
+        return cls(state.get("round", 0), usual, warm, ended, ranges, predictions, tested_at)
 
 
 @dataclass(frozen=True)
@@ -136,6 +140,8 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     )
     if verdict == "continue" and now == state.ended_with:
         verdict = "over_budget"  # only audits and logs have come since it ended, and they need no further real step
+    sure, testing = verdict == "ready", verdict == "ready" and _is_untested(definition, samples, state)
+    verdict = "continue" if testing else verdict
     candidates, reserved = judged.candidates, judged.reserved
     chosen, rollouts = candidates.points[:0], tuple[Rollout, ...]()
     if definition.max_rollout is None:
@@ -144,11 +150,16 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
             chosen = _choose(learned.model, samples, candidates, confidences, tolerances, verdict, request, reserved)
     else:
         rng = _rng(definition, f"rollouts {state.round}")
-        rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, reserved is not None)
+        if testing:
+            rollouts = _excursion(learned.model, samples, request, rng)
+        else:
+            ends = reserved is not None
+            rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, ends)
     if verdict == "continue" and not len(chosen) and not rollouts:
         verdict = "over_budget"  # the rest of the budget is pending, or no distinct query is left
     ended = now if verdict != "continue" and not len(chosen) and not rollouts else ()
-    new_state = DesignState(state.round + 1, usual, learned.warm, ended, frozen.ranges, state.predictions)
+    tested_at = (len(samples) if testing else state.tested_at) if sure else 0
+    new_state = DesignState(state.round + 1, usual, learned.warm, ended, frozen.ranges, state.predictions, tested_at)
     return Decision(learned.model, confidences, tolerances, new_state, verdict, chosen.q, chosen.u, rollouts)
 
 
@@ -299,14 +310,36 @@ def _plan(
     """
     steps, below = request.extra, _below(confidences, request.target)
     if verdict == "continue":
-        pending = sum(map(len, request.pending_rollouts))
-        room = request.budget + request.free - len(samples) - pending
         usual = max(SHORTEST_ROUND, len(samples) // 4)
-        steps = min(room, max(len(below), len(samples) // 8) if model.definition.snapshots else usual)
+        steps = min(
+            _room(samples, request), max(len(below), len(samples) // 8) if model.definition.snapshots else usual
+        )
     longest = model.definition.max_rollout or 1
     ended = bool(samples.terminated.any())
     aim = Aim(below, tolerances, longest, request.snapshots, request.states, ending, ended)
     return tuple(plan_round(model, aim, steps, request.pending_rollouts, rng))
+
+
+def _is_untested(definition: EnvironmentDefinition, samples: Samples, state: DesignState) -> bool:
+    """Whether a design that would be ready needs an excursion first: it has snapshots, and no step was taken since one
+    was planned."""
+    if not definition.snapshots or definition.design.stopping != "tested_confidence":
+        return False
+    return not state.tested_at or len(samples) <= state.tested_at
+
+
+def _excursion(
+    model: DynamicsModel, samples: Samples, request: Request, rng: np.random.Generator
+) -> tuple[Rollout, ...]:
+    """An excursion, if the budget has room for it."""
+    room = _room(samples, request)
+    visited = torch.cat([samples.q, samples.q_next])
+    return (excursion(model, visited, request.snapshots, room, rng),) if room > 0 else ()
+
+
+def _room(samples: Samples, request: Request) -> int:
+    """Real steps that the budget has left for rollouts, without those of pending ones."""
+    return request.budget + request.free - len(samples) - sum(map(len, request.pending_rollouts))
 
 
 def _below(confidences: tuple[OutputConfidence, ...], target: float) -> list[int]:

@@ -10,8 +10,9 @@ predicted.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -34,6 +35,7 @@ GENERATIONS = 3
 DOUBTFUL = 0.25  # least chance of an ending for which a rollout is planned
 
 Sequences = NDArray[np.float64]  # (k, T, F)
+Worth = Callable[[Tensor, Sequences], tuple[Tensor, Tensor]]  # see ``_worth``
 
 
 @dataclass(frozen=True)
@@ -103,28 +105,40 @@ def plan_round(
 def plan_rollout(model: DynamicsModel, aim: Aim, rng: np.random.Generator) -> Rollout:
     """The sequence (T, F), 1 <= T <= ``aim.longest``, with the highest value per expected real step, from a reset or
     from the best snapshot. It is found by random shooting and by varying the best sequences."""
-    best, value = _search(model, aim, start_points(model.definition, STARTS, rng)[None], POPULATION, rng)
-    if aim.snapshots is None or not len(aim.snapshots):
+    return best_rollout(model.definition, partial(_worth, model, aim), aim.longest, aim.snapshots, rng)
+
+
+def best_rollout(
+    definition: EnvironmentDefinition, worth: Worth, longest: int, snapshots: Tensor | None, rng: np.random.Generator
+) -> Rollout:
+    """The best sequence of at most ``longest`` actions, from a reset or from one of the snapshots (s, C)."""
+    best, value = _search(definition, worth, longest, start_points(definition, STARTS, rng)[None], POPULATION, rng)
+    if snapshots is None or not len(snapshots):
         return best
-    returned, known = _search(model, aim, aim.snapshots[:, None], POPULATION * STARTS, rng)
+    returned, known = _search(definition, worth, longest, snapshots[:, None], POPULATION * STARTS, rng)
     return best if value >= known else returned
 
 
 def _search(
-    model: DynamicsModel, aim: Aim, origins: Tensor, population: int, rng: np.random.Generator
+    definition: EnvironmentDefinition,
+    worth: Worth,
+    longest: int,
+    origins: Tensor,
+    population: int,
+    rng: np.random.Generator,
 ) -> tuple[Rollout, float]:
     """The best sequence from one of k origins, each of several equally likely states (k, s, C), and its value. The
     number of the origin is the rollout's snapshot if there is one state each."""
-    sequences = random_sequences(model.definition, population, aim.longest, rng)
+    sequences = random_sequences(definition, population, longest, rng)
     places = np.resize(rng.permutation(len(origins)), population)
     elite = population * ELITE // POPULATION
-    value, length = _worth(model, aim, origins[places], sequences)
+    value, length = worth(origins[places], sequences)
     for _ in range(GENERATIONS - 1):
         kept = value.argsort(descending=True)[:elite].numpy()
         parents = np.concatenate([kept, kept[rng.integers(elite, size=population - elite)]])
         sequences, places = sequences[parents], places[parents]
-        _vary(model.definition, sequences[elite:], rng)
-        value, length = _worth(model, aim, origins[places], sequences)
+        _vary(definition, sequences[elite:], rng)
+        value, length = worth(origins[places], sequences)
     best = int(value.argmax())
     snapshot = int(places[best]) if origins.shape[1] == 1 else None
     return Rollout(torch.from_numpy(sequences[best, : int(length[best])]), snapshot), float(value[best])
@@ -222,11 +236,18 @@ def _endings(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
 
 
 def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tensor:
-    """Weight of each step (b, T)."""
+    """Weight of each step (b, T).
+
+    With snapshots a step also counts the less, the less likely the sampling range has its state: a plan could go on
+    and on to states that hardly count for the verdict.
+    """
     low = torch.tensor([c.sampling.low for c in definition.coordinates], dtype=paths.q.dtype)
     high = torch.tensor([c.sampling.high for c in definition.coordinates], dtype=paths.q.dtype)
     inside = ((paths.q >= low) & (paths.q <= high)).all(-1)
     weight = paths.running * inside * definition.known(paths.q) * (-0.5 * paths.drift).exp()
+    if aim.snapshots is not None:
+        columns = zip(definition.coordinates, paths.q.unbind(-1), strict=True)
+        weight = weight * (0.5 * torch.stack([c.sampling.log_density(q) for c, q in columns]).sum(0)).exp()
     if aim.states is None or not len(aim.states):
         return weight
     density = log_occupancy(definition, aim.states, paths.q.flatten(0, 1)).exp().reshape(weight.shape)

@@ -2,7 +2,8 @@
 
 They are frozen after the first round, so that a design does not change its own goal. A size estimated from few samples
 can be wrong in two ways: it may be mere rounding, or the samples may have missed everything of interest. So sizes have
-a floor, and a tolerance is computed again when later samples cover a far larger range.
+a floor, and a tolerance is computed again when later samples cover a far larger range. The initial design of an
+environment with snapshots stays near the resets, so there a tolerance grows with the samples' deviation.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Usual:
 
 def frozen_tolerances(definition: EnvironmentDefinition, samples: Samples, before: Usual) -> Usual:
     """Keep the tolerances of the round before. Compute them from the samples if there are none, or if the range of the
-    targets has grown by more than 1 / ``NOTHING`` since.
+    targets has grown by more than 1 / ``NOTHING`` since. With snapshots, take larger ones than before in each round.
 
     A pure function of samples and state, so that a repeated round gives the same result. States of older designs have
     no ranges; then nothing changes. Rewards of terminating steps are not counted, because the reward's process does not
@@ -60,8 +61,15 @@ def frozen_tolerances(definition: EnvironmentDefinition, samples: Samples, befor
     if not before.ranges or definition.design.tolerance == "raw":
         return before
     old, now = zip(before.tolerances, before.ranges, strict=True), zip(taken, ranges, strict=True)
-    kept = [new if new[1] * NOTHING > last[1] else last for last, new in zip(old, now, strict=True)]
+    kept = [_later(last, new, grows=definition.snapshots) for last, new in zip(old, now, strict=True)]
     return Usual(tuple(tolerance for tolerance, _ in kept), tuple(width for _, width in kept))
+
+
+def _later(last: tuple[float, float], new: tuple[float, float], *, grows: bool) -> tuple[float, float]:
+    """Tolerance and range of one output after a round, from those before it and those of all samples."""
+    if new[1] * NOTHING > last[1]:
+        return new
+    return max(last, new) if grows else last
 
 
 def _ranges(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:

@@ -63,3 +63,19 @@ def test_raw_tolerances_are_one_whatever_was_met():
     raw = definition_from_spec(plane().model_copy(update={"design": Design(tolerance="raw")}))
     first = frozen_tolerances(raw, NOTHING_MET, Usual())
     assert frozen_tolerances(raw, PAID, first).tolerances == (1.0, 1.0, 1.0)
+
+
+def test_tolerance_of_a_design_with_snapshots_grows_with_the_samples_and_never_shrinks():
+    """Its first samples lie near the resets, so their deviation is far below that over the sampling range."""
+    definition = definition_from_spec(plane().model_copy(update={"query": "rollout", "snapshots": True}))
+    first = frozen_tolerances(definition, PAID, Usual())
+    assert first == frozen(PAID)
+    more = replace(PAID, reward=3 * PAID.reward, q_next=PAID.q + 2 * (PAID.q_next - PAID.q))
+    grown = frozen_tolerances(definition, more, first)
+    assert grown.tolerances == pytest.approx(
+        [2 * first.tolerances[0], 2 * first.tolerances[1], 3 * first.tolerances[2]]
+    )
+    assert frozen_tolerances(definition, PAID, grown) == grown
+    constant = replace(PAID, reward=torch.ones(6, dtype=torch.float64))
+    varied = frozen_tolerances(definition, replace(PAID, reward=1 + 1e-3 * PAID.reward), frozen(constant))
+    assert varied.tolerances[-1] < 1e-4, "that of a constant reward is taken again, as without snapshots"

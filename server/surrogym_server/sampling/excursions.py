@@ -1,0 +1,53 @@
+"""Excursions: action sequences that test a model where no sample has been.
+
+A design that begins at resets or snapshots sees a small part of the sampling range at first. A model that fits this
+part can be sure of all the rest and wrong there: beside an inflection every function looks linear. So before such a
+design is ready, one sequence leads away from all samples.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.features import distances
+from surrogym_server.environment.points import Points
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.sampling.rollouts import Rollout, Sequences, best_rollout, predict_paths
+
+FAR = 0.5  # deviations of the sampling range between the end of an excursion and the nearest sample
+LONGEST = 16  # actions in an excursion
+
+
+def excursion(
+    model: DynamicsModel, samples: Tensor, snapshots: Tensor | None, longest: int, rng: np.random.Generator
+) -> Rollout:
+    """Plan the shortest sequence whose predicted state is ``FAR`` from all sampled states (n, C); if none is, the
+    sequence that leads farthest. It begins at a reset or at one of the snapshots (s, C)."""
+    longest = min(longest, LONGEST, model.definition.max_rollout or 1)
+    return best_rollout(model.definition, partial(_reach, model, samples), longest, snapshots, rng)
+
+
+def _reach(model: DynamicsModel, samples: Tensor, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
+    """Value of each sequence (k, T, F) from its equally likely states (k, s, C), and its length, (k,). Sequences that
+    get ``FAR`` come first, the shortest of them before the others."""
+    count, lanes = starts.shape[:2]
+    paths = predict_paths(model, starts.flatten(0, 1), torch.from_numpy(sequences).repeat_interleave(lanes, 0))
+    states = paths.q_next.flatten(0, 1)
+    away = _state_distances(model.definition, states, samples).amin(1) * model.definition.in_range(states)
+    away = (away.reshape(paths.running.shape) * paths.running).reshape(count, lanes, -1).mean(1)
+    farthest = away.max(1)
+    reached = away >= FAR
+    first = reached.double().argmax(1)  # of equal values the first
+    value = torch.where(reached.any(1), FAR + away.shape[1] - first, farthest.values)
+    return value, torch.where(reached.any(1), first, farthest.indices) + 1
+
+
+def _state_distances(definition: EnvironmentDefinition, a: Tensor, b: Tensor) -> Tensor:
+    """Distances of states a (m, C) and b (n, C), in deviations of the sampling range, (m, n)."""
+    still = (Points(q, q.new_zeros(len(q), definition.action.size)) for q in (a, b))
+    return distances(definition, *still)

@@ -1,0 +1,105 @@
+"""Excursions: a design with snapshots tests its model away from its samples before it is ready."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from support.models import learn
+from support.real_steps import join, roll
+from surrogym_client.original.classic import pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.features import distances
+from surrogym_server.environment.points import Points
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
+from surrogym_server.sampling.design import DesignState, Request, advance
+from surrogym_server.sampling.excursions import FAR, excursion
+from surrogym_server.sampling.rollouts import predict_paths, random_sequences
+from surrogym_shared.spec import EnvironmentSpec
+
+STILL = {"kind": "uniform", "low": -0.01, "high": 0.01}  # resets lead to the top, nearly at rest
+CHANGES = {"query": "rollout", "snapshots": True, "start": {"theta": STILL, "speed": STILL}}
+SPEC = EnvironmentSpec.model_validate(pendulum().model_dump() | CHANGES)
+DEFINITION = definition_from_spec(SPEC)
+NOTHING = Points(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 1, dtype=torch.float64))
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+@pytest.fixture(scope="module")
+def samples() -> Samples:
+    """Three ways from resets: enough for a sure model."""
+    sequences = random_sequences(DEFINITION, 3, 10, rng())
+    return join(*(roll(SPEC, torch.from_numpy(actions), seed) for seed, actions in enumerate(sequences)))
+
+
+@pytest.fixture(scope="module")
+def model(samples: Samples) -> GaussianProcessModel:
+    return learn(DEFINITION, samples).model
+
+
+def away(model: GaussianProcessModel, start: torch.Tensor, actions: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+    """Distance of each predicted state to the nearest of the known ones, (T,)."""
+    reached = predict_paths(model, start[None], actions[None]).q_next[0]
+    still = (Points(q, torch.zeros(len(q), 1, dtype=torch.float64)) for q in (reached, known))
+    return distances(model.definition, *still).amin(1)
+
+
+def test_an_excursion_ends_at_the_first_state_far_from_all_samples(model: GaussianProcessModel):
+    known = torch.zeros(1, 2, dtype=torch.float64)
+    found = excursion(model, known, known, 16, rng())
+    gone = away(model, known[0], found.actions, known)
+    assert gone[-1] >= FAR
+    assert (gone[:-1] < FAR).all()
+    shorter = torch.from_numpy(random_sequences(DEFINITION, 300, len(found) - 1, rng(1)))
+    assert all(away(model, known[0], actions, known).amax() < FAR for actions in shorter)
+
+
+def test_an_excursion_that_cannot_get_far_goes_as_far_as_it_can(model: GaussianProcessModel):
+    known = torch.zeros(1, 2, dtype=torch.float64)
+    found = excursion(model, known, torch.tensor([[0.0, 0.0], [0.0, 0.4]], dtype=torch.float64), 2, rng())
+    assert len(found) == 2
+    assert found.snapshot == 1, "it moves away already"
+    torch.testing.assert_close(found.actions.abs(), torch.full_like(found.actions, 2.0))  # all the torque that there is
+
+
+def test_without_a_snapshot_an_excursion_begins_at_a_reset(model: GaussianProcessModel, samples: Samples):
+    for snapshots in (None, samples.q[:0]):
+        assert excursion(model, samples.q, snapshots, 4, rng()).snapshot is None
+
+
+def request(samples: Samples, budget: int = 60) -> Request:
+    return Request(budget=budget, target=0.9, pending=NOTHING, snapshots=samples.q_next)
+
+
+def test_a_sure_design_with_snapshots_is_ready_once_an_excursion_was_answered(samples: Samples):
+    first = advance(DEFINITION, samples, DesignState(), request(samples))
+    assert first.verdict == "continue"
+    (rollout,) = first.rollouts
+    lost = advance(DEFINITION, samples, first.state, request(samples))
+    assert lost.verdict == "continue", "its query was withdrawn, so another excursion is due"
+    assert len(lost.rollouts) == 1
+    answered = join(samples, roll(SPEC, rollout.actions, 7))
+    state = DesignState.from_json(first.state.to_json())
+    assert advance(DEFINITION, answered, state, request(answered)).verdict == "ready"
+
+
+def test_a_sure_design_without_room_for_an_excursion_is_not_ready(samples: Samples):
+    decision = advance(DEFINITION, samples, DesignState(), request(samples, len(samples)))
+    assert decision.verdict == "over_budget"
+    assert not decision.rollouts
+    raised = advance(DEFINITION, samples, decision.state, request(samples))
+    assert len(raised.rollouts) == 1, "once there is room, the excursion is due"
+
+
+def test_with_resets_alone_and_in_preset_paper_no_excursion_is_needed(samples: Samples):
+    plain = replace(DEFINITION, snapshots=False)
+    assert advance(plain, samples, DesignState(), request(samples)).verdict == "ready"
+    paper = replace(DEFINITION, design=replace(DEFINITION.design, stopping="confidence"))
+    assert advance(paper, samples, DesignState(), request(samples)).verdict == "ready"
