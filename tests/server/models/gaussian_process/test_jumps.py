@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -96,3 +97,21 @@ def test_jumps_survive_storage_and_bad_ones_are_refused():
     for bad in (replace(jump, size=math.inf), replace(jump, region=replace(jump.region, forms=()))):
         with pytest.raises(InvalidInput):
             from_bytes(model.definition, to_bytes(replace(model, jumps=(bad,))))
+
+
+def test_forms_whose_weights_exceed_1_by_rounding_leave_no_negative_variance():
+    """The reward's deviation was NaN there, and the design failed."""
+    model = learn(definition_from_spec(plane()), drifting(sparse, 60)).model
+    form = model.jumps[0].region.forms[0][1]
+    weights = (0.058312872925848885, 0.9416871270741513)
+    assert sum(weights) > 1
+    region = replace(model.jumps[0].region, forms=tuple((weight, form) for weight in weights))
+    model = replace(model, jumps=(replace(model.jumps[0], region=region),))
+    unseen = drifting(sparse, 1000, seed=1)
+    assert (region.probability(unseen.q) == 1).any()
+    plain = model.transition(unseen.q, unseen.u, reward_deviation=True)
+    assert plain.reward_deviation.isfinite().all()
+    if (steps := model.compiled()) is not None:
+        q, u = (np.ascontiguousarray(x) for x in (unseen.q, unseen.u))
+        moved = steps(q, u, noise=None, process=None, paths=None, deviations=False, reward_deviation=True)
+        assert np.isfinite(moved.deviation[:, -1]).all()

@@ -157,7 +157,8 @@ class Region:
 
     def probability(self, q: Tensor) -> Tensor:
         """Probability that q (m, C) lies inside, (m,)."""
-        return torch.stack([weight * form.probability(q) for weight, form in self.forms]).sum(0)
+        mixed = torch.stack([weight * form.probability(q) for weight, form in self.forms]).sum(0)
+        return mixed.clamp(0, 1)  # the weights add up to 1 but for rounding
 
     @property
     def description(self) -> dict[str, Any]:

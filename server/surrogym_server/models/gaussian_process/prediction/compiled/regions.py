@@ -124,6 +124,8 @@ def probability(numbers: Floats, places: Ints, at: int, observe: int, q: Floats,
             inside = _within(numbers, places, first, second, third, q)
         for b in range(len(total)):
             total[b] += weight * inside[b]
+    for b in range(len(total)):
+        total[b] = min(total[b], 1.0)  # the weights add up to 1 but for rounding
     return total
 
 
