@@ -16,7 +16,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from surrogym_client.original.errors import OriginalError, RequestRefused, StepFailed, UnknownEnvironment
+from surrogym_client.original.errors import OriginalError, RequestRefused, StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_client.original.executables.environment import MORE_TIME
 from surrogym_client.original.executables.messages import Reply, numbers, truth
 from surrogym_client.original.executables.program import Program
 from surrogym_client.original.fmus.archive import Archive, Declared
@@ -160,6 +161,8 @@ class Process:
         deadline = time.monotonic() + (limit or self.step_limit)
         try:
             return self._program.ask(method, deadline, **fields)
+        except StepTimedOut as error:
+            raise error if limit else StepTimedOut(f"{error}; {MORE_TIME}") from error
         except RequestRefused as error:
             if error.code == "broken":
                 self._program.end()
