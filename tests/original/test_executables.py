@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 import time
@@ -16,7 +17,7 @@ import pytest
 from support.noting import until
 from support.programs import HANGS, NOTES_ITSELF, UNTERMINABLE, left_behind, program
 from surrogym_client import original
-from surrogym_client.original.errors import StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_client.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
 from surrogym_client.original.executables.messages import decode
 from surrogym_client.original.executables.program import Program
 from surrogym_client.original.loading import is_known
@@ -221,3 +222,19 @@ plant.ask("step", time.monotonic() + 3600, action=[1.0])
         process.kill()
         process.wait()
     assert left_behind(tmp_path) == []
+
+
+def test_a_program_that_can_no_longer_be_started_is_the_machines_fault(tmp_path):
+    """So the sampler keeps the snapshot that a query began at."""
+    rail = tmp_path / "rail.sh"
+    shutil.copy(SHELL, rail)
+    rail.chmod(0o755)
+    plant = original.make(f"exec:{shlex.quote(str(rail))}")
+    try:
+        snapshot = (plant.begin(), plant.save())[1]
+        plant._program.end()
+        rail.unlink()
+        with pytest.raises(EnvironmentDied, match="could not be started anew"):
+            plant.restore(snapshot)
+    finally:
+        plant.close()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from surrogym_client.original.errors import StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_client.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
 from surrogym_client.original.executables.messages import (
     PROTOCOL,
     Reply,
@@ -111,10 +111,12 @@ class Executable:
             own = _specification(self._program)
         except UnknownEnvironment as error:
             self._program.end()
-            raise StepFailed(f"the program could not be started anew: {error}") from error
+            raise EnvironmentDied(f"the program could not be started anew: {error}") from error
         if own != self._own:
             self._program.end()
-            raise StepFailed("expected the same specification from the program that was started anew, got another one")
+            raise EnvironmentDied(
+                "expected the same specification from the program that was started anew, got another one"
+            )
 
     def _ask(self, method: str, deadline: float, **fields: object) -> Reply:
         try:

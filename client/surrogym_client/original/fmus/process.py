@@ -16,7 +16,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from surrogym_client.original.errors import OriginalError, RequestRefused, StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_client.original.errors import (
+    EnvironmentDied,
+    OriginalError,
+    RequestRefused,
+    StepFailed,
+    StepTimedOut,
+    UnknownEnvironment,
+)
 from surrogym_client.original.executables.environment import MORE_TIME
 from surrogym_client.original.executables.messages import Reply, numbers, truth
 from surrogym_client.original.executables.program import Program
@@ -154,7 +161,7 @@ class Process:
             self._open()
         except OriginalError as error:
             self._program.end()
-            raise StepFailed(f"{self._archive.path.name} could not be started anew: {error}") from error
+            raise EnvironmentDied(f"{self._archive.path.name} could not be started anew: {error}") from error
 
     def _ask(self, method: str, limit: float | None = None, **fields: Any) -> Reply:
         self._values = self._values if method == "save" else None
