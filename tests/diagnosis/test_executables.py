@@ -66,6 +66,13 @@ def test_a_missing_field_is_named_with_the_way_out(tmp_path: Path):
     assert said.endswith("give all four fields in every answer to step")
 
 
+def test_numbers_and_missing_fields_are_named_without_words_of_python(tmp_path: Path):
+    one_start = failures(program(tmp_path, (SEEDED, "0.25")))["other seeds give other starts"]
+    assert "got [0.25] each time" in one_start
+    no_snapshot = failures(program(tmp_path, ('{"snapshot": ', '{"state": ')))["restore returns to what was saved"]
+    assert "expected a text for 'snapshot' in the program's answer, got nothing" in no_snapshot
+
+
 def test_a_program_with_rollouts_alone_needs_no_set(tmp_path: Path):
     command = program(tmp_path, ('"query":"step"', '"query":"rollout"'), ('"set": put, "get": get, ', ""))
     left_out = {outcome.name for outcome in conformance(command, 10.0) if outcome.left_out}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 import time
@@ -15,7 +17,8 @@ import pytest
 from support.noting import until
 from support.programs import HANGS, NOTES_ITSELF, UNTERMINABLE, left_behind, program
 from surrogym_client import original
-from surrogym_client.original.errors import StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_client.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_client.original.executables.messages import decode
 from surrogym_client.original.executables.program import Program
 from surrogym_client.original.loading import is_known
 
@@ -59,7 +62,11 @@ def test_a_shell_program_takes_exact_steps():
     [
         ("os._exit(7)", "exit code 7 during step"),
         ("print('hello', flush=True)", "one line of JSON from the program, got hello"),
+        ("print(flush=True)", "one line of JSON from the program, got an empty line; let it print"),
         ("result = {'state': [0]}", "4 finite numbers"),
+        ("result = {}", "4 finite numbers for 'state' in the program's answer, got nothing$"),
+        ("result['state'][3] = float('-inf')", "expected finite numbers from the program, got -Infinity in"),
+        ("os.close(1); time.sleep(60)", "the program closed its standard output and was ended during step$"),
     ],
 )
 def test_a_fault_costs_one_step(mood, message):
@@ -85,6 +92,34 @@ def test_a_hanging_program_is_ended_and_started_anew():
         plant.close()
 
 
+def test_a_line_without_an_end_is_in_the_error_with_the_way_out():
+    plant = moody("sys.stdout.write('{\"id\": 3'); sys.stdout.flush(); time.sleep(3600)", step_limit=2.0)
+    try:
+        with pytest.raises(StepTimedOut, match=r'printed {"id": 3 without an end of the line; a larger --step-limit'):
+            plant.step_from(np.zeros(4), np.ones(1))
+    finally:
+        plant.close()
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        ("no\n\x1b[2Jlicence", "the program answered: no [2Jlicence"),
+        ("E" * 10**6, f"the program answered: {'E' * 400}…"),
+        ("", "the program answered: an error without words"),
+        (None, "expected 'result' or 'error' in the program's answer, got {\"id\": 1, \"error\": null}"),
+    ],
+)
+def test_an_error_of_a_program_is_repeated_as_one_short_line(error, said):
+    with pytest.raises(StepFailed) as raised:
+        decode(json.dumps({"id": 1, "error": error}).encode(), 1)
+    assert str(raised.value) == said
+
+
+def test_a_result_beside_an_error_that_is_null_is_a_result():
+    assert decode(b'{"id": 1, "error": null, "result": {"state": [0]}}', 1) == {"state": [0]}
+
+
 def test_what_an_ended_program_has_started_is_ended_too(tmp_path):
     plant = f"sh -c 'sleep 3600 >/dev/null & echo $! > {tmp_path}/pids; exit 3'"
     with pytest.raises(UnknownEnvironment, match="got none"):
@@ -95,7 +130,9 @@ def test_what_an_ended_program_has_started_is_ended_too(tmp_path):
 def test_the_last_line_of_standard_error_is_in_the_error(capfd: pytest.CaptureFixture[str]):
     plant = moody("print('no licence\\x1b[2J\\n', file=sys.stderr, flush=True); os.abort()")
     try:
-        with pytest.raises(StepFailed, match=r"exit code -6 during step; .* standard error: no licence\[2J$"):
+        with pytest.raises(
+            StepFailed, match=r"exit code -6 \(SIGABRT\) during step; .* standard error: no licence\[2J$"
+        ):
             plant.step_from(np.zeros(4), np.ones(1))
     finally:
         plant.close()
@@ -172,6 +209,7 @@ def test_a_program_that_hangs_is_ended_after_its_client_was_killed(tmp_path):
     command = program(tmp_path, NOTES_ITSELF, UNTERMINABLE, hangs)
     client = f"""
 import time
+from surrogym_client.original.executables.messages import decode
 from surrogym_client.original.executables.program import Program
 plant = Program({command!r}, grace=0.0)
 plant.start()
@@ -184,3 +222,19 @@ plant.ask("step", time.monotonic() + 3600, action=[1.0])
         process.kill()
         process.wait()
     assert left_behind(tmp_path) == []
+
+
+def test_a_program_that_can_no_longer_be_started_is_the_machines_fault(tmp_path):
+    """So the sampler keeps the snapshot that a query began at."""
+    rail = tmp_path / "rail.sh"
+    shutil.copy(SHELL, rail)
+    rail.chmod(0o755)
+    plant = original.make(f"exec:{shlex.quote(str(rail))}")
+    try:
+        snapshot = (plant.begin(), plant.save())[1]
+        plant._program.end()
+        rail.unlink()
+        with pytest.raises(EnvironmentDied, match="could not be started anew"):
+            plant.restore(snapshot)
+    finally:
+        plant.close()

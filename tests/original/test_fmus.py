@@ -241,8 +241,8 @@ def test_an_fmu_is_never_opened_for_a_server() -> None:
 @pytest.mark.parametrize(
     ("push", "message"),
     [
-        (1.5, r"the process of Moody.fmu ended with exit code -6 during step"),
-        (3.0, r"Moody.fmu: expected finite values of the FMU, but x is nan"),
+        (1.5, r"the process of Moody.fmu ended with exit code -6 \(SIGABRT\) during step"),
+        (3.0, r"Moody.fmu: expected finite values of the FMU, but x is nan$"),
         (4.0, r"Moody.fmu: the FMU answered fmi2DoStep with status"),
     ],
 )
@@ -263,7 +263,9 @@ def test_a_fault_of_native_code_costs_one_step(moody: Path, tmp_path: Path, push
 def test_a_hanging_fmu_is_ended_and_started_anew(moody: Path, tmp_path: Path) -> None:
     plant = moody_with_limits(moody, tmp_path, step_limit=5.0)
     try:
-        with pytest.raises(StepTimedOut, match=r"the process of Moody.fmu did not answer step"):
+        with pytest.raises(
+            StepTimedOut, match=r"the process of Moody.fmu did not answer step .* a larger --step-limit"
+        ):
             plant.step_from(np.array([0.5]), np.array([2.0]))
         assert plant.step_from(np.array([0.5]), np.zeros(1)).reward == -0.25
     finally:
@@ -322,62 +324,6 @@ def test_calculated_outputs_are_reset_or_restored(tanks: Path, tmp_path: Path) -
         plant.close()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ({"<CoSimulation": "<ModelExchange"}, "for model exchange only, .*: export it for co-simulation"),
-        ({'fmiVersion="2.0"': 'fmiVersion="1.0"'}, r"can't be read|of FMI 2.0 or 3.0"),
-        ({'causality="input"': 'causality="parameter" variability="fixed"'}, "got no scalar input: declare one"),
-        ({' stepSize="10.0"': ""}, r'expected the seconds of one action, as \{"fmu": "copy.fmu", "step": 0.1\}'),
-        ({"</fmiModelDescription>": ""}, "modelDescription.xml of .* can't be read"),
-    ],
-)
-def test_a_description_that_does_not_fit_is_named(tanks: Path, tmp_path: Path, words, message: str) -> None:
-    with pytest.raises(UnknownEnvironment, match=message):
-        open_simulator(f"fmu:{changed(tanks, tmp_path / 'copy.fmu', words)}")
-
-
-def test_code_for_another_platform_is_named(tanks: Path, tmp_path: Path) -> None:
-    foreign = changed(tanks, tmp_path / "foreign.fmu", {}, moved="win32")
-    with pytest.raises(UnknownEnvironment, match=r"expected native code for \S+ in .*, got win32, win64: export it"):
-        open_simulator(f"fmu:{foreign}")
-    bare = changed(tanks, tmp_path / "bare.fmu", {}, left_out="modelDescription")
-    with pytest.raises(UnknownEnvironment, match=r"has no modelDescription.xml, so it is not an FMU"):
-        open_simulator(f"fmu:{bare}")
-
-
-def test_broken_files_are_named(tanks: Path, tmp_path: Path) -> None:
-    whole = tanks.read_bytes()
-    for content, message in ((b"hello", "is not a zip archive"), (whole[: len(whole) // 2], "is not a zip archive")):
-        (tmp_path / "broken.fmu").write_bytes(content)
-        with pytest.raises(UnknownEnvironment, match=message):
-            open_simulator(f"fmu:{tmp_path / 'broken.fmu'}")
-    flipped = bytearray(whole)
-    flipped[len(whole) // 2] ^= 0xFF
-    (tmp_path / "broken.fmu").write_bytes(flipped)
-    with pytest.raises(UnknownEnvironment, match="is damaged: copy or export"):
-        open_simulator(f"fmu:{tmp_path / 'broken.fmu'}")
-    with pytest.raises(UnknownEnvironment, match="got no file"):
-        open_simulator(f"fmu:{tmp_path / 'none.fmu'}")
-
-
-@pytest.mark.parametrize(
-    ("choices", "message"),
-    [
-        ({"start": {"flow": "much"}}, "expected a finite number for 'flow'"),
-        ({"start": {"depth": 1.0}}, "has no scalar variable 'depth': expected one of pump, upper, lower, flow"),
-        ({"actions": {"pump": [1, 0]}}, r"expected low < high, got \[1, 0\]"),
-        ({"actions": ["flow"]}, "expected some of the continuous inputs of .*, pump, got flow"),
-        ({"coordinates": []}, "expected continuous variables of .*, got none"),
-        ({"steps": 1.0}, "expected fmu, and optionally step, actions, coordinates and start"),
-        ({"step": -1.0}, "step: Input should be greater than 0"),
-    ],
-)
-def test_choices_that_do_not_fit_are_named(tanks: Path, tmp_path: Path, choices, message: str) -> None:
-    with pytest.raises(UnknownEnvironment, match=message):
-        open_simulator(mapping(tmp_path, fmu=str(tanks), **choices))
-
-
 def test_nothing_is_left_after_closing(tanks: Path, monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     fmu = opened(f"fmu:{tanks}")
@@ -391,5 +337,7 @@ def test_a_specification_fits_the_same_file_in_another_folder(tanks: Path) -> No
     original.make(f"fmu:{tanks}", spec=spec).close()
     assert fits("fmu:TwoTanks.fmu", f"fmu:{tanks}")
     assert not fits("fmu:Other.fmu", f"fmu:{tanks}")
-    with pytest.raises(UnknownEnvironment, match=r"expected a specification of .*, got one of fmu:Other.fmu"):
+    with pytest.raises(
+        UnknownEnvironment, match=r"expected a specification of .*, got one of fmu:Other.fmu: if .*, write"
+    ):
         original.make(f"fmu:{tanks}", spec=spec.model_copy(update={"environment": "fmu:Other.fmu"}))

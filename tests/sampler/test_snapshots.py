@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from support.rail import SPEC, Rail
-from surrogym_client.original.errors import SnapshotGone
+from surrogym_client.original.errors import EnvironmentDied, SnapshotGone
+from surrogym_client.original.rollouts import answering
 from surrogym_client.sampler import Sampler, SamplerSettings
+from surrogym_client.sampler.returning import Returning
 from surrogym_client.sampler.snapshots import Bounds, SnapshotFolder, least_useful
 from surrogym_shared.spec import Design
 
@@ -81,6 +83,44 @@ def test_a_query_whose_snapshot_no_longer_loads_is_chosen_anew(api, rail, tmp_pa
     assert view.phase in ("ready", "over_budget")
     assert view.ledger.total >= 9
     assert (view.ledger.unresolved, view.queries.set_aside, view.queries.pending) == (0, 0, 0)
+
+
+def test_a_snapshot_at_which_the_environment_dies_is_gone_if_it_can_be_reset(tmp_path):
+    class Dies(SavedRail):
+        asked = 0
+
+        def restore(self, snapshot):
+            self.asked += 1
+            if self.asked > 1 and snapshot == b"1.0":
+                return super().restore(snapshot)
+            raise EnvironmentDied("the program ended with exit code 9 during restore")
+
+    for state, gone in ((b"0.5", True), (b"1.0", False)):
+        folder = SnapshotFolder(tmp_path / str(gone), SAVED, Bounds(10, 10**6))
+        returning = Returning(answering(Dies()), folder)
+        name, _ = folder.add(state, [0.0])
+        if gone:
+            with pytest.raises(SnapshotGone, match=r"can't be restored: the program ended .* during restore, twice"):
+                returning.begin(name)
+        else:
+            returning.begin(name)
+        assert (returning.gone, folder.names()) == (([name], []) if gone else ([], [name]))
+
+
+def test_a_snapshot_stays_if_the_environment_is_broken(tmp_path):
+    class Broken(SavedRail):
+        def restore(self, snapshot):
+            raise EnvironmentDied("the program could not be started anew: no licence")
+
+        def reset(self, *, seed=None):
+            raise EnvironmentDied("the program could not be started anew: no licence")
+
+    folder = SnapshotFolder(tmp_path, SAVED, Bounds(10, 10**6))
+    returning = Returning(answering(Broken()), folder)
+    name, _ = folder.add(b"0.5", [0.0])
+    with pytest.raises(EnvironmentDied):
+        returning.begin(name)
+    assert (returning.gone, list(folder.names())) == ([], [name])
 
 
 def test_a_folder_keeps_states_for_the_next_sampler(tmp_path):

@@ -209,7 +209,10 @@ def load_factory(name: str) -> Any:
 
 def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str, step_limit: float) -> Environment:
     if spec is not None and spec.environment and not is_same(spec.environment, name):
-        raise UnknownEnvironment(f"expected a specification of {name}, got one of {spec.environment}")
+        raise UnknownEnvironment(
+            f"expected a specification of {name}, got one of {spec.environment}: if it describes {name} as well, write "
+            f'"environment": "{name}" in it'
+        )
     if name in TASKS:
         spec = spec and spec.model_copy(update={"environment": name})
         base = spec or task_for(name, preset).spec()

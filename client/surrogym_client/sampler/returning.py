@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 from surrogym_client.original.errors import EnvironmentDied, SnapshotGone, StepFailed, StepTimedOut, sentence
-from surrogym_client.original.protocol import SnapshotEnvironment
+from surrogym_client.original.protocol import Array, SnapshotEnvironment
 from surrogym_client.sampler.snapshots import SnapshotFolder
+
+
+@runtime_checkable
+class Resettable(SnapshotEnvironment, Protocol):
+    """An environment that can also be reset."""
+
+    def begin(self, seed: int | None = None) -> Array: ...
 
 
 class Returning:
@@ -21,7 +29,7 @@ class Returning:
         gone: names of snapshots that the server has yet to forget.
     """
 
-    def __init__(self, environment: SnapshotEnvironment, folder: SnapshotFolder, known: Sequence[str] = ()) -> None:
+    def __init__(self, environment: Resettable, folder: SnapshotFolder, known: Sequence[str] = ()) -> None:
         self._environment, self._folder = environment, folder
         self.gone = sorted(set(known) - set(folder.names()))
 
@@ -29,11 +37,16 @@ class Returning:
         """Return to a snapshot.
 
         Raises:
-            SnapshotGone: it can't be used; it is dropped.
-            StepTimedOut, EnvironmentDied: the environment hung or died.
+            SnapshotGone: it can't be used, or the environment died or hung at it twice; it is dropped.
+            StepTimedOut, EnvironmentDied: the environment hung or died, and can't be reset either.
         """
         try:
-            self._restore(name)
+            try:
+                self._restore(name)
+            except (StepTimedOut, EnvironmentDied):
+                if not self._resets():
+                    raise  # the fault is the machine's
+                self._restore_again(name)
         except SnapshotGone:
             self._folder.drop(name)
             self.gone.append(name)
@@ -54,6 +67,21 @@ class Returning:
         try:
             self._environment.restore(state)
         except (StepTimedOut, EnvironmentDied):
-            raise  # the fault may be the machine's
+            raise  # the fault may be the snapshot's or the machine's
         except Exception as error:  # an environment that is not isolated may raise anything
             raise SnapshotGone(f"snapshot {name} can't be restored: {sentence(error)}") from error
+
+    def _restore_again(self, name: str) -> None:
+        """Return to a snapshot at which the environment died or hung, although it can be reset."""
+        try:
+            self._restore(name)
+        except (StepTimedOut, EnvironmentDied) as error:
+            raise SnapshotGone(f"snapshot {name} can't be restored: {error}, twice") from error
+
+    def _resets(self) -> bool:
+        """Whether the environment, started anew, can be reset."""
+        try:
+            self._environment.begin()
+        except Exception:  # an environment that is not isolated may raise anything
+            return False
+        return True

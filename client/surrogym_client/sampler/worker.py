@@ -19,14 +19,13 @@ from surrogym_client.original.protocol import (
     Environment,
     OriginalEnvironment,
     RolloutEnvironment,
-    SnapshotEnvironment,
 )
 from surrogym_client.original.rollouts import answering
 from surrogym_client.sampler.failures import Failures
 from surrogym_client.sampler.leases import AWAY, ONE_ATTEMPT, LeaseEnded, Leases
 from surrogym_client.sampler.pipeline import Pipeline
 from surrogym_client.sampler.query_limits import check_environment, check_query
-from surrogym_client.sampler.returning import Returning
+from surrogym_client.sampler.returning import Resettable, Returning
 from surrogym_client.sampler.sample_conversion import reset_seed, sample_of
 from surrogym_client.sampler.settings import Outcome, SamplerReport, SamplerSettings
 from surrogym_client.sampler.snapshots import SnapshotFolder
@@ -188,7 +187,7 @@ class Sampler:
         if not self._spec.snapshots:
             yield None
             return
-        assert isinstance(self._environment, SnapshotEnvironment)
+        assert isinstance(self._environment, Resettable)
         known = [one.name for one in self._api.snapshots(self._surrogate)]
         with tempfile.TemporaryDirectory(prefix="surrogym-snapshots-") as ended:
             folder = Path(ended) if self._settings.snapshots is None else self._settings.snapshots

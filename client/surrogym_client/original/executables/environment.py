@@ -8,9 +8,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from surrogym_client.original.errors import StepFailed, UnknownEnvironment
+from surrogym_client.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
 from surrogym_client.original.executables.messages import (
     PROTOCOL,
+    Reply,
     action_entries,
     number,
     numbers,
@@ -24,6 +25,7 @@ from surrogym_client.original.protocol import Array, RealStep
 from surrogym_shared.spec import EnvironmentSpec
 
 PREFIX = "exec:"
+MORE_TIME = "a larger --step-limit gives it more time"
 START_LIMIT = 120.0  # seconds until the specification is there; a simulator may start slowly
 
 
@@ -52,7 +54,7 @@ class Executable:
         """Reset the program; the coordinates (C,) it starts at."""
         self._at = None
         self._revive()
-        self._at = self._state(self._program.ask("reset", self._deadline(), seed=seed))
+        self._at = self._state(self._ask("reset", self._deadline(), seed=seed))
         return self._at
 
     def act(self, action: Array) -> RealStep:
@@ -71,13 +73,13 @@ class Executable:
 
     def save(self) -> bytes:
         """The program's snapshot: the text that it answered with, as bytes."""
-        return text(self._program.ask("save", self._deadline()), "snapshot").encode()
+        return text(self._ask("save", self._deadline()), "snapshot").encode()
 
     def restore(self, snapshot: bytes) -> Array:
         """Let the program return to a snapshot; the coordinates (C,) there."""
         self._at = None
         self._revive()
-        reply = self._program.ask("restore", self._deadline(), snapshot=snapshot.decode(errors="replace"))
+        reply = self._ask("restore", self._deadline(), snapshot=snapshot.decode(errors="replace"))
         self._at = self._state(reply)
         return self._at
 
@@ -87,7 +89,7 @@ class Executable:
 
     def _stepped(self, before: Array, action: Array, deadline: float) -> RealStep:
         sent = action_entries(self._spec.action, action)
-        reply = self._program.ask("step", deadline, action=sent)
+        reply = self._ask("step", deadline, action=sent)
         return RealStep(
             coordinates=before,
             action=numbers(reply if "action" in reply else {"action": sent}, "action", len(sent)),
@@ -109,10 +111,18 @@ class Executable:
             own = _specification(self._program)
         except UnknownEnvironment as error:
             self._program.end()
-            raise StepFailed(f"the program could not be started anew: {error}") from error
+            raise EnvironmentDied(f"the program could not be started anew: {error}") from error
         if own != self._own:
             self._program.end()
-            raise StepFailed("expected the same specification from the program that was started anew, got another one")
+            raise EnvironmentDied(
+                "expected the same specification from the program that was started anew, got another one"
+            )
+
+    def _ask(self, method: str, deadline: float, **fields: object) -> Reply:
+        try:
+            return self._program.ask(method, deadline, **fields)
+        except StepTimedOut as error:
+            raise StepTimedOut(f"{error}; {MORE_TIME}") from error
 
     def _deadline(self) -> float:
         return time.monotonic() + self._step_limit
@@ -125,7 +135,7 @@ class SettableExecutable(Executable):
         """Set the program to coordinates (C,), apply action (F,). Both together have one time limit."""
         self._revive()
         deadline = self._deadline()
-        achieved = self._state(self._program.ask("set", deadline, state=[float(c) for c in coordinates]))
+        achieved = self._state(self._ask("set", deadline, state=[float(c) for c in coordinates]))
         return self._stepped(achieved, action, deadline)
 
 

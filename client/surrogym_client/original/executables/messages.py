@@ -20,6 +20,7 @@ from surrogym_shared.spec.actions import Action
 PROTOCOL = 1
 LONGEST_LINE = 1 << 24  # bytes, without the end of the line
 SHOWN = 80  # characters of a line that an error repeats
+SHOWN_ERROR = 400  # characters of a program's own error
 
 Reply = dict[str, Any]
 
@@ -48,6 +49,8 @@ def decode(line: bytes, number: int) -> Reply:
     """
     try:
         answer = json.loads(line, parse_constant=_not_finite)
+    except _NotFinite as error:
+        raise StepFailed(f"expected finite numbers from the program, got {error} in {short(line)}") from error
     except (ValueError, RecursionError) as error:
         raise StepFailed(
             f"expected one line of JSON from the program, got {short(line)}; let it print everything else to "
@@ -55,8 +58,9 @@ def decode(line: bytes, number: int) -> Reply:
         ) from error
     if not isinstance(answer, dict) or type(answer.get("id")) is not int or answer["id"] != number:
         raise StepFailed(f"expected an answer with id {number} from the program, got {short(line)}")
-    if "error" in answer:
-        raise RequestRefused(f"the program answered: {answer['error']}", str(answer.get("code", "failed")))
+    if answer.get("error") is not None:
+        said, code = one_line(str(answer["error"]), SHOWN_ERROR), one_line(str(answer.get("code", "failed")), SHOWN)
+        raise RequestRefused(f"the program answered: {said or 'an error without words'}", code)
     if not isinstance(answer.get("result"), dict):
         raise StepFailed(f"expected 'result' or 'error' in the program's answer, got {short(line)}")
     result: Reply = answer["result"]
@@ -71,7 +75,7 @@ def numbers(reply: Reply, key: str, size: int) -> Array:
     """
     came = reply.get(key)
     if not isinstance(came, list) or len(came) != size or not all(map(_is_number, came)):
-        raise StepFailed(f"expected {size} finite numbers for {key!r} in the program's answer, got {short(came)}")
+        raise StepFailed(f"expected {size} finite numbers for {key!r} in the program's answer, got {_got(reply, key)}")
     return np.array(came, dtype=np.float64)
 
 
@@ -82,7 +86,7 @@ def number(reply: Reply, key: str) -> float:
         StepFailed: the reply has none under this key.
     """
     if not _is_number(reply.get(key)):
-        raise StepFailed(f"expected a finite number for {key!r} in the program's answer, got {short(reply.get(key))}")
+        raise StepFailed(f"expected a finite number for {key!r} in the program's answer, got {_got(reply, key)}")
     return float(reply[key])
 
 
@@ -94,7 +98,7 @@ def truth(reply: Reply, key: str) -> bool:
     """
     came = reply.get(key)
     if not isinstance(came, bool):
-        raise StepFailed(f"expected true or false for {key!r} in the program's answer, got {short(came)}")
+        raise StepFailed(f"expected true or false for {key!r} in the program's answer, got {_got(reply, key)}")
     return came
 
 
@@ -106,7 +110,7 @@ def text(reply: Reply, key: str) -> str:
     """
     came = reply.get(key)
     if not isinstance(came, str):
-        raise StepFailed(f"expected a text for {key!r} in the program's answer, got {short(came)}")
+        raise StepFailed(f"expected a text for {key!r} in the program's answer, got {_got(reply, key)}")
     return came
 
 
@@ -146,11 +150,27 @@ def _is_number(value: object) -> bool:
         return False
 
 
+class _NotFinite(ValueError):
+    """NaN or an infinity, which is not JSON."""
+
+
 def _not_finite(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is not JSON")
+    raise _NotFinite(constant)
+
+
+def _got(reply: Reply, key: str) -> str:
+    return short(reply[key]) if key in reply else "nothing"
 
 
 def short(value: object) -> str:
     """Return a line, or another value, as an error repeats it."""
-    text = value.decode(errors="replace") if isinstance(value, bytes) else repr(value)
-    return text if len(text) <= SHOWN else f"{text[:SHOWN]}…"
+    if not isinstance(value, bytes):
+        return one_line(repr(value), SHOWN)
+    return one_line(value.decode(errors="replace"), SHOWN) or ("no printable character" if value else "an empty line")
+
+
+def one_line(text: str, most: int) -> str:
+    """Return the first printable characters of a text, ``most`` at most, in one line."""
+    printable = "".join(c if c.isprintable() else " " for c in text[: 2 * most])
+    line = " ".join(printable.split())
+    return line if len(line) <= most and len(text) <= 2 * most else f"{line[:most]}…"

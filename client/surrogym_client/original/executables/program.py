@@ -57,7 +57,7 @@ class Program:
         self._process: subprocess.Popen[bytes] | None = None
         self._guard: Guard | None = None
         self._standard_error: StandardError | None = None
-        self._unread = b""
+        self._unread = bytearray()
         self._number = 0  # of the last request
 
     @property
@@ -86,7 +86,7 @@ class Program:
             raise UnknownEnvironment(
                 f"expected a program that can be started, got {self._words[0]!r}: {error}"
             ) from error
-        self._unread = b""
+        self._unread.clear()
         assert self._process.stdin is not None
         assert self._process.stderr is not None
         os.set_blocking(self._process.stdin.fileno(), False)
@@ -139,7 +139,7 @@ class Program:
                 selector.register(self._process.stdout.fileno(), selectors.EVENT_READ)
                 if selector.select(seconds):
                     self._unread += os.read(self._process.stdout.fileno(), CHUNK)
-        return self._unread
+        return bytes(self._unread)
 
     def end_input(self) -> None:
         """Close the program's standard input."""
@@ -208,16 +208,18 @@ class Program:
                 except BlockingIOError:
                     continue
                 except OSError as error:
-                    raise self._death(method) from error
+                    raise self._death(method, "input") from error
 
     def _read(self, method: str, deadline: float) -> bytes:
         assert self._process is not None
         assert self._process.stdout is not None
         begun, output = time.monotonic(), self._process.stdout.fileno()
+        searched = 0
         with selectors.DefaultSelector() as selector:
             selector.register(output, selectors.EVENT_READ)
-            while b"\n" not in self._unread:
-                if len(self._unread) > LONGEST_LINE:
+            while (end := self._unread.find(b"\n", searched)) < 0:
+                searched = len(self._unread)
+                if searched > LONGEST_LINE:
                     raise StepFailed(
                         f"expected a line of at most {LONGEST_LINE} bytes from the program, got a longer one"
                     )
@@ -225,23 +227,37 @@ class Program:
                 if left <= 0 or not selector.select(left):
                     raise StepTimedOut(
                         f"{self._called} did not answer {method} within {max(0.0, deadline - begun):.3g} s and was "
-                        f"ended{self._complaint()}"
+                        f"ended{self._unfinished()}{self._complaint()}"
                     )
                 if not (chunk := os.read(output, CHUNK)):
-                    raise self._death(method)
+                    raise self._death(method, "output")
                 self._unread += chunk
-        line, _, self._unread = self._unread.partition(b"\n")
+        line = bytes(self._unread[:end])
+        del self._unread[: end + 1]
         return line
 
-    def _death(self, method: str) -> EnvironmentDied:
-        """The error of a program that closed its input or output. It has a moment to end by itself."""
-        self.wait(END_SECONDS)
+    def _unfinished(self) -> str:
+        """What an error says of a line that has begun."""
+        return f"; it printed {short(bytes(self._unread))} without an end of the line" if self._unread else ""
+
+    def _death(self, method: str, closed: str) -> EnvironmentDied:
+        """The error of a program that closed its ``closed``, input or output. It has a moment to end by itself."""
+        code = self.wait(END_SECONDS)
         printed = self.surplus(0.0)
-        after = f", after it printed {short(printed.strip())}" if printed else ""
-        code = self.end()
-        return EnvironmentDied(f"{self._called} ended with exit code {code} during {method}{after}{self._complaint()}")
+        after = f", after it printed {short(printed)}" if printed.strip() else ""
+        self.end()
+        did = f"closed its standard {closed} and was ended" if code is None else f"ended with exit code {_named(code)}"
+        return EnvironmentDied(f"{self._called} {did} during {method}{after}{self._complaint()}")
 
     def _complaint(self) -> str:
         """What an error says of the program's standard error."""
         last = "" if self._standard_error is None else self._standard_error.last_line()
         return f"; the last line of its standard error: {last}" if last else ""
+
+
+def _named(code: int) -> str:
+    """An exit code, with the signal's name if a signal ended the program."""
+    try:
+        return f"{code} ({signal.Signals(-code).name})" if code < 0 else str(code)
+    except ValueError:  # a real-time signal, which has no name
+        return str(code)

@@ -113,8 +113,9 @@ def read_archive(path: Path) -> Archive:
     try:
         described: Any = read_model_description(str(path), validate=False)
     except Exception as error:  # fmpy raises errors of zipfile, lxml, its own, and TypeErrors
+        words = "it lacks a part" if isinstance(error, AttributeError | TypeError | KeyError) else _first_line(error)
         raise UnknownEnvironment(
-            f"the {DESCRIPTION} of {path} can't be read ({_first_line(error)}): export the FMU anew, or check it with "
+            f"the {DESCRIPTION} of {path} can't be read ({words}): export the FMU anew, or check it with "
             f"fmpy validate {path}"
         ) from error
     return _archive(path, names, described)

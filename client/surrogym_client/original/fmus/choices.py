@@ -67,9 +67,10 @@ def read_choices(name: str) -> tuple[Path, Choices]:
         given = _File.model_validate(json.loads(path.read_text(encoding="utf-8")))
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "the file"
+        place = ".".join(map(str, first["loc"]))
+        wrong = f"{place}: {first['msg']}" if place else "not a JSON object"
         raise UnknownEnvironment(
-            f"{path}: {place}: {first['msg']}; expected fmu, and optionally step, actions, coordinates and start"
+            f"{path}: {wrong}; expected fmu, and optionally step, actions, coordinates and start"
         ) from error
     except ValueError as error:
         raise UnknownEnvironment(f"{path} is not JSON: {error}") from error
@@ -82,6 +83,9 @@ def _choices(path: Path, given: _File) -> Choices:
         if not low < high:
             raise UnknownEnvironment(f"{path}: action {action!r}: expected low < high, got [{low:g}, {high:g}]")
     actions = None if given.actions is None else tuple(given.actions)
+    for key, names in (("actions", actions), ("coordinates", given.coordinates)):
+        if names and (twice := next((name for name in names if names.count(name) > 1), None)) is not None:
+            raise UnknownEnvironment(f"{path}: {key}: expected each variable once, got {twice!r} twice")
     return Choices(given.step, actions, limits, given.coordinates, given.start)
 
 

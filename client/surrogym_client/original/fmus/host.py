@@ -119,9 +119,8 @@ class Host:
 
     def _values(self) -> Fields:
         values = self._open_instance.read(self._reads)
-        wrong = [
-            f"{name} is {value}" for name, value in zip(self._names, values, strict=True) if not math.isfinite(value)
-        ]
+        named = dict(zip(self._names, values, strict=True))  # a state that is an output too is read twice
+        wrong = [f"{name} is {value}" for name, value in named.items() if not math.isfinite(value)]
         if wrong:
             raise Refused(f"expected finite values of the FMU, but {', '.join(wrong)}")
         return {"values": values}

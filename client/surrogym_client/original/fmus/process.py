@@ -16,7 +16,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from surrogym_client.original.errors import OriginalError, RequestRefused, StepFailed, UnknownEnvironment
+from surrogym_client.original.errors import (
+    EnvironmentDied,
+    OriginalError,
+    RequestRefused,
+    StepFailed,
+    StepTimedOut,
+    UnknownEnvironment,
+)
+from surrogym_client.original.executables.environment import MORE_TIME
 from surrogym_client.original.executables.messages import Reply, numbers, truth
 from surrogym_client.original.executables.program import Program
 from surrogym_client.original.fmus.archive import Archive, Declared
@@ -153,13 +161,15 @@ class Process:
             self._open()
         except OriginalError as error:
             self._program.end()
-            raise StepFailed(f"{self._archive.path.name} could not be started anew: {error}") from error
+            raise EnvironmentDied(f"{self._archive.path.name} could not be started anew: {error}") from error
 
     def _ask(self, method: str, limit: float | None = None, **fields: Any) -> Reply:
         self._values = self._values if method == "save" else None
         deadline = time.monotonic() + (limit or self.step_limit)
         try:
             return self._program.ask(method, deadline, **fields)
+        except StepTimedOut as error:
+            raise error if limit else StepTimedOut(f"{error}; {MORE_TIME}") from error
         except RequestRefused as error:
             if error.code == "broken":
                 self._program.end()

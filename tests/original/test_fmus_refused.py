@@ -1,0 +1,88 @@
+"""What can't be used as an FMU, or does not fit one, is refused in one sentence with the way out."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from support.fmus import EXAMPLES, STATES, build, changed, mapping
+from surrogym_client.original.adapters.fmu import open_simulator
+from surrogym_client.original.errors import UnknownEnvironment
+
+pytest.importorskip("fmpy")
+pytest.importorskip("pythonfmu")
+
+
+@pytest.fixture(scope="module")
+def tanks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(EXAMPLES / "two_tanks.py", tmp_path_factory.mktemp("fmus"), *STATES)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"<CoSimulation": "<ModelExchange"}, "for model exchange only, .*: export it for co-simulation"),
+        ({'fmiVersion="2.0"': 'fmiVersion="1.0"'}, r"can't be read|of FMI 2.0 or 3.0"),
+        ({'causality="input"': 'causality="parameter" variability="fixed"'}, "got no scalar input: declare one"),
+        ({' stepSize="10.0"': ""}, r'expected the seconds of one action, as \{"fmu": "copy.fmu", "step": 0.1\}'),
+        ({"</fmiModelDescription>": ""}, "modelDescription.xml of .* can't be read"),
+    ],
+)
+def test_a_description_that_does_not_fit_is_named(tanks: Path, tmp_path: Path, words, message: str) -> None:
+    with pytest.raises(UnknownEnvironment, match=message):
+        open_simulator(f"fmu:{changed(tanks, tmp_path / 'copy.fmu', words)}")
+
+
+def test_code_for_another_platform_is_named(tanks: Path, tmp_path: Path) -> None:
+    foreign = changed(tanks, tmp_path / "foreign.fmu", {}, moved="win32")
+    with pytest.raises(UnknownEnvironment, match=r"expected native code for \S+ in .*, got win32, win64: export it"):
+        open_simulator(f"fmu:{foreign}")
+    bare = changed(tanks, tmp_path / "bare.fmu", {}, left_out="modelDescription")
+    with pytest.raises(UnknownEnvironment, match=r"has no modelDescription.xml, so it is not an FMU"):
+        open_simulator(f"fmu:{bare}")
+
+
+def test_broken_files_are_named(tanks: Path, tmp_path: Path) -> None:
+    whole = tanks.read_bytes()
+    for content, message in ((b"hello", "is not a zip archive"), (whole[: len(whole) // 2], "is not a zip archive")):
+        (tmp_path / "broken.fmu").write_bytes(content)
+        with pytest.raises(UnknownEnvironment, match=message):
+            open_simulator(f"fmu:{tmp_path / 'broken.fmu'}")
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 0xFF
+    (tmp_path / "broken.fmu").write_bytes(flipped)
+    with pytest.raises(UnknownEnvironment, match="is damaged: copy or export"):
+        open_simulator(f"fmu:{tmp_path / 'broken.fmu'}")
+    with pytest.raises(UnknownEnvironment, match="got no file"):
+        open_simulator(f"fmu:{tmp_path / 'none.fmu'}")
+
+
+@pytest.mark.parametrize(
+    ("choices", "message"),
+    [
+        ({"start": {"flow": "much"}}, "expected a finite number for 'flow'"),
+        ({"start": {"depth": 1.0}}, "has no scalar variable 'depth': expected one of pump, upper, lower, flow"),
+        ({"actions": {"pump": [1, 0]}}, r"expected low < high, got \[1, 0\]"),
+        ({"actions": ["flow"]}, "expected some of the continuous inputs of .*, pump, got flow"),
+        ({"coordinates": []}, "expected continuous variables of .*, got none"),
+        ({"steps": 1.0}, "expected fmu, and optionally step, actions, coordinates and start"),
+        ({"actions": ["pump", "pump"]}, "actions: expected each variable once, got 'pump' twice"),
+        ({"coordinates": ["lower", "lower"]}, "coordinates: expected each variable once, got 'lower' twice"),
+        ({"step": -1.0}, "step: Input should be greater than 0"),
+    ],
+)
+def test_choices_that_do_not_fit_are_named(tanks: Path, tmp_path: Path, choices, message: str) -> None:
+    with pytest.raises(UnknownEnvironment, match=message):
+        open_simulator(mapping(tmp_path, fmu=str(tanks), **choices))
+
+
+def test_files_of_other_forms_are_named_without_words_of_python(tmp_path: Path) -> None:
+    (tmp_path / "list.json").write_text("[1]")
+    with pytest.raises(UnknownEnvironment, match=r"list.json: not a JSON object; expected fmu"):
+        open_simulator(f"fmu:{tmp_path / 'list.json'}")
+    with zipfile.ZipFile(tmp_path / "bare.fmu", "w") as bare:
+        bare.writestr("modelDescription.xml", "<fmiModelDescription/>")
+    with pytest.raises(UnknownEnvironment, match=r"can't be read \(it lacks a part\): export the FMU anew"):
+        open_simulator(f"fmu:{tmp_path / 'bare.fmu'}")
