@@ -86,7 +86,7 @@ def test_a_query_whose_snapshot_no_longer_loads_is_chosen_anew(api, rail, tmp_pa
 def test_a_folder_keeps_states_for_the_next_sampler(tmp_path):
     name, dropped = SnapshotFolder(tmp_path, SAVED).add(b"state", [0.5])
     again = SnapshotFolder(tmp_path, SAVED)
-    assert (again.names(), again.state(name), dropped) == ([name], b"state", [])
+    assert (again.names(), again.read(name), dropped) == ([name], ((0.5,), b"state"), [])
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_a_snapshot_that_is_not_as_written_is_gone(tmp_path, change, message):
     name, _ = folder.add(b"state", [0.5])
     change(tmp_path / f"{name}.snapshot")
     with pytest.raises(SnapshotGone, match=message):
-        folder.state(name)
+        folder.read(name)
 
 
 def test_a_full_folder_drops_one_of_the_nearest_and_never_the_newest(tmp_path):

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import TypeVar, get_args
 
 import numpy as np
@@ -19,17 +17,15 @@ from surrogym_client.original.protocol import (
     Environment,
     OriginalEnvironment,
     RolloutEnvironment,
-    SnapshotEnvironment,
 )
 from surrogym_client.original.rollouts import answering
 from surrogym_client.sampler.failures import Failures
 from surrogym_client.sampler.leases import AWAY, ONE_ATTEMPT, LeaseEnded, Leases
 from surrogym_client.sampler.pipeline import Pipeline
 from surrogym_client.sampler.query_limits import check_environment, check_query
-from surrogym_client.sampler.returning import Returning
+from surrogym_client.sampler.returning import Returning, snapshots_of
 from surrogym_client.sampler.sample_conversion import reset_seed, sample_of
 from surrogym_client.sampler.settings import Outcome, SamplerReport, SamplerSettings
-from surrogym_client.sampler.snapshots import SnapshotFolder
 from surrogym_client.surrogates.phases import ENDED
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import Retries
@@ -49,12 +45,13 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class _Answer:
-    """The real steps of a query. ``outcome``: if there are none."""
+    """The real steps of a query. ``outcome``: if there are none. ``remark``: what went wrong without harm to it."""
 
     query: Query
     taken: list[NewSample]
     outcome: Outcome
     error: str
+    remark: str = ""
 
     @property
     def clean(self) -> bool:
@@ -142,7 +139,8 @@ class Sampler:
         self._started, self._broken_off = time.monotonic(), False
         self._check()
         leases = Leases(self._api, self._surrogate, self._settings.lease_seconds)
-        with self._snapshots() as self._returning, leases as self._leases, closing(self._pipeline):
+        saved = snapshots_of(self._api, self._surrogate, self._environment, self._own, self._settings)
+        with saved as self._returning, leases as self._leases, closing(self._pipeline):
             self._report_gone()
             try:
                 self._answer_all()
@@ -181,19 +179,6 @@ class Sampler:
         self._environment = answering(self._environment)
         self._spec, self._own = self._api.surrogate(self._surrogate).spec, self._environment.spec()
         check_environment(self._surrogate, self._spec, self._own)
-
-    @contextmanager
-    def _snapshots(self) -> Iterator[Returning | None]:
-        """Open the folder of snapshots, if queries begin there."""
-        if not self._spec.snapshots:
-            yield None
-            return
-        assert isinstance(self._environment, SnapshotEnvironment)
-        known = [one.name for one in self._api.snapshots(self._surrogate)]
-        with tempfile.TemporaryDirectory(prefix="surrogym-snapshots-") as ended:
-            folder = Path(ended) if self._settings.snapshots is None else self._settings.snapshots
-            kept = SnapshotFolder(folder / self._surrogate, self._own, self._settings.bounds)
-            yield Returning(self._environment, kept, known)
 
     def _wait_seconds(self) -> float:
         """Seconds that a claim waits for queries."""
@@ -267,7 +252,7 @@ class Sampler:
             self._hand_in(taken)
             self._steps += len(taken)
             raise
-        return _Answer(query, taken, outcome, error)
+        return _Answer(query, taken, outcome, error, self._returning.remarks() if self._returning else "")
 
     def _deliver(self, answer: _Answer) -> _Answer:
         """Send the samples of an answer, or return its query. Returns the answer as the server took it."""
@@ -285,8 +270,11 @@ class Sampler:
         """Count a query whose answer was acknowledged. Returns whether it has one."""
         self._leases.release(answer.query)
         self._steps += len(answer.taken)
+        if self._returning is not None:
+            self._returning.handed_in([sample.snapshot for sample in answer.taken if sample.snapshot is not None])
         self._report_gone()
-        self._count(answer.query, "answered" if answer.taken else answer.outcome, answer.error)
+        said = "; ".join(filter(None, (answer.error, answer.remark)))
+        self._count(answer.query, "answered" if answer.taken else answer.outcome, said)
         return answer.clean
 
     def _take(self, query: Query, taken: list[NewSample]) -> None:
