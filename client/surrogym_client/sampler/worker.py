@@ -261,6 +261,7 @@ class Sampler:
         except InvalidInput as invalid:
             answer = replace(answer, taken=[], outcome="failed", error=str(invalid))
         if not answer.taken:
+            self._report_gone()  # first, or another sampler claims the query and finds its snapshot gone too
             begun = bool(answer.error) and answer.outcome == "failed"
             give_back = partial(self._give_back, answer.query, answer.error or STOPPED, begun=begun)
             self._patiently(give_back, LAST_SECONDS)
