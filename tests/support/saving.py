@@ -14,11 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from surrogym_client import original
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
 from surrogym_client.original.protocol import Array, RealStep
 from surrogym_client.sampler import Sampler, SamplerSettings
-from surrogym_client.sampler.snapshots import ENDING, Bounds
+from surrogym_client.sampler.snapshots import ENDING, Bounds, SnapshotFolder
 from surrogym_client.transport import Api
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -136,6 +138,15 @@ def work(url: str, name: str, snapshots: Path | None, most: int, path: str) -> N
     tempfile.tempdir = str(Path(path).parent.parent)  # where a kill leaves what nobody removes
     with Api(url) as api:
         Sampler(api, name, NotingPendulum(notes), settings, lambda _, *said: _note(notes, said=said)).run()
+
+
+def fill(folder: Path, spec: EnvironmentSpec, seed: int) -> None:
+    """Keep snapshots in a folder that has room for a few, for as long as another one does the same."""
+    rng, kept = np.random.default_rng(seed), SnapshotFolder(folder, spec, Bounds(count=5))
+    for number in range(1_000):
+        kept.add(bytes(2_000), [float(rng.uniform(-1, 1))])
+        if number % 10 == 0:
+            SnapshotFolder(folder, spec).names()
 
 
 def _note(notes: int, **what: Any) -> None:

@@ -54,6 +54,12 @@ class Returning:
         self._hangs: dict[str, int] = {}  # by snapshot
         self._hung_saves = 0
         self._remarks: dict[str, str] = {}  # the first of each kind; empty: it was told
+        if self.gone:
+            self._remark(
+                "start",
+                f"{len(self.gone)} of {len(known)} snapshots that the server knew are not in this sampler's folder, or "
+                "can't be used, so the server forgets them",
+            )
 
     def begin(self, name: str) -> None:
         """Return to a snapshot.
@@ -92,7 +98,8 @@ class Returning:
         return name
 
     def handed_in(self, names: Iterable[str]) -> None:
-        """Notice which of these snapshots, of which the server has just learned, another sampler has dropped."""
+        """Notice which of these snapshots, of which the server has just learned, are gone already: another sampler has
+        dropped them, or this one has while their samples were on the way."""
         self.gone += [name for name in names if name not in self._folder and name not in self.gone]
 
     def remarks(self) -> str:

@@ -225,7 +225,7 @@ class Sampler:
 
     def _answer(self, query: Query, *, last: bool) -> None:
         """Take the real steps of a query, and send them. ``last``: the next query has to be claimed."""
-        flows = self._returning is None and not self._settings.once  # each step may drop a snapshot of a later query
+        flows = not self._settings.once
         ahead = self._limit(running=1) if flows and last else 0
         claim = partial(self._claim, ahead, 0.0, ONE_ATTEMPT) if ahead > 0 else None
         answer = self._pipeline.step(partial(self._step, query), claim)
@@ -261,7 +261,8 @@ class Sampler:
         except InvalidInput as invalid:
             answer = replace(answer, taken=[], outcome="failed", error=str(invalid))
         if not answer.taken:
-            self._report_gone()  # first, or another sampler claims the query and finds its snapshot gone too
+            if answer.outcome == "impossible":
+                self._report_gone()  # first, or another sampler claims the query and finds its snapshot gone too
             begun = bool(answer.error) and answer.outcome == "failed"
             give_back = partial(self._give_back, answer.query, answer.error or STOPPED, begun=begun)
             self._patiently(give_back, LAST_SECONDS)
@@ -310,7 +311,7 @@ class Sampler:
         """Tell the server which of its snapshots are gone, so that the design chooses other queries."""
         while self._returning is not None and (some := self._returning.gone[:MOST_GONE]):
             self._patiently(partial(self._api.drop_snapshots, self._surrogate, some), LAST_SECONDS)
-            del self._returning.gone[:MOST_GONE]
+            del self._returning.gone[: len(some)]
 
     def _hand_in(self, samples: list[NewSample]) -> None:
         if samples:
