@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import uuid
 
 import numpy as np
 import pytest
 
 from support.rail import SPEC, Rail
-from surrogym_client.original.errors import EnvironmentDied, SnapshotGone
+from support.saving import SPAWN, fill
+from surrogym_client.original.errors import EnvironmentDied, SnapshotGone, SnapshotNotKept, StepTimedOut, UnusableFolder
 from surrogym_client.original.rollouts import answering
 from surrogym_client.sampler import Sampler, SamplerSettings
 from surrogym_client.sampler.returning import Returning
@@ -40,10 +42,40 @@ def rail(api):
     api.delete_surrogate(name)
 
 
-def sample(api, rail, folder, told=None, **settings):
+class GivesNoBytes(SavedRail):
+    def save(self):
+        return "text"
+
+
+class RaisesInSave(SavedRail):
+    def save(self):
+        raise RuntimeError("no licence")
+
+
+class SavesMuch(SavedRail):
+    def save(self):
+        return bytes(5_000)
+
+
+class HangsInSave(SavedRail):
+    def save(self):
+        raise StepTimedOut("save took longer than 30 s and was killed")
+
+
+class ReturnsElsewhere(SavedRail):
+    def restore(self, snapshot):
+        return super().restore(repr(float(snapshot) + 0.3).encode())
+
+
+class ReturnsNowhere(SavedRail):
+    def restore(self, snapshot):
+        return np.array([np.nan, np.nan])
+
+
+def sample(api, rail, folder, told=None, environment=SavedRail, **settings):
     chosen = SamplerSettings(snapshots=folder, time_limit=60.0, **settings)
     report = (lambda *seen: told.append(seen)) if told is not None else None
-    return Sampler(api, rail, SavedRail(), chosen, report).run()
+    return Sampler(api, rail, environment(), chosen, report).run()
 
 
 def test_a_design_returns_to_saved_states_after_a_restart_and_past_damage(api, rail, tmp_path):
@@ -63,6 +95,7 @@ def test_a_design_returns_to_saved_states_after_a_restart_and_past_damage(api, r
     assert view.ledger.total == len(list(api.samples(rail))) <= 16
     assert (view.ledger.unresolved, view.queries.set_aside) == (0, 0)
     assert files[1].stem not in left, "the server learned that it is gone"
+    assert f"2 of {len(known)} snapshots that the server knew are not in this sampler's folder" in told[0][2]
     returned = [query for query in api.queries(rail) if query.snapshot is not None]
     assert returned
     assert {query.id for query, outcome, _ in told if outcome == "answered"} >= {query.id for query in returned}
@@ -85,7 +118,14 @@ def test_a_query_whose_snapshot_no_longer_loads_is_chosen_anew(api, rail, tmp_pa
     assert (view.ledger.unresolved, view.queries.set_aside, view.queries.pending) == (0, 0, 0)
 
 
-def test_a_snapshot_at_which_the_environment_dies_is_gone_if_it_can_be_reset(tmp_path):
+@pytest.mark.parametrize(
+    "fault",
+    [
+        EnvironmentDied("the program ended with exit code 9 during restore"),
+        StepTimedOut("restore took longer than 30 s and was killed"),
+    ],
+)
+def test_a_snapshot_at_which_the_environment_dies_or_hangs_is_gone_if_it_can_be_reset(tmp_path, fault):
     class Dies(SavedRail):
         asked = 0
 
@@ -93,14 +133,14 @@ def test_a_snapshot_at_which_the_environment_dies_is_gone_if_it_can_be_reset(tmp
             self.asked += 1
             if self.asked > 1 and snapshot == b"1.0":
                 return super().restore(snapshot)
-            raise EnvironmentDied("the program ended with exit code 9 during restore")
+            raise fault
 
     for state, gone in ((b"0.5", True), (b"1.0", False)):
         folder = SnapshotFolder(tmp_path / str(gone), SAVED, Bounds(10, 10**6))
-        returning = Returning(answering(Dies()), folder)
+        returning = Returning(answering(Dies()), SAVED, folder)
         name, _ = folder.add(state, [0.0])
         if gone:
-            with pytest.raises(SnapshotGone, match=r"can't be restored: the program ended .* during restore, twice"):
+            with pytest.raises(SnapshotGone, match=f"can't be restored: {fault}, twice"):
                 returning.begin(name)
         else:
             returning.begin(name)
@@ -116,7 +156,7 @@ def test_a_snapshot_stays_if_the_environment_is_broken(tmp_path):
             raise EnvironmentDied("the program could not be started anew: no licence")
 
     folder = SnapshotFolder(tmp_path, SAVED, Bounds(10, 10**6))
-    returning = Returning(answering(Broken()), folder)
+    returning = Returning(answering(Broken()), SAVED, folder)
     name, _ = folder.add(b"0.5", [0.0])
     with pytest.raises(EnvironmentDied):
         returning.begin(name)
@@ -126,7 +166,7 @@ def test_a_snapshot_stays_if_the_environment_is_broken(tmp_path):
 def test_a_folder_keeps_states_for_the_next_sampler(tmp_path):
     name, dropped = SnapshotFolder(tmp_path, SAVED).add(b"state", [0.5])
     again = SnapshotFolder(tmp_path, SAVED)
-    assert (again.names(), again.state(name), dropped) == ([name], b"state", [])
+    assert (again.names(), again.read(name), dropped) == ([name], ((0.5,), b"state"), [])
 
 
 @pytest.mark.parametrize(
@@ -143,7 +183,7 @@ def test_a_snapshot_that_is_not_as_written_is_gone(tmp_path, change, message):
     name, _ = folder.add(b"state", [0.5])
     change(tmp_path / f"{name}.snapshot")
     with pytest.raises(SnapshotGone, match=message):
-        folder.state(name)
+        folder.read(name)
 
 
 def test_a_full_folder_drops_one_of_the_nearest_and_never_the_newest(tmp_path):
@@ -165,3 +205,114 @@ def test_a_folder_holds_no_more_bytes_than_it_may(tmp_path):
 def test_the_older_one_of_the_nearest_two_is_least_useful():
     assert least_useful(np.array([[0.0], [1.0], [1.1], [5.0]]), keep=3) == 1
     assert least_useful(np.array([[0.0], [1.0], [1.1], [5.0]]), keep=1) == 2
+
+
+@pytest.mark.parametrize(
+    ("environment", "sentence"),
+    [
+        (GivesNoBytes, "a state is not kept, so no query will begin there: expected bytes from save, got a str"),
+        (RaisesInSave, "a state is not kept, so no query will begin there: RuntimeError: no licence"),
+        (SavesMuch, "expected a snapshot of at most 4000 bytes, which all snapshots together"),
+        (ReturnsElsewhere, "restore leads to another state than was saved"),
+    ],
+)
+def test_what_costs_no_step_is_told_once(api, rail, tmp_path, environment, sentence):
+    told: list = []
+    report = sample(api, rail, tmp_path, told, environment, bounds=Bounds(size=4_000), until_done=True)
+    errors = [error for _, outcome, error in told if outcome == "answered" and error]
+    assert len(errors) == 1
+    assert sentence in errors[0]
+    view = api.surrogate(rail)
+    assert report.steps == view.ledger.total == len(list(api.samples(rail)))
+    assert (report.failed, view.ledger.unresolved, view.queries.set_aside) == (0, 0, 0)
+    assert view.phase in ("ready", "over_budget")
+
+
+def test_a_save_that_hangs_ends_its_rollout_and_then_all_saving(api, rail, tmp_path):
+    """No step may follow in the same query: it would begin elsewhere, and the server would refuse the whole answer."""
+    told: list = []
+    report = sample(api, rail, tmp_path, told, HangsInSave, until_done=True)
+    errors = [error for _, _, error in told if error]
+    hung = "save took longer than 30 s and was killed"
+    assert errors == [hung, f"{hung}; this sampler saves no state any more, because save hung or died too often"]
+    view = api.surrogate(rail)
+    assert (report.steps, view.ledger.unresolved) == (view.ledger.total, 0)
+
+
+def test_a_return_to_nowhere_costs_no_step(api, rail, tmp_path):
+    told: list = []
+    sample(api, rail, tmp_path, told, ReturnsNowhere, until_done=True)
+    errors = [error for _, outcome, error in told if outcome == "impossible"]
+    assert errors
+    assert all(error.endswith("can't be restored: expected coordinates (x), got array([nan])") for error in errors)
+    assert api.surrogate(rail).ledger.unresolved == 0
+
+
+def test_samplers_share_a_full_folder(tmp_path):
+    """Each drops the newest files of the other at any moment."""
+    both = [SPAWN.Process(target=fill, args=(tmp_path, SAVED, seed)) for seed in range(2)]
+    for process in both:
+        process.start()
+    for process in both:
+        process.join()
+    assert [process.exitcode for process in both] == [0, 0]
+    assert {file.suffix for file in tmp_path.iterdir()} == {".snapshot"}
+
+
+def test_a_snapshot_that_another_sampler_dropped_before_its_sample_was_sent_is_reported(tmp_path):
+    folder = SnapshotFolder(tmp_path, SAVED)
+    returning = Returning(SavedRail(), SAVED, folder)
+    names = [folder.add(b"", [x])[0] for x in (0.1, 0.2)]
+    SnapshotFolder(tmp_path, SAVED).drop(names[0])
+    returning.handed_in(names)
+    assert returning.gone == [names[0]]
+
+
+def test_what_the_server_does_not_know_is_dropped_first(tmp_path):
+    """A killed sampler did not send its sample, or the surrogate was deleted and made again."""
+    folder = SnapshotFolder(tmp_path, SAVED, Bounds(count=3))
+    names = [folder.add(b"", [x])[0] for x in (0.0, 0.01, 0.9)]
+    folder.drop_first([names[2]])
+    assert folder.add(b"", [-0.9])[1] == [names[2]]
+
+
+def test_what_a_killed_sampler_left_unfinished_is_removed_once_nobody_writes_it(tmp_path):
+    old, new = (tmp_path / f"{name}.part" for name in ("old", "new"))
+    for path in (old, new):
+        path.write_bytes(b"{")
+    os.utime(old, (0, 0))
+    SnapshotFolder(tmp_path, SAVED)
+    assert [path.exists() for path in (old, new)] == [False, True]
+
+
+def test_a_state_that_can_not_be_written_leaves_the_others_alone(tmp_path):
+    resource = pytest.importorskip("resource")
+    folder = SnapshotFolder(tmp_path, SAVED, Bounds(size=1_000_000))
+    name, _ = folder.add(b"state", [0.5])
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+    try:
+        with pytest.raises(SnapshotNotKept, match="File too large"):
+            folder.add(bytes(100_000), [0.1])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with pytest.raises(SnapshotNotKept, match="at most 1000000 bytes"):
+        folder.add(bytes(1_000_000), [0.1])
+    assert [file.name for file in tmp_path.iterdir()] == [f"{name}.snapshot"]
+
+
+def test_a_folder_that_is_a_file_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(
+        UnusableFolder, match=r"expected a folder for snapshots that can be written to, got .*/file/rail"
+    ):
+        SnapshotFolder(tmp_path / "file" / "rail", SAVED)
+
+
+def test_a_full_folder_leaves_no_snapshot_known_without_its_file(api, rail, tmp_path):
+    """Snapshots are dropped while the samples of others, and their own, are on the way to the server."""
+    report = sample(api, rail, tmp_path, bounds=Bounds(count=2), until_done=True)
+    files = {file.stem for file in (tmp_path / rail).iterdir()}
+    assert len(files) == 2
+    assert {one.name for one in api.snapshots(rail)} <= files
+    assert (report.failed, api.surrogate(rail).ledger.unresolved) == (0, 0)

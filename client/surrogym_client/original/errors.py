@@ -9,6 +9,8 @@ OriginalError
 ├── PolicyMisfit            the policy gives actions that the environment does not have
 ├── QueryRefused            a query asks for what the environment does not allow; nothing was sent to it
 ├── SnapshotGone            a query begins at a snapshot that can't be used; the design chooses another query
+├── SnapshotNotKept         a state can't be saved or written; no query will begin there
+├── UnusableFolder          snapshots can't be kept in this folder; nothing was begun
 ├── MachineFails            the environment failed at several different queries in a row; the worker stops
 ├── EvaluationFailed        the environment or the policy failed after real steps had been taken
 └── StepFailed              the environment did not give a step; the query fails, the worker continues
@@ -57,6 +59,14 @@ class QueryRefused(OriginalError):
 
 class SnapshotGone(OriginalError):
     """A snapshot was dropped, is damaged, or can't be restored; no real step was taken."""
+
+
+class SnapshotNotKept(OriginalError):
+    """A state could not be saved or written. The step before it counts all the same."""
+
+
+class UnusableFolder(OriginalError):
+    """The folder for snapshots can't be made, or not written to."""
 
 
 class MachineFails(OriginalError):

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import TypeVar, get_args
 
 import numpy as np
@@ -25,10 +23,9 @@ from surrogym_client.sampler.failures import Failures
 from surrogym_client.sampler.leases import AWAY, ONE_ATTEMPT, LeaseEnded, Leases
 from surrogym_client.sampler.pipeline import Pipeline
 from surrogym_client.sampler.query_limits import check_environment, check_query
-from surrogym_client.sampler.returning import Resettable, Returning
+from surrogym_client.sampler.returning import Returning, snapshots_of
 from surrogym_client.sampler.sample_conversion import reset_seed, sample_of
 from surrogym_client.sampler.settings import Outcome, SamplerReport, SamplerSettings
-from surrogym_client.sampler.snapshots import SnapshotFolder
 from surrogym_client.surrogates.phases import ENDED
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import Retries
@@ -48,12 +45,13 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class _Answer:
-    """The real steps of a query. ``outcome``: if there are none."""
+    """The real steps of a query. ``outcome``: if there are none. ``remark``: what went wrong without harm to it."""
 
     query: Query
     taken: list[NewSample]
     outcome: Outcome
     error: str
+    remark: str = ""
 
     @property
     def clean(self) -> bool:
@@ -141,7 +139,8 @@ class Sampler:
         self._started, self._broken_off = time.monotonic(), False
         self._check()
         leases = Leases(self._api, self._surrogate, self._settings.lease_seconds)
-        with self._snapshots() as self._returning, leases as self._leases, closing(self._pipeline):
+        saved = snapshots_of(self._api, self._surrogate, self._environment, self._own, self._settings)
+        with saved as self._returning, leases as self._leases, closing(self._pipeline):
             self._report_gone()
             try:
                 self._answer_all()
@@ -180,19 +179,6 @@ class Sampler:
         self._environment = answering(self._environment)
         self._spec, self._own = self._api.surrogate(self._surrogate).spec, self._environment.spec()
         check_environment(self._surrogate, self._spec, self._own)
-
-    @contextmanager
-    def _snapshots(self) -> Iterator[Returning | None]:
-        """Open the folder of snapshots, if queries begin there."""
-        if not self._spec.snapshots:
-            yield None
-            return
-        assert isinstance(self._environment, Resettable)
-        known = [one.name for one in self._api.snapshots(self._surrogate)]
-        with tempfile.TemporaryDirectory(prefix="surrogym-snapshots-") as ended:
-            folder = Path(ended) if self._settings.snapshots is None else self._settings.snapshots
-            kept = SnapshotFolder(folder / self._surrogate, self._own, self._settings.bounds)
-            yield Returning(self._environment, kept, known)
 
     def _wait_seconds(self) -> float:
         """Seconds that a claim waits for queries."""
@@ -239,7 +225,7 @@ class Sampler:
 
     def _answer(self, query: Query, *, last: bool) -> None:
         """Take the real steps of a query, and send them. ``last``: the next query has to be claimed."""
-        flows = self._returning is None and not self._settings.once  # each step may drop a snapshot of a later query
+        flows = not self._settings.once
         ahead = self._limit(running=1) if flows and last else 0
         claim = partial(self._claim, ahead, 0.0, ONE_ATTEMPT) if ahead > 0 else None
         answer = self._pipeline.step(partial(self._step, query), claim)
@@ -266,7 +252,7 @@ class Sampler:
             self._hand_in(taken)
             self._steps += len(taken)
             raise
-        return _Answer(query, taken, outcome, error)
+        return _Answer(query, taken, outcome, error, self._returning.remarks() if self._returning else "")
 
     def _deliver(self, answer: _Answer) -> _Answer:
         """Send the samples of an answer, or return its query. Returns the answer as the server took it."""
@@ -275,6 +261,8 @@ class Sampler:
         except InvalidInput as invalid:
             answer = replace(answer, taken=[], outcome="failed", error=str(invalid))
         if not answer.taken:
+            if answer.outcome == "impossible":
+                self._report_gone()  # first, or another sampler claims the query and finds its snapshot gone too
             begun = bool(answer.error) and answer.outcome == "failed"
             give_back = partial(self._give_back, answer.query, answer.error or STOPPED, begun=begun)
             self._patiently(give_back, LAST_SECONDS)
@@ -284,8 +272,11 @@ class Sampler:
         """Count a query whose answer was acknowledged. Returns whether it has one."""
         self._leases.release(answer.query)
         self._steps += len(answer.taken)
+        if self._returning is not None:
+            self._returning.handed_in([sample.snapshot for sample in answer.taken if sample.snapshot is not None])
         self._report_gone()
-        self._count(answer.query, "answered" if answer.taken else answer.outcome, answer.error)
+        said = "; ".join(filter(None, (answer.error, answer.remark)))
+        self._count(answer.query, "answered" if answer.taken else answer.outcome, said)
         return answer.clean
 
     def _take(self, query: Query, taken: list[NewSample]) -> None:
@@ -320,7 +311,7 @@ class Sampler:
         """Tell the server which of its snapshots are gone, so that the design chooses other queries."""
         while self._returning is not None and (some := self._returning.gone[:MOST_GONE]):
             self._patiently(partial(self._api.drop_snapshots, self._surrogate, some), LAST_SECONDS)
-            del self._returning.gone[:MOST_GONE]
+            del self._returning.gone[: len(some)]
 
     def _hand_in(self, samples: list[NewSample]) -> None:
         if samples:

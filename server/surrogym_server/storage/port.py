@@ -245,7 +245,8 @@ class Queries(ABC):
     def fail(self, name: str, query_id: int, token: str, error: str, *, begun: bool = True) -> QueryRecord:
         """End the lease with an error. The query becomes pending again, or is set aside. A repeat is harmless.
 
-        ``begun`` says that a real step may have been taken, so that the ledger counts it as unresolved.
+        ``begun`` says that a real step may have been taken, so that the ledger counts it as unresolved. A query that
+        begins at a snapshot which was dropped meanwhile then goes the way of the pending ones that begin there.
 
         Raises:
             UnknownQuery: there is no such query.

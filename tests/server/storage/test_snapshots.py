@@ -80,6 +80,19 @@ def test_a_repeated_sample_does_not_bring_a_dropped_snapshot_back(
     assert list(storage.snapshots.all(name)) == ["two"]
 
 
+def test_a_query_that_was_leased_when_its_snapshot_went_is_not_offered_again(
+    storage: Storage, name: str, chosen: list[LeasedQuery]
+) -> None:
+    first, second, third = storage.queries.claim(name, "a", 3, LONG)
+    storage.snapshots.drop(name, ["one"])
+    assert storage.queries.counts(name).leased == 3, "its sampler may have returned to it before"
+    for query in (first, second, third):
+        storage.queries.fail(name, query.id, query.token, "gone", begun=False)
+    left = storage.queries.claim(name, "b", 3, LONG)
+    assert [query.id for query in left] == [query.id for query in chosen[1:]]
+    assert storage.ledger.read(name).unresolved == 0
+
+
 def test_a_query_that_may_have_been_begun_is_set_aside(storage: Storage, name: str, chosen: list[LeasedQuery]) -> None:
     again = storage.queries.claim(name, "a", 1, LONG)[0]
     storage.queries.fail(name, again.id, again.token, "it shook")

@@ -24,6 +24,7 @@ from surrogym_server.storage.sql import expiry
 from surrogym_server.storage.sql import leases as leasing
 from surrogym_server.storage.sql.database import NOW, Database
 from surrogym_server.storage.sql.rows import Span, append_event, find, hold, insert_queries, recall, remember, within
+from surrogym_server.storage.sql.snapshots import give_up_lost
 from surrogym_server.storage.sql.tables import leases, queries, surrogates
 
 COLUMNS = [
@@ -108,6 +109,9 @@ class SqlQueries(port.Queries):
             if lease.outcome == "open" and lease.expires > held.now:
                 leasing.set_outcome(connection, [lease.id], outcome)
                 leasing.give_back(connection, held, [query_id], error, begun=begun)
+                given_back = _read(connection, held.id, query_id)
+                give_up_lost(connection, held, given_back)
+                return given_back
             elif lease.outcome != outcome:
                 raise _ended(query_id)
             return _read(connection, held.id, query_id)

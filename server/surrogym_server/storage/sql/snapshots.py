@@ -9,7 +9,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.storage import port
-from surrogym_server.storage.records import Vector
+from surrogym_server.storage.records import QueryRecord, Vector
 from surrogym_server.storage.sql import leases as leasing
 from surrogym_server.storage.sql.database import Database, conflict_insert
 from surrogym_server.storage.sql.rows import append_event, find, hold, touch
@@ -42,6 +42,16 @@ def insert_snapshots(connection: Connection, held: Row[Any], made: dict[str, Vec
         rows = [{"surrogate_id": held.id, "name": name, "coordinates": at} for name, at in made.items()]
         insert = conflict_insert(connection, snapshots).on_conflict_do_nothing()
         connection.execute(insert, rows)
+
+
+def give_up_lost(connection: Connection, held: Row[Any], given_back: QueryRecord) -> None:
+    """Give up a query that was leased while its snapshot was reported as gone. Otherwise samplers would claim it again
+    and again."""
+    if given_back.snapshot is None or given_back.status != "pending":
+        return
+    own = (snapshots.c.surrogate_id == held.id) & (snapshots.c.name == given_back.snapshot)
+    if not connection.execute(sa.select(sa.exists().where(own))).scalar():
+        _give_up_queries(connection, held, [given_back.snapshot])
 
 
 def _forget(connection: Connection, held: Row[Any], names: Sequence[str]) -> int:
