@@ -94,6 +94,7 @@ OTHERWISE = {
     "docs/results/trust-third.md": "tests/cli runs its study, in short",
     "docs/results/trust-fourth.md": "tests/cli runs its study, in short",
     "docs/results/trust-fifth.md": "tests/cli runs its study, in short",
+    "docs/results/trust-sixth.md": "tests/cli runs its study, in short",
     "docs/results/trust-again.md": "tests/cli runs its study, in short",
     "docs/results/acquisition.md": "tests/cli runs its studies, in short",
     "docs/results/paper.md": "tests/cli runs its studies, in short",

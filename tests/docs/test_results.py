@@ -43,7 +43,7 @@ def test_tables_from_before_a_change_or_of_fresh_seeds_are_those_of_their_rows(p
     assert contrasts(rows) in text, again
 
 
-@pytest.mark.parametrize("study", ["trust", "trust-again", "trust-third", "trust-fourth", "trust-fifth"])
+@pytest.mark.parametrize("study", ["trust", "trust-again", "trust-third", "trust-fourth", "trust-fifth", "trust-sixth"])
 def test_every_table_of_the_unseen_tasks_is_that_of_its_rows(study):
     text, rows = (DOCS / "results" / f"{study}.md").read_text(), read_rows(DOCS / "results" / f"{study}.csv")
     made = summary(rows) + promise_tables(grouped(rows))
