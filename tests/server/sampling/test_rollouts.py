@@ -305,6 +305,16 @@ def test_steps_with_unknown_lags_count_and_are_not_learned_from():
     assert 0 < sum(map(len, result.query_rollouts)) <= 2 or result.phase == "over_budget"
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_tolerance_below_the_noise_floor_still_values_plans(model: GaussianProcessModel, aim: Aim, seed: int):
+    """The covariance of a path is rounding there, and its factorization failed: a design ended with ChoiceFailed."""
+    actions = torch.from_numpy(random_sequences(model.definition, 48, 12, rng(seed)))
+    paths = predict_paths(model, start_points(model.definition, len(actions), rng(seed)), actions)
+    values = path_values(model, replace(aim, tolerances=[1e-12] * 3), paths)
+    assert values.isfinite().all()
+    assert (values.diff(dim=1) >= -1e-9).all()
+
+
 def test_a_plan_begins_at_the_snapshot_from_where_it_learns_more(model: GaussianProcessModel, aim: Aim):
     """Far from what is known, beside the states that a reset leads to."""
     known = torch.zeros(3, 2, dtype=torch.float64)

@@ -97,7 +97,8 @@ class ProcessAlongPaths(PathOutlook):
         if (slope := slope_at(output, self.x.flatten(0, 1))) is not None:
             weight = weight * slope.reshape(weight.shape)
         blocks = zip(torch.split(self.x, room), torch.split(weight, room), strict=True)
-        ratio = (output.scale / tolerance) ** 2
+        # Below the noise floor a covariance is rounding, which a finer tolerance would make larger than 1.
+        ratio = min((output.scale / tolerance) ** 2, 1 / output.noise_floor)
         return torch.cat([_log_determinants(ratio * output.posterior.joint_covariance(b), w) for b, w in blocks])
 
 
