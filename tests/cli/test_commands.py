@@ -186,6 +186,8 @@ def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum
     assert ledger.logged == differing["learned"] == min(4, len(differing["steps"]))
     few = on_server("evaluate", "policy.zip", "--episodes", "3")
     assert few.out.splitlines()[2] == "3 episodes are too few to judge the promise: take 30 or more"
+    unaudited = on_server("audit", "policy.zip")  # the sampler has ended
+    assert (unaudited.code, f"start surrogym sample {pendulum} in another" in unaudited.err) == (1, True), unaudited.err
     _look_at(on_server, pendulum, tmp_path)
     nothing = on_server("sample", pendulum, "--max-queries", "1", "--time-limit", "0.5")
     assert "None" not in nothing.out

@@ -53,9 +53,17 @@ def test_a_wrong_step_is_found_with_its_episode_state_and_output() -> None:
     assert found.missing == {0: 0.0, 1: -1.5}
     lines = Differing(found, 10_000).in_words(SPEC)
     assert lines[0] == "2 of 20 real steps differ from the model by more than the model's uncertainty"
-    assert lines[1].startswith("  episode of seed 10001: 2 such steps; its compared steps earned -1.5 ")
+    assert lines[1].startswith("  episode of seed 10001: 2 such steps; its compared steps earned 1.5 less than ")
     assert f"seed 10001, step 3, at x {traces[1].coordinates[3, 0]:.4g}: reward is -1.5 off the prediction" in lines[2]
     assert Differing(found, 10_000).as_json()["steps"][0]["seed"] == 10_001
+
+
+def test_a_single_wrong_step_is_told_in_the_singular() -> None:
+    errors = np.zeros((20, 2))
+    errors[13] = (0.9, 1.5)
+    first, second, *_ = Differing(held(episodes(2, 10), errors), 0).in_words(SPEC)
+    assert first.startswith("1 of 20 real steps differs from the model")
+    assert second == "  episode of seed 1: 1 such step; its compared steps earned 1.5 more than predicted"
 
 
 def test_a_correct_model_has_no_disagreements() -> None:

@@ -253,6 +253,14 @@ def test_a_broken_promise_comes_first_in_the_next_steps(modelled: Known):
     assert "were not run without the controller" in parts["With and without the controller"]
 
 
+def test_a_policy_that_is_not_trusted_is_not_named_for_production(modelled: Known):
+    """It earned what was promised, but the first next step says not to use it."""
+    parts = told(replace(modelled, policy=policy(trusted=False, reason="the audit failed"), real=evaluation()))
+    assert parts["What to do next"].startswith("Don't use it yet")
+    assert "policy alias" not in parts["What to do next"]
+    assert "policy alias" in told(replace(modelled, policy=policy(), real=evaluation()))["What to do next"]
+
+
 def test_without_a_policy_each_section_says_so_and_the_model_is_shown(modelled: Known):
     parts = told(modelled)
     assert parts[""] == "There is a model of pendulum from 6 real steps, and no controller yet."

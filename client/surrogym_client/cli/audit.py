@@ -46,7 +46,7 @@ def command(
     """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.policies.card import read_card, write_card
-    from surrogym_client.training.handover import AuditSettings, Subject, hand_over
+    from surrogym_client.training.handover import NO_SAMPLER, AuditSettings, Subject, hand_over
     from surrogym_client.training.words import words_of_handover
     from surrogym_client.transport import HttpSurrogate
     from surrogym_shared.terminal import progress
@@ -65,7 +65,8 @@ def command(
         subject = Subject(api, name, port, predict, session, card.untrained, seed)
         found = hand_over(subject, asked, lambda view: update(None, f"{view.ledger.audit} real steps of audits"))
     if found.audit is None:
-        raise CommandError(f"no audit was made, and the card is unchanged: {found.reason}")
+        start = f"; start surrogym sample {name} in another terminal" if found.reason.endswith(NO_SAMPLER) else ""
+        raise CommandError(f"no audit was made, and the card is unchanged: {found.reason}{start}")
     noted = card.model_copy(update=vars(found))
     write_card(policy, noted)
     version = push_or_say(service.server, service.token_for(context), policy, name, quiet=output.quiet)

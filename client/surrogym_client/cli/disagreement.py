@@ -124,15 +124,16 @@ class Differing:
         found = self.found
         if not found.found:
             return [f"none of {found.compared} real steps differs from the model by more than the model's uncertainty"]
+        count = len(found.found)
         lines = [
-            f"{len(found.found)} of {found.compared} real steps differ from the model by more than the model's "
-            "uncertainty"
+            f"{count} of {found.compared} real steps differ{'s' * (count == 1)} from the model by more than the "
+            "model's uncertainty"
         ]
         for episode, count in list(found.by_episode().items())[:SHOWN]:
-            paid = found.missing.get(episode, 0.0)
+            more = found.missing.get(episode, 0.0)
             lines.append(
-                f"  episode of seed {self.first_seed + episode}: {count} such steps; its compared steps earned "
-                f"{paid:+.4g} compared with the prediction"
+                f"  episode of seed {self.first_seed + episode}: {count} such step{'s' * (count > 1)}; its compared "
+                f"steps earned {abs(more):.4g} {'less' if more < 0 else 'more'} than predicted"
             )
         names = () if spec is None else spec.coordinate_names
         lines += [f"  {self._at(one, names)}" for one in found.found[:SHOWN]]

@@ -29,9 +29,6 @@ if TYPE_CHECKING:
     from surrogym_shared.wire import Controller
 
 
-FEWEST_TO_JUDGE = 30  # episodes: the mean of fewer is too uncertain to judge a promise
-
-
 Environment = Annotated[
     str | None,
     typer.Option(
@@ -130,6 +127,7 @@ def command(
     """
     from surrogym_client.policies.card import card_path, read_card
     from surrogym_shared.terminal import give
+    from surrogym_shared.wire import FEWEST_TO_JUDGE
 
     card, settings = read_card(policy), episodes.settings()
     differences.check(settings)
@@ -350,6 +348,7 @@ def _kept(promise: Promise | None, result: Evaluation) -> bool | None:
 
 def _words(reports: Sequence[tuple[Controller, Evaluation]], promise: Promise | None) -> str:
     from surrogym_client.cli.columns import columns
+    from surrogym_shared.wire import FEWEST_TO_JUDGE
 
     names = ("mean", "iqm", "min", "max", "std", "mean_length", "success_rate", "episodes", "steps")
     several = len(reports) > 1

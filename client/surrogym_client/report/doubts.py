@@ -71,7 +71,7 @@ def next_steps(known: Known) -> list[str]:
         found.append("Look at the worst episode above, and decide whether it is good enough: no success was declared.")
     tests = _tests(known, policy, real, run)
     found += [fetch, *tests] if tests else []
-    if real.promise_kept and PREFERRED not in policy.aliases:
+    if real.promise_kept and policy.trusted is not False and PREFERRED not in policy.aliases:
         found.append(f"If that is good enough, name it: surrogym policy alias {name}@{policy.version} {PREFERRED}")
     return found + _of_the_model(known)
 

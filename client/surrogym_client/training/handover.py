@@ -241,7 +241,7 @@ def _unaudited(subject: Subject, promise: Promise, why: str) -> Handover:
 def _without(view: SurrogateView, promise: Promise, floor: float | None, why: str) -> Handover:
     """Return a handover without an audit. It is trusted only if the design is ready."""
     if (wide := _too_wide(promise, floor)) is not None:
-        return Handover(promise, None, False, wide)
+        return Handover(promise, None, False, f"{wide}; not audited: {why}")
     if view.phase == "ready":
         return Handover(promise, None, True, f"the design is ready; not audited: {why}")
     state = "is not certain of its model" if view.phase in COMPLETED else "has not ended"

@@ -93,6 +93,7 @@ def _fields(record: PolicyRecord, card: wire.PushedCard) -> dict[str, Any]:
 
 def _evaluation(record: EvaluationRecord, card: wire.PushedCard) -> dict[str, Any]:
     summary, promise = record.summary, card.promise
-    about = promise is not None and summary.get("controller") == "policy" and summary.get("declared")
-    kept = bool(summary["mean"] >= promise.low) if promise is not None and about else None
+    about = summary.get("controller") == "policy" and summary.get("declared")
+    judged = about and summary["episodes"] >= wire.FEWEST_TO_JUDGE
+    kept = bool(summary["mean"] >= promise.low) if promise is not None and judged else None
     return {"id": record.id, "created_at": record.created_at, **summary, "promise_kept": kept}

@@ -42,7 +42,8 @@ export function sentence(policy) {
   const [real, { promise }] = [realOf(policy), policy];
   const said = promise ? `Promised ${number(promise.low)} to ${number(promise.high)}` : "No promise";
   if (!real) return `${said}; no real episodes from the declared starts yet.`;
-  const kept = real.promise_kept === null ? "" : real.promise_kept ? ": the promise was kept" : ": the promise was broken";
+  const unjudged = promise ? ": too few to judge the promise" : "";
+  const kept = real.promise_kept === null ? unjudged : real.promise_kept ? ": the promise was kept" : ": the promise was broken";
   const success = real.success_rate === null ? "" : `; ${percent(real.success_rate)} succeeded`;
   return `${said}; real mean return ${meanWords(real)} in ${plural(real.episodes, "episode")}${success}${kept}.`;
 }

@@ -80,6 +80,7 @@ from surrogym_shared.wire.models import (
     Uncertainty,
 )
 from surrogym_shared.wire.policies import (
+    FEWEST_TO_JUDGE,
     MAX_CURVE,
     MAX_EPISODES,
     MAX_TRACE,
@@ -178,6 +179,7 @@ from surrogym_shared.wire.surrogates import (
 )
 
 __all__ = [
+    "FEWEST_TO_JUDGE",
     "MAX_BATCH",
     "MAX_CLAIM",
     "MAX_CURVE",

@@ -17,6 +17,7 @@ AliasName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
 Count = Annotated[int, Field(ge=0, le=2**53)]
 Text = Annotated[str, Field(max_length=2_000, pattern=VISIBLE)]
 
+FEWEST_TO_JUDGE = 30  # episodes: the mean of fewer is too uncertain to judge a promise
 MAX_CURVE = 500
 MAX_EPISODES = 10_000
 MAX_TRACE = 10_000  # most steps of one episode's trace
@@ -205,8 +206,8 @@ class EvaluationView(Reply):
     )
     success_interval: Interval | None = Field(description="interval of the success rate")
     promise_kept: bool | None = Field(
-        description="whether the mean return is at least the promise's lower end; null without a promise, or if "
-        "the starts are not those of the promise"
+        description="whether the mean return is at least the promise's lower end; null without a promise, if "
+        "the starts are not those of the promise, or with fewer than 30 episodes"
     )
 
 

@@ -92,7 +92,7 @@ def test_an_evaluation_has_intervals_and_says_whether_the_promise_was_kept(api: 
     )
     success = [True, False, True]
     said = api.policies.evaluate(surrogate, 1, episodes(success=success, traces=[trace]))
-    assert (said.mean, said.median, said.least, said.steps, said.promise_kept) == (-150, -150, -160, 600, True)
+    assert (said.mean, said.median, said.least, said.steps, said.promise_kept) == (-150, -150, -160, 600, None)
     assert said.mean_interval is not None
     assert -160 <= said.mean_interval.low < -150 < said.mean_interval.high <= -140
     assert said.success_interval is not None
@@ -104,11 +104,19 @@ def test_an_evaluation_has_intervals_and_says_whether_the_promise_was_kept(api: 
     assert (detail.returns, detail.traces, detail.missing) == ([-140, -160, -150], [trace], None)
     short = api.connection.send("GET", f"/v1/surrogates/{surrogate}/policies/1/evaluations/{said.id}?traces=false")
     assert wire.EvaluationDetail.model_validate_json(short) == detail.model_copy(update={"traces": []})
-    worse = api.policies.evaluate(surrogate, 1, episodes("b", returns=[-180.0] * 3))
-    wide = api.policies.evaluate(surrogate, 1, episodes("c", returns=[-180.0] * 3, declared=False))
-    assert (worse.promise_kept, wide.promise_kept) == (False, None)
+    worse = api.policies.evaluate(surrogate, 1, episodes("b", returns=[-180.0] * 30, lengths=[200] * 30))
+    kept = api.policies.evaluate(surrogate, 1, episodes("d", returns=[-150.0] * 30, lengths=[200] * 30))
+    wide = api.policies.evaluate(surrogate, 1, episodes("c", returns=[-180.0] * 30, lengths=[200] * 30, declared=False))
+    assert (worse.promise_kept, kept.promise_kept, wide.promise_kept) == (False, True, None)
     (policy,) = api.policies.list(surrogate)
-    assert [one.id for one in policy.evaluations] == [said.id, worse.id, wide.id]
+    assert [one.id for one in policy.evaluations] == [said.id, worse.id, kept.id, wide.id]
+
+
+def test_fewer_than_30_episodes_do_not_judge_a_promise(api: Api, surrogate: str, tmp_path: Path):
+    """Their mean is too uncertain. `surrogym evaluate` says so, and the server has to agree."""
+    api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
+    few = api.policies.evaluate(surrogate, 1, episodes(returns=[-180.0] * 29, lengths=[200] * 29))
+    assert few.promise_kept is None
 
 
 def test_the_median_is_the_return_of_an_episode(api: Api, surrogate: str, tmp_path: Path):
