@@ -83,6 +83,19 @@ def test_endings_against_the_prediction_fail(misplaced: int, passed: bool):
     assert judge(compared(np.zeros((8, 1)), misplaced=misplaced), PROMISE, PROMISE, UNTRAINED).passed is passed
 
 
+def test_a_rollout_fails_by_its_only_end():
+    """It ends once at most, so two misplaced ends can't be asked for."""
+    beside = replace(compared(np.zeros((3, 1)), misplaced=1), cut_short=True)
+    assert judge(beside, PROMISE, PROMISE, UNTRAINED).faults == (
+        "the episode ended after 3 steps, where the model predicted no end",
+    )
+
+
+def test_a_step_that_the_machine_could_not_take_fails():
+    audit = judge(replace(compared(np.zeros((7, 1))), unanswered=1), PROMISE, PROMISE, UNTRAINED)
+    assert audit.faults == ("the original environment failed at 1 of 8 queries, so nothing is known there",)
+
+
 @pytest.mark.parametrize("degrees", [1, 2, 8, 64])
 def test_chi_squared_is_that_of_scipy(degrees: int):
     for above in (0.05, 0.01, 0.001):

@@ -164,6 +164,57 @@ def test_where_no_state_can_be_set_an_audit_is_one_rollout(server_process: Serve
         assert place.api.surrogate(place.name).ledger.audit == handover.audit.steps
 
 
+class Broken(Changed):
+    """The line with a wall on the left, once it is changed."""
+
+    def step_from(self, coordinates: np.ndarray, action: np.ndarray) -> RealStep:
+        if self.changed and coordinates[0] < -0.3:
+            raise RuntimeError("there is a wall on the left")
+        return super().step_from(coordinates, action)
+
+
+def test_a_step_that_fails_on_the_way_is_not_left_out(server_process: ServerProcess) -> None:
+    with placed(server_process.url, SPEC, Broken()) as place:
+        place.environment.changed = True
+        handover = hand_over(place.subject(), AUDIT)
+        assert not handover.trusted
+        assert handover.audit is not None
+        assert handover.audit.steps + handover.audit.unanswered == 8
+        assert handover.reason.endswith(" of 8 queries, so nothing is known there")
+        assert place.api.surrogate(place.name).ledger.audit == handover.audit.steps
+
+
+class Interlocked(rail.Rail):
+    """The rail, which once it is changed stops every episode at its third step, or fails at its first."""
+
+    changed = False
+    fails = False
+    steps = 0
+
+    def reset(self, *, seed: int | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        self.steps = 0
+        return super().reset(seed=seed)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        if self.changed and self.fails:
+            raise RuntimeError("the interlock is open")
+        observation, reward, over, truncated, said = super().step(action)
+        self.steps += 1
+        return observation, reward, over or (self.changed and self.steps == 3), truncated, said
+
+
+@pytest.mark.parametrize("fails", [False, True], ids=["ends", "fails"])
+def test_a_rollout_that_does_not_get_far_is_not_trusted(server_process: ServerProcess, fails: bool) -> None:
+    with placed(server_process.url, rail.SPEC, Interlocked()) as place:
+        place.environment.fails, place.environment.changed = fails, True
+        handover = hand_over(place.subject(), AUDIT)
+        assert handover.audit is not None
+        assert handover.audit.steps == (0 if fails else 3)
+        assert not handover.trusted
+        end = "failed at 1 of 1 queries, so nothing is known there" if fails else "where the model predicted no end"
+        assert handover.reason.endswith(end)
+
+
 def test_the_way_of_a_policy_is_what_it_visits(line: Place) -> None:
     q, u = way_of(line.subject(), 4, 20)
     assert q.shape == (80, 1)
@@ -183,16 +234,21 @@ def test_a_failed_audit_is_on_the_result_of_a_training(line: Place, tmp_path: Pa
     assert line.api.surrogate(line.name).ledger.audit == 8, "no budget is left to learn more"
 
 
+@pytest.mark.parametrize("own", [True, False], ids=["its own surrogate", "another surrogate"])
 def test_the_command_audits_a_policy_and_notes_it_on_the_card(
-    line: Place, tmp_path: Path, capsys: pytest.CaptureFixture[str], server_process: ServerProcess
+    line: Place, tmp_path: Path, capsys: pytest.CaptureFixture[str], server_process: ServerProcess, own: bool
 ) -> None:
+    """In another surrogate the card's gain over an untrained policy is worth nothing: this policy does nothing."""
     policy, spec = tmp_path / "p.zip", line.port.spec()
     Network.of(spec, np.zeros(1), np.ones(1), 2, np.zeros(Network.size(spec, 2))).save(policy)
-    write_card(policy, PolicyCard(algorithm="CMAES", surrogate=line.name))
+    known = {"untrained": -1e3, "imagined_return": 7.0}
+    write_card(policy, PolicyCard(algorithm="CMAES", surrogate=line.name if own else "another", **known))
     with pytest.raises(SystemExit) as ended:
-        main(["audit", str(policy), "--steps", "4", "--json", "--server", server_process.url])
+        main(["audit", str(policy), "--steps", "4", "--surrogate", line.name, "--json", "--server", server_process.url])
     assert ended.value.code == 0
     said, card = json.loads(capsys.readouterr().out), read_card(policy)
-    assert said["trusted"] is card.trusted is True
+    assert card.surrogate == line.name
+    assert (card.untrained, card.imagined_return) == ((-1e3, 7.0) if own else (None, None))
+    assert said["trusted"] is card.trusted is own
     assert card.audit is not None
     assert said["audit"]["steps"] == card.audit.steps == line.api.surrogate(line.name).ledger.audit == 4

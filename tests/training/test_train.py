@@ -46,6 +46,16 @@ def small(**settings) -> TrainSettings:
     return TrainSettings(**{"algorithm": "PPO", "total_steps": 256, "num_envs": 8, "hyperparameters": SMALL} | settings)
 
 
+def test_no_promise_of_an_earlier_policy_stays_if_the_policy_is_not_saved(surrogate, tmp_path: Path):
+    """Else a kill between the two files leaves a new policy with an old verdict."""
+    out = tmp_path / "policy.zip"
+    out.mkdir()
+    out.with_suffix(".json").write_text('{"trusted": true}')
+    with pytest.raises(OSError):
+        train(surrogate, out, TrainSettings(algorithm="CMAES", total_steps=256))
+    assert not out.with_suffix(".json").exists()
+
+
 def test_a_policy_and_what_it_was_trained_with_are_written(surrogate, tmp_path: Path):
     out, seen = tmp_path / "new" / "policy.zip", []
     result = train(surrogate, out, small(), seen.append)

@@ -12,6 +12,7 @@ from surrogym_client.cli.pushing import push_or_say
 
 if TYPE_CHECKING:
     from surrogym_client.policies.card import PolicyCard
+    from surrogym_shared.port import SurrogatePort
     from surrogym_shared.wire import SurrogateView
 
 
@@ -40,7 +41,8 @@ def command(
     """Test a policy's promise with a few real steps.
 
     The real steps are taken on the policy's way and compared with the model. This needs a running sampler. The promise,
-    the audit and the verdict (trusted or not) go into the card beside the policy.
+    the audit and the verdict (trusted or not) go into the card beside the policy. With --surrogate, the card names
+    that surrogate from then on.
 
     Example: surrogym audit policy.zip --steps 16
     """
@@ -61,17 +63,39 @@ def command(
         HttpSurrogate(api.url, name, service.token_for(context)) as port,
         progress("audit", quiet=output.quiet) as update,
     ):
-        session = _session(card, api.surrogate(name))
-        subject = Subject(api, name, port, predict, session, card.untrained, seed)
+        view = api.surrogate(name)
+        if card.surrogate not in (None, name):
+            card = _of_another(card)
+        session = _session(card, view)
+        floor = _floor(port, seed, session) if card.untrained is None else card.untrained
+        subject = Subject(api, name, port, predict, session, floor, seed)
         found = hand_over(subject, asked, lambda view: update(None, f"{view.ledger.audit} real steps of audits"))
     if found.audit is None:
         start = f"; start surrogym sample {name} in another terminal" if found.reason.endswith(NO_SAMPLER) else ""
         raise CommandError(f"no audit was made, and the card is unchanged: {found.reason}{start}")
-    noted = card.model_copy(update=vars(found))
+    noted = card.model_copy(update={"surrogate": name, "spec": card.spec or view.spec, **vars(found)})
     write_card(policy, noted)
     version = push_or_say(service.server, service.token_for(context), policy, name, quiet=output.quiet)
     result = {"policy": str(policy), **noted.model_dump(mode="json", include=set(vars(found))), "version": version}
     output.give(result, lambda: words_of_handover(found))
+
+
+def _of_another(card: PolicyCard) -> PolicyCard:
+    """Return the card without what holds in the surrogate alone that it names."""
+    empty = {"server": None, "spec": None, "imagined_return": None, "untrained": None, "visited_confidence": ()}
+    return card.model_copy(update={**empty, "settings": {}})
+
+
+def _floor(port: SurrogatePort, seed: int, session: dict[str, object]) -> float:
+    """Return the imagined return without a policy, where no card notes that of an untrained one: a promise means
+    little without the gain over it."""
+    from surrogym_client.evaluation.imagined import imagined_returns
+    from surrogym_client.evaluation.uncontrolled import baseline, default_baseline
+    from surrogym_client.training.settings import CHECK_EPISODES
+
+    spec = port.spec()
+    predict = baseline(spec, default_baseline(spec), seed)
+    return float(imagined_returns(port, predict, CHECK_EPISODES, seed, **session).mean())
 
 
 def _session(card: PolicyCard, view: SurrogateView) -> dict[str, object]:

@@ -35,6 +35,8 @@ class Compared:
         expected: error (O,) that the model allows in addition: its tolerance, or its leave-one-out error if that is
             larger, which includes the noise; for the reward at least the error that matters for the return.
         misplaced: number of steps whose termination was predicted wrongly.
+        cut_short: whether the steps are one rollout that an end has cut short which the model did not predict.
+        unanswered: number of steps on the policy's way that the original environment failed to take.
         elsewhere: number of steps off the policy's way; they come last.
         length: mean number of steps of an episode; 0 if unknown.
         noise: standard deviation of the noise of a single step (O,), included in ``expected``; empty without noise.
@@ -45,6 +47,8 @@ class Compared:
     deviations: Array
     expected: Array
     misplaced: int = 0
+    cut_short: bool = False
+    unanswered: int = 0
     elsewhere: int = 0
     length: float = 0.0
     noise: Array = field(default_factory=lambda: np.zeros(0))
@@ -78,6 +82,9 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
     explains: beyond the 1 % quantile of the chi-squared distribution, shared between the outputs. A noisy output is
     also at fault if its mean error is. Errors within the tolerance are never a fault.
 
+    A rollout has one end at most, so a single one that was not predicted is a fault. A step that the original
+    environment fails to take is a fault, because the policy would need it.
+
     Args:
         compared: the real steps with their predictions.
         before: promise before the audit.
@@ -97,7 +104,11 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
         f"{compared.names[i]}: errors of {compared.errors[:, i].mean():.3g} on average, more than noise explains"
         for i in np.flatnonzero(compared.biased() & (sums <= limit)).tolist()
     ]
-    if compared.misplaced >= MISPLACED_ENDS:
+    if compared.unanswered:
+        faults.insert(0, unanswered(compared.unanswered, n + compared.unanswered))
+    if compared.cut_short:
+        faults.append(f"the episode ended after {n} step{'s' * (n > 1)}, where the model predicted no end")
+    elif compared.misplaced >= MISPLACED_ENDS:
         faults.append(f"{compared.misplaced} of {n} steps ended where the model predicted no end, or the reverse")
     slack = SLACK * max(earned(before, floor), earned(after, floor))
     if not before.low - slack <= after.median <= before.high + slack:
@@ -120,6 +131,11 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
         before=before,
         after=after,
     )
+
+
+def unanswered(count: int, of: int) -> str:
+    """Describe that the original environment failed at ``count`` queries ``of`` an audit."""
+    return f"the original environment failed at {count} of {of} queries, so nothing is known there"
 
 
 def disappointed(audit: Audit, floor: float | None, imagined: float | None = None) -> bool:

@@ -55,14 +55,15 @@ def compared(
     assert view.fidelity is not None
     claims = [output for output in view.fidelity.outputs if output.name in columns]
     deviations = np.array(uncertain.deviation)[:, [uncertain.outputs.index(claim.name) for claim in claims]]
-    ended = np.array([sample.terminated for sample in samples])
+    ended, foreseen = np.array([sample.terminated for sample in samples]), np.array(predicted.terminated)
     return Compared(
         names=[claim.name for claim in claims],
         errors=np.stack([columns[claim.name] for claim in claims], 1),
         deviations=deviations,
         expected=np.array([_expected(claim, matters if claim.name == "reward" else 0.0) for claim in claims]),
         noise=np.array([claim.noise for claim in claims]),
-        misplaced=int((ended != np.array(predicted.terminated)).sum()),
+        misplaced=int((ended != foreseen).sum()),
+        cut_short=spec.query == "rollout" and bool((ended & ~foreseen).any()),
     )
 
 

@@ -55,6 +55,7 @@ class Audit(BaseModel):
     Attributes:
         steps: number of real steps.
         elsewhere: how many of them were taken in gaps of the samples, off the policy's way.
+        unanswered: number of further queries, at which the original environment failed.
         passed: whether the promise stands.
         faults: what was wrong, one sentence each; empty if the audit passed.
         errors: root mean square of the prediction errors of each output, in the output's unit.
@@ -68,6 +69,7 @@ class Audit(BaseModel):
 
     steps: int
     elsewhere: int = 0
+    unanswered: int = 0
     passed: bool
     faults: tuple[str, ...] = ()
     errors: dict[str, float] = {}

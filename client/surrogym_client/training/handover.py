@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import Lanes, session_request
-from surrogym_client.evaluation.audit import AUDIT_STEPS, earned, gaps, judge, places, wider
+from surrogym_client.evaluation.audit import AUDIT_STEPS, earned, gaps, judge, places, unanswered, wider
 from surrogym_client.evaluation.comparing import compared
 from surrogym_client.evaluation.imagined import WHOLE
 from surrogym_client.evaluation.outside import Outside, outside_of
@@ -121,7 +121,11 @@ def _left_the_log(subject: Subject) -> Outside | None:
 def take(
     subject: Subject, settings: AuditSettings, before: Promise, progress: Callable[[SurrogateView], None] | None
 ) -> Audit | None:
-    """Take the real steps of an audit, fit the model to them, and judge. Returns None if no real step was taken."""
+    """Take the real steps of an audit, fit the model to them, and judge.
+
+    Returns None if there was no step to take. An audit whose steps the original environment all failed to take has
+    failed.
+    """
     api, name, spec = subject.api, subject.name, subject.port.spec()
     view = api.surrogate(name)
     q, u = way_of(subject, WAY_LANES, spec.time_limit or LONGEST_EPISODE)
@@ -131,17 +135,26 @@ def take(
     except BaseException:
         api.withdraw_audit(name, sorted(wanted))
         raise
+    failed = [query for query in api.queries(name) if query.id in wanted and query.status == "set_aside"]
     answers = [sample for sample in api.samples(name) if sample.query_id in wanted]
     samples = [sample for sample in answers if spec.known(sample.coordinates)]
     if not samples:
-        return None
+        faults = (unanswered(len(failed), len(wanted)),)
+        none = Audit(steps=0, unanswered=len(failed), passed=False, faults=faults, before=before, after=before)
+        return none if failed else None
     samples.sort(key=lambda sample: sample.query_id in elsewhere)
     wait_for_design(api, name, settings.patience_seconds, progress, after_round=view.round)
     after, length = subject.promise(), len(q) / WAY_LANES
     matters = UNNOTICED * earned(before, subject.floor) / length
     off_way = sum(sample.query_id in elsewhere for sample in samples)
-    beside = replace(compared(api, spec, view, samples, matters), length=length, elsewhere=off_way)
-    return judge(beside, before, after, subject.floor).model_copy(update={"range_left": range_left(spec, q)})
+    beside = replace(
+        compared(api, spec, view, samples, matters),
+        length=length,
+        elsewhere=off_way,
+        unanswered=sum(query.id not in elsewhere for query in failed),
+    )
+    more = {"unanswered": len(failed), "range_left": range_left(spec, q)}
+    return judge(beside, before, after, subject.floor).model_copy(update=more)
 
 
 def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, claims: bool) -> tuple[set[int], set[int]]:
@@ -228,7 +241,8 @@ def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
     where = f"{audit.steps - audit.elsewhere} real steps on the policy's way"
     if audit.elsewhere:
         where += f" and {audit.elsewhere} in the widest gaps of the samples"
-    return True, f"{where} agree with the model"
+    missing = f"; {audit.unanswered} in the gaps could not be taken" if audit.unanswered else ""
+    return True, f"{where} agree with the model{missing}"
 
 
 def _unaudited(subject: Subject, promise: Promise, why: str) -> Handover:

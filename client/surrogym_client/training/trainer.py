@@ -50,6 +50,7 @@ def train(
     started = time.perf_counter()
     found = search.search(task)
     out.parent.mkdir(parents=True, exist_ok=True)
+    out.with_suffix(".json").unlink(missing_ok=True)  # no promise of an earlier policy stands beside this one
     found.policy.save(out)
     result = _result(found, settings, out, time.perf_counter() - started)
     out.with_suffix(".json").write_text(json.dumps(asdict(result), indent=2, default=str) + "\n")
