@@ -48,7 +48,7 @@ def command(
     """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.policies.card import read_card, write_card
-    from surrogym_client.training.handover import NO_SAMPLER, AuditSettings, Subject, hand_over
+    from surrogym_client.training.handover import AuditSettings, Subject, hand_over
     from surrogym_client.training.words import words_of_handover
     from surrogym_client.transport import HttpSurrogate
     from surrogym_shared.terminal import progress
@@ -71,13 +71,20 @@ def command(
         subject = Subject(api, name, port, predict, session, floor, seed)
         found = hand_over(subject, asked, lambda view: update(None, f"{view.ledger.audit} real steps of audits"))
     if found.audit is None:
-        start = f"; start surrogym sample {name} in another terminal" if found.reason.endswith(NO_SAMPLER) else ""
-        raise CommandError(f"no audit was made, and the card is unchanged: {found.reason}{start}")
+        raise CommandError(_not_made(name, found.reason))
     noted = card.model_copy(update={"surrogate": name, "spec": card.spec or view.spec, **vars(found)})
     write_card(policy, noted)
     version = push_or_say(service.server, service.token_for(context), policy, name, quiet=output.quiet)
     result = {"policy": str(policy), **noted.model_dump(mode="json", include=set(vars(found))), "version": version}
     output.give(result, lambda: words_of_handover(found))
+
+
+def _not_made(name: str, reason: str) -> str:
+    """Say why no audit of the surrogate ``name`` was made."""
+    from surrogym_client.training.handover import NO_SAMPLER
+
+    start = f"; start surrogym sample {name} in another terminal" if reason.endswith(NO_SAMPLER) else ""
+    return f"no audit was made, and the card is unchanged: {reason}{start}"
 
 
 def _of_another(card: PolicyCard) -> PolicyCard:

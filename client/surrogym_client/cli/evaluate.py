@@ -127,7 +127,6 @@ def command(
     """
     from surrogym_client.policies.card import card_path, read_card
     from surrogym_shared.terminal import give
-    from surrogym_shared.wire import FEWEST_TO_JUDGE
 
     card, settings = read_card(policy), episodes.settings()
     differences.check(settings)
@@ -143,13 +142,20 @@ def command(
     filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if video else None
     version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
     promise = card.promise if settings.declared else None
-    judged = promise if settings.episodes >= FEWEST_TO_JUDGE else None
+    judged = promise if _judges(settings.episodes) else None
     found = differences.between(ledger, service.server, token, result, settings, judged, quiet=output.quiet)
     summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference)}
     summary |= {"promise_kept": _kept(judged, result), "version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
     more = [] if found is None else found.in_words(card.spec)
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
+
+
+def _judges(episodes: int) -> bool:
+    """Whether so many episodes are enough to judge a promise."""
+    from surrogym_shared.wire import FEWEST_TO_JUDGE
+
+    return episodes >= FEWEST_TO_JUDGE
 
 
 def _summary(reports: Sequence[tuple[Controller, Evaluation]], reference: str | None) -> dict[str, Any]:
@@ -359,7 +365,7 @@ def _words(reports: Sequence[tuple[Controller, Evaluation]], promise: Promise | 
     if promise is None:
         return table
     episodes = len(reports[0][1].returns)
-    if episodes < FEWEST_TO_JUDGE:
+    if not _judges(episodes):
         return f"{table}\n{episodes} episodes are too few to judge the promise: take {FEWEST_TO_JUDGE} or more"
     kept = "kept: the mean return is at least" if _kept(promise, reports[0][1]) else "broken: the mean return is below"
     return f"{table}\nthe promise of {promise.low:.4g} to {promise.high:.4g} was {kept} its lower end"
