@@ -36,12 +36,27 @@ class PolicyPromise(BaseModel):
     episodes: Count = Field(default=0, description="number of virtual episodes")
 
 
+class PolicyRangeLeft(BaseModel):
+    """Where a policy's way leaves the sampling range most often."""
+
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+
+    coordinate: Text = Field(description="name of the coordinate")
+    side: Literal["lower", "upper"] = Field(description="the end of the range that the way passes")
+    end: float = Field(description="value of this end")
+    share: float = Field(description="share of the way's states beyond it")
+    farthest: float = Field(description="the state farthest beyond it")
+
+
 class PolicyAudit(BaseModel):
-    """Result of comparing the model with real steps on the policy's way."""
+    """Result of comparing the model with real steps, most of them on the policy's way."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
     steps: Count = Field(description="number of real steps")
+    elsewhere: Count = Field(
+        default=0, description="how many of them were taken in gaps of the samples, off the policy's way"
+    )
     passed: bool = Field(description="whether the model agrees with the real steps")
     faults: tuple[Text, ...] = Field(
         default=(), max_length=100, description="reasons why the audit failed; empty if it passed"
@@ -53,6 +68,9 @@ class PolicyAudit(BaseModel):
     before: PolicyPromise | None = Field(default=None, description="promise before the audit")
     after: PolicyPromise | None = Field(
         default=None, description="promise of the model that has learned from the audit's steps"
+    )
+    range_left: PolicyRangeLeft | None = Field(
+        default=None, description="where the policy's way leaves the sampling range; null if it hardly does"
     )
 
 

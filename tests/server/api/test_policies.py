@@ -78,6 +78,14 @@ def test_a_policy_is_given_out_as_it_came(api: Api, surrogate: str, tmp_path: Pa
     assert (again.version, again.created, again.reason) == (1, False, "audited")
 
 
+def test_an_audit_is_given_out_as_it_came(api: Api, surrogate: str, tmp_path: Path):
+    """The server dropped how many steps were off the policy's way, and where this way leaves the sampling range."""
+    left = wire.PolicyRangeLeft(coordinate="speed", side="upper", end=8.0, share=0.1, farthest=9.0)
+    audit = wire.PolicyAudit(steps=8, elsewhere=2, passed=True, range_left=left)
+    api.policies.push(surrogate, card(audit=audit), [], "zip", network_file(tmp_path))
+    assert api.policies.get(surrogate, 1).audit == audit
+
+
 def test_a_card_with_the_largest_specification_and_a_curve_is_stored(api: Api, surrogate: str, tmp_path: Path):
     """A specification may have 128 KiB by itself."""
     curve = [wire.CurvePoint(steps=10**9 + n, imagined_return=-1 / 3, seconds=1 / 7) for n in range(200)]
