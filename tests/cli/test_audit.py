@@ -1,9 +1,13 @@
 """``surrogym audit`` computes the promise in the session that the policy was compared in, with the noise known now."""
 
+import numpy as np
 import pytest
 
-from surrogym_client.cli.audit import _session
+from surrogym_client.cli.audit import _require_fit, _session
+from surrogym_client.cli.errors import CommandError
+from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.policies.card import PolicyCard
+from surrogym_shared.network import Network
 from surrogym_shared.wire import SurrogateView
 
 
@@ -30,3 +34,14 @@ def test_session_of_an_audit_has_the_noise_known_now(settings, noise, expected):
 def test_errors_of_a_sensor_are_observed():
     expected = {"process_noise": True, "sensor_noise": {"x": 0.07}}
     assert _session(PolicyCard(settings={"session": {}}), view(0.1, sensor=0.07)) == expected
+
+
+def test_a_policy_of_another_surrogate_is_refused_before_a_real_step():
+    own, other = pendulum(), cartpole()
+    policy = Network.of(own, np.zeros(3), np.ones(3), 2, np.zeros(Network.size(own, 2)))
+    _require_fit(policy, own, "p.zip does not fit 'a'")
+    with pytest.raises(CommandError, match="does not fit 'b': expected a policy of 4 observations, got one of 3"):
+        _require_fit(policy, other, "p.zip does not fit 'b'")
+    discrete = own.model_copy(update={"action": other.action})
+    with pytest.raises(CommandError, match=r"expected a policy of actions \(2,\), got one of 1"):
+        _require_fit(policy, discrete, "p.zip does not fit 'b'")

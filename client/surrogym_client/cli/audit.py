@@ -12,7 +12,9 @@ from surrogym_client.cli.pushing import push_or_say
 
 if TYPE_CHECKING:
     from surrogym_client.policies.card import PolicyCard
+    from surrogym_client.policies.predict import Predict
     from surrogym_shared.port import SurrogatePort
+    from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import SurrogateView
 
 
@@ -64,6 +66,7 @@ def command(
         progress("audit", quiet=output.quiet) as update,
     ):
         view = api.surrogate(name)
+        _require_fit(predict, view.spec, f"{policy} does not fit {name!r}")
         if card.surrogate not in (None, name):
             card = _of_another(card)
         session = _session(card, view)
@@ -85,6 +88,22 @@ def _not_made(name: str, reason: str) -> str:
 
     start = f"; start surrogym sample {name} in another terminal" if reason.endswith(NO_SAMPLER) else ""
     return f"no audit was made, and the card is unchanged: {reason}{start}"
+
+
+def _require_fit(predict: Predict, spec: EnvironmentSpec, misfit: str) -> None:
+    """Raise ``CommandError`` if a network of arrays has other observations or actions than the surrogate."""
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_shared.network import Network, counts_of
+
+    if not isinstance(predict, Network):
+        return
+    own, seen = len(spec.observation), len(predict.mean)
+    if seen != own:
+        raise CommandError(f"{misfit}: expected a policy of {own} observations, got one of {seen}")
+    choices = counts_of(spec)
+    wanted, got = choices or spec.action.size, predict.counts or len(predict.low)
+    if wanted != got:
+        raise CommandError(f"{misfit}: expected a policy of actions {wanted}, got one of {got}")
 
 
 def _of_another(card: PolicyCard) -> PolicyCard:
