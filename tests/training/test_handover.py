@@ -215,6 +215,23 @@ def test_a_rollout_that_does_not_get_far_is_not_trusted(server_process: ServerPr
         assert handover.reason.endswith(end)
 
 
+class Growing(Line):
+    """x doubles in each step, and is paid by its square. In 20 steps that is 1e10; a model of [-1, 1] imagines 30."""
+
+    def step_from(self, coordinates: np.ndarray, action: np.ndarray) -> RealStep:
+        x = float(coordinates[0])
+        return RealStep(coordinates, action, [2 * x + 0.1 * float(action[0])], reward=x**2)
+
+
+def test_a_way_that_leaves_what_can_be_set_is_not_trusted(server_process: ServerProcess) -> None:
+    with placed(server_process.url, SPEC, Growing()) as place:
+        handover = hand_over(place.subject(), AUDIT)
+        assert handover.audit is not None
+        assert handover.audit.passed, "where it can be audited, the model is right"
+        assert not handover.trusted
+        assert "beyond what the original environment can be set to" in handover.reason
+
+
 def test_the_way_of_a_policy_is_what_it_visits(line: Place) -> None:
     q, u = way_of(line.subject(), 4, 20)
     assert q.shape == (80, 1)

@@ -56,6 +56,8 @@ class Audit(BaseModel):
         steps: number of real steps.
         elsewhere: how many of them were taken in gaps of the samples, off the policy's way.
         unanswered: number of further queries, at which the original environment failed.
+        untestable: a coordinate that many of the policy's states have beyond what the original environment can be set
+            to, and the share of these states; None if they are few.
         passed: whether the promise stands.
         faults: what was wrong, one sentence each; empty if the audit passed.
         errors: root mean square of the prediction errors of each output, in the output's unit.
@@ -70,6 +72,7 @@ class Audit(BaseModel):
     steps: int
     elsewhere: int = 0
     unanswered: int = 0
+    untestable: tuple[str, float] | None = None
     passed: bool
     faults: tuple[str, ...] = ()
     errors: dict[str, float] = {}

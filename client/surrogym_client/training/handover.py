@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import Lanes, session_request
-from surrogym_client.evaluation.audit import AUDIT_STEPS, earned, gaps, judge, places, unanswered, wider
+from surrogym_client.evaluation.audit import AUDIT_STEPS, earned, gaps, judge, places, unanswered, untestable, wider
 from surrogym_client.evaluation.comparing import compared
 from surrogym_client.evaluation.imagined import WHOLE
 from surrogym_client.evaluation.outside import Outside, outside_of
@@ -32,6 +32,7 @@ MOST_OF_A_WAY = 200  # steps of an episode that are compared with a log
 ELSEWHERE = 4  # an audit of a ready design takes one of every four steps in a gap of the samples
 ANYWHERE = 1_024  # points of the sampling range that such steps are chosen from
 WIDE = 0.5  # share of the gain over an untrained policy: a promise with a wider lower half is not trusted
+MOST_UNTESTABLE = 0.2  # share of the policy's states beyond what the original environment can be set to
 NO_SAMPLER = "no sampler is connected"
 
 Array = NDArray[np.float64]
@@ -153,7 +154,12 @@ def take(
         elsewhere=off_way,
         unanswered=sum(query.id not in elsewhere for query in failed),
     )
-    more = {"unanswered": len(failed), "range_left": range_left(spec, q)}
+    beyond = None if spec.query == "rollout" else untestable(spec, q)
+    more = {
+        "unanswered": len(failed),
+        "untestable": beyond if beyond is not None and beyond[1] > MOST_UNTESTABLE else None,
+        "range_left": range_left(spec, q),
+    }
     return judge(beside, before, after, subject.floor).model_copy(update=more)
 
 
@@ -238,6 +244,12 @@ def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
         return False, f"the audit failed: {audit.faults[0]}"
     if (wide := _too_wide(audit.after, floor)) is not None:
         return False, wide
+    if audit.untestable is not None:
+        name, share = audit.untestable
+        return False, (
+            f"{100 * share:.0f} % of the policy's states have a {name!r} beyond what the original environment can be "
+            "set to, so no audit tests them: register under a new name with a wider range or bounds"
+        )
     where = f"{audit.steps - audit.elsewhere} real steps on the policy's way"
     if audit.elsewhere:
         where += f" and {audit.elsewhere} in the widest gaps of the samples"
