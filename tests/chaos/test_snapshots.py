@@ -40,7 +40,9 @@ def test_killed_samplers_lose_no_sample_and_report_what_is_gone(
             for _ in range(min(KILLS_A_RUN, KILLS - kills)):
                 kills += _kill_one(samplers, source)
             assert until(lambda: _goes_on(api, name, samplers)), f"the design completes, but is {api.surrogate(name)}"  # noqa: B023
-            assert _until_done(samplers) == 0, "one that finds the design ended tells what is gone"
+            assert _until_done(samplers) == 0, (
+                "a sampler that starts after the design has ended still reports which snapshots are gone"
+            )
             require_no_dead_snapshots(api, name, snapshots)
             notes, view = samplers.notes(), api.surrogate(name)
             require_true(api, name, notes, BUDGET)
@@ -89,8 +91,8 @@ def _kill_one(samplers: SavingSamplers, source: random.Random) -> int:
 
 
 def _goes_on(api: Api, name: str, samplers: SavingSamplers) -> bool:
-    """Sample without kills; whether the design has ended. Kills may have set all of its first queries aside, so that it
-    failed: then a person says that it goes on."""
+    """Sample without kills, and return whether the design has ended. If kills have set all of its first queries aside,
+    the design has failed, and is resumed as a person would do it."""
     assert _until_done(samplers) == 0
     if api.surrogate(name).phase == "failed":
         api.patch_surrogate(name, paused=False)

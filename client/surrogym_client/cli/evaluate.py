@@ -152,7 +152,7 @@ def command(
 
 
 def _judges(episodes: int) -> bool:
-    """Whether so many episodes are enough to judge a promise."""
+    """Whether this number of episodes is enough to judge a promise."""
     from surrogym_shared.wire import FEWEST_TO_JUDGE
 
     return episodes >= FEWEST_TO_JUDGE

@@ -250,16 +250,3 @@ def _settable(spec: EnvironmentSpec, q: Array) -> Bools:
         low, high = coordinate.settable
         inside &= (q[:, index] >= low) & (q[:, index] <= high)
     return inside
-
-
-def untestable(spec: EnvironmentSpec, q: Array) -> tuple[str, float]:
-    """Name the coordinate that most states of a way (m, C) have beyond what the original environment can be set to, and
-    return the share of these states. No audit can test them. Angles have no end, and constants and lags follow from the
-    rest."""
-    worst = ("", 0.0)
-    for coordinate, values in zip(spec.coordinates, q.T, strict=True):
-        low, high = coordinate.settable
-        share = float(((values < low) | (values > high)).mean())
-        if coordinate.kind == "linear" and coordinate.moves and share > worst[1]:
-            worst = coordinate.name, share
-    return worst

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import Lanes, session_request
-from surrogym_client.evaluation.audit import AUDIT_STEPS, earned, gaps, judge, places, unanswered, untestable, wider
+from surrogym_client.evaluation.audit import AUDIT_STEPS, earned, gaps, judge, places, unanswered, wider
 from surrogym_client.evaluation.comparing import compared
 from surrogym_client.evaluation.imagined import WHOLE
 from surrogym_client.evaluation.outside import Outside, outside_of
 from surrogym_client.evaluation.promise import UNNOTICED, promise_of
-from surrogym_client.evaluation.ranges import range_left
+from surrogym_client.evaluation.ranges import range_left, untestable
 from surrogym_client.evaluation.uncontrolled import baseline
 from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.protocol import LONGEST_EPISODE
@@ -32,7 +32,6 @@ MOST_OF_A_WAY = 200  # steps of an episode that are compared with a log
 ELSEWHERE = 4  # an audit of a ready design takes one of every four steps in a gap of the samples
 ANYWHERE = 1_024  # points of the sampling range that such steps are chosen from
 WIDE = 0.5  # share of the gain over an untrained policy: a promise with a wider lower half is not trusted
-MOST_UNTESTABLE = 0.2  # share of the policy's states beyond what the original environment can be set to
 NO_SAMPLER = "no sampler is connected"
 
 Array = NDArray[np.float64]
@@ -154,12 +153,7 @@ def take(
         elsewhere=off_way,
         unanswered=sum(query.id not in elsewhere for query in failed),
     )
-    beyond = None if spec.query == "rollout" else untestable(spec, q)
-    more = {
-        "unanswered": len(failed),
-        "untestable": beyond if beyond is not None and beyond[1] > MOST_UNTESTABLE else None,
-        "range_left": range_left(spec, q),
-    }
+    more = {"unanswered": len(failed), "untestable": untestable(spec, q), "range_left": range_left(spec, q)}
     return judge(beside, before, after, subject.floor).model_copy(update=more)
 
 

@@ -269,7 +269,7 @@ class EnvironmentDefinition:
         return torch.maximum(low, begin - room), torch.minimum(high, end + room)
 
     def in_range(self, q: Tensor) -> Tensor:
-        """Whether states q (n, C) lie in the sampling range, (n,) bool."""
+        """Whether states q (..., C) lie in the sampling range, (...) bool."""
         low, high = self._sampled
         inside: Tensor = ((q >= low) & (q <= high)).all(-1)
         return inside

@@ -140,7 +140,8 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     )
     if verdict == "continue" and now == state.ended_with:
         verdict = "over_budget"  # only audits and logs have come since it ended, and they need no further real step
-    sure, testing = verdict == "ready", verdict == "ready" and _is_untested(definition, samples, state)
+    sure = verdict == "ready"
+    testing = sure and _is_untested(definition, samples, state)
     verdict = "continue" if testing else verdict
     candidates, reserved = judged.candidates, judged.reserved
     chosen, rollouts = candidates.points[:0], tuple[Rollout, ...]()

@@ -241,10 +241,7 @@ def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tenso
     With snapshots a step also counts the less, the less likely the sampling range has its state: a plan could go on
     and on to states that hardly count for the verdict.
     """
-    low = torch.tensor([c.sampling.low for c in definition.coordinates], dtype=paths.q.dtype)
-    high = torch.tensor([c.sampling.high for c in definition.coordinates], dtype=paths.q.dtype)
-    inside = ((paths.q >= low) & (paths.q <= high)).all(-1)
-    weight = paths.running * inside * definition.known(paths.q) * (-0.5 * paths.drift).exp()
+    weight = paths.running * definition.in_range(paths.q) * definition.known(paths.q) * (-0.5 * paths.drift).exp()
     if aim.snapshots is not None:
         columns = zip(definition.coordinates, paths.q.unbind(-1), strict=True)
         weight = weight * (0.5 * torch.stack([c.sampling.log_density(q) for c, q in columns]).sum(0)).exp()
