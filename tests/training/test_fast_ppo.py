@@ -170,6 +170,63 @@ def test_its_saved_policy_acts_with_and_without_noise(surrogate, tmp_path: Path)
     assert np.abs(first).max() <= 2
 
 
+@pytest.mark.parametrize("make", [pendulum, cartpole], ids=["continuous", "discrete"])
+def test_inputs_standardised_anew_leave_the_policy_as_it_was(make: Callable[[], EnvironmentSpec]):
+    """An input that hardly varies keeps a tenth of its deviation, so that it does not explode where it varies later."""
+    spec, rng = make(), np.random.default_rng(0)
+    size = len(spec.observation)
+    learner = Learner(spec, rng.normal(size=size), rng.uniform(1, 2, size), (16, 16), rng)
+    learner.actor.layers[-1][0][:] = rng.normal(size=learner.actor.layers[-1][0].shape)
+    observations = (3 + 0.5 * rng.normal(size=(200, size))).astype(np.float32)
+    observations[:, 0] = 0.7
+    before, critic = learner.policy().outputs(observations), learner.values(learner.standardised(observations))
+    narrowest = 0.1 * learner.deviation[0]
+    learner.standardise_anew(learner.standardised(observations), rng)
+    np.testing.assert_allclose(learner.policy().outputs(observations), before, atol=1e-5)
+    inputs = learner.standardised(observations)
+    np.testing.assert_allclose(inputs.mean(0), 0, atol=1e-4)
+    np.testing.assert_allclose(inputs.std(0)[1:], 1, atol=1e-3)
+    assert learner.deviation[0] == pytest.approx(narrowest, rel=1e-5)
+    assert np.abs(learner.values(inputs) - critic).max() > 0.1, "the critic is a new one"
+
+
+def test_a_training_ends_with_fine_tuning_from_the_declared_starts(surrogate, tmp_path: Path, monkeypatch):
+    """The policy is never worse in the surrogate than before. Asked-for steps are not followed by it."""
+    boxes: list[float] = []
+
+    def watched(num_envs: int, mode: str, options: dict):
+        boxes.append(options["start_box"])
+        return session_request(num_envs, mode, options)
+
+    monkeypatch.setattr(searches, "session_request", watched)
+    settings = TrainSettings(algorithm="fastppo", total_steps=4_096, num_envs=16, hyperparameters=SMALL, prolong=False)
+    plain = train(surrogate, tmp_path / "plain.zip", settings)
+    assert (plain.virtual_steps, boxes) == (4_096, [0.5])
+    tuned = train(surrogate, tmp_path / "tuned.zip", replace(settings, prolong=True))
+    assert (boxes[1:], tuned.virtual_steps % 4_096) == ([0.5, 0.0], 0)
+    assert tuned.virtual_steps >= 8_192
+    assert tuned.imagined_return >= plain.imagined_return
+    further = replace(settings, prolong=True, start_from=tuned.path)
+    assert train(surrogate, tmp_path / "further.zip", further).imagined_return >= tuned.imagined_return
+
+
+def test_fine_tuning_of_short_training_episodes_keeps_their_starts(tmp_path: Path, monkeypatch):
+    """All lanes of long episodes from the declared starts would be in the same part of an episode, and the policy would
+    forget the other parts."""
+    asked: list[dict] = []
+
+    def watched(num_envs: int, mode: str, options: dict):
+        asked.append(options)
+        return session_request(num_envs, mode, options)
+
+    monkeypatch.setattr(searches, "session_request", watched)
+    spec = pendulum().model_copy(update={"time_limit": 100})
+    port = LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, 12, seed=0)).model)
+    settings = TrainSettings(algorithm="fastppo", total_steps=1_024, num_envs=16, hyperparameters=SMALL, prolong=True)
+    train(port, tmp_path / "policy.zip", settings)
+    assert [(one["start_box"], one["time_limit"]) for one in asked] == [(1.0, 20), (1.0, 20)]
+
+
 def test_it_continues_from_a_saved_policy(surrogate, tmp_path: Path):
     """Parameters and the moments of Adam; a policy alone is refused."""
     settings = TrainSettings(algorithm="fastppo", total_steps=512, num_envs=16, hyperparameters=SMALL, prolong=False)

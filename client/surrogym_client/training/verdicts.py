@@ -110,6 +110,10 @@ class Verdicts:
         self.total += self._planned
         return True
 
+    def fine_tune(self) -> None:
+        """Take as many steps again for fine-tuning."""
+        self.total += self._planned
+
     def begin(self) -> None:
         """Record that a network begins to learn: the first one, another one, or the same one again."""
         if self.given_up:

@@ -35,6 +35,7 @@ from surrogym_shared.network import MAX_BYTES, Layer, Network, bounds_of, counts
 from surrogym_shared.spec import EnvironmentSpec
 
 HIDDEN_GAIN, ACTION_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0
+NARROWEST = 0.1  # smallest new deviation of an input, as a share of the one before
 LEARNER = "learner.npz"  # entry of a policy's file from which training can continue
 VECTORS = ("parameters", "first", "second")
 
@@ -170,6 +171,29 @@ class Learner:
         step = np.float32(rate / (1 - FIRST_DECAY**self._updates))
         self.parameters -= step * self._first / root
 
+    def take_up(self, learned: LearnedNetwork) -> None:
+        """Take the place of another learner of the same network."""
+        self.mean, self.deviation = learned.policy.mean.astype(np.float32), learned.policy.deviation.astype(np.float32)
+        self.restore(learned.state)
+
+    def standardise_anew(self, x: Array, rng: np.random.Generator) -> None:
+        """Standardise inputs by other observations, without a change of the actor's outputs.
+
+        The critic and Adam's moments begin anew.
+
+        Args:
+            x: these observations (B, D), standardised as before. The new deviations are at least ``NARROWEST`` of those
+                before.
+            rng: generator of the critic's initial parameters.
+        """
+        middle, spread = x.mean(0), np.maximum(x.std(0), NARROWEST)
+        weights, bias = self.actor.layers[0]
+        bias += middle @ weights
+        weights *= spread[:, None]
+        self.mean, self.deviation = self.mean + middle * self.deviation, self.deviation * spread
+        _initialise(self.critic, VALUE_GAIN, rng)
+        self._first[:], self._second[:], self._updates = 0, 0, 0
+
     def policy(self) -> Network:
         """Return the policy of the actor's most probable actions, with the present parameters."""
         layers = self.actor.layers
@@ -264,6 +288,7 @@ def _state(path: Path, require: Callable[[Mapping[str, Header]], None]) -> dict[
 
 
 def _initialise(network: Mlp, last_gain: float, rng: np.random.Generator) -> None:
-    for number, (weights, _) in enumerate(network.layers):
+    for number, (weights, bias) in enumerate(network.layers):
+        bias[:] = 0
         last = number == len(network.layers) - 1
         weights[:] = orthogonal(rng, len(weights), weights.shape[1], last_gain if last else HIDDEN_GAIN)

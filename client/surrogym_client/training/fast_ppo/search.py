@@ -13,10 +13,20 @@ from threadpoolctl import threadpool_limits
 
 from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_client.evaluation.imagined import observation_statistics
-from surrogym_client.policies.defaults import ATTEMPT_SEED, HIDDEN, LANES, WIDER, decaying
+from surrogym_client.original.protocol import LONGEST_EPISODE
+from surrogym_client.policies.defaults import (
+    ATTEMPT_SEED,
+    HIDDEN,
+    LANES,
+    LAST_RATE,
+    LEARNING_RATE,
+    WIDER,
+    decaying,
+)
 from surrogym_client.policies.files import load_policy
 from surrogym_client.policies.predict import Predict
 from surrogym_client.training.fast_ppo.learner import (
+    Batch,
     LearnedNetwork,
     Learner,
     Objective,
@@ -49,7 +59,13 @@ RANGES = {  # whole numbers have whole bounds
 }
 
 
+FINE_SEED = 2_000_003
 HELD = 16  # steps that share the noise of the second network
+
+FINE = 0.1  # learning rate of the fine-tuning, as a share of the one before
+LOOKS = 1 / 8  # largest share of the fine-tuning that only collects observations
+CRITIC_ROLLOUTS = 8  # next rollouts, from which the critic alone learns
+FRUITLESS = 1 / 4  # share of the fine-tuning after which it ends if the imagined return did not rise
 
 
 @dataclass(frozen=True)
@@ -61,6 +77,11 @@ class FastPpo(PolicySearch):
     its noise is held for ``HELD`` steps. If it is abandoned as well, one of Stable-Baselines3's ``PPO`` follows, with
     state-dependent noise. If episodes are long and nothing ends them, training episodes are short and begin anywhere
     (``with_short_episodes``).
+
+    If nobody chose the number of steps, as many steps follow for fine-tuning. It begins with a new critic, and
+    standardises inputs by the observations that the policy meets. If training episodes are not short, all of them begin
+    at declared starts now. The reason: returns from anywhere can be a thousand times those from the declared starts,
+    and critic and advantages then do not resolve the latter.
     """
 
     n_steps: int = 64  # steps of each lane in a rollout
@@ -87,9 +108,10 @@ class FastPpo(PolicySearch):
             return _reference().search(task)  # only Stable-Baselines3 can train its own policies further
         compiled_update()  # loads a linear algebra library now, so that its threads are limited as well
         with threadpool_limits(limits=task.settings.threads):
-            task = with_short_episodes(task, self.n_steps)
-            with _lanes(task) as lanes:
-                return _Training(self, task, lanes).run()
+            cut = with_short_episodes(task, self.n_steps)
+            fine = _from_declared_starts(task) if cut is task else cut
+            with _lanes(cut) as lanes:
+                return _Training(self, cut, lanes, fine).run()
 
     def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:
         if not Network.is_at(policy):
@@ -100,8 +122,8 @@ class FastPpo(PolicySearch):
 class _Training:
     """Networks of one training, and the checks that compare them."""
 
-    def __init__(self, search: FastPpo, task: SearchTask, lanes: Lanes) -> None:
-        self._search, self._task, self._spec = search, task, task.port.spec()
+    def __init__(self, search: FastPpo, task: SearchTask, lanes: Lanes, fine: SearchTask) -> None:
+        self._search, self._task, self._fine, self._spec = search, task, fine, task.port.spec()
         settings = task.settings
         self._gamma = suggested_gamma(self._spec) if search.gamma is None else search.gamma
         self._rng = np.random.default_rng(settings.seed)
@@ -127,10 +149,13 @@ class _Training:
         try:
             for learner, hold in self._networks():
                 self._learn(learner, verdicts.left, hold)
-                if self._task.prolong and not verdicts.given_up and verdicts.prolong():
+                if verdicts.given_up:
+                    continue
+                if self._task.prolong and verdicts.prolong():
                     self._learn(learner, verdicts.left, hold)
-                if not verdicts.given_up:
-                    break
+                if self._task.prolong and not verdicts.saturated:
+                    self._fine_tune(learner)
+                break
             else:
                 return self._by_reference()  # a network is only abandoned if steps are left
         except KeyboardInterrupt:
@@ -179,17 +204,54 @@ class _Training:
         verdicts.begin()
         before = verdicts.own_steps
         for number in range(1, max(steps // self._rollout, 1) + 1):
-            rollout = self._collector.collect(learner, search.n_steps, hold)
-            verdicts.saw(rollout.earned)
-            verdicts.at(before + number * self._rollout)
-            self._lost += rollout.lost
-            self._after(learner, rollout)
+            rollout = self._collect(learner, before + number * self._rollout, hold)
             if verdicts.given_up or verdicts.saturated:
                 return
             remaining = 1 - verdicts.own_steps / (before + steps)
             rate = decaying(remaining) if search.learning_rate is None else search.learning_rate
-            self._update(learner, rollout, rate)
+            self._update(learner, rollout.rows, rate)
         self._check(learner)
+
+    def _fine_tune(self, learner: Learner) -> None:
+        """Train the best policy further from the declared starts alone. ``FastPpo`` says why."""
+        verdicts, search = self._verdicts, self._search
+        assert self._kept is not None
+        learner.take_up(self._kept)
+        before, rate = verdicts.own_steps, search.learning_rate or LEARNING_RATE
+        verdicts.fine_tune()
+        rollouts = max(verdicts.left // self._rollout, 1)
+        episode = -(-(self._spec.time_limit or LONGEST_EPISODE) // search.n_steps)
+        looks, seen = max(min(episode, int(LOOKS * rollouts)), 1), []
+        best, rose = verdicts.best, looks + CRITIC_ROLLOUTS  # the last rollout after which the best return rose
+        with _lanes(self._fine) as lanes:
+            self._collector = Collector(lanes, self._gamma, search.gae_lambda, self._task.settings.seed + FINE_SEED)
+            for number in range(1, rollouts + 1):
+                rows = self._collect(learner, before + number * self._rollout).rows
+                if verdicts.best != best:
+                    best, rose = verdicts.best, max(number, rose)
+                if verdicts.saturated or number - rose > FRUITLESS * rollouts:
+                    return
+                if number <= looks:
+                    seen.append(rows.observations)
+                if number < looks:
+                    continue
+                if number == looks:
+                    learner.standardise_anew(np.concatenate(seen), self._rng)
+                elif number <= looks + CRITIC_ROLLOUTS:
+                    self._update(learner, replace(rows, advantages=np.zeros_like(rows.advantages)), rate)
+                else:
+                    self._update(learner, rows, FINE * rate * max(1 - number / rollouts, LAST_RATE))
+        self._check(learner)
+
+    def _collect(self, learner: Learner, steps: int, hold: int = 1) -> Rollout:
+        """Collect the rollout with which the present network will have taken ``steps``, and check it if that is due."""
+        verdicts = self._verdicts
+        rollout = self._collector.collect(learner, self._search.n_steps, hold)
+        verdicts.saw(rollout.earned)
+        verdicts.at(steps)
+        self._lost += rollout.lost
+        self._after(learner, rollout)
+        return rollout
 
     def _after(self, learner: Learner, rollout: Rollout) -> None:
         verdicts = self._verdicts
@@ -200,11 +262,11 @@ class _Training:
         penalty = self._collector.episode_penalty
         self._task.progress(TrainProgress(steps, verdicts.total, verdicts.latest, rollout.penalty_share, penalty))
 
-    def _update(self, learner: Learner, rollout: Rollout, rate: float) -> None:
-        rows = len(rollout.rows.returns)
+    def _update(self, learner: Learner, rows: Batch, rate: float) -> None:
+        size = len(rows.returns)
         for _ in range(self._search.n_epochs):
-            shuffled = rollout.rows.at(self._rng.permutation(rows))
-            for begin in range(0, rows, self._batch):
+            shuffled = rows.at(self._rng.permutation(size))
+            for begin in range(0, size, self._batch):
                 learner.update(shuffled.at(slice(begin, begin + self._batch)), self._objective, rate)
 
     def _check(self, learner: Learner) -> None:
@@ -278,6 +340,11 @@ def _reference(**hyperparameters: Any) -> StableBaselinesSearch:
         ModuleNotFoundError: it is not installed.
     """
     return cast("StableBaselinesSearch", SEARCHES.get(REFERENCE)(**hyperparameters))
+
+
+def _from_declared_starts(task: SearchTask) -> SearchTask:
+    """Return the task with every episode from a declared start."""
+    return replace(task, settings=replace(task.settings, session={**task.settings.session, "start_box": 0.0}))
 
 
 @contextmanager
