@@ -167,8 +167,9 @@ class StartOptions:
         bool | None,
         typer.Option(
             "--prolong/--no-prolong",
-            help="Train for as many virtual steps again, once, if the imagined return still rises at the end. Not "
-            "with cmaes or gradient. [default: on if --steps is not given]",
+            help="Train for as many virtual steps again, once, if the imagined return still rises at the end. Fastppo "
+            "then also fine-tunes its policy from the declared starts. Not with cmaes or gradient. [default: on if "
+            "--steps is not given]",
             show_default=False,
         ),
     ] = None

@@ -46,7 +46,7 @@ class SearchTask:
     settings: TrainSettings
     steps: int  # virtual steps at most
     out: Path  # where the policy will be saved; names the run to trackers
-    prolong: bool = False  # whether to take as many steps again, once, if the imagined return still rises
+    prolong: bool = False  # whether to take as many steps again while the return rises, and to fine-tune
     progress: Progress = lambda _: None
     patient: bool = False  # whether to keep a network that has learned nothing in the first quarter of the steps
 

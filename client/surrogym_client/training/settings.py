@@ -43,7 +43,7 @@ class TrainSettings:
     start_from: Path | None = None  # saved policy to continue from
     trust_policy: bool = False  # unpickle that policy's objects, which may run code
     anew: bool = False  # begin with a new network, and use the saved policy only if the new one stays worse
-    prolong: bool | None = None  # whether to take as many steps again if the return still rises; None: as ``prolongs``
+    prolong: bool | None = None  # whether to prolong and to fine-tune a training; None: as ``prolongs``
     threads: int = 1
     tracker: Tracker | None = None  # for searches that log curves
     tensorboard: Path | None = (
@@ -106,7 +106,7 @@ def noise_of(view: SurrogateView) -> dict[str, Any]:
 
 
 def prolongs(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
-    """Whether a training takes as many steps again if its imagined return still rises at the end.
+    """Whether a training takes as many steps again if its imagined return still rises at the end, and is fine-tuned.
 
     By default it does if the number of steps was not chosen. With preset ``paper``, the paper's maximum holds.
     """
