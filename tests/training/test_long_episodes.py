@@ -5,24 +5,34 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from torch import Tensor
 
 from support.models import learn
-from support.plane import drifting, plane
+from support.plane import Pay, drifting, plane
 from surrogym_client.training import TrainSettings, train
-from surrogym_client.training.fast_ppo.long_episodes import LONG, MORE, SHORTER, with_short_episodes
+from surrogym_client.training.fast_ppo.learner import Learner, restored
+from surrogym_client.training.fast_ppo.long_episodes import LONG, MORE, NOISE, SHORTER, with_short_episodes
+from surrogym_client.training.fast_ppo.search import units_of
 from surrogym_client.training.search import SearchTask
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
-from surrogym_shared.spec import EnvironmentSpec, Inequality, Term
+from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, Inequality, Term
 
 ROLLOUT, LIMIT, STEPS = 16, 200, 1_000
 FAR = Inequality(term=Term.linear(x=1), relation=">", value=0.9)
 
 
-def task(settings: TrainSettings | None = None, *, prolong: bool = True, **changes: Any) -> SearchTask:
+def summed(q: Tensor, u: Tensor) -> Tensor:
+    return q[:, 0] + u[:, 0]
+
+
+def task(
+    settings: TrainSettings | None = None, *, prolong: bool = True, pay: Pay = summed, **changes: Any
+) -> SearchTask:
     spec: EnvironmentSpec = plane().model_copy(update={"time_limit": LIMIT, **changes})
-    model = learn(definition_from_spec(spec), drifting(lambda q, u: q[:, 0] + u[:, 0], 12)).model
+    model = learn(definition_from_spec(spec), drifting(pay, 12)).model
     return SearchTask(LocalSurrogate(spec, model), settings or TrainSettings(), STEPS, Path("policy.zip"), prolong)
 
 
@@ -30,11 +40,44 @@ def test_long_episodes_become_short_and_begin_anywhere():
     changed = with_short_episodes(task(), ROLLOUT)
     assert changed.settings.learning == {"seed": 0, "start_box": 1.0, "time_limit": LIMIT // SHORTER}
     assert changed.settings.judging == {}, "checks are whole episodes from the declared starts"
-    assert (changed.steps, changed.prolong, changed.patient) == (MORE * STEPS, True, True)
+    assert (changed.steps, changed.prolong, changed.patient, changed.noise) == (MORE * STEPS, True, True, NOISE)
 
 
-def test_a_chosen_number_of_steps_is_kept():
-    assert with_short_episodes(task(prolong=False), ROLLOUT).steps == STEPS
+def test_a_chosen_number_of_steps_is_kept_and_its_noise_may_fall():
+    changed = with_short_episodes(task(prolong=False), ROLLOUT)
+    assert (changed.steps, changed.noise) == (STEPS, 0.0)
+
+
+def test_noise_is_raised_to_its_least_share_and_never_lowered():
+    spec = plane().model_copy(update={"action": BoxAction(low=(-1.0, 0.0), high=(1.0, 8.0))})
+    learner = Learner(spec, np.zeros(2), np.ones(2), (8,), np.random.default_rng(0))
+    first = learner.further.copy()
+    learner.further[:] = first + np.log([0.1, 3.0])
+    learner.keep_noise(0.5)
+    np.testing.assert_allclose(np.exp(learner.further - first), [0.5, 3.0], rtol=1e-6)
+    learner.keep_noise(0.0)
+    np.testing.assert_allclose(np.exp(learner.further - first), [0.5, 3.0], rtol=1e-6)
+
+
+def test_choices_have_no_noise_to_keep():
+    spec = plane().model_copy(update={"action": DiscreteAction(n=3)})
+    learner = Learner(spec, np.zeros(2), np.ones(2), (8,), np.random.default_rng(0))
+    before = learner.parameters.copy()
+    learner.keep_noise(0.5)
+    np.testing.assert_array_equal(learner.parameters, before)
+
+
+@pytest.mark.parametrize("prolong", [True, False])
+def test_the_noise_of_a_long_training_stays(prolong: bool, tmp_path: Path):
+    """The best action is 0, and noise costs, so without a bound it falls."""
+    given, path = task(pay=lambda _, u: -(u[:, 0] ** 2)), tmp_path / "policy.zip"
+    hyper = {"n_steps": ROLLOUT, "batch_size": 32, "n_epochs": 10, "learning_rate": 0.01}
+    settings = TrainSettings(total_steps=16 * ROLLOUT * 8, num_envs=8, prolong=prolong, hyperparameters=hyper)
+    train(given.port, path, settings)
+    spec = given.port.spec()
+    learner = restored(path, spec, units_of(spec))
+    share = np.exp(learner.further - learner.distribution.further()).item()
+    assert (share >= NOISE - 1e-6) is prolong
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ STEPS = 400
 EPISODES = 4  # that share the steps if none ends early
 RESETS = 32  # for the range of starts
 LONGEST_HOLD = 10  # steps in a row under one action
-PLACES_TRIED = 20  # attempts to find a start without contacts
+PLACES_TRIED = 20  # random starts, of which the ones without contacts can be taken
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,12 @@ class Counted:
 
 
 def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
-    """Take random steps: half of the episodes start from resets, the others from random positions within limits."""
+    """Take random steps.
+
+    Half of the episodes start from resets. The others start at rest from positions within limits that are far from all
+    positions so far. The reason: random actions leave a state of high energy and don't return to it, so the positions
+    that they did not reach are those from which something falls fastest.
+    """
     simulator = counted.simulator
     starts = np.stack([counted.reset(seed) for seed in range(RESETS)])
     rows: list[tuple[Array, Array, Array, float, bool, Array, int]] = []
@@ -90,7 +95,8 @@ def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
     while len(rows) < steps:
         state = counted.reset(RESETS + number)
         if number % 2 and simulator.settable:
-            state = _anywhere(simulator, state, rng)
+            visited = np.array([row[0] for row in rows] + [rows[-1][2]])
+            state = _far_from(simulator, visited, state, rng)
         for action in _actions(simulator.action, number, min(length, steps - len(rows)), rng):
             taken = counted.step(action)
             reached = simulator.read()
@@ -103,18 +109,30 @@ def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
     return Seen(starts, *columns)
 
 
-def _anywhere(simulator: Simulator, state: Array, rng: np.random.Generator) -> Array:
-    """Random positions within their limits, without contacts. If there are none, the state stays unchanged."""
+def _far_from(simulator: Simulator, visited: Array, state: Array, rng: np.random.Generator) -> Array:
+    """Of random positions within their limits without contacts, the one that is farthest from visited states (n, V).
+
+    A distance is the norm of the positions' differences, each as a share of its range. If all have contacts, the state
+    stays unchanged.
+    """
+    turns = np.array([v.motion == "turn" and not v.limited for v in simulator.variables])
+    at = [i for i, v in enumerate(simulator.variables) if v.motion == "turn" or (v.motion == "slide" and v.limited)]
+    bounds = [(simulator.variables[i].low, simulator.variables[i].high) for i in at]
+    low = np.array([-np.pi if lowest is None else lowest for lowest, _ in bounds])
+    high = np.array([np.pi if highest is None else highest for _, highest in bounds])
+    best, farthest = state, -1.0
     for _ in range(PLACES_TRIED):
         placed = state.copy()
-        for i, variable in enumerate(simulator.variables):
-            if variable.motion == "turn" or (variable.motion == "slide" and variable.limited):
-                low = -np.pi if variable.low is None else variable.low
-                placed[i] = rng.uniform(low, np.pi if variable.high is None else variable.high)
+        placed[at] = rng.uniform(low, high)
         simulator.write(placed)
-        if not simulator.touches():
-            return simulator.read()
-    simulator.write(state)
+        if simulator.touches():
+            continue
+        shares = (visited[:, at] - placed[at]) / np.maximum(high - low, 1e-12)
+        shares = np.where(turns[at], shares - np.round(shares), shares)  # the shorter way round
+        distance = float(np.sqrt((shares**2).sum(1)).min())
+        if distance > farthest:
+            best, farthest = simulator.read(), distance
+    simulator.write(best)
     return simulator.read()
 
 

@@ -9,6 +9,7 @@ from surrogym_client.training.search import MAX_STEPS, SearchTask
 LONG = 5  # rollouts of an episode; the lanes of a shorter one start often enough
 SHORTER = 5  # times: a training episode
 MORE = 3  # times as many steps if nobody chose their number
+NOISE = 0.6  # of its first value: least standard deviation of an action in these trainings
 
 
 def with_short_episodes(task: SearchTask, rollout: int) -> SearchTask:
@@ -18,6 +19,10 @@ def with_short_episodes(task: SearchTask, rollout: int) -> SearchTask:
     policy ends up, and it hardly sees the other states. The last reward of a truncated episode includes the critic's
     value of its last state, so short episodes don't change what is optimal. Policies are still compared over whole
     episodes from the declared starts. The task is unchanged if the user chose starts or a time limit.
+
+    Episodes from anywhere begin near states that are paid as well. What is learned there, such as to balance, needs
+    little noise, and the noise is the same in all states. So it would fall before the way to these states is found.
+    In the additional steps it keeps ``NOISE`` of its first value.
 
     Args:
         task: a task.
@@ -29,6 +34,6 @@ def with_short_episodes(task: SearchTask, rollout: int) -> SearchTask:
     if chosen or spec.termination != () or limit <= LONG * rollout or spec.design.preset == "paper":
         return task
     session = {**settings.session, "time_limit": limit // SHORTER}
-    steps = min(MORE * task.steps, MAX_STEPS) if task.prolong else task.steps
+    steps, noise = (min(MORE * task.steps, MAX_STEPS), NOISE) if task.prolong else (task.steps, 0.0)
     short = replace(settings, start_box=1.0, session=session, judge=settings.judging)
-    return replace(task, settings=short, steps=steps, patient=True)
+    return replace(task, settings=short, steps=steps, patient=True, noise=noise)

@@ -268,6 +268,7 @@ class _Training:
             shuffled = rows.at(self._rng.permutation(size))
             for begin in range(0, size, self._batch):
                 learner.update(shuffled.at(slice(begin, begin + self._batch)), self._objective, rate)
+        learner.keep_noise(self._task.noise)
 
     def _check(self, learner: Learner) -> None:
         if self._verdicts.check(self._imagined(learner)):
