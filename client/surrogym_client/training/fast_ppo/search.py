@@ -78,9 +78,9 @@ class FastPpo(PolicySearch):
     state-dependent noise. If episodes are long and nothing ends them, training episodes are short and begin anywhere
     (``with_short_episodes``).
 
-    If nobody chose the number of steps, as many steps follow for fine-tuning. It begins with a new critic, and
-    standardises inputs by the observations that the policy meets. If training episodes are not short, all of them begin
-    at declared starts now. The reason: returns from anywhere can be a thousand times those from the declared starts,
+    If nobody chose the number of steps, and training episodes are not short, as many steps follow for fine-tuning. All
+    of their episodes begin at declared starts. Inputs are standardised by the observations that the policy meets, and
+    the critic is a new one. The reason: returns from anywhere can be a thousand times those from the declared starts,
     and critic and advantages then do not resolve the latter.
     """
 
@@ -109,7 +109,7 @@ class FastPpo(PolicySearch):
         compiled_update()  # loads a linear algebra library now, so that its threads are limited as well
         with threadpool_limits(limits=task.settings.threads):
             cut = with_short_episodes(task, self.n_steps)
-            fine = _from_declared_starts(task) if cut is task else cut
+            fine = _from_declared_starts(task) if task.prolong and cut is task else None
             with _lanes(cut) as lanes:
                 return _Training(self, cut, lanes, fine).run()
 
@@ -122,7 +122,7 @@ class FastPpo(PolicySearch):
 class _Training:
     """Networks of one training, and the checks that compare them."""
 
-    def __init__(self, search: FastPpo, task: SearchTask, lanes: Lanes, fine: SearchTask) -> None:
+    def __init__(self, search: FastPpo, task: SearchTask, lanes: Lanes, fine: SearchTask | None) -> None:
         self._search, self._task, self._fine, self._spec = search, task, fine, task.port.spec()
         settings = task.settings
         self._gamma = suggested_gamma(self._spec) if search.gamma is None else search.gamma
@@ -153,8 +153,8 @@ class _Training:
                     continue
                 if self._task.prolong and verdicts.prolong():
                     self._learn(learner, verdicts.left, hold)
-                if self._task.prolong and not verdicts.saturated:
-                    self._fine_tune(learner)
+                if self._fine is not None and not verdicts.saturated:
+                    self._fine_tune(learner, self._fine)
                 break
             else:
                 return self._by_reference()  # a network is only abandoned if steps are left
@@ -212,8 +212,8 @@ class _Training:
             self._update(learner, rollout.rows, rate)
         self._check(learner)
 
-    def _fine_tune(self, learner: Learner) -> None:
-        """Train the best policy further from the declared starts alone. ``FastPpo`` says why."""
+    def _fine_tune(self, learner: Learner, task: SearchTask) -> None:
+        """Train the best policy further from the declared starts of ``task``. ``FastPpo`` says why."""
         verdicts, search = self._verdicts, self._search
         assert self._kept is not None
         learner.take_up(self._kept)
@@ -223,8 +223,8 @@ class _Training:
         episode = -(-(self._spec.time_limit or LONGEST_EPISODE) // search.n_steps)
         looks, seen = max(min(episode, int(LOOKS * rollouts)), 1), []
         best, rose = verdicts.best, looks + CRITIC_ROLLOUTS  # the last rollout after which the best return rose
-        with _lanes(self._fine) as lanes:
-            self._collector = Collector(lanes, self._gamma, search.gae_lambda, self._task.settings.seed + FINE_SEED)
+        with _lanes(task) as lanes:
+            self._collector = Collector(lanes, self._gamma, search.gae_lambda, task.settings.seed + FINE_SEED)
             for number in range(1, rollouts + 1):
                 rows = self._collect(learner, before + number * self._rollout).rows
                 if verdicts.best != best:
