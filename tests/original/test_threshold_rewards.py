@@ -136,6 +136,17 @@ def test_what_holds_everywhere_is_no_boundary():
     )
 
 
+def test_two_places_decide_no_ellipsoid():
+    """Two places of an angle, met again and again: many ellipsoids go through them, and pay differently elsewhere."""
+    q, _ = Machine(FORMULAS["a height"], "after").draw(100)
+    edge = q[:POINTS].copy()
+    edge[:, 2] = np.where(np.arange(POINTS) % 2, 0.14, -0.14)
+    cos, sin = Term.cos(turn=1), Term.sin(turn=1)
+    for group in [(sin, cos + (-1.0) * sin), (Term.linear(turn=1), sin)]:
+        assert not list(regions(spec(), group, edge, q))
+    assert [term.shape for term in regions(spec(), (cos,), edge, q)] == ["one"]
+
+
 def test_a_description_declares_a_bonus_near_a_goal(registered: Register):
     def step(self: Spiral, action: np.ndarray):
         shown, _, ended, cut, info = Spiral.step(self, action)

@@ -31,6 +31,7 @@ ENOUGH = 4  # steps with the rarer value, at which bisections begin
 POINTS = 12  # of the boundary: twice the numbers of an ellipsoid of three entries
 HALVINGS = 24
 LEVEL = 1e-5  # largest distance of a point from the boundary, as a share of the boundary's size
+FLAT = 1e-3  # a share of the largest singular value: with one below it, points lie on more than one ellipsoid
 MOST = 5_000  # groups of entries
 
 Steps = Callable[[Array, Array], Paid]  # from states (n, C) with actions (n, F), without those that end an episode
@@ -148,16 +149,17 @@ def regions(spec: EnvironmentSpec, group: Sequence[Term], bounds: Array, states:
 def _ellipsoid(group: Sequence[Term], x: Array, elsewhere: Array) -> tuple[Quantity, ...] | None:
     """The quantities (x_i - c_i) / r_i of an ellipsoid through the points x (K, k), or None.
 
-    None also if all other states are on it: x holds ``elsewhere`` (n, k) there. A cosine and a sine do this.
+    None also if other ellipsoids go through them, or if all other states are on it: x holds ``elsewhere`` (n, k) there.
+    A cosine and a sine do this.
     """
     middle, reach = x.mean(0), x.std(0)
-    if not reach.all():
+    if (reach <= LEVEL * np.ptp(elsewhere, axis=0)).any():
         return None
     # 0 is inside of the ellipsoid, so a . z^2 + b . z = 1 on it, where z is centred and scaled
     columns, others = (np.concatenate([z**2, z], axis=1) for z in ((x - middle) / reach, (elsewhere - middle) / reach))
-    weights = np.linalg.lstsq(columns, np.ones(len(x)), rcond=None)[0]
+    weights, _, rank, _ = np.linalg.lstsq(columns, np.ones(len(x)), rcond=FLAT)
     a, b = np.split(weights, 2)
-    if np.abs(columns @ weights - 1).max() > LEVEL or a.min() <= LEVEL:
+    if rank < len(weights) or np.abs(columns @ weights - 1).max() > LEVEL or a.min() <= LEVEL:
         return None
     if np.abs(others @ weights - 1).max() <= LEVEL:
         return None
