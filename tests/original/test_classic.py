@@ -41,6 +41,13 @@ def turned(spec, difference):
     return np.where(angles, (difference + np.pi) % (2 * np.pi) - np.pi, difference)
 
 
+def test_rows_of_states_are_wrapped_like_each_state(environments):
+    """An angle's column, and not the row of the same number: descriptions of rewards read many steps at once."""
+    spec = environments["Pendulum-v1"].spec()
+    rows = np.random.default_rng(0).uniform(-8, 8, (5, len(spec.coordinates)))
+    np.testing.assert_array_equal(wrapped(spec, rows), [wrapped(spec, row) for row in rows])
+
+
 @pytest.mark.parametrize("name", IDS)
 def test_step_from_follows_the_environments_own_trajectory(environments, name):
     environment = environments[name]

@@ -10,7 +10,15 @@ import pytest
 from support.simulators import Register, Spiral, installed
 from surrogym_client.original.describing import describe
 from surrogym_client.original.describing.rewarding import Paid
-from surrogym_client.original.describing.thresholds import HALVINGS, POINTS, SEEK, threshold_reward
+from surrogym_client.original.describing.thresholds import (
+    BATCH,
+    ENOUGH,
+    HALVINGS,
+    POINTS,
+    SEEK,
+    regions,
+    threshold_reward,
+)
 from surrogym_shared.logs.rewards import declared_reward
 from surrogym_shared.spec import (
     BoxAction,
@@ -104,6 +112,41 @@ def test_another_reward_is_left_to_be_learned(reward: Formula):
     assert machine.steps <= 100 + SEEK + 2 * POINTS * (HALVINGS + 1)
 
 
+def test_the_paid_steps_of_one_pass_are_enough():
+    """All paid steps of an episode may lie near one place of the boundary, which alone does not tell its form."""
+    machine = Machine(FORMULAS["a disc"], "after")
+    towards = np.column_stack([np.linspace(1, 0.5, 100), np.zeros(100), np.zeros(100)])
+    seen = machine.step(towards, 0.1 * machine.draw(100)[1])
+    assert seen.reward.sum() >= ENOUGH, "no further step is needed to meet both values"
+    found = threshold_reward(spec(), seen, machine.step, machine.draw)
+    assert found is not None
+    assert found.terms[0].shape == "ball"
+    assert machine.steps <= 100 + BATCH + POINTS * HALVINGS
+
+
+def test_what_holds_everywhere_is_no_boundary():
+    """The squares of a cosine and a sine add up to 1 in every state: rounding would decide who is inside."""
+    turning, shown = spec(), (Term.cos(turn=1), Term.sin(turn=1))
+    q, _ = Machine(FORMULAS["a disc"], "after").draw(100)
+    assert not list(regions(turning, shown, q[:POINTS], q))
+    edge = q[:POINTS].copy()
+    edge[:, 0] = np.sin(edge[:, 2])
+    assert [term.shape for term in regions(turning, (Term.cos(turn=1), Term.linear(x=1)), edge, q)] == ["ball"], (
+        "x equals a sine on this boundary alone"
+    )
+
+
+def test_two_places_decide_no_ellipsoid():
+    """Two places of an angle, met again and again: many ellipsoids go through them, and pay differently elsewhere."""
+    q, _ = Machine(FORMULAS["a height"], "after").draw(100)
+    edge = q[:POINTS].copy()
+    edge[:, 2] = np.where(np.arange(POINTS) % 2, 0.14, -0.14)
+    cos, sin = Term.cos(turn=1), Term.sin(turn=1)
+    for group in [(sin, cos + (-1.0) * sin), (Term.linear(turn=1), sin)]:
+        assert not list(regions(spec(), group, edge, q))
+    assert [term.shape for term in regions(spec(), (cos,), edge, q)] == ["one"]
+
+
 def test_a_description_declares_a_bonus_near_a_goal(registered: Register):
     def step(self: Spiral, action: np.ndarray):
         shown, _, ended, cut, info = Spiral.step(self, action)
@@ -117,9 +160,12 @@ def test_a_description_declares_a_bonus_near_a_goal(registered: Register):
 
 
 @installed("dm_control")
-@pytest.mark.parametrize(("task", "shape"), [("reacher-easy", "ball"), ("pendulum-swingup", "one")])
-def test_rewards_of_the_control_suite_are_found(task: str, shape: str):
-    found = describe(f"dm_control:{task}")
+@pytest.mark.parametrize(
+    ("task", "seed", "shape"),
+    [("reacher-easy", 0, "ball"), ("reacher-easy", 51, "ball"), ("pendulum-swingup", 0, "one")],
+)
+def test_rewards_of_the_control_suite_are_found(task: str, seed: int, shape: str):
+    found = describe(f"dm_control:{task}", seed=seed)
     assert isinstance(found.spec.reward, DeclaredReward)
     [term] = found.spec.reward.terms
     assert (term.shape, term.weight, found.spec.reward.timing) == (shape, pytest.approx(1), "after")

@@ -91,18 +91,18 @@ def native_action(space: Action, action: Array) -> Any:
 
 
 def wrapped(spec: EnvironmentSpec, coordinates: Array) -> Array:
-    """Wrap angles of coordinates (C,) to [-pi, pi), and clip bounded coordinates to their bounds.
+    """Wrap angles of coordinates (..., C) to [-pi, pi), and clip bounded coordinates to their bounds.
 
     Environments with a float32 state exceed their own bounds by a rounding error.
     """
     out = np.array(coordinates, dtype=np.float64)
     for i, coordinate in enumerate(spec.coordinates):
         if coordinate.kind == "angle":
-            out[i] = (out[i] + np.pi) % (2 * np.pi) - np.pi
+            out[..., i] = (out[..., i] + np.pi) % (2 * np.pi) - np.pi
         elif coordinate.bounds is not None:
             low = -np.inf if coordinate.bounds.low is None else coordinate.bounds.low
             high = np.inf if coordinate.bounds.high is None else coordinate.bounds.high
-            out[i] = np.clip(out[i], low, high)
+            out[..., i] = np.clip(out[..., i], low, high)
     return out
 
 
