@@ -24,7 +24,7 @@ from surrogym_client.policies import UnusablePolicy, load_policy
 from surrogym_client.training import TrainingInterrupted, TrainSettings, train
 from surrogym_client.training.fast_ppo import search as searches
 from surrogym_client.training.fast_ppo.actions import Bounded, Choices
-from surrogym_client.training.fast_ppo.learner import Learner, Objective, compiled_update, noisy
+from surrogym_client.training.fast_ppo.learner import Learner, Objective, compiled_update, noisy, restored
 from surrogym_client.training.fast_ppo.rollouts import Collector, RewardScale, Rollout
 from surrogym_client.training.search import search_for
 from surrogym_client.training.verdicts import Verdicts
@@ -206,6 +206,8 @@ def test_a_training_ends_with_fine_tuning_from_the_declared_starts(surrogate, tm
     assert (boxes[1:], tuned.virtual_steps % 4_096) == ([0.5, 0.0], 0)
     assert tuned.virtual_steps >= 8_192
     assert tuned.imagined_return >= plain.imagined_return
+    noise = [restored(path, surrogate.spec(), (64, 64)).further for path in (plain.path, tuned.path)]
+    assert noise[1] <= noise[0]
     further = replace(settings, prolong=True, start_from=tuned.path)
     assert train(surrogate, tmp_path / "further.zip", further).imagined_return >= tuned.imagined_return
 

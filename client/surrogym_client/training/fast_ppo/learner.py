@@ -161,6 +161,11 @@ class Learner:
         if share > 0:
             np.maximum(self.further, self.distribution.further() + np.float32(np.log(share)), out=self.further)
 
+    def limit_noise(self, logarithms: Array, share: float) -> None:
+        """Lower the standard deviations of continuous actions to at most this share of others, given by their
+        logarithms."""
+        np.minimum(self.further, logarithms + np.float32(np.log(share)), out=self.further)
+
     def _adam(self, largest: float, rate: float) -> None:
         gradient = self._gradient
         norm = float(np.sqrt(gradient @ gradient))

@@ -65,7 +65,8 @@ HELD = 16  # steps that share the noise of the second network
 FINE = 0.1  # learning rate of the fine-tuning, as a share of the one before
 LOOKS = 1 / 8  # largest share of the fine-tuning that only collects observations
 CRITIC_ROLLOUTS = 8  # next rollouts, from which the critic alone learns
-FRUITLESS = 1 / 4  # share of the fine-tuning after which it ends if the imagined return did not rise
+QUIET = 0.1  # noise at the end of the fine-tuning, as a share of that at its beginning
+FRUITLESS = 1 / 2  # share of the fine-tuning after which it ends if the imagined return did not rise
 
 
 @dataclass(frozen=True)
@@ -218,6 +219,7 @@ class _Training:
         assert self._kept is not None
         learner.take_up(self._kept)
         before, rate = verdicts.own_steps, search.learning_rate or LEARNING_RATE
+        noise = learner.further.copy()
         verdicts.fine_tune()
         rollouts = max(verdicts.left // self._rollout, 1)
         episode = -(-(self._spec.time_limit or LONGEST_EPISODE) // search.n_steps)
@@ -241,6 +243,7 @@ class _Training:
                     self._update(learner, replace(rows, advantages=np.zeros_like(rows.advantages)), rate)
                 else:
                     self._update(learner, rows, FINE * rate * max(1 - number / rollouts, LAST_RATE))
+                    learner.limit_noise(noise, 1 - (1 - QUIET) * number / rollouts)
         self._check(learner)
 
     def _collect(self, learner: Learner, steps: int, hold: int = 1) -> Rollout:
