@@ -37,7 +37,7 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.sampling.design import DesignState, Request, advance, initial_design, initial_rollouts
 from surrogym_shared.spec import EnvironmentSpec
 
-TASKS = ("pendulum", "swingup", "pendulum:resets", "cartpole:resets")
+TASKS = ("pendulum", "pendulum:resets", "cartpole:resets", "swingup")
 ACQUISITIONS = ("integrated_variance", "barl", "tip", "opax")
 BUDGET = {"pendulum": 40, "cartpole": 40, "swingup": 60}
 LONGEST = 40  # actions of one rollout
@@ -127,7 +127,7 @@ def main() -> None:
         writer = csv.DictWriter(lines, [field.name for field in fields(Row)])
         writer.writeheader()
         seeds = range(options.first_seed, options.first_seed + options.seeds)
-        for task, acquisition, seed in product(options.tasks, options.acquisitions, seeds):
+        for task, seed, acquisition in product(options.tasks, seeds, options.acquisitions):
             if acquisition == "tip" and ":" not in task:
                 continue  # of single queries TIP and BARL think the same
             rows.append(designed(task, acquisition, seed))

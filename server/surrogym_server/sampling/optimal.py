@@ -23,7 +23,7 @@ from surrogym_server.sampling.rollouts import Sequences, random_sequences, start
 
 POPULATION = 64  # action sequences compared at once, for each function
 ELITE = 16  # of them that the next generation varies
-GENERATIONS = 8
+GENERATIONS = 4
 
 
 @dataclass(frozen=True)

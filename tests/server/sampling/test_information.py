@@ -25,10 +25,12 @@ from surrogym_server.sampling.acquisition import ACQUISITIONS, BARL, OPAX, TIP, 
 from surrogym_server.sampling.batch import candidate_view, choose
 from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.confidence import deviations
+from surrogym_server.sampling.design import DesignState, Request, advance
 from surrogym_server.sampling.forecast import Forecast
 from surrogym_server.sampling.optimal import optimal_trajectories
 from surrogym_server.sampling.outlook import AfterSteps, outlook_of
 from surrogym_server.sampling.rollouts import Aim, path_values, plan_rollout, plan_round, predict_paths, start_points
+from surrogym_shared.spec import AcquisitionChoice, Design, EnvironmentSpec
 
 TOLERANCES = (0.02, 0.1)  # of the line's step and reward
 COUNT, HORIZON = 3, 6
@@ -319,10 +321,29 @@ def test_rollouts_are_planned(learned, optimal, name):
     model = by(learned, name, **settings)
     aim = replace(AIM, optimal=() if name == "opax" else optimal, snapshots=torch.tensor([[0.5], [-1.0]]).double())
     for aimed in (aim, replace(aim, snapshots=None)):
-        first, again = (plan_round(model, aimed, 7, (), rng()) for _ in range(2))
-        assert sum(map(len, first)) == 7
+        first, again = (plan_round(model, aimed, 3, (), rng()) for _ in range(2))
+        assert sum(map(len, first)) == 3
         assert all(one.actions.shape[1] == 1 and bool((one.actions.abs() <= 1).all()) for one in first)
         assert all(torch.equal(a.actions, b.actions) for a, b in zip(first, again, strict=True))
+
+
+@pytest.mark.parametrize("name", ["barl", "tip", "opax"])
+@pytest.mark.parametrize("resets", [False, True])
+def test_a_round_of_a_design_asks_by_them(name, resets):
+    """The design draws the trajectories, by its own seed: the same round again asks the same."""
+    settings = {} if name == "opax" else {"trajectories": 2, "horizon": 4}
+    chosen = Design(acquisition=AcquisitionChoice(name=name, settings=settings), symmetry="none", initial=4)
+    changes = {"design": chosen.model_dump(), **({"query": "rollout", "max_rollout": 6} if resets else {})}
+    definition = definition_from_spec(EnvironmentSpec.model_validate(line().model_dump() | changes))
+    samples = taught(8)
+    request = Request(40, 0.999, Points(samples.q[:0], samples.u[:0]))
+    first, again = (advance(definition, samples, DesignState(), request) for _ in range(2))
+    assert first.verdict == "continue"
+    assert (len(first.q) > 0) is not resets
+    assert (len(first.rollouts) > 0) is resets
+    assert torch.equal(first.q, again.q)
+    for one, other in zip(first.rollouts, again.rollouts, strict=True):
+        assert torch.equal(one.actions, other.actions)
 
 
 @pytest.mark.parametrize(
