@@ -122,7 +122,8 @@ class Acquisition(ABC):
     paths follow drawn functions too, and not the mean.
 
     An acquisition with ``optimism`` plans paths with the luck that suits it best: in each step a plan chooses, beside
-    the action, by how many deviations each transition output misses its mean, at most ``optimism`` of them.
+    the action, by how many deviations each transition output misses its mean, at most ``optimism`` of them. Then no
+    path follows a drawn function.
     """
 
     trajectories: int = 0  # number of drawn optimal trajectories that it reads

@@ -81,10 +81,12 @@ class Forecast:
 
     def move(self, model: DynamicsModel, sequences: int, lanes: int) -> Move | None:
         """The step of all lanes, (sequences * lanes) rows; None: the mean."""
-        if self.functions is not None:
-            index = torch.arange(lanes).repeat(sequences) % len(self.functions)
-            return self.functions.rows(index).step
-        return partial(_lucky, model, self.optimism) if self.controls else None
+        if self.controls:
+            return partial(_lucky, model, self.optimism)
+        if self.functions is None:
+            return None
+        index = torch.arange(lanes).repeat(sequences) % len(self.functions)
+        return self.functions.rows(index).step
 
 
 def _lucky(model: DynamicsModel, optimism: float, q: Tensor, controls: Tensor) -> Transition:

@@ -4,8 +4,8 @@ A sequence begins at a reset, or at a snapshot: a state to which the environment
 
 The value of a sequence is the acquisition's value per real step: for most acquisitions, the information that a path
 gives about each output (``PathOutlook.information``). A step has weight 0 outside the sampling range and after the end
-of an episode. The weight falls with the deviation accumulated along the path, so a plan ends where it can't be
-predicted.
+of an episode. The weight falls with the deviation accumulated along a mean path, so a plan ends where it can't be
+predicted. Paths of drawn functions and optimistic ones (``forecast``) have no such weight.
 """
 
 from __future__ import annotations
