@@ -39,11 +39,11 @@ from surrogym_client.policies.files import load_policy
 from surrogym_client.policies.predict import Predict
 from surrogym_server.convert import stored_definition
 from surrogym_server.environment.actions import model_actions
+from surrogym_server.models.draws import function_draws
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.models import load_model
 from surrogym_server.storage.sql.storage import open_storage
-from surrogym_server.virtual.paths import function_draws
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.terms import observe
 

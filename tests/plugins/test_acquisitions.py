@@ -38,7 +38,11 @@ def test_the_design_asks_by_an_installed_acquisition(plugin_server: ServerProces
 @pytest.mark.parametrize(
     ("name", "settings", "said"),
     [
-        ("nobody", {}, "expected one of integrated_variance, variance, uncertainty_index, latin_hypercube, focused_"),
+        (
+            "nobody",
+            {},
+            "expected one of integrated_variance, variance, uncertainty_index, latin_hypercube, barl, tip, opax, ",
+        ),
         ("broken", {}, f"package '{BROKEN}', entry point broken = 'nowhere_to_be_found:Missing'"),
         ("focused_variance", {"sigma": 1.0}, "expected a setting out of coordinate, near, width, got 'sigma'"),
         (

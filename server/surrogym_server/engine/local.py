@@ -38,11 +38,11 @@ from surrogym_server.engine.saved import session_from_bytes, session_to_bytes
 from surrogym_server.engine.session import Answer, Outcome, Session, digest_of, steps_of
 from surrogym_server.engine.sessions import Limits, LiveSessions, Threads
 from surrogym_server.engine.tallies import Counts, Durations, SessionActivity, Tallies
+from surrogym_server.models.draws import function_draws
 from surrogym_server.models.guard import plugin_calls
 from surrogym_server.sampling.uncertainty import visited_confidence
 from surrogym_server.tensors import CPU
 from surrogym_server.virtual import expected_bytes
-from surrogym_server.virtual.paths import function_draws
 
 STEP_THREADS, ROLLOUT_THREADS = 4, 2
 Tolerances = Callable[[int, int], tuple[float, ...]]  # of a surrogate's version, (O,)

@@ -32,7 +32,7 @@ def offers(model: DynamicsModel, ability: type[A]) -> A | None:
 class FunctionDraws(ABC):
     """Ability to draw whole functions from the posterior, each consistent for a whole episode.
 
-    Fallback of ``virtual``: one standard normal number for each transition output is kept for the episode, and shifts
+    Fallback of ``draws``: one standard normal number for each transition output is kept for the episode, and shifts
     this output everywhere by as many standard deviations. These are the draws of outputs whose errors are the same at
     all states.
     """

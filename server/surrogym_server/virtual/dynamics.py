@@ -12,9 +12,9 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.step_rules import paid
 from surrogym_server.models.abilities import ArraySteps
+from surrogym_server.models.draws import function_draws
 from surrogym_server.models.guard import require_shapes
 from surrogym_server.models.port import DynamicsModel, Transition
-from surrogym_server.virtual.paths import function_draws
 
 Weighting = Literal["inverse_variance", "uniform"]
 WEIGHT_FLOOR = 1e-12  # of the reward's variance, so that a certain particle's weight stays finite

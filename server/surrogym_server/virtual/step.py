@@ -6,11 +6,11 @@ import logging
 from dataclasses import replace
 
 from surrogym_server.models.abilities import ArraySteps, CompiledSteps, offers
+from surrogym_server.models.draws import function_draws
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual import environment
 from surrogym_server.virtual.environment import Bools, Floats, LaneTransition, VirtualSettings
 from surrogym_server.virtual.lanes import LaneState
-from surrogym_server.virtual.paths import function_draws
 
 logger = logging.getLogger(__name__)
 

@@ -38,9 +38,8 @@ def candidates(points) -> Candidates:
 def value(model: GaussianProcessModel, candidates: Candidates, criterion: str, column: int) -> torch.Tensor:
     points = candidates.points
     outlook = outlook_of(model, points, candidates.reference, points[:0])
-    output, distance = outlook[column], torch.ones(len(points), dtype=torch.float64)
-    assert output is not None
-    view = candidate_view(model, candidates, column, output, TOLERANCES[column], distance)
+    distance = torch.ones(len(points), dtype=torch.float64)
+    view = candidate_view(model, candidates, column, outlook, TOLERANCES, distance)
     return acquisition_of(Choice(criterion)).value(view)
 
 

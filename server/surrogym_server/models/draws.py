@@ -1,0 +1,57 @@
+"""Functions drawn from any model: by its family's ``FunctionDraws``, or by the fallback for families without it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from surrogym_server.models.abilities import FunctionDraws, UncertainHyperparameters, offers
+from surrogym_server.models.port import DynamicsModel, Transition
+
+
+def function_draws(model: DynamicsModel, functions: int | None = None) -> FunctionDraws:
+    """Return the object that draws functions of a model: the model itself, or a fallback if its family draws none.
+
+    If lanes share a number of ``functions``, hyperparameters are drawn too, so that the few functions cover their
+    uncertainty.
+    """
+    if functions is not None and (able := offers(model, UncertainHyperparameters)) is not None:
+        return able.uncertain_functions
+    return offers(model, FunctionDraws) or ConstantErrors(model)
+
+
+@dataclass(frozen=True)
+class ConstantErrors(FunctionDraws):
+    """Functions that have the same distance from the mean everywhere, in deviations. The reward's function is its mean.
+
+    A draw is one standard normal number for each transition output.
+    """
+
+    model: DynamicsModel
+
+    @property
+    def path_size(self) -> int:
+        return len(self.model.definition.outputs) - 1
+
+    def draw(self, noise: Tensor) -> Tensor:
+        return noise
+
+    def transition_along(
+        self,
+        paths: Tensor,
+        q: Tensor,
+        u: Tensor,
+        *,
+        process: Tensor | None = None,
+        deviations: bool = False,
+        reward_deviation: bool = False,
+    ) -> Transition:
+        return self.model.transition(
+            q,
+            u,
+            noise=paths[:, : self.path_size],
+            process=process,
+            deviations=deviations,
+            reward_deviation=reward_deviation,
+        )
