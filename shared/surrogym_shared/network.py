@@ -183,8 +183,8 @@ def bounds_of(spec: EnvironmentSpec) -> tuple[Array, Array]:
 
 
 def _sizes(spec: EnvironmentSpec, units: int | Sequence[int]) -> list[int]:
-    """Return the numbers of inputs, hidden units and outputs."""
-    hidden = [units] if isinstance(units, int) else units
+    """Return the numbers of inputs, hidden units and outputs. No units make a linear policy."""
+    hidden = ([units] if units else []) if isinstance(units, int) else units
     return [len(spec.observation), *hidden, sum(counts_of(spec)) or spec.action.size]
 
 

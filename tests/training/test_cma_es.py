@@ -45,6 +45,18 @@ def test_generations_are_as_many_as_the_steps_allow(surrogate, tmp_path: Path):
     assert not surrogate._sessions
 
 
+def test_no_units_make_a_linear_policy(surrogate, tmp_path: Path):
+    """Such a policy is saved, read and acts as any other."""
+    linear = {**SMALL, "units": 0}
+    result = train(surrogate, tmp_path / "policy.zip", small(total_steps=640, hyperparameters=linear))
+    policy = Network.load(result.path)
+    assert [layer.weights.shape for layer in policy.layers] == [(3, 1)]
+    observations = np.random.default_rng(0).normal(size=(5, 3))
+    x = (observations - policy.mean) / policy.deviation
+    expected = 2 * np.tanh(x @ policy.layers[0].weights + policy.layers[0].bias)
+    np.testing.assert_allclose(load_policy(result.path)(observations), expected, atol=1e-6)
+
+
 def test_a_penalty_is_reported(surrogate, tmp_path: Path):
     reports, results = [], []
     for penalty in (0.0, 100.0):

@@ -36,7 +36,7 @@ class CmaEs(PolicySearch):
 
     population: int = 24  # candidates of each generation
     starts: int = 16  # episodes of each candidate
-    units: int = 10  # hidden units of the network
+    units: int = 10  # hidden units of the network; 0 for a policy without a hidden layer
     sigma: float = 1.0  # initial standard deviation of a parameter
 
     suggested_steps = 10_000_000
