@@ -211,11 +211,17 @@ async def about(database: str) -> list[Found]:
 
 
 async def until_answered(case: EngineCase, request: Advance) -> Reply:
-    async with asyncio.timeout(300):
-        while True:
-            with suppress(Unavailable):
-                return await case.engine.advance(request)
-            await asyncio.sleep(0.1)
+    refused: Unavailable | None = None
+    try:
+        async with asyncio.timeout(300):
+            while True:
+                try:
+                    return await case.engine.advance(request)
+                except Unavailable as error:
+                    refused = error
+                await asyncio.sleep(0.1)
+    except TimeoutError as late:
+        raise TimeoutError(f"no answer in 300 s; the last refusal: {refused}") from late
 
 
 async def replayed(case: EngineCase, requests: list[Advance]) -> None:
