@@ -84,7 +84,7 @@ def test_endings_against_the_prediction_fail(misplaced: int, passed: bool):
 
 
 def test_a_rollout_fails_by_its_only_end():
-    """It ends once at most, so two misplaced ends can't be asked for."""
+    """An episode ends at most once. So one misplaced end fails a rollout, where it takes two to fail single steps."""
     beside = replace(compared(np.zeros((3, 1)), misplaced=1), cut_short=True)
     assert judge(beside, PROMISE, PROMISE, UNTRAINED).faults == (
         "the episode ended after 3 steps, where the model predicted no end",

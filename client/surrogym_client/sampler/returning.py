@@ -59,7 +59,7 @@ class Returning:
         self._environment, self._spec, self._folder = environment, spec, folder
         self.gone = sorted(set(known) - set(folder.names()))
         self._hung_saves = 0
-        self._remarks: dict[str, str] = {}  # the first remark of each kind; an empty text once it was told
+        self._remarks: dict[str, str] = {}  # first remark of each kind; "" after it was told
         if self.gone:
             self._remark(
                 "start",

@@ -107,11 +107,11 @@ class Verdicts:
         """Take as many steps again, if that has not happened yet and the training still gains."""
         if self.prolonged or not self.gaining:
             return False
-        self.total += self._planned
+        self.extend()
         return True
 
-    def fine_tune(self) -> None:
-        """Take as many steps again for fine-tuning."""
+    def extend(self) -> None:
+        """Take as many steps again as were planned."""
         self.total += self._planned
 
     def begin(self) -> None:

@@ -59,9 +59,9 @@ RANGES = {  # whole numbers have whole bounds
 }
 
 
-FINE_SEED = 2_000_003
 HELD = 16  # steps that share the noise of the second network
 
+FINE_SEED = 2_000_003  # difference between the noise seeds of the fine-tuning and of the training before
 FINE = 0.1  # learning rate of the fine-tuning, as a share of the one before
 LOOKS = 1 / 8  # largest share of the fine-tuning that only collects observations
 CRITIC_ROLLOUTS = 8  # next rollouts, from which the critic alone learns
@@ -218,9 +218,9 @@ class _Training:
         verdicts, search = self._verdicts, self._search
         assert self._kept is not None
         learner.take_up(self._kept)
-        before, rate = verdicts.own_steps, search.learning_rate or LEARNING_RATE
+        before, rate = verdicts.own_steps, LEARNING_RATE if search.learning_rate is None else search.learning_rate
         noise = learner.further.copy()
-        verdicts.fine_tune()
+        verdicts.extend()
         rollouts = max(verdicts.left // self._rollout, 1)
         episode = -(-(self._spec.time_limit or LONGEST_EPISODE) // search.n_steps)
         looks, seen = max(min(episode, int(LOOKS * rollouts)), 1), []
@@ -235,10 +235,8 @@ class _Training:
                     return
                 if number <= looks:
                     seen.append(rows.observations)
-                if number < looks:
-                    continue
-                if number == looks:
-                    learner.standardise_anew(np.concatenate(seen), self._rng)
+                    if number == looks:
+                        learner.standardise_anew(np.concatenate(seen), self._rng)
                 elif number <= looks + CRITIC_ROLLOUTS:
                     self._update(learner, replace(rows, advantages=np.zeros_like(rows.advantages)), rate)
                 else:
