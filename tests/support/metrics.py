@@ -17,6 +17,7 @@ METRICS: dict[str, Any] = {
     "reached": False,
     "imagined_return": -145.0,
     "promise": {"median": -144.0, "low": -160.0, "high": -130.0},
+    "varied": [],
     "trusted": True,
     "virtual_steps": 300,
     "phase": "ready",

@@ -13,7 +13,7 @@ from support.models import learn
 from support.plane import Pay, drifting, plane
 from surrogym_client.training import TrainSettings, train
 from surrogym_client.training.fast_ppo.learner import Learner, restored
-from surrogym_client.training.fast_ppo.long_episodes import LONG, MORE, NOISE, SHORTER, with_short_episodes
+from surrogym_client.training.fast_ppo.long_episodes import LONG, MORE, NOISE, SHORTER, SIGHT, with_short_episodes
 from surrogym_client.training.fast_ppo.search import units_of
 from surrogym_client.training.search import SearchTask
 from surrogym_server.convert import definition_from_spec
@@ -41,6 +41,7 @@ def test_long_episodes_become_short_and_begin_anywhere():
     assert changed.settings.learning == {"seed": 0, "start_box": 1.0, "time_limit": LIMIT // SHORTER}
     assert changed.settings.judging == {}, "checks are whole episodes from the declared starts"
     assert (changed.steps, changed.prolong, changed.patient, changed.noise) == (MORE * STEPS, True, True, NOISE)
+    assert changed.gamma == pytest.approx(1 - 1 / (SIGHT * LIMIT / SHORTER))
 
 
 def test_a_chosen_number_of_steps_is_kept_and_its_noise_may_fall():
@@ -71,7 +72,7 @@ def test_choices_have_no_noise_to_keep():
 def test_the_noise_of_a_long_training_stays(prolong: bool, tmp_path: Path):
     """The best action is 0, and noise costs, so without a bound it falls."""
     given, path = task(pay=lambda _, u: -(u[:, 0] ** 2)), tmp_path / "policy.zip"
-    hyper = {"n_steps": ROLLOUT, "batch_size": 32, "n_epochs": 10, "learning_rate": 0.01}
+    hyper = {"n_steps": ROLLOUT, "batch_size": 32, "n_epochs": 10, "learning_rate": 0.01, "gamma": 0.98}
     settings = TrainSettings(total_steps=16 * ROLLOUT * 8, num_envs=8, prolong=prolong, hyperparameters=hyper)
     train(given.port, path, settings)
     spec = given.port.spec()

@@ -141,13 +141,16 @@ def command(
         _keep(policy, reports, settings, quiet=output.quiet)
     filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if video else None
     version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
-    promise = card.promise if settings.declared else None
+    promise = card.promise if settings.declared and not result.varied else None
     judged = promise if _judges(settings.episodes) else None
     found = differences.between(ledger, service.server, token, result, settings, judged, quiet=output.quiet)
     summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference)}
     summary |= {"promise_kept": _kept(judged, result), "version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
     more = [] if found is None else found.in_words(card.spec)
+    if settings.declared and result.varied:
+        changed = ", ".join(result.varied)
+        more.append(f"the promise is not judged: it is for episodes without a change of {changed}, which changed here")
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
 
 

@@ -73,6 +73,7 @@ class Evaluation:
     lengths: NDArray[np.int64]  # (N,)
     success: NDArray[np.bool_] | None  # (N,); None where the specification has no criterion
     traces: tuple[Trace, ...]  # of every episode
+    varied: tuple[str, ...] = ()  # constants of the specification that changed within an episode
 
     @property
     def trace(self) -> Trace:
@@ -281,7 +282,8 @@ def _start(episode: Episode, settings: EvaluationSettings, index: int) -> Moment
 
 
 def _account(tallies: Sequence[_Tally]) -> Evaluation:
-    criterion = tallies[0].episode.spec.success
+    spec = tallies[0].episode.spec
+    criterion = spec.success
     return Evaluation(
         returns=np.array([t.total for t in tallies]),
         lengths=np.array([t.length for t in tallies], dtype=np.int64),
@@ -289,7 +291,15 @@ def _account(tallies: Sequence[_Tally]) -> Evaluation:
         traces=tuple(
             Trace(np.stack(t.path), np.stack(t.actions), np.array(t.rewards), t.moment.terminated) for t in tallies
         ),
+        varied=_varied(spec, tallies),
     )
+
+
+def _varied(spec: EnvironmentSpec, tallies: Sequence[_Tally]) -> tuple[str, ...]:
+    """Return the names of constants that changed within an episode, such as setpoints of a schedule."""
+    constants = [i for i, c in enumerate(spec.coordinates) if c.kind == "constant"]
+    moved = [i for i in constants if any(np.ptp(np.stack(t.path)[:, i]) > 0 for t in tallies)]
+    return tuple(spec.coordinate_names[i] for i in moved)
 
 
 def _holds(spec: EnvironmentSpec, coordinates: Array) -> bool:

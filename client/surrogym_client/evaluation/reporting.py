@@ -5,6 +5,8 @@ One trace is paired: it is from the same start for every controller in the compa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
@@ -34,8 +36,8 @@ def as_reported(
     shown: dict[wire.TraceRank, int] = {"paired": paired, **result.ranked()}
     return wire.AddEvaluation(
         controller=controller,
-        note=words_of(settings),
-        declared=settings.declared,
+        note=words_of(settings, result.varied),
+        declared=settings.declared and not result.varied,
         first_seed=settings.first_seed,
         returns=result.returns.tolist(),
         lengths=result.lengths.tolist(),
@@ -51,15 +53,16 @@ def paired_start(result: Evaluation, among: int) -> int:
     return int(order[(len(order) - 1) // 2])
 
 
-def words_of(settings: EvaluationSettings) -> str:
-    """Describe the starts and the environment's perturbation."""
+def words_of(settings: EvaluationSettings, varied: Sequence[str] = ()) -> str:
+    """Describe the starts, the environment's perturbation, and constants that ``varied`` within an episode."""
     starts = "declared starts"
     if settings.wide:
         starts = "starts anywhere in the sampling range"
     elif settings.start_scale != 1:
         starts = f"starts {settings.start_scale:g} times as far apart as declared"
     machine = f", masses, lengths and limits changed by {settings.perturb:.0%}" if settings.perturb else ""
-    return f"{starts}, from seed {settings.first_seed}{machine}"
+    changing = f", {', '.join(varied)} changed within episodes" if varied else ""
+    return f"{starts}, from seed {settings.first_seed}{machine}{changing}"
 
 
 def _trace(rank: wire.TraceRank, seed: int, trace: Trace) -> wire.EpisodeTrace:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -65,8 +66,8 @@ class Simulator(ABC):
         variables: the state's numbers, (V,).
         rest: the state (V,) that a variable has where no coordinate says otherwise.
         time_limit: steps of an episode; None without a limit.
-        scheduled: names of variables that a schedule sets, such as setpoints: coordinates, also where a few steps show
-            one value alone.
+        scheduled: variables that a schedule sets, such as setpoints, with their lowest and highest value in it. They
+            are coordinates, also where a few steps show one value alone.
         notes: findings that a description repeats, one sentence each.
         questions: to a person who reads a description, one sentence each.
     """
@@ -79,7 +80,7 @@ class Simulator(ABC):
     variables: tuple[Variable, ...]
     rest: Array
     time_limit: int | None = None
-    scheduled: frozenset[str] = frozenset()
+    scheduled: Mapping[str, tuple[float, float]] = MappingProxyType({})
     notes: tuple[str, ...] = ()
     questions: tuple[str, ...] = ()
 

@@ -49,6 +49,7 @@ class SearchTask:
     prolong: bool = False  # whether to take as many steps again while the return rises, and to fine-tune
     progress: Progress = lambda _: None
     patient: bool = False  # whether to keep a network that has learned nothing in the first quarter of the steps
+    gamma: float | None = None  # discount; None: as the time limit suggests
     noise: float = 0.0  # least standard deviation of a continuous action in a training, as a share of its first one
 
 

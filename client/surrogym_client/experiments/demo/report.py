@@ -49,6 +49,7 @@ def metrics_of(
         "imagined_return": card.imagined_return,
         "promise": None if card.promise is None else card.promise.model_dump(),
         "audit": None if card.audit is None else card.audit.model_dump(),
+        "varied": list(real.varied),
         "trusted": card.trusted,
         "reason": card.reason,
         "returns": real.returns.tolist(),
@@ -129,9 +130,15 @@ def _promise(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     if promise is None:
         return []
     low, median, high = (_number(promise[name]) for name in ("low", "median", "high"))
+    varied = ", ".join(metrics["varied"])
     steps = metrics["real_queries"].get("audit", 0 if audit is None else audit["steps"])
     return [
         ("promise", f"{median}, between {low} and {high} with 90 % chance; {steps} more real steps of audit"),
+        *(
+            [("not comparable", f"{varied} changed within real episodes, and not in the promised ones")]
+            if varied
+            else []
+        ),
         ("trusted", f"{'yes' if metrics['trusted'] else 'no'}: {metrics['reason']}"),
     ]
 

@@ -103,7 +103,10 @@ class Process(OfParts):
         env.reset()
         self._schedule = (env.SP, getattr(env, "disturbances", {}))
         super().__init__([_State(env)])
-        self.scheduled = frozenset(v.name for v in self.variables if v.motion == "held")
+        setpoints, disturbances = self._schedule
+        schedule = {f"{name}_setpoint": values for name, values in setpoints.items()} | dict(disturbances)
+        held = [v.name for v in self.variables if v.motion == "held"]
+        self.scheduled = {name: (float(np.min(schedule[name])), float(np.max(schedule[name]))) for name in held}
         self.action = action_of(name, env.action_space)
         self.time_limit = int(env.N) - 1  # its episodes end one step before their number of samples
 

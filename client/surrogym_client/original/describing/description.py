@@ -35,6 +35,7 @@ FASTER = 1.5  # times the largest observed speed: what a policy may reach
 MARGIN = 0.25  # of the observed range, on each side
 MOSTLY = 0.5  # of all steps with the same reward; then other rewards are met only by luck
 PLACES = 300  # at which an observation is read, without a step
+SHORT_WAY = 0.05  # of the way between two stops; a step that is longer may meet a stop from anywhere
 UNKNOWN_SPEED = 1.0  # of a variable that never moved, in the simulator's unit
 UNKNOWN_LIMIT = 200  # steps of an episode if the simulator has no limit
 
@@ -195,6 +196,11 @@ class _Draft:
             )
         else:
             lines.append("termination: no step ended an episode. If some states should end it, declare them")
+        if scheduled := _listed([name for name in spec.coordinate_names if name in self._simulator.scheduled]):
+            lines.append(
+                f"start of {scheduled}: a schedule changes it within an episode. A virtual episode keeps one value, "
+                "drawn from those of the schedule. Widen the start if a policy should follow other values"
+            )
         if self._simulator.time_limit is None:
             lines.append(f"time_limit: the environment declares none; {UNKNOWN_LIMIT} steps are assumed")
         lines.append(
@@ -222,7 +228,7 @@ class _Draft:
         unmoved = {f"{name}{VELOCITY}" for name in self._unmoved}
         for i, variable in enumerate(self._simulator.variables):
             repeats = variable.motion == "held" and any(np.allclose(self._all[:, i], self._all[:, k]) for k in kept)
-            moves = np.ptp(self._all[:, i]) > 0 or variable.name in unmoved | self._simulator.scheduled
+            moves = np.ptp(self._all[:, i]) > 0 or variable.name in unmoved | set(self._simulator.scheduled)
             if moves and not repeats and variable.name not in self._probed.shifts:
                 kept.append(i)
         return kept
@@ -265,6 +271,8 @@ class _Draft:
         pushed = variable.motion == "slide" and not variable.driven  # its limits may be far away
         trusted = not pushed and (self._probed.stays or constant)
         if variable.low is not None and variable.high is not None and trusted:
+            if variable.motion in ("slide", "turn"):
+                return self._before_the_stops(index, variable.low, variable.high)
             return min(low, variable.low), max(high, variable.high)
         if pushed and variable.limited:
             near = self._seen.starts[:, index]
@@ -273,8 +281,24 @@ class _Draft:
         margin = (0.0 if constant else MARGIN) * (high - low)
         return low - margin, high + margin
 
+    def _before_the_stops(self, index: int, low: float, high: float) -> tuple[float, float]:
+        """The sampling range of a joint with stops. A step that meets a stop is not smooth.
+
+        The range therefore ends before each stop, by the longest way of one step. It always has all starts. If
+        that way is a large part of the whole, stops are met everywhere, and nothing is left out.
+        """
+        seen, starts = self._seen, self._seen.starts[:, index]
+        way = FASTER * float(np.abs(seen.next_states[:, index] - seen.states[:, index]).max())
+        if way > SHORT_WAY * (high - low):
+            way = 0.0
+        return min(low + way, float(starts.min())), max(high - way, float(starts.max()))
+
     def _start(self, index: int, coordinate: Coordinate) -> Uniform | Fixed:
-        """The range of starts, widened, because the range of n uniform draws is too narrow on average."""
+        """The range of starts: that of a schedule, or else the seen one. The latter is widened, because the range of n
+        uniform draws is too narrow on average."""
+        if coordinate.name in self._simulator.scheduled:
+            low, high = self._simulator.scheduled[coordinate.name]
+            return Uniform(low=low, high=high) if low < high else Fixed(value=low)
         if coordinate.kind == "constant" and self._simulator.variables[index].limited:
             return Uniform(low=limits(coordinate.sampling)[0], high=limits(coordinate.sampling)[1])
         starts = self._seen.starts[:, index]

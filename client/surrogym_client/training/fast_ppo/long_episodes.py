@@ -9,6 +9,7 @@ from surrogym_client.training.search import MAX_STEPS, SearchTask
 LONG = 5  # rollouts of an episode; the lanes of a shorter one start often enough
 SHORTER = 5  # times: a training episode
 MORE = 3  # times as many steps if nobody chose their number
+SIGHT = 1 / 2  # horizon of the discount, 1 / (1 - gamma), as a share of a training episode
 NOISE = 0.6  # of its first value: least standard deviation of an action in these trainings
 
 
@@ -24,6 +25,9 @@ def with_short_episodes(task: SearchTask, rollout: int) -> SearchTask:
     little noise, and the noise is the same in all states. So it would fall before the way to these states is found.
     In the additional steps it keeps ``NOISE`` of its first value.
 
+    The discount has a horizon of ``SIGHT`` of a training episode. What lies further ahead is hardly seen in an episode,
+    so the critic guesses it.
+
     Args:
         task: a task.
         rollout: steps of each lane in a rollout.
@@ -33,7 +37,9 @@ def with_short_episodes(task: SearchTask, rollout: int) -> SearchTask:
     limit = spec.time_limit or 0
     if chosen or spec.termination != () or limit <= LONG * rollout or spec.design.preset == "paper":
         return task
-    session = {**settings.session, "time_limit": limit // SHORTER}
+    length = limit // SHORTER
+    session = {**settings.session, "time_limit": length}
     steps, noise = (min(MORE * task.steps, MAX_STEPS), NOISE) if task.prolong else (task.steps, 0.0)
     short = replace(settings, start_box=1.0, session=session, judge=settings.judging)
-    return replace(task, settings=short, steps=steps, patient=True, noise=noise)
+    gamma = 1 - 1 / (SIGHT * length)
+    return replace(task, settings=short, steps=steps, patient=True, gamma=gamma, noise=noise)

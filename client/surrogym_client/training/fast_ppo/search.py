@@ -89,7 +89,7 @@ class FastPpo(PolicySearch):
     n_epochs: int = 10
     batch_size: int | None = None  # None: about 1,024
     learning_rate: float | None = None  # None: decreases from 3e-3 to a fiftieth of it
-    gamma: float | None = None  # None: derived from the time limit
+    gamma: float | None = None  # None: derived from the time limit, or from that of short training episodes
     gae_lambda: float = 0.97
     clip_range: float = 0.2
     vf_coef: float = 0.5
@@ -126,7 +126,8 @@ class _Training:
     def __init__(self, search: FastPpo, task: SearchTask, lanes: Lanes, fine: SearchTask | None) -> None:
         self._search, self._task, self._fine, self._spec = search, task, fine, task.port.spec()
         settings = task.settings
-        self._gamma = suggested_gamma(self._spec) if search.gamma is None else search.gamma
+        suggested = suggested_gamma(self._spec) if task.gamma is None else task.gamma
+        self._gamma = suggested if search.gamma is None else search.gamma
         self._rng = np.random.default_rng(settings.seed)
         mean, deviation = observation_statistics(task.port, settings.seed)
         self._standardisation = np.array(mean), np.array(deviation)

@@ -1,0 +1,70 @@
+"""A promise is for episodes in which constants stay. Episodes in which one changed neither keep nor break it."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
+from surrogym_client.evaluation.reporting import as_reported
+from surrogym_client.original.episodes import open_episode
+from surrogym_client.original.protocol import RealStep
+from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, Fixed, ObservationEntry, Term, Uniform
+
+SETTINGS = EvaluationSettings(episodes=3)
+SPEC = EnvironmentSpec(
+    environment="a follower",
+    coordinates=(
+        Coordinate(name="x", sampling=Uniform(low=-1, high=1)),
+        Coordinate(name="wanted", kind="constant", sampling=Uniform(low=-1, high=1)),
+    ),
+    observation=tuple(ObservationEntry(name=name, term=Term.linear(**{name: 1})) for name in ("x", "wanted")),
+    action=BoxAction(low=(-1.0,), high=(1.0,)),
+    start={"x": Fixed(value=0.0), "wanted": Fixed(value=0.5)},
+    time_limit=6,
+)
+
+
+class Follower:
+    """x' = x + u / 10; what is wanted moves by ``drift`` in the third step of an episode."""
+
+    def __init__(self, drift: float) -> None:
+        self._drift, self._steps, self._at = drift, 0, np.zeros(2)
+
+    def spec(self) -> EnvironmentSpec:
+        return SPEC
+
+    def begin(self, seed: int | None = None) -> np.ndarray:
+        del seed
+        self._steps, self._at = 0, np.array([0.0, 0.5])
+        return self._at
+
+    def act(self, action: np.ndarray) -> RealStep:
+        self._steps += 1
+        before = self._at
+        moved = (float(action[0]) / 10, self._drift * (self._steps == 3))
+        self._at = before + np.array(moved)
+        return RealStep(before, action, self._at, reward=-abs(float(before[0] - before[1])))
+
+    def step_from(self, coordinates: np.ndarray, action: np.ndarray) -> RealStep:
+        self._at = np.asarray(coordinates, dtype=np.float64)
+        return self.act(action)
+
+    def close(self) -> None:
+        pass
+
+
+def episodes(drift: float) -> Evaluation:
+    opener = partial(open_episode, "a follower", SPEC, partial(Follower, drift))
+    return evaluate(lambda observations: np.ones((len(observations), 1)), opener, SETTINGS)
+
+
+@pytest.mark.parametrize(("drift", "names"), [(0.0, ()), (-0.2, ("wanted",))])
+def test_a_constant_that_changed_within_an_episode_is_named(drift: float, names: tuple[str, ...]) -> None:
+    result = episodes(drift)
+    assert result.varied == names
+    told = as_reported(result, SETTINGS, "a" * 32)
+    assert told.declared is not bool(names), "the server judges a promise by declared episodes alone"
+    assert ("wanted changed within episodes" in told.note) is bool(names)
