@@ -29,7 +29,7 @@ from surrogym_client.training.audited import AuditedTraining
 from surrogym_client.training.handover import NO_SAMPLER, AuditSettings, Subject, hand_over, way_of
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_shared.network import Network
-from surrogym_shared.spec import Design, EnvironmentSpec
+from surrogym_shared.spec import Design, EnvironmentSpec, ModelChoice
 
 AUDIT = AuditSettings(patience_seconds=60.0)
 
@@ -67,19 +67,21 @@ def line(server_process: ServerProcess) -> Iterator[Place]:
 
 
 @contextmanager
-def placed(url: str, spec: EnvironmentSpec, environment: Any) -> Iterator[Place]:
+def placed(url: str, spec: EnvironmentSpec, environment: Any, design: Design | None = None) -> Iterator[Place]:
     """A surrogate whose design has ended, with a sampler in a thread."""
     name = f"handed-{uuid4().hex[:8]}"
-    spec = spec.model_copy(update={"design": Design(initial=8, budget=16)})
+    spec = spec.model_copy(update={"design": design or Design(initial=8, budget=16)})
     settings = SamplerSettings(name="beside", wait_seconds=1.0, time_limit=120.0)
     with Api(url) as api, Api(url) as own, HttpSurrogate(url, name) as port:
         api.create_surrogate(name, spec)
         thread = threading.Thread(target=_until_deleted, args=(Sampler(own, name, environment, settings),))
         thread.start()
-        wait_for_design(api, name, 60)
-        yield Place(api, port, environment)
-        api.delete_surrogate(name)
-        thread.join(30)
+        try:
+            wait_for_design(api, name, 60)
+            yield Place(api, port, environment)
+        finally:
+            api.delete_surrogate(name)
+            thread.join(30)
 
 
 def _until_deleted(sampler: Sampler) -> None:
@@ -107,6 +109,30 @@ def test_a_machine_that_has_changed_fails_the_audit(line: Place) -> None:
     assert handover.audit is not None
     assert handover.audit.faults[0].startswith("reward: errors of 3")
     assert handover.promise.median < handover.audit.before.median - 10, "the model has learned what is paid now"
+
+
+class Bowl(Changed):
+    """The line, paid by -x^2 instead of -|x|, which has no kink."""
+
+    def step_from(self, coordinates: np.ndarray, action: np.ndarray) -> RealStep:
+        step, x = super().step_from(coordinates, action), float(coordinates[0])
+        return replace(step, reward=step.reward + abs(x) - x**2)
+
+
+@pytest.mark.parametrize("wrong", [True, False])
+def test_members_of_an_ensemble_that_agree_and_are_wrong_fail_the_audit(
+    server_process: ServerProcess, wrong: bool
+) -> None:
+    """Their disagreement can't show it: all have learned from the same samples."""
+    choice = ModelChoice(name="ensemble", settings={"members": 4, "units": 32, "steps": 600})
+    with placed(server_process.url, SPEC, Bowl(), Design(initial=24, budget=28, model=choice)) as place:
+        place.environment.changed = wrong
+        handover = hand_over(place.subject(), AUDIT)
+        assert handover.audit is not None
+        before = handover.audit.before
+        assert before.high - before.low < 5, "they agree: an episode of 20 steps loses 60"
+        assert handover.trusted is not wrong
+        assert any(fault.startswith("reward: errors of") for fault in handover.audit.faults) is wrong
 
 
 class Slope(Line):
