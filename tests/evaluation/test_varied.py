@@ -61,10 +61,11 @@ def episodes(drift: float) -> Evaluation:
     return evaluate(lambda observations: np.ones((len(observations), 1)), opener, SETTINGS)
 
 
-@pytest.mark.parametrize(("drift", "names"), [(0.0, ()), (-0.2, ("wanted",))])
+@pytest.mark.parametrize(("drift", "names"), [(0.0, ()), (1e-9, ()), (-0.2, ("wanted",))])
 def test_a_constant_that_changed_within_an_episode_is_named(drift: float, names: tuple[str, ...]) -> None:
     result = episodes(drift)
-    assert result.varied == names
+    assert result.varied == names, "a change by rounding is none"
+    assert result.summary()["varied"] == list(names)
     told = as_reported(result, SETTINGS, "a" * 32)
     assert told.declared is not bool(names), "the server judges a promise by declared episodes alone"
     assert ("wanted changed within episodes" in told.note) is bool(names)

@@ -148,7 +148,7 @@ def command(
     summary |= {"promise_kept": _kept(judged, result), "version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
     more = [] if found is None else found.in_words(card.spec)
-    if settings.declared and result.varied:
+    if card.promise is not None and settings.declared and result.varied:
         changed = ", ".join(result.varied)
         more.append(f"the promise is not judged: it is for episodes without a change of {changed}, which changed here")
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too

@@ -16,7 +16,7 @@ from surrogym_client.original.errors import EvaluationFailed, PolicyMisfit
 from surrogym_client.original.protocol import LONGEST_EPISODE
 from surrogym_client.policies.predict import Acting, PerEpisode
 from surrogym_client.runtime.lifetime import signals_between_steps
-from surrogym_shared.spec import EnvironmentSpec, Success
+from surrogym_shared.spec import EnvironmentSpec, Success, limits
 from surrogym_shared.terms import holds
 from surrogym_shared.wire import TraceRank
 
@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[float, int], None]  # arguments: share done in [0, 1], number of episodes that terminated
 
 FIRST_SEED = 10_000
+ROUNDING = 1e-6  # share of its range by which a constant may change within an episode
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,7 @@ class Evaluation:
             "mean_length": float(self.lengths.mean()),
             "success_rate": self.success_rate,
             "steps": self.steps,
+            "varied": list(self.varied),
             "per_episode": [float(r) for r in self.returns],
         }
 
@@ -297,9 +299,13 @@ def _account(tallies: Sequence[_Tally]) -> Evaluation:
 
 def _varied(spec: EnvironmentSpec, tallies: Sequence[_Tally]) -> tuple[str, ...]:
     """Return the names of constants that changed within an episode, such as setpoints of a schedule."""
-    constants = [i for i, c in enumerate(spec.coordinates) if c.kind == "constant"]
-    moved = [i for i in constants if any(np.ptp(np.stack(t.path)[:, i]) > 0 for t in tallies)]
-    return tuple(spec.coordinate_names[i] for i in moved)
+    names = []
+    for i, coordinate in enumerate(spec.coordinates):
+        low, high = limits(coordinate.sampling)
+        moved = max(float(np.ptp(np.stack(t.path)[:, i])) for t in tallies)
+        if coordinate.kind == "constant" and moved > ROUNDING * (high - low):
+            names.append(coordinate.name)
+    return tuple(names)
 
 
 def _holds(spec: EnvironmentSpec, coordinates: Array) -> bool:
