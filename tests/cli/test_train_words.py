@@ -16,7 +16,7 @@ RESULT = TrainResult(Path("p.zip"), "PPO", 512, 1.0, -150.0, 0, {})
 
 def test_a_training_without_rounds_says_nothing_of_them():
     assert words_of_result(RESULT) == (
-        "p.zip: 512 virtual steps in 1.0 s, imagined return -150.0 (in the surrogate); next: surrogym evaluate p.zip"
+        "p.zip: 512 virtual steps in 1.0 s, imagined return -150 (in the surrogate); next: surrogym evaluate p.zip"
     )
 
 

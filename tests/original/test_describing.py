@@ -108,7 +108,7 @@ def test_a_setpoint_is_constant_over_its_whole_range() -> None:
 def test_virtual_episodes_begin_with_the_setpoints_of_the_schedule() -> None:
     found = describe("pcgym:cstr", STEPS)
     assert limits(found.spec.start["Ca_setpoint"]) == (0.85, 0.9), "others can't all be reached, and would cost much"
-    assert any(line.startswith("start of Ca_setpoint: a schedule changes it") for line in found.asked)
+    assert any(line.startswith("start of Ca_setpoint: a schedule sets it") for line in found.asked)
 
 
 def test_every_step_is_counted(registered: Register) -> None:

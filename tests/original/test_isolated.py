@@ -163,6 +163,17 @@ class Numbered(Moody):
         return RealStep(coordinates, action, coordinates, reward=float(self.steps))
 
 
+def test_one_that_is_interrupted_while_it_starts_can_be_closed(monkeypatch):
+    def interrupted(_self, _pipe):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(IsolatedEnvironment, "_await_start", interrupted)
+    environment = IsolatedEnvironment(Moody, step_limit=1.0)
+    with pytest.raises(KeyboardInterrupt):
+        environment.step_from(np.zeros(2), np.zeros(1))
+    environment.close()
+
+
 def test_the_answer_to_an_interrupted_step_reaches_no_other_request():
     with IsolatedEnvironment(Numbered) as environment:
         environment.spec()

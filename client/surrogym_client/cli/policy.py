@@ -114,10 +114,11 @@ def get(
     Example: surrogym policy get pendulum@production --out policy.zip
     """
     from surrogym_client.errors import UnknownPolicy
-    from surrogym_client.policies.card import write_card
+    from surrogym_client.policies.card import require_card_or_none, write_card
 
     name, which = _parsed(policy)
     form: Any = out.suffix.lower().removeprefix(".")
+    require_card_or_none(out)
     with service.connect(context) as api:
         found, spec = api.policies.get(name, which), api.surrogate(name).spec
         card = _card(name, found, spec if found.differs is None else None)

@@ -112,7 +112,11 @@ class IsolatedEnvironment:
         self._process = context.Process(target=_serve, args=(theirs, self._factory, self._step_limit), daemon=True)
         self._process.start()
         theirs.close()
-        self._await_start(self._pipe)
+        try:
+            self._await_start(self._pipe)
+        except KeyboardInterrupt:
+            self._kill()  # its first message was not read, so it can't be told to close
+            raise
         return self._pipe
 
     def _await_start(self, pipe: Connection) -> None:

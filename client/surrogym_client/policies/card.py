@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,23 @@ class PolicyCard(BaseModel):
 def card_path(policy: Path) -> Path:
     """Return the path of a policy's card."""
     return policy.with_suffix(".json")
+
+
+def require_card_or_none(policy: Path) -> None:
+    """Refuse a path whose card would replace another kind of file, such as a specification.
+
+    Raises:
+        UnusablePolicy: there is a JSON file of this name that is no card.
+    """
+    path = card_path(policy)
+    if not path.exists():
+        return
+    try:
+        known = path.stat().st_size <= MAX_CARD_BYTES and "virtual_steps" in json.loads(path.read_bytes())
+    except (ValueError, TypeError, RecursionError):
+        known = False
+    if not known:
+        raise UnusablePolicy(f"the card of {policy} would replace {path}, which is no card: choose another file")
 
 
 def write_card(policy: Path, card: PolicyCard) -> None:

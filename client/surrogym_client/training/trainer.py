@@ -7,6 +7,7 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
+from surrogym_client.policies.card import require_card_or_none
 from surrogym_client.training.search import (
     Found,
     Progress,
@@ -38,9 +39,11 @@ def train(
     Raises:
         ValueError: an unknown algorithm, one that does not support the action space, or too many steps.
         SurrogymClientError: the surrogate can't be reached, or has no model yet.
-        UnusablePolicy: the file to start from is not a policy of the algorithm.
+        UnusablePolicy: the file to start from is not a policy of the algorithm, or the card would replace another
+            kind of file.
         TrainingInterrupted: Ctrl-C was pressed; the policy with the best imagined return so far is saved.
     """
+    require_card_or_none(out)
     settings = with_algorithm(settings or TrainSettings(), port.spec())
     search = search_for(settings)
     if search.tracked:

@@ -101,4 +101,4 @@ def _known(index: float | None) -> str:
 
 
 def _imagined(value: float | None) -> str:
-    return "" if value is None else f", imagined return {value:.1f} (in the surrogate)"
+    return "" if value is None else f", imagined return {value:.4g} (in the surrogate)"

@@ -151,8 +151,8 @@ class _Draft:
             lines.append(
                 f"a whole turn of {_listed(kinds['angle'])} changes nothing, so it is observed as cosine and sine"
             )
-        if kinds["constant"]:
-            lines.append(f"{_listed(kinds['constant'])}: constant within an episode, and drawn again at each reset")
+        if drawn := [name for name in kinds["constant"] if name not in self._simulator.scheduled]:
+            lines.append(f"{_listed(drawn)}: constant within an episode, and drawn again at each reset")
         if not probed.stays:
             lines.append(
                 f"{probed.leaving:.0%} of the steps from random states within the declared limits led far outside: the "
@@ -198,7 +198,7 @@ class _Draft:
             lines.append("termination: no step ended an episode. If some states should end it, declare them")
         if scheduled := _listed([name for name in spec.coordinate_names if name in self._simulator.scheduled]):
             lines.append(
-                f"start of {scheduled}: a schedule changes it within an episode. A virtual episode keeps one value, "
+                f"start of {scheduled}: a schedule sets it in an original episode. A virtual episode keeps one value, "
                 "drawn from those of the schedule. Widen the start if a policy should follow other values"
             )
         if self._simulator.time_limit is None:

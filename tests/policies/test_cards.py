@@ -1,0 +1,25 @@
+"""A policy's card never takes the place of another kind of file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from surrogym_client.policies.card import PolicyCard, UnusablePolicy, require_card_or_none, write_card
+
+
+@pytest.mark.parametrize("content", ["{}", '{"model": "cstr"}', "[1, 2]", "3", "level, valve", ""])
+def test_a_file_that_is_no_card_is_not_replaced(content: str, tmp_path: Path) -> None:
+    other = tmp_path / "tank.json"
+    other.write_text(content)
+    with pytest.raises(UnusablePolicy, match=r"tank\.json, which is no card: choose another file"):
+        require_card_or_none(tmp_path / "tank.zip")
+    assert other.read_text() == content
+
+
+def test_an_earlier_card_may_be_replaced(tmp_path: Path) -> None:
+    policy = tmp_path / "tank.zip"
+    require_card_or_none(policy)
+    write_card(policy, PolicyCard())
+    require_card_or_none(policy)
