@@ -9,7 +9,7 @@ from surrogym_client.training.search import MAX_STEPS, SearchTask
 LONG = 5  # rollouts of an episode; the lanes of a shorter one start often enough
 SHORTER = 5  # times: a training episode
 MORE = 3  # times as many steps if nobody chose their number
-SIGHT = 1  # horizon of the discount, 1 / (1 - gamma), as a share of a training episode
+SIGHT = 1 / 2  # horizon of the discount, 1 / (1 - gamma), as a share of a training episode
 NOISE = 0.6  # of its first value: least standard deviation of an action in these trainings
 
 
