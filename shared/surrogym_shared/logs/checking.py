@@ -74,6 +74,8 @@ def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
     roles = _of_spec(roles, spec)
     rows = rows_of(table, roles, spec)
     require_units(rows.q, spec)
+    if rows.following is not None:
+        require_units(rows.following, spec, "next ")
     steps = _consistent(spec, _shaped(spec, roles, transitions_of(rows)))
     require_steps(table, steps, 1)
     return ReadLog(table, roles, steps, spec)
