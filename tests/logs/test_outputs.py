@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -68,3 +69,14 @@ def test_an_output_that_cant_be_written_is_refused_before_anything_is_stored(
 ):
     said = refusal(capsys, folder / "log.csv", "--register", "new", "--server", NOWHERE, option, folder / name)
     assert f"{option}: {says}" in said
+
+
+def test_a_log_in_a_write_protected_folder_can_be_read(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    """Rejected rows go beside the log only where there are some."""
+    monkeypatch.setattr("os.access", lambda _path, mode, **_options: mode != os.W_OK)
+    with pytest.raises(SystemExit) as ended:
+        main(["import", str(folder / "log.csv")])
+    assert not ended.value.code
+    assert "is write-protected" in refusal(capsys, folder / "log.csv", "--draft", folder / "draft.json")

@@ -129,11 +129,8 @@ def _require_outputs(file: Path, log: OfLogs) -> None:
     require_outputs(
         {"--rejected": log.rejected, "--draft": log.draft, "--picture": log.picture},
         {"the log": file, "--map": log.mapping, "--spec": log.spec},
+        perhaps={"the rejected rows": rejected_file(file, None) if log.rejected is None else None},
     )
-    if log.rejected is None:
-        rows = rejected_file(file, None)
-        require_outputs({"--draft": log.draft, "--picture": log.picture}, {"the rejected rows": rows})
-        require_outputs({"the rejected rows": rows}, {"--map": log.mapping, "--spec": log.spec})
     if log.picture is not None:
         require_picture("--picture", log.picture)
 

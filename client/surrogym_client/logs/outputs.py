@@ -22,25 +22,27 @@ def rejected_file(log: Path, given: str | Path | None) -> Path:
     return log.with_name(f"{log.stem}.rejected.csv")
 
 
-def require_outputs(outputs: Files, inputs: Files) -> None:
+def require_outputs(outputs: Files, inputs: Files, perhaps: Files | None = None) -> None:
     """Refuse outputs that would overwrite an input or each other, or that can't be written.
 
     Args:
         outputs: files to write, by the words that a message names them by; None is no file.
         inputs: files to read, likewise.
+        perhaps: files that are written only if they are needed, likewise. Their folder may be write-protected.
 
     Raises:
         UnusableLog: an output is an input, equals another output, or has no folder to be written to.
     """
     read = {words: file for words, file in inputs.items() if file is not None}
     written: dict[str, Path] = {}
-    for words, file in outputs.items():
+    for words, file in {**(perhaps or {}), **outputs}.items():
         if file is None:
             continue
         for other, one in (read | written).items():
             if _same(file, one):
                 raise UnusableLog(f"{words}: expected another file than {other}, got {file} for both")
-        _require_writable(words, file)
+        if words in outputs:
+            _require_writable(words, file)
         written[words] = file
 
 

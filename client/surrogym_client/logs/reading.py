@@ -81,11 +81,7 @@ def read_parquet(path: Path) -> Table:
         columns = [(name, read_table.column(i).to_numpy()) for i, name in enumerate(read_table.column_names)]
     except (ArrowException, OSError, ValueError) as error:
         raise UnusableLog(f"expected a Parquet file in {path}, got one that can't be read: {_line(error)}") from error
-    arrays: dict[str, Any] = {}
-    for name, cells in columns:
-        if name in arrays:
-            raise UnusableLog(f"expected different names of columns in {path}, got {name!r} twice")
-        arrays[name] = _of_objects(path, name, cells) if cells.dtype == object else cells
+    arrays = {name: _of_objects(path, name, cells) if cells.dtype == object else cells for name, cells in columns}
     return table_of_arrays(path, arrays)
 
 

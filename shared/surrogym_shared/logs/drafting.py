@@ -127,8 +127,9 @@ def _require_range(name: str, low: float, high: float) -> None:
 
 def _require_size(name: str, low: float, high: float) -> None:
     if max(abs(low), abs(high)) > LARGEST:
+        came = f"{low:g}" if low == high else f"{low:g} to {high:g}"
         raise UnusableLog(
-            f"{name}: expected values of at most {LARGEST:g} in size, got {low:g} to {high:g}: convert the column to "
+            f"{name}: expected values of at most {LARGEST:g} in size, got {came}: convert the column to "
             "another unit, or leave out the rows that are faults"
         )
 
