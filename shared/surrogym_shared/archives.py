@@ -8,6 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,16 @@ INFLATED = (
     zipfile.ZIP_DEFLATED,
 )  # methods that numpy and torch write; others can't be limited while they decompress
 ARRAY = ".npy"
+MALFORMED = (
+    ValueError,
+    LookupError,
+    TypeError,
+    SyntaxError,
+    TokenError,
+    RecursionError,
+    MemoryError,
+    OverflowError,
+)  # errors of NumPy's reader of headers, which parses them as Python
 
 
 class Header(NamedTuple):
@@ -91,9 +102,12 @@ def _content(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
 def _header(name: str, content: bytes) -> Header:
     """Return the header of an array of numbers. Its size must match the bytes that follow it."""
     file = io.BytesIO(content)
-    version = np.lib.format.read_magic(file)
-    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read_header(file)
+    try:
+        version = np.lib.format.read_magic(file)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read_header(file)
+    except MALFORMED as error:
+        raise ValueError(f"expected an array {name!r} with a header of NumPy, got one that can't be read") from error
     named, came = math.prod(shape) * dtype.itemsize, len(content) - file.tell()
     if dtype.hasobject or min(shape, default=0) < 0 or named != came:
         raise ValueError(f"expected an array {name!r} of numbers in {named} bytes, got {dtype} in {came} bytes")

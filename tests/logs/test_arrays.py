@@ -65,3 +65,46 @@ def test_the_command_says_the_role_of_each_column(tmp_path: Path, capsys: pytest
         read_back = json.loads(told)
         assert read_back["columns"]["r"] == "reward"
         assert set(read_back["ignored"]) == {"dt", "late"}
+
+
+MOMENTS = np.arange(20).astype("M8[s]")
+
+
+@pytest.mark.parametrize(
+    ("cells", "kind"),
+    [
+        (np.where(np.arange(20) == 5, np.datetime64("NaT"), MOMENTS), "dates"),
+        (np.arange(20).astype("m8[s]"), "durations"),
+        (np.arange(20) + 1j, "complex numbers"),
+        (np.zeros(20, dtype=[("a", "f8"), ("b", "f8")]), "records"),
+    ],
+)
+@pytest.mark.parametrize("column", ["x", "next_x", "action", "reward"])
+def test_dates_durations_and_complex_numbers_are_no_numbers(tmp_path: Path, cells: np.ndarray, kind: str, column: str):
+    """They were cast: a missing date was a state of -9.2e18, and an imaginary part was lost."""
+    arrays = {"x": STATES[:-1, 0], "next_x": STATES[1:, 0], "action": VECTORS["u"], "reward": VECTORS["r"]}
+    with pytest.raises(UnusableLog, match=f"{column}: expected a column of numbers, got {kind}"):
+        read(tmp_path, **arrays | {column: cells})
+
+
+@pytest.mark.parametrize("unit", ["M8[ms]", "m8[ms]"])
+def test_times_may_be_dates_or_durations(tmp_path: Path, unit: str):
+    log = read(tmp_path, x=STATES[:-1, 0], action=VECTORS["u"], time=(500 * np.arange(20)).astype(unit))
+    assert log.steps.interval == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ({"obs": STATES[:-1]}, r"one array for the column 'q.s0' in .*, got two: states and obs"),
+        ({"next_obs": STATES[:-1]}, r"one array for the column 'next.s0' in .*, got two: next_states and next_obs"),
+        ({"action": np.zeros(20)}, r"one column for the action '0', got two: u and action"),
+        ({"coordinate_names": np.array(["a", "a"])}, r"different names in coordinate_names in .*, got \['a', 'a'\]"),
+        ({"coordinate_names": np.array(["a"])}, r"2 names in coordinate_names in .*, one for each column of states"),
+        ({"r": np.zeros((20, 2))}, r"one value a step for r, got an array of shape \(20, 2\)"),
+    ],
+)
+def test_arrays_that_collide_are_refused(tmp_path: Path, more: dict[str, np.ndarray], says: str):
+    """One of them won silently, or became columns of states."""
+    with pytest.raises(UnusableLog, match=says):
+        read(tmp_path, **VECTORS | more)

@@ -165,3 +165,42 @@ def test_outside_the_log_counts_as_its_worst_step_where_there_is_no_machine(tmp_
     np.savez(tmp_path / "log.npz", **columns)
     assert read_log(tmp_path / "log.npz").spec.outside_reward == columns["reward"].min()
     assert read_log(tmp_path / "log.npz", Options(budget=20)).spec.outside_reward is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"x": 1e13}, "x: expected values of at most 1e.12 in size"),
+        ({"action": 1e13}, "the action '0': expected values of at most 1e.12 in size"),
+        ({"reward": 1e13}, "the reward: expected values of at most 1e.12 in size"),
+        ({"x": 1e-300}, "x: expected values that differ by 1e-12 or more"),
+        ({"action": 1e-300}, "the action '0': expected values that differ by 1e-12 or more"),
+    ],
+)
+def test_numbers_that_no_specification_takes_are_refused_in_a_sentence(
+    tmp_path: Path, changes: dict[str, float], says: str
+):
+    columns = rows()
+    del columns["next_x"]
+    with pytest.raises(UnusableLog, match=says):
+        drafted(tmp_path, **columns | {name: factor * columns[name] for name, factor in changes.items()})
+
+
+def test_a_draft_that_is_no_specification_is_refused_in_a_sentence(tmp_path: Path):
+    name = "a" * 62  # cos(name) is longer than a name may be
+    angle = np.remainder(np.arange(50) * 0.3, 2 * math.pi)
+    with pytest.raises(UnusableLog, match="the drafted specification is not valid: name: "):
+        drafted(tmp_path, **{name: angle, "action": rows()["action"]})
+
+
+@pytest.mark.parametrize("name", ["cls", "self"])
+def test_a_coordinate_may_have_any_name(tmp_path: Path, name: str):
+    columns = rows()
+    log = drafted(tmp_path, **{name: columns["x"], "action": columns["action"], "reward": columns["reward"]})
+    assert log.spec.coordinate_names == (name,)
+
+
+def test_starts_that_differ_by_rounding_are_one_start(tmp_path: Path):
+    columns = rows(episode=np.arange(50) // 10)
+    columns["x"][::10] = 1.0 + 1e-15 * np.arange(5)
+    assert isinstance(drafted(tmp_path, **columns).spec.start["x"], Fixed)

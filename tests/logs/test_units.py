@@ -44,3 +44,23 @@ def test_a_log_in_another_unit_is_refused_as_it_is_read(tmp_path) -> None:
     options = importing.Options(spec=type(spec).model_validate(small))
     with pytest.raises(UnusableLog, match="is the column in another unit"):
         importing.read_log(log, options)
+
+
+def test_next_states_in_another_unit_are_refused_too(tmp_path) -> None:
+    """Only current states were checked: next states of a thousand times their size reached the model."""
+    log = reactor.log(runs=3, length=20).write(tmp_path / "log.csv")
+    read = importing.read_log(log)
+    q, u, q_next = read.steps.q, read.steps.u, read.steps.q_next
+    names = read.spec.coordinate_names
+    columns = {name: q[:, i] for i, name in enumerate(names)} | {f"next_{n}": q_next[:, i] for i, n in enumerate(names)}
+    columns |= {f"action_{i}": u[:, i] for i in range(u.shape[1])} | {"reward": read.reward}
+    np.savez(tmp_path / "same.npz", **columns)
+    options = importing.Options(spec=read.spec)
+    assert len(importing.read_log(tmp_path / "same.npz", options).steps) == len(q)
+    free = read.spec.model_dump()
+    for coordinate in free["coordinates"]:
+        coordinate["bounds"] = None  # a bound would set each row aside
+    options = importing.Options(spec=type(read.spec).model_validate(free))
+    np.savez(tmp_path / "other.npz", **columns | {f"next_{names[0]}": 1_000 * q_next[:, 0]})
+    with pytest.raises(UnusableLog, match=f"next {names[0]}: half of the log lies between"):
+        importing.read_log(tmp_path / "other.npz", options)

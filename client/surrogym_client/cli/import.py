@@ -118,7 +118,21 @@ def command(
         raise CommandError("expected --register or --to, got both")
     if log.to and log.spec:
         raise CommandError("expected --spec without --to, whose surrogate has a specification, got both")
+    _require_outputs(file, log)
     _import_log(context, file, log, wait, service, output)
+
+
+def _require_outputs(file: Path, log: OfLogs) -> None:
+    """Raise ``UnusableLog`` if a file to write is one to read, or can't be written."""
+    from surrogym_client.logs.outputs import rejected_file, require_outputs, require_picture
+
+    require_outputs(
+        {"--rejected": log.rejected, "--draft": log.draft, "--picture": log.picture},
+        {"the log": file, "--map": log.mapping, "--spec": log.spec},
+        perhaps={"the rejected rows": rejected_file(file, None) if log.rejected is None else None},
+    )
+    if log.picture is not None:
+        require_picture("--picture", log.picture)
 
 
 def _import_surrogate(context: typer.Context, file: Path, name: str | None, service: Service, output: Output) -> None:
@@ -174,17 +188,10 @@ def _import_log(context: typer.Context, file: Path, log: OfLogs, wait: float, se
 
 
 def _draw(log: ReadLog, file: Path) -> None:
-    """Draw the coverage of a log.
-
-    Raises:
-        CommandError: the file's ending is not of a known kind of picture.
-    """
-    from surrogym_client.cli.errors import CommandError
+    """Draw the coverage of a log."""
     from surrogym_client.report.coverage import coverage_of
     from surrogym_client.report.figures import draw_coverage
 
-    if file.suffix not in (".png", ".svg", ".pdf"):
-        raise CommandError(f"--picture: expected a name that ends in .png, .svg or .pdf, got {file.name!r}")
     draw_coverage(coverage_of(log.spec, log.steps.q, log.steps.u)).savefig(file, dpi=150)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,8 @@ def table_of_arrays(path: Path, arrays: dict[str, Any], names: Sequence[str] = (
         names: of the coordinates; without them they are called ``s0``, ``s1``, ...
 
     Raises:
-        UnusableLog: states, actions or next states are not (n, k), or columns differ in their length.
+        UnusableLog: states, actions or next states are not (n, k), a reward or the like is not one value a step,
+            columns differ in their length, two arrays have the same columns, or the names don't fit the states.
     """
     for name, array in arrays.items():
         if name in (*STATES, *ACTIONS, *NEXT) and array.ndim > 2:
@@ -35,6 +36,7 @@ def table_of_arrays(path: Path, arrays: dict[str, Any], names: Sequence[str] = (
                 f"expected one row a step, got shape {array.shape} for {name} in {path}: give (steps, dims), and the "
                 "episodes as an array of their own, such as episode"
             )
+    _require_names(path, arrays, names)
     ignored = {name: _shape(array) for name, array in arrays.items() if array.ndim not in (1, 2)}
     columns = {name: _columns(name, array, names) for name, array in arrays.items() if name not in ignored}
     if not columns:
@@ -46,11 +48,37 @@ def table_of_arrays(path: Path, arrays: dict[str, Any], names: Sequence[str] = (
         if len(array) != rows and (array.size == 1 or spare):
             ignored[name] = _shape(array)
             del columns[name]
-    flat = {column: cells for found in columns.values() for column, cells in found.items()}
+    flat = _flat(path, columns)
     lengths = {name: len(arrays[name]) for name in columns}
     if len(set(lengths.values())) > 1:
         raise UnusableLog(f"expected columns of one length in {path}, got {lengths}")
     return Table(flat, np.arange(1, 1 + rows), ignored=ignored)
+
+
+def _require_names(path: Path, arrays: Mapping[str, Cells], names: Sequence[str]) -> None:
+    """Raise ``UnusableLog`` unless the names of the coordinates are different, and as many as the states have."""
+    if len(set(names)) < len(names):
+        raise UnusableLog(f"expected different names in coordinate_names in {path}, got {list(names)}")
+    for name, array in arrays.items():
+        if names and name in (*STATES, *NEXT) and array.ndim == 2 and array.shape[1] != len(names):
+            raise UnusableLog(
+                f"expected {array.shape[1]} names in coordinate_names in {path}, one for each column of {name}, got "
+                f"{list(names)}"
+            )
+
+
+def _flat(path: Path, columns: Mapping[str, dict[str, Cells]]) -> dict[str, Cells]:
+    """Return the columns of all arrays by name. Raises ``UnusableLog`` if two arrays have the same column."""
+    flat: dict[str, Cells] = {}
+    source: dict[str, str] = {}
+    for array, found in columns.items():
+        for column, cells in found.items():
+            if column in flat:
+                raise UnusableLog(
+                    f"expected one array for the column {column!r} in {path}, got two: {source[column]} and {array}"
+                )
+            flat[column], source[column] = cells, array
+    return flat
 
 
 def _columns(name: str, array: Cells, names: Sequence[str]) -> dict[str, Cells]:
@@ -63,7 +91,9 @@ def _columns(name: str, array: Cells, names: Sequence[str]) -> dict[str, Cells]:
     if name in (*STATES, *NEXT):
         own = names if len(names) == count else [f"s{i}" for i in range(count)]
         return {f"{'q' if name in STATES else 'next'}.{one}": array[:, i] for i, one in enumerate(own)}
-    if count == 1 and _is_single(name):
+    if _is_single(name):
+        if count != 1:
+            raise UnusableLog(f"expected one value a step for {name}, got an array of shape {array.shape}")
         return {name: array[:, 0]}
     return {f"{name}.{i}": array[:, i] for i in range(count)}
 

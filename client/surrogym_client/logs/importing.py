@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from surrogym_client.logs.outputs import rejected_file, require_outputs
 from surrogym_client.logs.reading import read
 from surrogym_client.transport.api import Api
 from surrogym_shared.logs.checking import ReadLog, check_log, draft_log, write_rejected
@@ -116,7 +117,8 @@ def import_log(
 
     Raises:
         ValueError: both ``register`` and ``to``, or ``to`` with ``spec``.
-        UnusableLog: no log, columns without a clear role, or ``register`` is no name of a surrogate.
+        UnusableLog: no log, columns without a clear role, ``register`` is no name of a surrogate, or ``rejected`` is
+            the log or the mapping.
         TooFewSteps: no usable step, or a single one where a specification is to be drafted.
         SurrogymClientError: as every request.
 
@@ -131,6 +133,10 @@ def import_log(
             f"first, got {register!r}"
         )
     given = Path(mapping) if isinstance(mapping, str) else mapping
+    require_outputs(
+        {"the file of rejected rows": None if rejected is None else Path(rejected)},
+        {"the log": Path(path), "the mapping": given if isinstance(given, Path) else None},
+    )
     options = Options(given, spec, budget, progress=lambda share, words: progress(0.3 * share, words))
     if register is None and to is None:
         log, kept = _read_or_keep(Path(path), options, rejected)
@@ -152,8 +158,7 @@ def keep_rejected(path: Path, log: ReadLog, where: str | Path | None = None) -> 
 
 
 def _keep(path: Path, table: Table, steps: Transitions, where: str | Path | None) -> Path | None:
-    path = path if path.name else path.resolve()  # "." is the folder of a data set too
-    file = Path(where) if where is not None else path.with_name(f"{path.stem}.rejected.csv")
+    file = rejected_file(path, where)
     if not steps.rejected and not file.exists():
         return None
     write_rejected(file, table, steps)

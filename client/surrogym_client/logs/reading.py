@@ -73,19 +73,34 @@ def read_npz(path: Path) -> Table:
 def read_parquet(path: Path) -> Table:
     """The columns of a Parquet file; lists of one length become columns of their own."""
     try:
-        from pyarrow import parquet
+        from pyarrow import ArrowException, parquet
     except ModuleNotFoundError as error:
         raise UnusableLog("a log in Parquet needs the package pyarrow: pip install 'surrogym[logs]'") from error
-    read_table = parquet.read_table(path)
-    arrays: dict[str, Any] = {}
-    for name, column in zip(read_table.column_names, read_table.columns, strict=True):
-        cells = column.to_numpy()
-        if cells.dtype == object and len(cells) and isinstance(cells[0], np.ndarray):
-            cells = np.stack(cells)
-        elif cells.dtype == object:
-            cells = np.array(["" if cell is None else str(cell) for cell in cells])
-        arrays[name] = cells
+    try:
+        read_table = parquet.read_table(path)
+        columns = [(name, read_table.column(i).to_numpy()) for i, name in enumerate(read_table.column_names)]
+    except (ArrowException, OSError, ValueError) as error:
+        raise UnusableLog(f"expected a Parquet file in {path}, got one that can't be read: {_line(error)}") from error
+    arrays = {name: _of_objects(path, name, cells) if cells.dtype == object else cells for name, cells in columns}
     return table_of_arrays(path, arrays)
+
+
+def _of_objects(path: Path, name: str, cells: Cells) -> Cells:
+    """Return lists of one length as an array (n, k), and other cells as text (n,)."""
+    lists = [isinstance(cell, np.ndarray) for cell in cells]
+    if not any(lists):
+        return np.array(["" if cell is None else str(cell) for cell in cells])
+    shapes = {cell.shape if one else None for cell, one in zip(cells, lists, strict=True)}
+    if len(shapes) > 1:
+        raise UnusableLog(
+            f"expected lists of one length in the column {name} of {path}, got lists of different lengths"
+        )
+    return np.stack(list(cells))
+
+
+def _line(error: Exception) -> str:
+    """Return the first line of an error's message."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def read_minari(path: Path) -> Table:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from surrogym_shared.logs.columns import Roles
 from surrogym_shared.logs.drafting import Draft, draft, wrapped
@@ -74,6 +75,8 @@ def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
     roles = _of_spec(roles, spec)
     rows = rows_of(table, roles, spec)
     require_units(rows.q, spec)
+    if rows.following is not None:
+        require_units(rows.following, spec, "next ")
     steps = _consistent(spec, _shaped(spec, roles, transitions_of(rows)))
     require_steps(table, steps, 1)
     return ReadLog(table, roles, steps, spec)
@@ -89,12 +92,17 @@ def draft_log(table: Table, roles: Roles, name: str, budget: int = 0) -> ReadLog
         budget: real steps that a design may take in addition to the log.
 
     Raises:
-        UnusableLog: no state ever moves, or an action never varies.
+        UnusableLog: no state ever moves, an action never varies, or a specification can't have such names or numbers.
         TooFewSteps: fewer than two steps are usable.
     """
     steps = transitions_of(rows_of(table, roles))
     require_steps(table, steps, 2)
-    drafted: Draft = draft(roles, steps, name, budget)
+    try:
+        drafted: Draft = draft(roles, steps, name, budget)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise UnusableLog(f"the drafted specification is not valid: {where}: {first['msg']}") from error
     return ReadLog(table, roles, _shaped(drafted.spec, roles, steps), drafted.spec, drafted.notes)
 
 

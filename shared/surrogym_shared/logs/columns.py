@@ -13,6 +13,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, ValidationError
 
 from surrogym_shared.bounded import FailFast
+from surrogym_shared.checks import LARGEST
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.spec.base import MAX_DIMENSIONS
 
@@ -137,16 +138,20 @@ class LogMapping(FailFast):
 
 
 def roles_by_name(names: Sequence[str]) -> Roles:
-    """Find the roles of columns by their names; see the how-to page on logs."""
+    """Find the roles of columns by their names; see the how-to page on logs.
+
+    Raises:
+        UnusableLog: states or actions have no column, too many, or two for one name.
+    """
     single: dict[str, Any] = {role: _first(names, known) for role, known in SINGLE.items()}
     left = [name for name in names if name not in single.values()]
-    action = {_part(ACTION.match(name)) or "0": name for name in left if ACTION.match(name)}
+    action = _single("action", [(_part(match) or "0", name) for name in left if (match := ACTION.match(name))])
     left = [name for name in left if name not in action.values()]
-    marked = {_part(match): name for name in left if (match := STATE.match(name))}
-    following = {_part(match): name for name in left if (match := NEXT.match(name))}
+    marked = _single("state", [(_part(match), name) for name in left if (match := STATE.match(name))])
+    ahead = [(_part(match), name) for name in left if (match := NEXT.match(name))]
+    following = _single("next state", [(_part(STATE.match(part)) or part, name) for part, name in ahead])
     plain = {name: name for name in left if name not in following.values()}
     state = marked or plain
-    following = {_part(STATE.match(name)) or name: column for name, column in following.items()}
     _require(names, state, action)
     used = {*state.values(), *action.values(), *following.values(), *single.values()}
     return _checked(
@@ -161,9 +166,13 @@ def roles_by_file(path: Path, names: Sequence[str]) -> Roles:
         OSError: the file can't be read.
         UnusableLog: the file is not a mapping, or names a column that the log does not have.
     """
-    text = path.read_text(encoding="utf-8")
     try:
+        text = path.read_text(encoding="utf-8")
         content = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
+    except UnicodeDecodeError as error:
+        raise UnusableLog(f"expected JSON or TOML in {path}, got bytes that are no text in UTF-8") from error
+    except RecursionError as error:
+        raise UnusableLog(f"expected a table of columns in {path}, got lists or tables nested too deeply") from error
     except ValueError as error:
         raise UnusableLog(f"expected JSON or TOML in {path}: {error}") from error
     return roles_by_map(content, names, str(path))
@@ -175,16 +184,19 @@ def roles_by_map(content: Mapping[str, Any], names: Sequence[str], where: str = 
 
 
 def roles_by_mapping(mapped: LogMapping, names: Sequence[str], where: str = "the mapping") -> Roles:
-    """Find the roles of columns by a parsed mapping. Raises ``UnusableLog`` if it names a missing column."""
+    """Find the roles of columns by a parsed mapping.
+
+    Raises:
+        UnusableLog: the mapping names a missing column, gives one column two roles, or contradicts itself.
+    """
     fields: dict[str, Any] = {role: getattr(mapped, role) or None for role in SINGLE}
     state, action = _by_name(mapped.state), _by_name(mapped.action)
     wanted = [*state.values(), *action.values(), *mapped.next.values(), *filter(None, fields.values())]
     if missing := [column for column in wanted if column not in names]:
         raise UnusableLog(f"{where} names the column {missing[0]!r}: expected one of {list(names)}")
     _require(names, state, action)
-    declared = {*mapped.limits, *mapped.angles, *mapped.constants}
-    if unknown := sorted(declared - {*state, *action}):
-        raise UnusableLog(f"{where} names {unknown[0]!r}: expected one of {[*state, *action]}")
+    _require_one_role(mapped, where)
+    _require_declared(mapped, state, action, where)
     return _checked(
         Roles(
             state,
@@ -198,6 +210,60 @@ def roles_by_mapping(mapped: LogMapping, names: Sequence[str], where: str = "the
             ignored=tuple(name for name in names if name not in wanted),
         )
     )
+
+
+def _single(role: str, found: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Return columns by the names of their states or actions. Raises ``UnusableLog`` if two have the same name."""
+    columns: dict[str, str] = {}
+    for name, column in found:
+        if name in columns:
+            raise UnusableLog(
+                f"expected one column for the {role} {name!r}, got two: {columns[name]} and {column}: rename one, or "
+                "name the columns in a mapping file (--map)"
+            )
+        columns[name] = column
+    return columns
+
+
+def _require_one_role(mapped: LogMapping, where: str) -> None:
+    """Raise ``UnusableLog`` if a mapping names a column twice."""
+    tables = {"state": mapped.state, "action": mapped.action, "next state": mapped.next}
+    named = [
+        (f"{role} {name}", column)
+        for role, given in tables.items()
+        for name, column in (given.items() if isinstance(given, dict) else zip(given, given, strict=True))
+    ]
+    named += [(role, column) for role in SINGLE if (column := getattr(mapped, role))]
+    roles: dict[str, str] = {}
+    for role, column in named:
+        if column in roles:
+            raise UnusableLog(f"{where}: expected one role for the column {column!r}, got {roles[column]} and {role}")
+        roles[column] = role
+
+
+def _require_declared(mapped: LogMapping, state: Iterable[str], action: Iterable[str], where: str) -> None:
+    """Raise ``UnusableLog`` if limits, angles or constants of a mapping name nothing, or contradict each other."""
+    states, actions = list(state), list(action)
+    for key, given, known in (
+        ("limits", mapped.limits, [*states, *actions]),
+        ("angles", mapped.angles, states),
+        ("constants", mapped.constants, states),
+    ):
+        if unknown := sorted(set(given) - set(known)):
+            what = "one of" if key == "limits" else "one of the states"
+            raise UnusableLog(f"{where} names {unknown[0]!r} in {key}: expected {what} {known}")
+    if both := sorted(set(mapped.angles) & set(mapped.constants)):
+        raise UnusableLog(f"{where}: expected {both[0]!r} in angles or in constants, got it in both")
+    if both := sorted(set(mapped.limits) & set(states) & set(actions)):
+        raise UnusableLog(f"{where}: expected limits of a state or of an action, got {both[0]!r}, which names both")
+    for name, (low, high) in mapped.limits.items():
+        ends = [end for end in (low, high) if end is not None]
+        if not all(abs(end) <= LARGEST for end in ends):
+            raise UnusableLog(
+                f"{where}: expected limits of {name!r} to be at most {LARGEST:g} in size, got [{low}, {high}]"
+            )
+        if len(ends) == 2 and ends[0] >= ends[1]:
+            raise UnusableLog(f"{where}: expected limits of {name!r} with the lowest value first, got [{low}, {high}]")
 
 
 def _mapped(content: Mapping[str, Any], where: str) -> LogMapping:
@@ -221,7 +287,10 @@ def _fault(key: str, content: Mapping[str, Any]) -> str:
 
 
 def _short(value: object) -> str:
-    text = repr(value)
+    try:
+        text = repr(value)
+    except RecursionError:
+        text = "a value that is nested too deeply"
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from surrogym_shared.checks import LARGEST, NARROWEST, RESOLUTION
 from surrogym_shared.logs.columns import Roles
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.table import Bools, Floats
@@ -58,7 +59,7 @@ def draft(roles: Roles, steps: Transitions, name: str, budget: int = 0) -> Draft
         budget: real steps that a design may take in addition to the log.
 
     Raises:
-        UnusableLog: no state ever moves, or an action never varies.
+        UnusableLog: no state ever moves, an action never varies, or numbers are too large or too close together.
     """
     notes: list[str] = []
     coordinates = [
@@ -95,21 +96,47 @@ def _coordinate(roles: Roles, steps: Transitions, name: str, index: int, notes: 
     if low == high:
         notes.append(f"{name}: always {low:g}, left out")
         return None
+    _require_range(name, low, high)
     if name in roles.angles or _turns(before, after):
         notes.append(f"{name}: an angle in radians, as it {_why(name in roles.angles, 'jumps by a full turn')}")
         return Coordinate(name=name, kind="angle", sampling=Uniform(low=-math.pi, high=math.pi))
     if _turns(np.deg2rad(before), np.deg2rad(after)):
         notes.append(f"{name}: jumps by 360, as an angle in degrees does: give it in radians")
-    margin = MARGIN * (high - low)
     if name in roles.constants or bool((before == after).all()):
         notes.append(f"{name}: a constant of each episode, as it {_why(name in roles.constants, 'never moves in one')}")
         return Coordinate(name=name, kind="constant", sampling=Uniform(low=low, high=high))
     bounds = _bounds(roles, name, after, (low, high), notes)
     ends = (-math.inf, math.inf) if bounds is None else (bounds.low, bounds.high)
+    margin = MARGIN * (high - low)
     least, most = (-math.inf if ends[0] is None else ends[0]), (math.inf if ends[1] is None else ends[1])
-    sampling = Uniform(low=max(low - margin, least), high=min(high + margin, most))
+    sampling = Uniform(low=max(low - margin, least, -LARGEST), high=min(high + margin, most, LARGEST))
     notes += [f"{name}: {remark}" for remark in _remarks(after)]
     return Coordinate(name=name, sampling=sampling, bounds=bounds)
+
+
+def _require_range(name: str, low: float, high: float) -> None:
+    """Raise ``UnusableLog`` if a specification can't have the range [low, high]: too large, or too narrow."""
+    _require_size(name, low, high)
+    least = _narrowest(low, high)
+    if high - low < least:
+        raise UnusableLog(
+            f"{name}: expected values that differ by {least:g} or more, got {low:.12g} to {high:.12g}: convert the "
+            "column to another unit, or leave it out with a mapping file (--map)"
+        )
+
+
+def _require_size(name: str, low: float, high: float) -> None:
+    if max(abs(low), abs(high)) > LARGEST:
+        came = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+        raise UnusableLog(
+            f"{name}: expected values of at most {LARGEST:g} in size, got {came}: convert the column to "
+            "another unit, or leave out the rows that are faults"
+        )
+
+
+def _narrowest(low: float, high: float) -> float:
+    """Return the narrowest range that a specification takes."""
+    return max(NARROWEST, RESOLUTION * max(abs(low), abs(high)))
 
 
 def _why(declared: bool, shown: str) -> str:
@@ -153,7 +180,7 @@ def _start(coordinate: Coordinate, steps: Transitions, index: int) -> Uniform | 
     if coordinate.kind == "angle":
         values = wrapped(values)
     low, high = float(values.min()), float(values.max())
-    return Fixed(value=low) if low == high else Uniform(low=low, high=high)
+    return Fixed(value=low) if high - low < _narrowest(low, high) else Uniform(low=low, high=high)
 
 
 def _starts(steps: Transitions, kept: list[int], coordinates: list[Coordinate]) -> tuple[tuple[float, ...], ...]:
@@ -178,6 +205,7 @@ def _outside_reward(steps: Transitions, budget: int, notes: list[str]) -> float 
     if budget or steps.reward is None:
         return None
     worst = float(steps.reward.min())
+    _require_size("the reward", worst, worst)
     notes.append(
         f"outside the ranges: a virtual episode ends, and each missing step up to the time limit pays {worst:g}, the "
         "log's worst reward"
@@ -221,6 +249,7 @@ def _action(roles: Roles, steps: Transitions, notes: list[str]) -> BoxAction | D
                 f"expected an action {name!r} that varies, got {least:g} in every row: nothing can be learned of it; "
                 "leave it out with a mapping file (--map)"
             )
+        _require_range(f"the action {name!r}", least, most)
         low.append(least)
         high.append(most)
     return BoxAction(low=tuple(low), high=tuple(high))

@@ -10,12 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_shared.logs.errors import UnusableLog
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Cells = NDArray[Any]  # (n,) numbers, or text
 
 TRUE, FALSE = ("true", "t", "yes"), ("false", "f", "no")
+DATES, DURATIONS = "M", "m"  # kinds of NumPy types
+NO_NUMBERS = {DATES: "dates", DURATIONS: "durations", "c": "complex numbers", "V": "records"}
 MAX_MEASURED = 1e30  # the server takes no larger number
 
 
@@ -54,7 +58,13 @@ class Table:
 
 
 def numbers(name: str, cells: Cells) -> tuple[Floats, dict[int, str]]:
-    """Convert cells to numbers (n,). A cell that is not a number gives NaN, and a reason by the row's index."""
+    """Convert cells to numbers (n,). A cell that is not a number gives NaN, and a reason by the row's index.
+
+    Raises:
+        UnusableLog: the whole column has dates, durations, complex numbers or records.
+    """
+    if kind := NO_NUMBERS.get(cells.dtype.kind):
+        raise UnusableLog(f"{name}: expected a column of numbers, got {kind} ({cells.dtype})")
     values = _plain(cells) if cells.dtype.kind in "biuf" else _parsed(cells)
     unusable = np.flatnonzero(~(np.abs(values) <= MAX_MEASURED))
     return values, {int(row): f"{name}: {_reason(cells[row], values[row])}" for row in unusable}
@@ -63,10 +73,11 @@ def numbers(name: str, cells: Cells) -> tuple[Floats, dict[int, str]]:
 def times(name: str, cells: Cells) -> tuple[Floats, dict[int, str]]:
     """Convert cells to times (n,), with a reason for each cell that is none.
 
-    Dates of NumPy and text in ISO 8601 become seconds. Numbers keep the column's own unit.
+    Dates and durations of NumPy and text in ISO 8601 become seconds. Numbers keep the column's own unit.
     """
-    if cells.dtype.kind == "M":
-        seconds = cells.astype("datetime64[ns]").astype(np.int64) / 1e9
+    if cells.dtype.kind in (DATES, DURATIONS):
+        fine = "datetime64[ns]" if cells.dtype.kind == DATES else "timedelta64[ns]"
+        seconds = cells.astype(fine).astype(np.int64) / 1e9
         values = np.where(np.isnat(cells), np.nan, seconds)
         return values, {int(row): f"{name}: missing" for row in np.flatnonzero(np.isnat(cells))}
     values, faults = numbers(name, cells)

@@ -11,8 +11,13 @@ from surrogym_shared.spec import EnvironmentSpec, limits
 BEYOND = 20.0  # distance outside a coordinate's range, in widths of the range, that no real plant reaches
 
 
-def require_units(q: Floats, spec: EnvironmentSpec) -> None:
+def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:
     """Refuse states q (n, C) with a column that seems to be in another unit than its coordinate.
+
+    Args:
+        q: the states.
+        spec: specification with the ranges of the coordinates.
+        which: what a message says before the name of a coordinate.
 
     Raises:
         UnusableLog: the middle half of a column lies far outside the coordinate's range, or is far wider than it.
@@ -28,6 +33,6 @@ def require_units(q: Floats, spec: EnvironmentSpec) -> None:
         wide = last - first > far
         if outside or wide:
             raise UnusableLog(
-                f"{coordinate.name}: half of the log lies between {first:.4g} and {last:.4g}, its range is "
+                f"{which}{coordinate.name}: half of the log lies between {first:.4g} and {last:.4g}, its range is "
                 f"{low:.4g} to {high:.4g}: is the column in another unit? Convert it, or name another column (--map)"
             )

@@ -45,16 +45,16 @@ class Term(Frozen):
         return cls(parts=(Part(function="one", coefficient=value),))
 
     @classmethod
-    def linear(cls, **weights: float) -> Term:
+    def linear(cls, /, **weights: float) -> Term:
         """Make a linear term of coordinates: ``Term.linear(x=1)`` is the coordinate x."""
         return cls(parts=(Part(function="linear", weights=weights),))
 
     @classmethod
-    def sin(cls, **weights: float) -> Term:
+    def sin(cls, /, **weights: float) -> Term:
         return cls(parts=(Part(function="sin", weights=weights),))
 
     @classmethod
-    def cos(cls, **weights: float) -> Term:
+    def cos(cls, /, **weights: float) -> Term:
         return cls(parts=(Part(function="cos", weights=weights),))
 
     def clipped(self, low: float | None, high: float | None) -> Term:

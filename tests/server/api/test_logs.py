@@ -89,3 +89,20 @@ def test_an_invalid_log_is_refused_with_the_expected_form(
     assert expected in refused.json()["detail"]
     assert client.get(f"/v1/surrogates/{fresh}").json()["samples"] == 0
     assert client.get(f"/v1/surrogates/{fresh}").json()["queries"]["pending"] == pendulum.INITIAL
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "says"),
+    [("1e13", "3e13", "at most 1e+12 in size"), ("1e-300", "3e-300", "differ by 1e-12 or more")],
+)
+def test_numbers_that_no_specification_takes_are_no_fault_of_the_server(
+    client: httpx.Client, first: str, last: str, says: str
+):
+    refused = client.post("/v1/logs:draft", json={"text": f"x,action_a\n{first},1.5\n{last},2\n{first},3\n"})
+    assert (refused.status_code, refused.json()["code"]) == (422, "invalid_request")
+    assert says in refused.json()["detail"]
+
+
+def test_a_column_may_be_called_cls(client: httpx.Client):
+    drafted = client.post("/v1/logs:draft", json={"text": "cls,action_a\n1,1.5\n2,2\n4,3\n"})
+    assert drafted.raise_for_status().json()["spec"]["coordinates"][0]["name"] == "cls"

@@ -1,0 +1,72 @@
+"""Files that an import writes: each is checked before anything is read, stored or written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from surrogym_shared.logs.errors import UnusableLog
+
+PICTURES = (".png", ".svg", ".pdf")
+DATA = "data"  # folder of a Minari data set with its files
+
+Files = Mapping[str, Path | None]
+
+
+def rejected_file(log: Path, given: str | Path | None) -> Path:
+    """Return the file for the rows that can't be used: the given one, or LOG.rejected.csv beside the log."""
+    if given is not None:
+        return Path(given)
+    log = log if log.name else log.resolve()  # "." is the folder of a data set too
+    return log.with_name(f"{log.stem}.rejected.csv")
+
+
+def require_outputs(outputs: Files, inputs: Files, perhaps: Files | None = None) -> None:
+    """Refuse outputs that would overwrite an input or each other, or that can't be written.
+
+    Args:
+        outputs: files to write, by the words that a message names them by; None is no file.
+        inputs: files to read, likewise.
+        perhaps: files that are written only if they are needed, likewise. Their folder may be write-protected.
+
+    Raises:
+        UnusableLog: an output is an input, equals another output, or has no folder to be written to.
+    """
+    read = {words: file for words, file in inputs.items() if file is not None}
+    written: dict[str, Path] = {}
+    for words, file in {**(perhaps or {}), **outputs}.items():
+        if file is None:
+            continue
+        for other, one in (read | written).items():
+            if _same(file, one):
+                raise UnusableLog(f"{words}: expected another file than {other}, got {file} for both")
+        if words in outputs:
+            _require_writable(words, file)
+        written[words] = file
+
+
+def require_picture(words: str, file: Path) -> None:
+    """Raise ``UnusableLog`` if the ending of a picture's name is of no known kind."""
+    if file.suffix not in PICTURES:
+        raise UnusableLog(f"{words}: expected a name that ends in .png, .svg or .pdf, got {file.name!r}")
+
+
+def _same(output: Path, other: Path) -> bool:
+    """Return whether two paths are one file. A device, such as /dev/null, is no file."""
+    if output.exists() and not output.is_file():
+        return False
+    if other.is_dir():
+        return output.resolve().is_relative_to((other / DATA).resolve())
+    if output.exists() and other.exists():
+        return output.samefile(other)
+    return output.resolve() == other.resolve()
+
+
+def _require_writable(words: str, file: Path) -> None:
+    if file.is_dir():
+        raise UnusableLog(f"{words}: expected a file, got the folder {file}")
+    if not file.parent.is_dir():
+        raise UnusableLog(f"{words}: expected a file in a folder that exists, got {file}")
+    if not os.access(file if file.exists() else file.parent, os.W_OK):
+        raise UnusableLog(f"{words}: expected a file that can be written, got {file}, which is write-protected")

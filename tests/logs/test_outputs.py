@@ -1,0 +1,82 @@
+"""Files that an import writes: none overwrites a file that it reads, and none fails after steps were stored."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from support import reactor
+from surrogym_client.cli import main
+from surrogym_client.logs import UnusableLog, import_log
+from surrogym_client.logs.importing import read_log
+
+NOWHERE = "http://127.0.0.1:9"  # no server: a refusal comes before a request
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with a log, a mapping and a specification."""
+    log = reactor.log(runs=3, length=20).write(tmp_path / "log.csv")
+    (tmp_path / "spec.json").write_text(read_log(log).spec.model_dump_json())
+    (tmp_path / "map.json").write_text("{}")
+    (tmp_path / "link.csv").hardlink_to(log)
+    return tmp_path
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    with pytest.raises(SystemExit) as ended:
+        main(["import", *map(str, arguments)])
+    assert ended.value.code not in (0, None)
+    return capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--rejected", "--draft", "--picture"])
+@pytest.mark.parametrize("name", ["log.csv", "link.csv", "map.json", "spec.json"])
+def test_an_output_never_overwrites_an_input(folder: Path, capsys: pytest.CaptureFixture[str], option: str, name: str):
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    inputs = (folder / "log.csv", "--map", folder / "map.json", "--spec", folder / "spec.json")
+    said = refusal(capsys, *inputs, option, folder / name)
+    assert f"{option}: expected another file than " in said
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+
+
+def test_two_outputs_are_two_files(folder: Path, capsys: pytest.CaptureFixture[str]):
+    said = refusal(capsys, folder / "log.csv", "--draft", folder / "a.png", "--picture", folder / "a.png")
+    assert "--picture: expected another file than --draft" in said
+    said = refusal(capsys, folder / "log.csv", "--draft", folder / "log.rejected.csv")
+    assert "--draft: expected another file than the rejected rows" in said
+
+
+def test_the_rejected_rows_of_the_library_never_overwrite_the_log(folder: Path):
+    with pytest.raises(UnusableLog, match="the file of rejected rows: expected another file than the log"):
+        import_log(folder / "log.csv", rejected=folder / "log.csv")
+
+
+@pytest.mark.parametrize(
+    ("option", "name", "says"),
+    [
+        ("--picture", "x.jpg", "expected a name that ends in .png, .svg or .pdf, got 'x.jpg'"),
+        ("--draft", "missing/x.json", "expected a file in a folder that exists"),
+        ("--picture", "missing/x.png", "expected a file in a folder that exists"),
+        ("--rejected", "missing/x.csv", "expected a file in a folder that exists"),
+        ("--draft", "", "expected a file, got the folder"),
+    ],
+)
+def test_an_output_that_cant_be_written_is_refused_before_anything_is_stored(
+    folder: Path, capsys: pytest.CaptureFixture[str], option: str, name: str, says: str
+):
+    said = refusal(capsys, folder / "log.csv", "--register", "new", "--server", NOWHERE, option, folder / name)
+    assert f"{option}: {says}" in said
+
+
+def test_a_log_in_a_write_protected_folder_can_be_read(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    """Rejected rows go beside the log only where there are some."""
+    monkeypatch.setattr("os.access", lambda _path, mode, **_options: mode != os.W_OK)
+    with pytest.raises(SystemExit) as ended:
+        main(["import", str(folder / "log.csv")])
+    assert not ended.value.code
+    assert "is write-protected" in refusal(capsys, folder / "log.csv", "--draft", folder / "draft.json")

@@ -1,0 +1,79 @@
+"""Roles of columns: two columns for one name, and mappings that contradict themselves, are refused in a sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from surrogym_client.logs import UnusableLog
+from surrogym_shared.logs.columns import roles_by_file, roles_by_map, roles_by_name
+
+NAMES = ["x", "y", "v", "r"]
+PLAIN = {"state": ["x", "y"], "action": ["v"]}
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        (["action_a", "u_a", "x"], "one column for the action 'a', got two: action_a and u_a"),
+        (["action", "action_0", "x"], "one column for the action '0', got two: action and action_0"),
+        (["state_x", "q.x", "action"], "one column for the state 'x', got two: state_x and q.x"),
+        (["x", "next_x", "x_next", "action"], "one column for the next state 'x', got two: next_x and x_next"),
+        (["q.x", "next_x", "next_q.x", "action"], "one column for the next state 'x', got two: next_x and next_q.x"),
+    ],
+)
+def test_two_columns_for_one_name_are_refused(names: list[str], says: str):
+    """The last one won, and the others were lost."""
+    with pytest.raises(UnusableLog, match="expected " + says):
+        roles_by_name(names)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"reward": "x"}, "one role for the column 'x', got state x and reward"),
+        ({"reward": "r", "time": "r"}, "one role for the column 'r', got reward and time"),
+        ({"state": {"a": "x", "b": "x"}}, "one role for the column 'x', got state a and state b"),
+        ({"state": ["x", "x"]}, "one role for the column 'x', got state x and state x"),
+        ({"state": ["x"], "next": {"x": "x"}}, "one role for the column 'x', got state x and next state x"),
+        ({"angles": ["v"]}, r"names 'v' in angles: expected one of the states \['x', 'y'\]"),
+        ({"constants": ["z"]}, "names 'z' in constants: expected one of the states"),
+        ({"limits": {"z": [0, 1]}}, "names 'z' in limits: expected one of"),
+        ({"angles": ["x"], "constants": ["x"]}, "'x' in angles or in constants, got it in both"),
+        ({"limits": {"x": [2, -2]}}, r"limits of 'x' with the lowest value first, got \[2.0, -2.0\]"),
+        ({"limits": {"x": [0, 0]}}, "limits of 'x' with the lowest value first"),
+        ({"limits": {"x": [float("nan"), 1]}}, "limits of 'x' to be at most 1e.12 in size"),
+        ({"limits": {"v": [float("-inf"), None]}}, "limits of 'v' to be at most 1e.12 in size"),
+        (
+            {"state": {"v": "x"}, "limits": {"v": [0, 1]}},
+            "limits of a state or of an action, got 'v', which names both",
+        ),
+    ],
+)
+def test_a_mapping_that_contradicts_itself_is_refused(changes: dict[str, object], says: str):
+    with pytest.raises(UnusableLog, match="the mapping.*" + says):
+        roles_by_map(PLAIN | changes, NAMES)
+
+
+def test_the_mapping_of_known_names_is_a_mapping():
+    """A page that sends back the roles that it was told gets the same ones."""
+    roles = roles_by_name(["x", "next_x", "action_x", "reward", "time"])
+    assert roles_by_map(roles.mapping.model_dump(), ["x", "next_x", "action_x", "reward", "time"]) == roles
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("map.toml", b"\xff\xfe\x00state", "expected JSON or TOML in .*, got bytes that are no text in UTF-8"),
+        ("map.json", b"[" * 100_000, "expected a table of columns in .*nested too deeply"),
+        ("map.json", b"[" * 4_000 + b"]" * 4_000, "expected a table"),
+        ("map.toml", b"a=" + b"[" * 100_000, "nested too deeply|expected JSON or TOML"),
+    ],
+)
+def test_a_mapping_file_that_cant_be_read_is_refused_in_a_sentence(
+    tmp_path: Path, name: str, content: bytes, says: str
+):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(UnusableLog, match=says):
+        roles_by_file(tmp_path / name, NAMES)
