@@ -72,6 +72,8 @@ def command(
             if given is None:
                 given, words = _described(env)
                 yield from words
+                if any(word.name == "environment" for word in words):
+                    return
             yield from environment(partial(isolated, env, step_limit, given), history)
 
     found: list[Finding] = []
@@ -87,8 +89,8 @@ def command(
 
 
 def _described(env: str) -> tuple[EnvironmentSpec | None, list[Finding]]:
-    """Draft the specification of an environment that has none, by real steps. None if it has one or can't be opened."""
-    from surrogym_client.diagnosis.doctor import Finding
+    """Draft the specification of an environment that has none, by real steps. None if it has one or fails."""
+    from surrogym_client.diagnosis.doctor import NEEDS, Finding
     from surrogym_client.original.describing import describe
     from surrogym_client.original.errors import OriginalError
     from surrogym_client.original.loading import has_specification
@@ -98,8 +100,8 @@ def _described(env: str) -> tuple[EnvironmentSpec | None, list[Finding]]:
         return None, []
     try:
         found = describe(env)
-    except OriginalError:
-        return None, []  # making it says the same
+    except OriginalError as error:
+        return None, [Finding("environment", str(error), NEEDS)]
     spec, lacking = found.spec, []
     if not found.pays:
         nothing = DeclaredReward(kind="declared", terms=(RewardTerm(weight=0.0, shape="one"),))

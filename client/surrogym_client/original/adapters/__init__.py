@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import PurePath
 from typing import NamedTuple
 
-from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.errors import UnknownEnvironment, sentence
 from surrogym_client.original.simulator import Simulator
 
 GYMNASIUM_ID = re.compile(r"(?:[A-Za-z_][\w.]*:)?[\w./-]+-v\d+")  # package:Id-v0 is Gymnasium's own spelling
@@ -79,7 +79,8 @@ def open_simulator(name: str) -> Simulator:
     """Open the simulator of a name.
 
     Raises:
-        UnknownEnvironment: no adapter knows the name, its package is not installed, or the simulator can't be used.
+        UnknownEnvironment: no adapter knows the name, its package is not installed, or the simulator fails or can't be
+            used.
     """
     adapter = adapter_of(name)
     if adapter is None:
@@ -91,4 +92,8 @@ def open_simulator(name: str) -> Simulator:
         opened: Simulator = import_module(adapter.module).open_simulator(name)
     except ImportError as error:
         raise UnknownEnvironment(f"{name} can't be made: {error} (pip install 'surrogym[{adapter.extra}]')") from error
+    except UnknownEnvironment:
+        raise
+    except Exception as error:  # an environment raises any kind
+        raise UnknownEnvironment(f"{name} can't be opened: {sentence(error)}") from error
     return opened

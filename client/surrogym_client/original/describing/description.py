@@ -80,10 +80,11 @@ def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
 
     Raises:
         UnknownEnvironment: no adapter knows the name, or no specification can express the environment.
+        StepFailed: the environment failed at a reset or a step, after a number of real steps.
     """
     simulator = open_simulator(name)
     try:
-        counted, rng = Counted(simulator), np.random.default_rng(seed)
+        counted, rng = Counted(simulator, name), np.random.default_rng(seed)
         seen = explore(counted, steps, rng)
         probed = probe(counted, seen, rng) if simulator.settable else Probed(np.inf, 0.0, 0.0)
         drafted = _Draft(name, simulator, seen, probed)

@@ -136,7 +136,7 @@ def _replayed(counted: Counted, seen: Seen, scale: Array) -> float:
     errors = []
     for i in rows:
         taken = counted.step(seen.actions[i])
-        reached = counted.simulator.read()
+        reached = counted.read()
         errors.append(_error(reached, seen.next_states[i], scale, taken.reward, float(seen.rewards[i])))
     return max(errors)
 

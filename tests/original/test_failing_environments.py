@@ -1,0 +1,89 @@
+"""An environment that fails, or returns something else than Gymnasium expects, is described by one sentence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from support.simulators import Register, Spiral
+from surrogym_client.original.adapters import open_simulator
+from surrogym_client.original.describing import describe
+from surrogym_client.original.errors import StepFailed, UnknownEnvironment
+
+STEPS = 60
+
+
+def raises_late(self, action):
+    self.taken = getattr(self, "taken", 0) + 1
+    if self.taken > 50:
+        raise ZeroDivisionError("valve stuck")
+    return Spiral.step(self, action)
+
+
+def grows(self, action):
+    shown, *rest = Spiral.step(self, action)
+    self.state = np.zeros(3)
+    return shown, *rest
+
+
+def paying(reward):
+    def step(self, action):
+        shown, _, *rest = Spiral.step(self, action)
+        return shown, reward, *rest
+
+    return step
+
+
+@pytest.mark.parametrize(
+    ("step", "message"),
+    [
+        (raises_late, r"Fails-v0 failed after 50 real steps: ZeroDivisionError: valve stuck \(test_failing"),
+        (
+            lambda self, action: Spiral.step(self, action)[:4],
+            r"Fails-v0 failed after 0 real steps: expected its step to return 5 values \(observation, .* got 4 values",
+        ),
+        (paying("ten"), "Fails-v0 failed after 0 real steps: expected its reward to be a number, got 'ten'"),
+        (paying(None), "expected its reward to be a number, got None"),
+        (paying(np.ones(2)), "expected its reward to be a number, got array"),
+        (grows, "expected a state of 2 numbers, as after its first reset, got 3"),
+    ],
+)
+def test_a_step_that_fails_is_described_with_the_real_steps_before_it(
+    registered: Register, step: object, message: str
+) -> None:
+    name = registered("Fails-v0", space={"step": step})
+    with pytest.raises(StepFailed, match=message):
+        describe(name, STEPS)
+
+
+def fails_at_once(self, *, seed=None, options=None):
+    raise OSError("no device")
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        ({"reset": fails_at_once}, "Fails-v0 can't be opened: OSError: no device"),
+        ({"reset": lambda self: Spiral.reset(self)}, "Fails-v0 can't be opened: TypeError: .*'seed'"),
+        ({"__init__": lambda _: 1 / 0}, "Fails-v0 can't be opened: ZeroDivisionError"),
+    ],
+)
+def test_an_environment_that_cannot_be_opened_says_why(
+    registered: Register, space: dict[str, object], message: str
+) -> None:
+    with pytest.raises(UnknownEnvironment, match=message):
+        open_simulator(registered("Fails-v0", space=space))
+
+
+def test_a_reset_of_the_old_form_is_not_taken_for_an_observation_and_info(registered: Register) -> None:
+    def reset(self, *, seed=None, options=None):
+        return Spiral.reset(self, seed=seed)[0]  # two numbers, not two values
+
+    message = r"Old-v0 can't be opened: expected its reset to return 2 values \(observation, info\), got a ndarray"
+    with pytest.raises(UnknownEnvironment, match=message):
+        open_simulator(registered("Old-v0", space={"reset": reset}))
+
+
+def test_a_reward_of_one_entry_is_a_number(registered: Register) -> None:
+    simulator = open_simulator(registered("Row-v0", space={"step": paying(np.array([2.0]))}))
+    assert simulator.step(np.zeros(1)).reward == 2.0
