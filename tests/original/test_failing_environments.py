@@ -87,3 +87,26 @@ def test_a_reset_of_the_old_form_is_not_taken_for_an_observation_and_info(regist
 def test_a_reward_of_one_entry_is_a_number(registered: Register) -> None:
     simulator = open_simulator(registered("Row-v0", space={"step": paying(np.array([2.0]))}))
     assert simulator.step(np.zeros(1)).reward == 2.0
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("reward", [float("inf"), float("nan")])
+def test_rewards_that_are_no_numbers_are_refused(registered: Register, reward: float) -> None:
+    with pytest.raises(UnknownEnvironment, match="Fails-v0 paid infinite rewards or NaN"):
+        describe(registered("Fails-v0", space={"step": paying(reward)}), STEPS)
+
+
+def test_a_variable_that_moves_by_rounding_only_is_left_out(registered: Register) -> None:
+    def reset(self, *, seed=None, options=None):
+        Spiral.reset(self, seed=seed)
+        self.state[1] = 300.0
+        return self.state, {}
+
+    def step(self, action):
+        x = self.state[0]
+        self.state = np.array([0.9 * x + 0.1 * action[0], 300.0 + self.np_random.normal() * 1e-13])
+        return self.state, -float(x * x), False, False, {}
+
+    found = describe(registered("Rounds-v0", space={"reset": reset, "step": step}), STEPS)
+    assert found.spec.coordinate_names == ("state0",)
+    assert found.spec.query == "step", "an error of a rounding does not tell of hidden memory"

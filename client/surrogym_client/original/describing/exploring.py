@@ -22,6 +22,7 @@ STEPS = 400
 EPISODES = 4  # that share the steps if none ends early
 RESETS = 32  # for the range of starts
 LONGEST_HOLD = 10  # steps in a row under one action
+ROUNDING = 1e-9  # of a variable's size or of 1: what moves by less than this moves by rounding only
 PLACES_TRIED = 20  # random starts, of which the ones without contacts can be taken
 
 
@@ -109,6 +110,13 @@ class Counted:
             raise
         except Exception as error:  # an environment raises any kind
             raise StepFailed(f"{self._name} failed after {steps} real steps: {sentence(error)}") from error
+
+
+def moved_by(values: Array) -> Array:
+    """The range of each column (n, ...), and 0 where it is so small that rounding explains it."""
+    ranges = np.ptp(values, axis=0)
+    small: Array = np.where(ranges > ROUNDING * np.maximum(1.0, np.abs(values).max(0)), ranges, 0.0)
+    return small
 
 
 def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
