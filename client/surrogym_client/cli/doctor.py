@@ -67,14 +67,16 @@ def command(
         with service.connect(context) as api:
             yield from findings_of(api)
         if env is not None:
+            from surrogym_client.cli.printing import found_aside, prints_aside
             from surrogym_client.original.loading import isolated
 
             if given is None:
-                given, words = _described(env)
+                with prints_aside():
+                    given, words = _described(env)
                 yield from words
                 if any(word.name == "environment" for word in words):
                     return
-            yield from environment(partial(isolated, env, step_limit, given), history)
+            yield from found_aside(environment(partial(isolated, env, step_limit, given), history))
 
     found: list[Finding] = []
     for finding in findings():
