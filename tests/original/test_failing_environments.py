@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Box, Discrete, Space
 
 from support.simulators import Register, Spiral
 from surrogym_client.original.adapters import open_simulator
@@ -110,3 +111,23 @@ def test_a_variable_that_moves_by_rounding_only_is_left_out(registered: Register
     found = describe(registered("Rounds-v0", space={"reset": reset, "step": step}), STEPS)
     assert found.spec.coordinate_names == ("state0",)
     assert found.spec.query == "step", "an error of a rounding does not tell of hidden memory"
+
+
+@pytest.mark.parametrize("name", ["own_cart:Cart", "my.plants:make", "exec:./plant"])
+def test_a_factory_is_not_described_and_is_told_why(name: str) -> None:
+    with pytest.raises(UnknownEnvironment, match="gives its own specification: there is nothing to describe"):
+        describe(name, STEPS)
+
+
+@pytest.mark.parametrize("name", ["nowhere", "", ":", "own_cart:", "../x:y"])
+def test_the_forms_of_names_that_can_be_described_are_listed(name: str) -> None:
+    with pytest.raises(UnknownEnvironment, match=r"no adapter knows .* expected a Gymnasium id such as") as refused:
+        describe(name, STEPS)
+    assert "factory" not in str(refused.value), "a factory is no environment to describe"
+
+
+@pytest.mark.parametrize("space", [Box(1, 1, (1,)), Box(-1, 1, (0,)), Box(-1e30, 1e30, (1,), np.float64), Discrete(1)])
+def test_actions_that_no_specification_allows_are_refused_in_one_line(registered: Register, space: Space) -> None:
+    with pytest.raises(UnknownEnvironment, match=r"\AFails-v0 can't be specified: .+\Z") as refused:
+        open_simulator(registered("Fails-v0", space={"action_space": space}))
+    assert "\n" not in str(refused.value)
