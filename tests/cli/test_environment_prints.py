@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 
 CHATTY = """
@@ -41,3 +44,30 @@ def test_output_stays_json_beside_an_environment_that_prints(surrogym, tmp_path,
     said = surrogym(*command)
     assert isinstance(said.json, dict), said.out
     assert "a step" in said.err
+
+
+FACTORY = """
+from surrogym_client.original import RealStep
+from surrogym_client.original.classic import pendulum
+
+class Pendulum:
+    def spec(self):
+        return pendulum().model_copy(update={"environment": "chatty_plant:Pendulum"})
+
+    def step_from(self, coordinates, action):
+        print("a step", flush=True)
+        return RealStep(coordinates, action, coordinates, 0.0)
+
+    def close(self):
+        pass
+"""
+
+
+def test_an_environment_in_a_process_of_its_own_prints_aside_too(tmp_path) -> None:
+    (tmp_path / "chatty_plant.py").write_text(FACTORY)
+    command = [sys.executable, "-m", "surrogym_client", "doctor", "--server", "http://127.0.0.1:9"]
+    said = subprocess.run(
+        [*command, "--env", "chatty_plant:Pendulum"], cwd=tmp_path, capture_output=True, text=True, timeout=60
+    )
+    assert "a step" not in said.stdout
+    assert "a step" in said.stderr
