@@ -115,3 +115,30 @@ def test_a_program_that_hangs_is_not_left_behind(surrogym, tmp_path):
     assert "the program did not answer step within" in found(said)["step"]["said"]
     assert (tmp_path / "pids").read_text()
     assert left_behind(tmp_path) == []
+
+
+FAILING = """
+import gymnasium
+
+class Failing(gymnasium.Env):
+    action_space = gymnasium.spaces.Box(-1, 1, (1,))
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        raise RuntimeError("valve stuck")
+
+gymnasium.register("Failing-v0", entry_point=Failing)
+"""
+
+
+def test_an_environment_that_fails_while_it_is_described_is_one_problem(surrogym, tmp_path, monkeypatch):
+    (tmp_path / "failing_env.py").write_text(FAILING)
+    monkeypatch.syspath_prepend(tmp_path)
+    said = surrogym("doctor", "--server", "http://127.0.0.1:9", "--env", "failing_env:Failing-v0", "--json")
+    assert said.code == 1
+    problem_of = found(said)["environment"]
+    assert "failing_env:Failing-v0 failed after 0 real steps: RuntimeError: valve stuck" in problem_of["said"]
+    assert "own-environment.md" in problem_of["way_out"]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from importlib.util import find_spec
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -101,12 +102,77 @@ def test_a_reset_shows_the_setpoint_that_the_first_step_is_paid_by() -> None:
     assert reward == pytest.approx(-((tank.read()[0] - setpoint) ** 2))
 
 
-@pytest.mark.parametrize("wrong", [{"a_space": [1, 2]}, {"o_space": {"low": [0.0]}}, {"x0": "cold"}])
-def test_parameters_of_another_form_are_named(wrong: dict[str, object], tmp_path) -> None:
+TANK = {
+    "model": "cstr",
+    "N": 10,
+    "tsim": 3,
+    "SP": {"Ca": [0.85] * 5 + [0.9] * 5},
+    "x0": [0.8, 330, 0.8],
+    "a_space": {"low": [295], "high": [302]},
+    "o_space": {"low": [0.7, 300, 0.8], "high": [1.0, 350, 0.9]},
+}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"a_space": [1, 2]}, r"expected a_space to be low and high as lists .* got \[1, 2\]"),
+        ({"a_space": {"low": [302], "high": [295]}}, "expected low of a_space to be below its high"),
+        ({"o_space": {"low": [0.0]}}, "expected o_space to be low and high"),
+        ({"o_space": {"low": [0.0], "high": [float("inf")]}}, "expected o_space to be .* finite numbers"),
+        ({"o_space": {"low": [0.5], "high": [0.5]}}, "expected low of o_space to be below its high"),
+        ({"x0": "cold"}, 'expected x0 to be a list of finite numbers, got "cold"'),
+        ({"x0": [float("nan")]}, "expected x0 to be a list of finite numbers"),
+        ({"SP": {}}, "expected SP to be an object"),
+        ({"SP": {"Ca": 0.85}}, "expected SP of Ca to be a list of finite numbers, got 0.85"),
+        ({"SP": {"Ca": []}}, "expected SP of Ca to be a list"),
+        ({"SP": {"Ca": ["a"] * 10}}, "expected SP of Ca to be a list"),
+        ({"SP": {"Ca": [[0.8, 0.9]] * 10}}, "expected SP of Ca to be a list"),
+        ({"SP": {"Ca": [0.85] * 9}}, "expected SP of Ca to have a value for each of the N = 10 samples, got 9"),
+        ({"disturbances": {"Ti": [350] * 10}}, "expected disturbance_bounds"),
+        ({"N": 1}, "expected N to be a whole number from 2 to 100,000, got 1"),
+        ({"N": 10.5}, "expected N to be a whole number"),
+        ({"N": "10"}, "expected N to be a whole number"),
+        ({"N": 10**9}, "expected N to be a whole number"),
+        ({"tsim": 0}, "expected tsim to be a positive number, got 0"),
+        ({"model": 5}, "expected model to be the name of a model"),
+    ],
+)
+def test_a_value_of_a_process_that_cannot_be_used_is_named(
+    wrong: dict[str, object], message: str, tmp_path: Path
+) -> None:
     file = tmp_path / "process.json"
-    file.write_text(json.dumps({"x0": [1.0], **wrong}))
-    with pytest.raises(UnknownEnvironment, match="expected x0 as a list of numbers, and low and high of a_space"):
+    file.write_text(json.dumps(TANK | wrong))
+    with pytest.raises(UnknownEnvironment, match=message):
         parameters_of(str(file))
+
+
+@installed("pcgym")
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"model": "nope"}, "expected model to be one of .*cstr.*, got 'nope'"),
+        ({"SP": {"Zz": [0.85] * 10}}, "expected names of SP among Ca, T, got Zz"),
+        ({"x0": [0.8, 330]}, "expected x0 to have 3 values .*states Ca, T, then setpoints of Ca.* got 2"),
+        ({"SP": {"Ca": [0.85] * 10, "T": [330] * 10}}, "expected low and high of o_space to have 4 values"),
+        ({"a_space": {"low": [295, 1], "high": [302, 2]}}, r"expected low and high of a_space to have 1 value \(Tc\)"),
+        ({"constraints": {"T": [327]}}, "pc-gym refused the parameters of pcgym:.*KeyError: 'done_on_cons_vio'"),
+    ],
+)
+def test_a_value_that_does_not_fit_the_model_is_named(wrong: dict[str, object], message: str, tmp_path: Path) -> None:
+    file = tmp_path / "process.json"
+    file.write_text(json.dumps(TANK | wrong))
+    with pytest.raises(UnknownEnvironment, match=message):
+        open_simulator(f"pcgym:{file}")
+
+
+@installed("pcgym")
+@pytest.mark.filterwarnings("ignore")
+def test_setpoints_after_the_last_sample_do_not_count(tmp_path: Path) -> None:
+    file = tmp_path / "process.json"
+    file.write_text(json.dumps(TANK | {"SP": {"Ca": [0.85] * 10 + [7.0]}}))
+    assert open_simulator(f"pcgym:{file}").scheduled == {"Ca_setpoint": (0.85, 0.85)}
 
 
 def test_choices_that_do_not_begin_at_zero_are_refused() -> None:
@@ -119,12 +185,11 @@ def test_choices_that_do_not_begin_at_zero_are_refused() -> None:
 
 def test_parameters_of_a_process_come_from_a_file(tmp_path) -> None:
     file = tmp_path / "tank.json"
-    given = {"model": "cstr", "N": 10, "x0": [0.8, 330, 0.8], "a_space": {"low": [295], "high": [302]}}
-    file.write_text(json.dumps(given))
+    file.write_text(json.dumps(TANK))
     read = parameters_of(str(file))
     assert read["a_space"]["high"].tolist() == [302.0]
     assert read["x0"].tolist() == [0.8, 330.0, 0.8]
-    file.write_text(json.dumps(given | {"noise": True}))
+    file.write_text(json.dumps(TANK | {"noise": True}))
     with pytest.raises(UnknownEnvironment, match="sets noise"):
         parameters_of(str(file))
 

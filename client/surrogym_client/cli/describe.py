@@ -37,11 +37,13 @@ def command(
 
     Example: surrogym describe Swimmer-v5 > env.json
     """
+    from surrogym_client.cli.printing import prints_aside
     from surrogym_client.original.describing import describe
     from surrogym_shared.terminal import say
 
     del as_json  # a specification is JSON in any case
-    description = describe(environment, steps, seed)
+    with prints_aside():
+        description = describe(environment, steps, seed)
     typer.echo(description.text())
     for line in description.words():
         say(line, quiet=quiet)

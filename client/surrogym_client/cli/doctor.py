@@ -67,12 +67,16 @@ def command(
         with service.connect(context) as api:
             yield from findings_of(api)
         if env is not None:
+            from surrogym_client.cli.printing import found_aside, prints_aside
             from surrogym_client.original.loading import isolated
 
             if given is None:
-                given, words = _described(env)
+                with prints_aside():
+                    given, words = _described(env)
                 yield from words
-            yield from environment(partial(isolated, env, step_limit, given), history)
+                if any(word.name == "environment" for word in words):
+                    return
+            yield from found_aside(environment(partial(isolated, env, step_limit, given), history))
 
     found: list[Finding] = []
     for finding in findings():
@@ -87,8 +91,8 @@ def command(
 
 
 def _described(env: str) -> tuple[EnvironmentSpec | None, list[Finding]]:
-    """Draft the specification of an environment that has none, by real steps. None if it has one or can't be opened."""
-    from surrogym_client.diagnosis.doctor import Finding
+    """Draft the specification of an environment that has none, by real steps. None if it has one or fails."""
+    from surrogym_client.diagnosis.doctor import NEEDS, Finding
     from surrogym_client.original.describing import describe
     from surrogym_client.original.errors import OriginalError
     from surrogym_client.original.loading import has_specification
@@ -98,8 +102,8 @@ def _described(env: str) -> tuple[EnvironmentSpec | None, list[Finding]]:
         return None, []
     try:
         found = describe(env)
-    except OriginalError:
-        return None, []  # making it says the same
+    except OriginalError as error:
+        return None, [Finding("environment", str(error), NEEDS)]
     spec, lacking = found.spec, []
     if not found.pays:
         nothing = DeclaredReward(kind="declared", terms=(RewardTerm(weight=0.0, shape="one"),))

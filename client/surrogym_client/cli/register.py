@@ -131,18 +131,21 @@ def command(
 
     Example: surrogym register Pendulum-v1 --name pendulum --budget 30
     """
+    from surrogym_client.cli.printing import prints_aside
     from surrogym_client.original.adapters import open_simulator
     from surrogym_client.original.loading import has_specification
 
     environment, name, spec = _sorted_out(environment, file, env, name, spec)
     given, steps = read_spec(spec), 0
     if given is None and environment is not None and not has_specification(environment):
-        open_simulator(environment).close()  # a name that can't be opened is an error without a server too
+        with prints_aside():
+            open_simulator(environment).close()  # a name that can't be opened is an error without a server too
         if not print_spec:
             with service.connect(context, wait, quiet=output.quiet) as api:
                 _require_free(api, name or default_name(environment))
         given, steps = _described(environment, quiet=output.quiet)
-    chosen = _specification(environment, given, **vars(choices))
+    with prints_aside():
+        chosen = _specification(environment, given, **vars(choices))
     if tolerance:
         chosen = _with_tolerances(chosen, read_tolerances(tolerance))
     if print_spec:
@@ -191,10 +194,12 @@ def _require_free(api: Api, name: str) -> None:
 
 def _described(environment: str, *, quiet: bool) -> tuple[EnvironmentSpec, int]:
     """Draft a specification, and return it with the number of real steps that were taken."""
+    from surrogym_client.cli.printing import prints_aside
     from surrogym_client.original.describing import describe
     from surrogym_shared.terminal import say
 
-    description = describe(environment)
+    with prints_aside():
+        description = describe(environment)
     for line in description.words():
         say(line, quiet=quiet)
     return description.spec, description.steps

@@ -34,6 +34,7 @@ from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.wire import PROTOCOL, StepQuery
 
 ROUND_TRIPS = 20
+NEEDS = "see docs/how-to/own-environment.md for what an environment needs"
 OF_THE_SERVER = {  # registries by the group of their entry points; they exist if a server can run here
     "surrogym.acquisitions": "surrogym_server.sampling.acquisition:ACQUISITIONS",
     "surrogym.models": "surrogym_server.models.registry:MODELS",
@@ -119,7 +120,7 @@ def environment(
                 if history:
                     yield _history_of(original, spec, history)
     except OriginalError as error:
-        yield Finding("environment", str(error), "see docs/how-to/own-environment.md for what an environment needs")
+        yield Finding("environment", str(error), NEEDS)
 
 
 def _access_of(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> Iterator[Finding]:

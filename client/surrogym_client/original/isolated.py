@@ -178,7 +178,11 @@ class _Ending:
 
 
 def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
-    """Main function of the child: one answer (ok, value) for the start, then one for every request."""
+    """Main function of the child: one answer (ok, value) for the start, then one for every request.
+
+    What the environment prints goes to standard error, because the output of a command may be JSON.
+    """
+    sys.stdout = sys.stderr
     for number in PARENTS_BUSINESS:
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_exit_after_parent, args=(step_limit + CLOSE_LIMIT,), daemon=True).start()

@@ -11,10 +11,13 @@ from importlib import import_module
 from pathlib import PurePath
 from typing import NamedTuple
 
-from surrogym_client.original.errors import UnknownEnvironment
+from pydantic import ValidationError
+
+from surrogym_client.original.errors import UnknownEnvironment, sentence
 from surrogym_client.original.simulator import Simulator
 
 GYMNASIUM_ID = re.compile(r"(?:[A-Za-z_][\w.]*:)?[\w./-]+-v\d+")  # package:Id-v0 is Gymnasium's own spelling
+WITH_SPECIFICATION = re.compile(r"exec:.*|[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # a program, or package.module:factory
 
 
 class Adapter(NamedTuple):
@@ -79,16 +82,32 @@ def open_simulator(name: str) -> Simulator:
     """Open the simulator of a name.
 
     Raises:
-        UnknownEnvironment: no adapter knows the name, its package is not installed, or the simulator can't be used.
+        UnknownEnvironment: no adapter knows the name, its package is not installed, or the simulator fails or can't be
+            used.
     """
     adapter = adapter_of(name)
+    if adapter is None and WITH_SPECIFICATION.fullmatch(name):
+        raise UnknownEnvironment(
+            f"{name} is a factory or a program, which gives its own specification: there is nothing to describe. A "
+            "Gymnasium class without one is described by its id: register it with Gymnasium, and give package:Id-v0"
+        )
     if adapter is None:
         raise UnknownEnvironment(
             f"no adapter knows the environment {name!r}: expected a Gymnasium id such as Pendulum-v1, package:Id-v0, "
-            "dm_control:DOMAIN-TASK, pcgym:MODEL, fmu:PLANT.fmu, or package.module:factory"
+            "dm_control:DOMAIN-TASK, pcgym:cstr, pcgym:FILE.json, fmu:PLANT.fmu or fmu:PLANT.json"
         )
     try:
         opened: Simulator = import_module(adapter.module).open_simulator(name)
     except ImportError as error:
         raise UnknownEnvironment(f"{name} can't be made: {error} (pip install 'surrogym[{adapter.extra}]')") from error
+    except UnknownEnvironment:
+        raise
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "its spaces"
+        raise UnknownEnvironment(
+            f"{name} can't be specified: {where}: {first['msg'].removeprefix('Value error, ')}"
+        ) from error
+    except Exception as error:  # an environment raises any kind
+        raise UnknownEnvironment(f"{name} can't be opened: {sentence(error)}") from error
     return opened

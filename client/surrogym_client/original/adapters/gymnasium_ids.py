@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from surrogym_client.original.adapters.parts import OfParts, action_of, flat
-from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.errors import StepFailed, UnknownEnvironment
 from surrogym_client.original.gymnasium import native_action
 from surrogym_client.original.protocol import Array
 from surrogym_client.original.simulator import Simulator, Taken, Variable
@@ -24,6 +24,7 @@ from surrogym_client.original.state_parts import (
 )
 
 SYMBOLS = ("Discrete", "MultiDiscrete", "MultiBinary", "Text", "Graph", "Sequence")  # spaces without numbers
+STEP = ("observation", "reward", "terminated", "truncated", "info")
 
 
 def open_simulator(name: str) -> Simulator:
@@ -89,13 +90,15 @@ class _Gymnasium(Simulator):
         self.time_limit = limit
 
     def reset(self, seed: int | None) -> Array:
-        self._last = flat(self._name, self._env.reset(seed=seed)[0])
+        observation, _ = _entries(self._env.reset(seed=seed), "its reset", ("observation", "info"))
+        self._last = flat(self._name, observation)
         return self._last
 
     def step(self, action: Array) -> Taken:
-        observation, reward, terminated, truncated, _ = self._env.step(native_action(self.action, action))
+        given = self._env.step(native_action(self.action, action))
+        observation, reward, terminated, truncated, _ = _entries(given, "its step", STEP)
         self._last = flat(self._name, observation)
-        return Taken(self._last, float(reward), bool(terminated), bool(truncated))
+        return Taken(self._last, _reward(reward), bool(terminated), bool(truncated))
 
     def close(self) -> None:
         self._env.close()
@@ -147,6 +150,25 @@ class ResetOnly(_Gymnasium):
 
     def observe(self) -> Array:
         return self._last
+
+
+def _entries(given: Any, whose: str, expected: tuple[str, ...]) -> tuple[Any, ...]:
+    """What a reset or a step returned.
+
+    Raises:
+        StepFailed: it is no tuple of as many values as Gymnasium expects.
+    """
+    if isinstance(given, tuple) and len(given) == len(expected):
+        return given
+    came = f"{len(given)} values" if isinstance(given, tuple) else f"a {type(given).__name__}"
+    raise StepFailed(f"expected {whose} to return {len(expected)} values ({', '.join(expected)}), got {came}")
+
+
+def _reward(given: Any) -> float:
+    number = np.asarray(given)
+    if number.size != 1 or number.dtype.kind not in "fiub":
+        raise StepFailed(f"expected its reward to be a number, got {given!r:.60}")
+    return float(number.item())
 
 
 def _mujoco(env: Any) -> list[StatePart]:

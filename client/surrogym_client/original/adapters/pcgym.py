@@ -6,14 +6,14 @@ they keep the values that were set.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from surrogym_client.original.adapters.parts import OfParts, action_of
-from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.adapters.pcgym_file import RANGES, check_model, read_parameters
+from surrogym_client.original.errors import OriginalError, UnknownEnvironment
 from surrogym_client.original.gymnasium import native_action
 from surrogym_client.original.protocol import Array
 from surrogym_client.original.simulator import Simulator, Taken, Variable
@@ -28,7 +28,7 @@ STIRRED_TANK: dict[str, Any] = {  # the quick start of pc-gym 0.1.8
     "o_space": {"low": [0.7, 300.0, 0.8], "high": [1.0, 350.0, 0.9]},
     "x0": [0.8, 330.0, 0.8],
 }
-ARRAYS = ("a_space", "o_space", "disturbance_bounds", "a_space_act")
+SCHEDULES = ("SP", "disturbances")  # of which only the first N values count
 REFUSED = {
     "a_delta": "actions are changes, and their sum is not part of the state",
     "uncertainty_percentages": "its parameters are drawn by a generator that can't be seeded",
@@ -44,16 +44,27 @@ def open_simulator(name: str) -> Simulator:
         ImportError: pc-gym is not installed.
     """
     parameters = parameters_of(name.partition(":")[2])
-    from pcgym import make_env
+    from pcgym import make_env, model_classes
 
+    _require_model(name, parameters["model"], model_classes)
     try:
-        return Process(name, make_env(parameters))
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        env = make_env(parameters)
+        check_model(name, parameters, env.model.info())
+        return Process(name, env)
+    except (ImportError, OriginalError):
+        raise
+    except Exception as error:  # pc-gym raises any kind
         raise UnknownEnvironment(
-            f"pc-gym refuses the parameters of {name}: {type(error).__name__}: {error}; pc-gym's documentation lists "
-            "what "
+            f"pc-gym refused the parameters of {name}: {type(error).__name__}: {error}; its documentation lists what "
             "make_env needs"
         ) from error
+
+
+def _require_model(name: str, model: str, classes: Any) -> None:
+    found = [key for key, value in vars(classes).items() if isinstance(value, type) and hasattr(value, "info")]
+    known = sorted(key for key in found if key.islower())  # make_env knows no others
+    if model not in known:
+        raise UnknownEnvironment(f"{name}: expected model to be one of {', '.join(known)}, got {model!r}")
 
 
 def parameters_of(which: str) -> dict[str, Any]:
@@ -68,16 +79,11 @@ def parameters_of(which: str) -> dict[str, Any]:
             raise UnknownEnvironment(
                 f"pcgym:{which} sets {key}, which is not supported: {why}; remove it from the parameters"
             )
-    try:
-        spaces = {
-            key: {end: np.array(given[key][end], float) for end in ("low", "high")} for key in ARRAYS if key in given
-        }
-        return {**given, **spaces, "x0": np.array(given["x0"], dtype=float)}
-    except (KeyError, TypeError, ValueError) as error:
-        raise UnknownEnvironment(
-            f"pcgym:{which}: expected x0 as a list of numbers, and low and high of {', '.join(ARRAYS)} as such lists, "
-            f"got something else ({type(error).__name__}: {error})"
-        ) from error
+    spaces = {key: {end: np.array(given[key][end], float) for end in ("low", "high")} for key in RANGES if key in given}
+    schedules = {
+        key: {name: values[: given["N"]] for name, values in given[key].items()} for key in SCHEDULES if given.get(key)
+    }
+    return {**given, **spaces, **schedules, "x0": np.array(given["x0"], dtype=float)}
 
 
 def _read(which: str) -> dict[str, Any]:
@@ -86,13 +92,7 @@ def _read(which: str) -> dict[str, Any]:
         raise UnknownEnvironment(
             f"expected pcgym:cstr, or pcgym:FILE.json with what pcgym.make_env takes, got 'pcgym:{which}'"
         )
-    try:
-        given = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise UnknownEnvironment(f"{path} is not JSON: {error}") from error
-    if not isinstance(given, dict) or "x0" not in given:
-        raise UnknownEnvironment(f"{path}: expected an object with model, N, tsim, SP, a_space, o_space and x0")
-    return given
+    return read_parameters(path)
 
 
 class Process(OfParts):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surrogym_client.original.adapters import open_simulator
-from surrogym_client.original.describing.exploring import RESETS, STEPS, Counted, Seen, explore
+from surrogym_client.original.describing.exploring import RESETS, STEPS, Counted, Seen, explore, moved_by
 from surrogym_client.original.describing.expressing import express, names_in, shown_by_itself
 from surrogym_client.original.describing.known_rewards import known_reward
 from surrogym_client.original.describing.probing import EXACT, Probed, probe
@@ -80,10 +80,11 @@ def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
 
     Raises:
         UnknownEnvironment: no adapter knows the name, or no specification can express the environment.
+        StepFailed: the environment failed at a reset or a step, after a number of real steps.
     """
     simulator = open_simulator(name)
     try:
-        counted, rng = Counted(simulator), np.random.default_rng(seed)
+        counted, rng = Counted(simulator, name), np.random.default_rng(seed)
         seen = explore(counted, steps, rng)
         probed = probe(counted, seen, rng) if simulator.settable else Probed(np.inf, 0.0, 0.0)
         drafted = _Draft(name, simulator, seen, probed)
@@ -105,6 +106,8 @@ class _Draft:
         self._all = np.concatenate([seen.starts, seen.states[lived], seen.next_states[lived]])
         if not np.isfinite(self._all).all():
             raise UnknownEnvironment(f"{name} reached states with infinite values or NaN under random actions")
+        if not np.isfinite(seen.rewards[lived]).all():
+            raise UnknownEnvironment(f"{name} paid infinite rewards or NaN under random actions: expected numbers")
         self._kept = self._chosen()
         if len(self._kept) > MAX_DIMENSIONS:
             raise UnknownEnvironment(
@@ -228,7 +231,7 @@ class _Draft:
         unmoved = {f"{name}{VELOCITY}" for name in self._unmoved}
         for i, variable in enumerate(self._simulator.variables):
             repeats = variable.motion == "held" and any(np.allclose(self._all[:, i], self._all[:, k]) for k in kept)
-            moves = np.ptp(self._all[:, i]) > 0 or variable.name in unmoved | set(self._simulator.scheduled)
+            moves = moved_by(self._all[:, i]) > 0 or variable.name in unmoved | set(self._simulator.scheduled)
             if moves and not repeats and variable.name not in self._probed.shifts:
                 kept.append(i)
         return kept
@@ -237,7 +240,7 @@ class _Draft:
     def _unmoved(self) -> list[str]:
         """Joints that no random action moved although they can move: each reset gave them another position."""
         moved = (self._seen.states != self._seen.next_states).any(0)
-        differs = np.ptp(self._seen.starts, axis=0) > 0
+        differs = moved_by(self._seen.starts) > 0
         return [
             v.name
             for v, m, d in zip(self._simulator.variables, moved, differs, strict=True)

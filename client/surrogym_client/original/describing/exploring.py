@@ -5,11 +5,14 @@ Shapes: n steps, R resets, V variables of the state, F action entries, D observa
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_client.original.errors import StepFailed, UnknownEnvironment, sentence
 from surrogym_client.original.protocol import Array
 from surrogym_client.original.simulator import Simulator, Taken
 from surrogym_shared.spec import BoxAction, DiscreteAction
@@ -19,6 +22,7 @@ STEPS = 400
 EPISODES = 4  # that share the steps if none ends early
 RESETS = 32  # for the range of starts
 LONGEST_HOLD = 10  # steps in a row under one action
+ROUNDING = 1e-9  # of a variable's size or of 1: what moves by less than this moves by rounding only
 PLACES_TRIED = 20  # random starts, of which the ones without contacts can be taken
 
 
@@ -56,29 +60,63 @@ class Seen:
 
 
 class Counted:
-    """A simulator whose real steps and resets are counted."""
+    """A simulator whose real steps and resets are counted.
 
-    def __init__(self, simulator: Simulator) -> None:
+    Whatever the simulator raises becomes ``StepFailed``, with the number of real steps before it.
+    """
+
+    def __init__(self, simulator: Simulator, name: str = "the environment") -> None:
         self.simulator = simulator
         self.steps = 0
         self.resets = 0
+        self._name = name
 
     def reset(self, seed: int) -> Array:
         """Begin an episode. Returns the state (V,)."""
         self.resets += 1
-        self.simulator.reset(seed)
-        return self.simulator.read()
+        with self._failures(self.steps):
+            self.simulator.reset(seed)
+            return self._read()
 
     def step(self, action: Array) -> Taken:
         """Take a step."""
         self.steps += 1
-        return self.simulator.step(action)
+        with self._failures(self.steps - 1):
+            return self.simulator.step(action)
+
+    def read(self) -> Array:
+        """The state (V,)."""
+        with self._failures(self.steps):
+            return self._read()
 
     def step_from(self, state: Array, action: Array) -> tuple[Array, Taken]:
         """Set the state (V,) and take a step. Returns the next state and the step's results."""
-        self.simulator.write(state)
+        with self._failures(self.steps):
+            self.simulator.write(state)
         taken = self.step(action)
-        return self.simulator.read(), taken
+        return self.read(), taken
+
+    def _read(self) -> Array:
+        state, expected = self.simulator.read(), len(self.simulator.variables)
+        if len(state) != expected:
+            raise StepFailed(f"expected a state of {expected} numbers, as after its first reset, got {len(state)}")
+        return state
+
+    @contextmanager
+    def _failures(self, steps: int) -> Iterator[None]:
+        try:
+            yield
+        except UnknownEnvironment:
+            raise
+        except Exception as error:  # an environment raises any kind
+            raise StepFailed(f"{self._name} failed after {steps} real steps: {sentence(error)}") from error
+
+
+def moved_by(values: Array) -> Array:
+    """The range of each column (n, ...), and 0 where it is so small that rounding explains it."""
+    ranges = np.ptp(values, axis=0)
+    small: Array = np.where(ranges > ROUNDING * np.maximum(1.0, np.abs(values).max(0)), ranges, 0.0)
+    return small
 
 
 def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
@@ -99,7 +137,7 @@ def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
             state = _far_from(simulator, visited, state, rng)
         for action in _actions(simulator.action, number, min(length, steps - len(rows)), rng):
             taken = counted.step(action)
-            reached = simulator.read()
+            reached = counted.read()
             rows.append((state, action, reached, taken.reward, taken.terminated, taken.observation, number))
             state = reached
             if taken.terminated or taken.truncated or not np.isfinite(reached).all():

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surrogym_client.original.describing.exploring import RESETS, Counted, Seen
+from surrogym_client.original.describing.exploring import RESETS, Counted, Seen, moved_by
 from surrogym_client.original.errors import StepFailed
 from surrogym_client.original.protocol import Array
 
@@ -93,7 +93,7 @@ def probe(counted: Counted, seen: Seen, rng: np.random.Generator) -> Probed:
 
     shifts, turns = set(), set()
     for i, variable in enumerate(simulator.variables):
-        if variable.limited or not np.ptp(seen.next_states[:, i]):
+        if variable.limited or not moved_by(seen.next_states[:, i]):
             continue
         if variable.motion == "slide" and changes_nothing(i, float(rng.uniform(1, FARTHEST)), seen_in_observation=True):
             shifts.add(variable.name)
@@ -136,14 +136,14 @@ def _replayed(counted: Counted, seen: Seen, scale: Array) -> float:
     errors = []
     for i in rows:
         taken = counted.step(seen.actions[i])
-        reached = counted.simulator.read()
+        reached = counted.read()
         errors.append(_error(reached, seen.next_states[i], scale, taken.reward, float(seen.rewards[i])))
     return max(errors)
 
 
 def _scale(seen: Seen) -> Array:
     """Observed range of each variable (V,), followed by that of the reward."""
-    moved = np.append(np.ptp(np.concatenate([seen.states, seen.next_states]), axis=0), np.ptp(seen.rewards))
+    moved = np.append(moved_by(np.concatenate([seen.states, seen.next_states])), np.ptp(seen.rewards))
     return np.where(moved > 0, moved, 1.0)
 
 

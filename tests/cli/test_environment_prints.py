@@ -1,0 +1,73 @@
+"""What an environment prints is not part of a command's output."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+CHATTY = """
+import gymnasium
+import numpy as np
+
+class Chatty(gymnasium.Env):
+    action_space = gymnasium.spaces.Box(-1, 1, (1,))
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        print("a reset")
+        self.state = self.np_random.uniform(-1, 1, 2)
+        return self.state, {}
+
+    def step(self, action):
+        print("a step")
+        self.state = 0.9 * self.state + 0.1 * action[0]
+        return self.state, -float(self.state @ self.state), False, False, {}
+
+gymnasium.register("Chatty-v0", entry_point=Chatty)
+"""
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("describe", "chatty_env:Chatty-v0", "--steps", "40"),
+        ("doctor", "--server", "http://127.0.0.1:9", "--env", "chatty_env:Chatty-v0", "--json"),
+        ("register", "chatty", "--env", "chatty_env:Chatty-v0", "--print-spec"),
+    ],
+)
+def test_output_stays_json_beside_an_environment_that_prints(surrogym, tmp_path, monkeypatch, command) -> None:
+    (tmp_path / "chatty_env.py").write_text(CHATTY)
+    monkeypatch.syspath_prepend(tmp_path)
+    said = surrogym(*command)
+    assert isinstance(said.json, dict), said.out
+    assert "a step" in said.err
+
+
+FACTORY = """
+from surrogym_client.original import RealStep
+from surrogym_client.original.classic import pendulum
+
+class Pendulum:
+    def spec(self):
+        return pendulum().model_copy(update={"environment": "chatty_plant:Pendulum"})
+
+    def step_from(self, coordinates, action):
+        print("a step", flush=True)
+        return RealStep(coordinates, action, coordinates, 0.0)
+
+    def close(self):
+        pass
+"""
+
+
+def test_an_environment_in_a_process_of_its_own_prints_aside_too(tmp_path) -> None:
+    (tmp_path / "chatty_plant.py").write_text(FACTORY)
+    command = [sys.executable, "-m", "surrogym_client", "doctor", "--server", "http://127.0.0.1:9"]
+    said = subprocess.run(
+        [*command, "--env", "chatty_plant:Pendulum"], cwd=tmp_path, capture_output=True, text=True, timeout=60
+    )
+    assert "a step" not in said.stdout
+    assert "a step" in said.stderr

@@ -1,0 +1,133 @@
+"""An environment that fails, or returns something else than Gymnasium expects, is described by one sentence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Discrete, Space
+
+from support.simulators import Register, Spiral
+from surrogym_client.original.adapters import open_simulator
+from surrogym_client.original.describing import describe
+from surrogym_client.original.errors import StepFailed, UnknownEnvironment
+
+STEPS = 60
+
+
+def raises_late(self, action):
+    self.taken = getattr(self, "taken", 0) + 1
+    if self.taken > 50:
+        raise ZeroDivisionError("valve stuck")
+    return Spiral.step(self, action)
+
+
+def grows(self, action):
+    shown, *rest = Spiral.step(self, action)
+    self.state = np.zeros(3)
+    return shown, *rest
+
+
+def paying(reward):
+    def step(self, action):
+        shown, _, *rest = Spiral.step(self, action)
+        return shown, reward, *rest
+
+    return step
+
+
+@pytest.mark.parametrize(
+    ("step", "message"),
+    [
+        (raises_late, r"Fails-v0 failed after 50 real steps: ZeroDivisionError: valve stuck \(test_failing"),
+        (
+            lambda self, action: Spiral.step(self, action)[:4],
+            r"Fails-v0 failed after 0 real steps: expected its step to return 5 values \(observation, .* got 4 values",
+        ),
+        (paying("ten"), "Fails-v0 failed after 0 real steps: expected its reward to be a number, got 'ten'"),
+        (paying(None), "expected its reward to be a number, got None"),
+        (paying(np.ones(2)), "expected its reward to be a number, got array"),
+        (grows, "expected a state of 2 numbers, as after its first reset, got 3"),
+    ],
+)
+def test_a_step_that_fails_is_described_with_the_real_steps_before_it(
+    registered: Register, step: object, message: str
+) -> None:
+    name = registered("Fails-v0", space={"step": step})
+    with pytest.raises(StepFailed, match=message):
+        describe(name, STEPS)
+
+
+def fails_at_once(self, *, seed=None, options=None):
+    raise OSError("no device")
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        ({"reset": fails_at_once}, "Fails-v0 can't be opened: OSError: no device"),
+        ({"reset": lambda self: Spiral.reset(self)}, "Fails-v0 can't be opened: TypeError: .*'seed'"),
+        ({"__init__": lambda _: 1 / 0}, "Fails-v0 can't be opened: ZeroDivisionError"),
+    ],
+)
+def test_an_environment_that_cannot_be_opened_says_why(
+    registered: Register, space: dict[str, object], message: str
+) -> None:
+    with pytest.raises(UnknownEnvironment, match=message):
+        open_simulator(registered("Fails-v0", space=space))
+
+
+def test_a_reset_of_the_old_form_is_not_taken_for_an_observation_and_info(registered: Register) -> None:
+    def reset(self, *, seed=None, options=None):
+        return Spiral.reset(self, seed=seed)[0]  # two numbers, not two values
+
+    message = r"Old-v0 can't be opened: expected its reset to return 2 values \(observation, info\), got a ndarray"
+    with pytest.raises(UnknownEnvironment, match=message):
+        open_simulator(registered("Old-v0", space={"reset": reset}))
+
+
+def test_a_reward_of_one_entry_is_a_number(registered: Register) -> None:
+    simulator = open_simulator(registered("Row-v0", space={"step": paying(np.array([2.0]))}))
+    assert simulator.step(np.zeros(1)).reward == 2.0
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("reward", [float("inf"), float("nan")])
+def test_rewards_that_are_no_numbers_are_refused(registered: Register, reward: float) -> None:
+    with pytest.raises(UnknownEnvironment, match="Fails-v0 paid infinite rewards or NaN"):
+        describe(registered("Fails-v0", space={"step": paying(reward)}), STEPS)
+
+
+def test_a_variable_that_moves_by_rounding_only_is_left_out(registered: Register) -> None:
+    def reset(self, *, seed=None, options=None):
+        Spiral.reset(self, seed=seed)
+        self.state[1] = 300.0
+        return self.state, {}
+
+    def step(self, action):
+        x = self.state[0]
+        self.state = np.array([0.9 * x + 0.1 * action[0], 300.0 + self.np_random.normal() * 1e-13])
+        return self.state, -float(x * x), False, False, {}
+
+    found = describe(registered("Rounds-v0", space={"reset": reset, "step": step}), STEPS)
+    assert found.spec.coordinate_names == ("state0",)
+    assert found.spec.query == "step", "an error of a rounding does not tell of hidden memory"
+
+
+@pytest.mark.parametrize("name", ["own_cart:Cart", "my.plants:make", "exec:./plant"])
+def test_a_factory_is_not_described_and_is_told_why(name: str) -> None:
+    with pytest.raises(UnknownEnvironment, match="gives its own specification: there is nothing to describe"):
+        describe(name, STEPS)
+
+
+@pytest.mark.parametrize("name", ["nowhere", "", ":", "own_cart:", "../x:y"])
+def test_the_forms_of_names_that_can_be_described_are_listed(name: str) -> None:
+    with pytest.raises(UnknownEnvironment, match=r"no adapter knows .* expected a Gymnasium id such as") as refused:
+        describe(name, STEPS)
+    assert "factory" not in str(refused.value), "a factory is no environment to describe"
+
+
+@pytest.mark.parametrize("space", [Box(1, 1, (1,)), Box(-1, 1, (0,)), Box(-1e30, 1e30, (1,), np.float64), Discrete(1)])
+def test_actions_that_no_specification_allows_are_refused_in_one_line(registered: Register, space: Space) -> None:
+    with pytest.raises(UnknownEnvironment, match=r"\AFails-v0 can't be specified: .+\Z") as refused:
+        open_simulator(registered("Fails-v0", space={"action_space": space}))
+    assert "\n" not in str(refused.value)
