@@ -57,7 +57,7 @@ def command(
     """
     from dataclasses import asdict
 
-    from surrogym_client.diagnosis.doctor import environment, installation
+    from surrogym_client.diagnosis.doctor import installation
     from surrogym_client.diagnosis.doctor import service as findings_of
     from surrogym_shared.terminal import give
 
@@ -67,16 +67,7 @@ def command(
         with service.connect(context) as api:
             yield from findings_of(api)
         if env is not None:
-            from surrogym_client.cli.printing import found_aside, prints_aside
-            from surrogym_client.original.loading import isolated
-
-            if given is None:
-                with prints_aside():
-                    given, words = _described(env)
-                yield from words
-                if any(word.name == "environment" for word in words):
-                    return
-            yield from found_aside(environment(partial(isolated, env, step_limit, given), history))
+            yield from _of_environment(env, given, step_limit, history)
 
     found: list[Finding] = []
     for finding in findings():
@@ -88,6 +79,21 @@ def command(
         give({"problems": problems, "findings": [asdict(finding) for finding in found]}, str, as_json=True)
     if problems:
         raise typer.Exit(1)
+
+
+def _of_environment(env: str, given: EnvironmentSpec | None, step_limit: float, history: int) -> Iterator[Finding]:
+    """Check an environment. What it prints goes to standard error."""
+    from surrogym_client.cli.printing import found_aside, prints_aside
+    from surrogym_client.diagnosis.doctor import environment
+    from surrogym_client.original.loading import isolated
+
+    if given is None:
+        with prints_aside():
+            given, words = _described(env)
+        yield from words
+        if any(word.name == "environment" for word in words):
+            return
+    yield from found_aside(environment(partial(isolated, env, step_limit, given), history))
 
 
 def _described(env: str) -> tuple[EnvironmentSpec | None, list[Finding]]:

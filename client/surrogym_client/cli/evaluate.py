@@ -147,11 +147,16 @@ def command(
     summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference)}
     summary |= {"promise_kept": _kept(judged, result), "version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
-    more = [] if found is None else found.in_words(card.spec)
-    if card.promise is not None and settings.declared and result.varied:
-        changed = ", ".join(result.varied)
-        more.append(f"the promise is not judged: it is for episodes without a change of {changed}, which changed here")
+    more = [*(found.in_words(card.spec) if found else []), *_why_not_judged(card, settings, result)]
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
+
+
+def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Evaluation) -> list[str]:
+    """Say which constants changed within an episode; nothing if none did, or if there is no promise for these starts."""
+    if card.promise is None or not (settings.declared and result.varied):
+        return []
+    changed = ", ".join(result.varied)
+    return [f"the promise is not judged: it is for episodes without a change of {changed}, which changed here"]
 
 
 def _judges(episodes: int) -> bool:

@@ -127,11 +127,8 @@ def import_log(
     """
     if (register is not None and to is not None) or (to is not None and spec is not None):
         raise ValueError("expected either register or to, and spec only together with register")
-    if register is not None and not re.match(NAME_PATTERN, register):
-        raise UnusableLog(
-            "expected a name of at most 64 letters, digits, '.', '_' and '-' for the surrogate, with a letter or digit "
-            f"first, got {register!r}"
-        )
+    if register is not None:
+        _require_name(register)
     given = Path(mapping) if isinstance(mapping, str) else mapping
     require_outputs(
         {"the file of rejected rows": None if rejected is None else Path(rejected)},
@@ -150,6 +147,14 @@ def import_log(
         name = register or to or ""
         sent, duplicates = send(api, name, log, lambda share, words: progress(0.3 + 0.7 * share, words))
     return Imported(log, name, sent, duplicates, kept)
+
+
+def _require_name(name: str) -> None:
+    if not re.match(NAME_PATTERN, name):
+        raise UnusableLog(
+            "expected a name of at most 64 letters, digits, '.', '_' and '-' for the surrogate, with a letter or digit "
+            f"first, got {name!r}"
+        )
 
 
 def keep_rejected(path: Path, log: ReadLog, where: str | Path | None = None) -> Path | None:
