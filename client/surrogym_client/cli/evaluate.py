@@ -152,7 +152,7 @@ def command(
 
 
 def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Evaluation) -> list[str]:
-    """Say which constants changed within an episode; nothing if none did, or if there is no promise for these starts."""
+    """Say which constants changed within an episode. Nothing if none did, or without a promise for these starts."""
     if card.promise is None or not (settings.declared and result.varied):
         return []
     changed = ", ".join(result.varied)
