@@ -36,6 +36,10 @@ def test_a_described_environment_is_registered_by_its_file_and_by_its_name(on_se
         "register", "Swimmer-v5", "--spec", str(described), "--name", name, "--budget", "20", "--json"
     )
     assert by_option.json["spec"] == by_file.json["spec"]
+    ledger = on_server("status", name, "--json").json["ledger"]
+    assert ledger["evaluation"] == json.loads(described.read_text())["real_steps"], (
+        "once, though it was registered twice"
+    )
 
 
 def test_registering_by_name_alone_describes_and_enters_the_steps(on_server, name) -> None:

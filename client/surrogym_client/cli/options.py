@@ -210,6 +210,13 @@ def read_spec(path: Path | None) -> EnvironmentSpec | None:
         raise CommandError(f"{path} is not a specification: {error}") from error
 
 
+def described_steps(path: Path | None) -> int:
+    """Return the real steps that ``surrogym describe`` noted in its output; 0 for another specification file."""
+    read = None if path is None else json.loads(path.read_bytes())
+    steps = read.get("real_steps") if isinstance(read, dict) else None
+    return steps if type(steps) is int and steps > 0 else 0
+
+
 def read_tolerances(given: list[str]) -> dict[str, float]:
     """Parse tolerances of the form ``output=number`` into a dictionary.
 

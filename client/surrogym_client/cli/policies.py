@@ -62,10 +62,17 @@ def _row(name: str, policy: PolicyView) -> tuple[str, ...]:
         policy.algorithm or "-",
         "-" if promise is None else f"{promise.low:.4g} to {promise.high:.4g}",
         trusted,
-        "-" if real is None else words_of_mean(real),
+        _real(real),
         "-" if real is None or real.success_rate is None else f"{real.success_rate:.0%}",
         ", ".join(file.form for file in policy.files if file.stored) or "missing",
     )
+
+
+def _real(evaluation: EvaluationView | None) -> str:
+    """Real episodes, and whether the promise is about others."""
+    if evaluation is None:
+        return "-"
+    return words_of_mean(evaluation) + ("" if evaluation.declared else "; the promise is for others")
 
 
 def words_of_mean(evaluation: EvaluationView) -> str:

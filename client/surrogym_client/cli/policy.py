@@ -243,5 +243,5 @@ def _evaluation(one: EvaluationView) -> tuple[str | int, ...]:
     from surrogym_client.cli.policies import words_of_mean
 
     success = "-" if one.success_rate is None else f"{one.success_rate:.0%}"
-    kept = {True: "yes", False: "no", None: "-"}[one.promise_kept]
+    kept = {True: "yes", False: "no", None: "not judged"}[one.promise_kept]
     return one.controller, one.note or "-", one.episodes, words_of_mean(one), success, kept

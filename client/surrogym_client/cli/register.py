@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 import shlex
 from contextlib import suppress
@@ -17,6 +18,7 @@ from surrogym_client.cli.options import (
     SpecFile,
     Tolerances,
     Wait,
+    described_steps,
     read_spec,
     read_tolerances,
 )
@@ -127,7 +129,7 @@ def command(
     """Register an original environment under a name.
 
     Samplers and trainers use this name. If the environment has no built-in specification, the command first drafts one
-    as surrogym describe does, which takes real steps.
+    as surrogym describe does, which takes real steps. The ledger counts them, also those noted in a described file.
 
     Example: surrogym register Pendulum-v1 --name pendulum --budget 30
     """
@@ -136,7 +138,7 @@ def command(
     from surrogym_client.original.loading import has_specification
 
     environment, name, spec = _sorted_out(environment, file, env, name, spec)
-    given, steps = read_spec(spec), 0
+    given, steps = read_spec(spec), described_steps(spec)
     if given is None and environment is not None and not has_specification(environment):
         with prints_aside():
             open_simulator(environment).close()  # a name that can't be opened is an error without a server too
@@ -154,7 +156,8 @@ def command(
     with service.connect(context, wait, quiet=output.quiet) as api:
         view = api.create_surrogate(name or default_name(chosen.environment or environment or ""), chosen)
         if steps:
-            api.report_steps(view.name, steps, note="description")
+            key = None if spec is None else _key(view.name, spec)
+            api.report_steps(view.name, steps, note="description", idempotency_key=key)
     output.give(view.model_dump(mode="json"), lambda: _words(view, environment or ""))
 
 
@@ -173,6 +176,11 @@ def _sorted_out(
     if environment is not None and name is not None:
         raise CommandError(f"expected one name, got {environment!r} and --name {name!r}")
     return env, environment or name, spec
+
+
+def _key(name: str, file: Path) -> str:
+    """Return the key of a described file's steps, so that registering it twice counts them once."""
+    return hashlib.sha256(name.encode() + b"\n" + file.read_bytes()).hexdigest()[:32]
 
 
 def _require_free(api: Api, name: str) -> None:
