@@ -50,7 +50,7 @@ def test_no_promise_of_an_earlier_policy_stays_if_the_policy_is_not_saved(surrog
     """Else a kill between the two files leaves a new policy with an old verdict."""
     out = tmp_path / "policy.zip"
     out.mkdir()
-    out.with_suffix(".json").write_text('{"trusted": true}')
+    out.with_suffix(".json").write_text('{"trusted": true, "virtual_steps": 1}')
     with pytest.raises(OSError):
         train(surrogate, out, TrainSettings(algorithm="CMAES", total_steps=256))
     assert not out.with_suffix(".json").exists()
