@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 LARGEST, NARROWEST = 1e12, 1e-12  # so that squares, products and float32 observations stay finite
 RESOLUTION = 1e-9  # narrowest range relative to the size of its numbers; rounding errors dominate below
@@ -40,3 +40,10 @@ def require_known(where: str, given: Iterable[str], known: Iterable[str]) -> Non
     known = list(known)
     unknown = [name for name in given if name not in known]
     require(not unknown, f"{where} names unknown {unknown}: expected some of {known}")
+
+
+def first_fault(error: ValidationError) -> str:
+    """The first thing that is wrong, with its place."""
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    return f"{where}: {first['msg']}" if where else first["msg"]

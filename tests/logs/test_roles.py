@@ -57,7 +57,7 @@ def test_a_mapping_that_contradicts_itself_is_refused(changes: dict[str, object]
 
 
 def test_the_mapping_of_known_names_is_a_mapping():
-    """A page that sends back the roles that it was told gets the same ones."""
+    """The server tells a page the roles of the columns. The page sends them back, and the roles stay the same."""
     roles = roles_by_name(["x", "next_x", "action_x", "reward", "time"])
     assert roles_by_map(roles.mapping.model_dump(), ["x", "next_x", "action_x", "reward", "time"]) == roles
 

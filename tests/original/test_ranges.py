@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from support.toys import Toy
 from surrogym_client.original.describing.description import FASTER
 from surrogym_client.original.describing.exploring import EPISODES, STEPS, Counted, Seen, explore
-from surrogym_client.original.simulator import Simulator, Taken, Variable
+from surrogym_client.original.simulator import Taken, Variable
 from surrogym_shared.spec import BoxAction
 
 GRAVITY = 20.0  # rad/s^2, of a weightless rod with a mass at its end
@@ -15,7 +16,7 @@ FALLEN = 2 * np.sqrt(GRAVITY)  # rad/s: at the bottom, after a fall from upright
 STEP = 0.02  # s
 
 
-class Pendulum(Simulator):
+class Pendulum(Toy):
     """A pendulum that hangs at ``down`` and is too heavy for its motor. ``touching``: bodies touch away from there."""
 
     def __init__(self, down: float = 0.0, *, touching: bool = False) -> None:
@@ -35,20 +36,8 @@ class Pendulum(Simulator):
         self._state = np.array([angle + STEP * speed, speed])
         return Taken(self._state, 0.0, False, False)
 
-    def read(self) -> np.ndarray:
-        return self._state.copy()
-
-    def write(self, state: np.ndarray) -> None:
-        self._state = state.copy()
-
-    def observe(self) -> np.ndarray:
-        return self._state
-
     def touches(self) -> bool:
         return self._touching and abs(self._state[0] - self._down) > 0.1
-
-    def close(self) -> None:
-        pass
 
 
 def explored(pendulum: Pendulum, seed: int) -> Seen:

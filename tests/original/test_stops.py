@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from support.toys import Toy
 from surrogym_client.original.describing import description
-from surrogym_client.original.simulator import Simulator, Taken, Variable
+from surrogym_client.original.simulator import Taken, Variable
 from surrogym_shared.spec import BoxAction, limits
 
 STEP = 0.01  # s
 
 
-class Cart(Simulator):
+class Cart(Toy):
     """A cart on a rail with stops at -1 and 1 m, which take all of its speed. ``push``: m/s^2 of a whole action."""
 
     def __init__(self, push: float, spread: float) -> None:
@@ -31,18 +32,6 @@ class Cart(Simulator):
         moved = x + STEP * speed
         self._state = np.array([moved, speed]) if abs(moved) < 1 else np.array([np.sign(moved), 0.0])
         return Taken(self._state, -(x**2), False, False)
-
-    def read(self) -> np.ndarray:
-        return self._state.copy()
-
-    def write(self, state: np.ndarray) -> None:
-        self._state = state.copy()
-
-    def observe(self) -> np.ndarray:
-        return self._state
-
-    def close(self) -> None:
-        pass
 
 
 def ranges(monkeypatch: pytest.MonkeyPatch, push: float, spread: float = 0.1) -> dict[str, tuple[float, float]]:

@@ -115,7 +115,7 @@ class IsolatedEnvironment:
         try:
             self._await_start(self._pipe)
         except KeyboardInterrupt:
-            self._kill()  # its first message was not read, so it can't be told to close
+            self._kill()  # nobody read its first message, so ``close`` would read it as an answer
             raise
         return self._pipe
 

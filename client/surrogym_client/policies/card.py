@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError
 
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.policies.evidence import Audit, Promise
+from surrogym_shared.checks import first_fault
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import CurvePoint, SurrogateName
 
@@ -110,10 +111,3 @@ def read_card(policy: Path) -> PolicyCard:
         return PolicyCard.model_validate_json(content)
     except ValidationError as error:
         raise UnusablePolicy(f"{card_path(policy)} is not the card of a policy: {first_fault(error)}") from error
-
-
-def first_fault(error: ValidationError) -> str:
-    """The first thing that is wrong, with its place."""
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    return f"{where}: {first['msg']}" if where else first["msg"]

@@ -13,9 +13,10 @@ from typing import cast, get_args
 from pydantic import TypeAdapter, ValidationError
 
 from surrogym_client.errors import InvalidInput
-from surrogym_client.policies.card import PolicyCard, UnusablePolicy, first_fault, read_card
+from surrogym_client.policies.card import PolicyCard, UnusablePolicy, read_card
 from surrogym_client.transport import Api
 from surrogym_shared import wire
+from surrogym_shared.checks import first_fault
 
 MAX_WAITING_BYTES = 64 * 1024 * 1024
 MAX_VIDEO_BYTES = 32 * 1024 * 1024  # of a file on the server

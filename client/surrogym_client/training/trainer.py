@@ -7,7 +7,7 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-from surrogym_client.policies.card import require_card_or_none
+from surrogym_client.policies.card import card_path, require_card_or_none
 from surrogym_client.training.search import (
     Found,
     Progress,
@@ -53,10 +53,10 @@ def train(
     started = time.perf_counter()
     found = search.search(task)
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.with_suffix(".json").unlink(missing_ok=True)  # no promise of an earlier policy stands beside this one
+    card_path(out).unlink(missing_ok=True)  # no promise of an earlier policy stands beside this one
     found.policy.save(out)
     result = _result(found, settings, out, time.perf_counter() - started)
-    out.with_suffix(".json").write_text(json.dumps(asdict(result), indent=2, default=str) + "\n")
+    card_path(out).write_text(json.dumps(asdict(result), indent=2, default=str) + "\n")
     if not found.whole:
         raise TrainingInterrupted(result)
     return result

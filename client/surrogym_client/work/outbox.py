@@ -12,10 +12,11 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from surrogym_client.errors import LeaseExpired, ServerUnreachable, SurrogymClientError, Unavailable
-from surrogym_client.policies.card import UnusablePolicy, first_fault
+from surrogym_client.policies.card import UnusablePolicy
 from surrogym_client.policies.pushing import push
 from surrogym_client.transport.api import Api
 from surrogym_shared import wire
+from surrogym_shared.checks import first_fault
 
 ENDING = ".waiting.json"
 REFUSED = ".refused.json"

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from surrogym_shared.checks import first_fault
 from surrogym_shared.logs.columns import Roles
 from surrogym_shared.logs.drafting import Draft, draft, wrapped
 from surrogym_shared.logs.errors import UnusableLog
@@ -100,9 +101,7 @@ def draft_log(table: Table, roles: Roles, name: str, budget: int = 0) -> ReadLog
     try:
         drafted: Draft = draft(roles, steps, name, budget)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise UnusableLog(f"the drafted specification is not valid: {where}: {first['msg']}") from error
+        raise UnusableLog(f"the drafted specification is not valid: {first_fault(error)}") from error
     return ReadLog(table, roles, _shaped(drafted.spec, roles, steps), drafted.spec, drafted.notes)
 
 
