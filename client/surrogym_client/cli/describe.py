@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from surrogym_client.cli.groups import add
-from surrogym_client.cli.options import AsJson, Quiet
+from surrogym_client.cli.options import Quiet
 
 
 def register(app: typer.Typer) -> None:
@@ -27,7 +27,7 @@ def command(
         int, typer.Option(min=20, help="Real steps to take in random episodes. Some more real steps check the result.")
     ] = 400,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random actions.")] = 0,
-    as_json: AsJson = False,
+    as_json: Annotated[bool, typer.Option("--json", help="No effect: the output is always JSON.")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Draft an environment's specification from random steps.

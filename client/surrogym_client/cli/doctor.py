@@ -10,6 +10,7 @@ import typer
 
 from surrogym_client.cli.groups import Output, Service, add
 from surrogym_client.cli.options import (
+    NAMES,
     SpecFile,
     StepLimit,
     read_spec,
@@ -30,7 +31,8 @@ def command(
     env: Annotated[
         str | None,
         typer.Option(
-            help="Also check this environment, by some real steps. Takes the same names as surrogym register."
+            help=f"Also check this environment, by 14 real steps at most: {NAMES}. Without --spec, one that has no "
+            "specification of its own is described first, by 400 real steps or more."
         ),
     ] = None,
     spec: SpecFile = None,

@@ -13,7 +13,7 @@ from surrogym_client.cli.beside import Beside
 from surrogym_client.cli.disagreement import Differences
 from surrogym_client.cli.filming import film
 from surrogym_client.cli.groups import Output, PolicyReading, Service, add
-from surrogym_client.cli.options import SpecFile, read_spec
+from surrogym_client.cli.options import NAMES, SpecFile, read_spec
 from surrogym_client.cli.pushing import push_or_say
 
 if TYPE_CHECKING:
@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 Environment = Annotated[
     str | None,
     typer.Option(
-        help="Gymnasium id or package.module:factory. [default: the environment that the policy was trained for]"
+        help=f"Environment to evaluate in: {NAMES}. [default: the one that the policy was trained for, if its name can "
+        "run no file of yours]"
     ),
 ]
 Ledger = Annotated[

@@ -20,6 +20,10 @@ SHOWN = (
     "warning: --token shows the token in the list of processes; SURROGYM_TOKEN, --token-file or SURROGYM_TOKEN_FILE "
     "keep it out of there"
 )
+NAMES = (  # of environments, in the help of every command that opens one
+    "a Gymnasium id, package:Id-v0, dm_control:DOMAIN-TASK, pcgym:MODEL, pcgym:FILE.json, fmu:PLANT.fmu or "
+    "package.module:factory"
+)
 QUICK = 1.0  # seconds a person waits for a server that is not there
 
 
@@ -73,7 +77,8 @@ ExitWithParent = Annotated[
     bool, typer.Option("--exit-with-parent", hidden=True, help="End when the process that started this one ends.")
 ]
 SpecFile = Annotated[
-    Path | None, typer.Option("--spec", help="JSON file with a specification. It replaces the environment's own.")
+    Path | None,
+    typer.Option("--spec", help="JSON file with a specification. It replaces the environment's own, or a log's draft."),
 ]
 Tolerances = Annotated[
     list[str] | None,

@@ -14,6 +14,7 @@ import typer
 
 from surrogym_client.cli.groups import Output, Service, add
 from surrogym_client.cli.options import (
+    NAMES,
     Preset,
     SpecFile,
     Tolerances,
@@ -104,8 +105,7 @@ def command(
     environment: Annotated[
         str | None,
         typer.Argument(
-            help="Environment: a Gymnasium id, dm_control:DOMAIN-TASK, pcgym:MODEL, fmu:PLANT.fmu, or your own "
-            "package.module:factory. With --env or FILE, this argument is the surrogate's name instead."
+            help=f"Environment: {NAMES}. With --env or FILE, this argument is the surrogate's name instead."
         ),
     ] = None,
     file: Annotated[
@@ -120,7 +120,11 @@ def command(
     choices: DesignChoices,
     tolerance: Tolerances = None,
     print_spec: Annotated[
-        bool, typer.Option("--print-spec", help="Print the specification, and register nothing.")
+        bool,
+        typer.Option(
+            "--print-spec",
+            help="Print the specification, and register nothing. If it has to be drafted, this takes real steps.",
+        ),
     ] = False,
     wait: Wait = 0.0,
     service: Service,

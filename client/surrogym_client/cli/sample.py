@@ -14,6 +14,7 @@ import typer
 
 from surrogym_client.cli.groups import Output, Service, add
 from surrogym_client.cli.options import (
+    NAMES,
     ExitWithParent,
     SpecFile,
     StepLimit,
@@ -37,8 +38,8 @@ if TYPE_CHECKING:
 Environment = Annotated[
     str | None,
     typer.Option(
-        help="Environment to take real steps in: a Gymnasium id, package.module:factory or fmu:PLANT.fmu. [default: "
-        "the surrogate's]"
+        help=f"Environment to take real steps in: {NAMES}. [default: the surrogate's, if its name can run no file of "
+        "yours]"
     ),
 ]
 Command = Annotated[

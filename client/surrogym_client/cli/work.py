@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from surrogym_client.cli.groups import Output, Service, add
-from surrogym_client.cli.options import ExitWithParent, SpecFile, Surrogate, Wait, awaited_surrogate, read_spec
+from surrogym_client.cli.options import NAMES, ExitWithParent, SpecFile, Surrogate, Wait, awaited_surrogate, read_spec
 
 if TYPE_CHECKING:
     from surrogym_client.work.reporter import Stand
@@ -40,8 +40,8 @@ def command(
     env: Annotated[
         str | None,
         typer.Option(
-            help="Environment to evaluate in: a Gymnasium id or package.module:factory. [default: the surrogate's, if "
-            "it is Gymnasium's own; otherwise the worker only trains]"
+            help=f"Environment to evaluate in: {NAMES}. [default: the surrogate's, if its name can run no file of "
+            "yours; otherwise the worker only trains]"
         ),
     ] = None,
     spec: SpecFile = None,
