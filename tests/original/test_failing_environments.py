@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete, Space
@@ -19,6 +21,13 @@ def raises_late(self, action):
     if self.taken > 50:
         raise ZeroDivisionError("valve stuck")
     return Spiral.step(self, action)
+
+
+def exits_late(self, action):
+    try:
+        return raises_late(self, action)
+    except ZeroDivisionError:
+        sys.exit("the licence has expired")
 
 
 def grows(self, action):
@@ -39,6 +48,10 @@ def paying(reward):
     ("step", "message"),
     [
         (raises_late, r"Fails-v0 failed after 50 real steps: ZeroDivisionError: valve stuck \(test_failing"),
+        (
+            exits_late,
+            r"Fails-v0 failed after 50 real steps: SystemExit: the licence has expired \(test_failing",
+        ),
         (
             lambda self, action: Spiral.step(self, action)[:4],
             r"Fails-v0 failed after 0 real steps: expected its step to return 5 values \(observation, .* got 4 values",
@@ -67,6 +80,8 @@ def fails_at_once(self, *, seed=None, options=None):
         ({"reset": fails_at_once}, "Fails-v0 can't be opened: OSError: no device"),
         ({"reset": lambda self: Spiral.reset(self)}, "Fails-v0 can't be opened: TypeError: .*'seed'"),
         ({"__init__": lambda _: 1 / 0}, "Fails-v0 can't be opened: ZeroDivisionError"),
+        ({"__init__": lambda _: sys.exit(3)}, r"Fails-v0 can't be opened: SystemExit: 3 \(test_failing"),
+        ({"reset": lambda _, **__: sys.exit()}, r"Fails-v0 can't be opened: SystemExit \(test_failing"),
     ],
 )
 def test_an_environment_that_cannot_be_opened_says_why(
@@ -74,6 +89,33 @@ def test_an_environment_that_cannot_be_opened_says_why(
 ) -> None:
     with pytest.raises(UnknownEnvironment, match=message):
         open_simulator(registered("Fails-v0", space=space))
+
+
+def shown_once(self):
+    """An observation that can be read in the episodes, and not where the state was set without a step."""
+    if not self.stepped:
+        raise OSError("no picture")
+    return np.zeros(2)
+
+
+def test_what_fails_between_the_steps_says_how_many_there_were(registered: Register) -> None:
+    """The observation of a state that was set was read outside of all counts: it ended in a traceback."""
+    name = registered("Fails-v0", space={"_get_obs": shown_once, "stepped": False})
+    with pytest.raises(StepFailed, match=r"Fails-v0 failed after \d+ real steps: OSError: no picture") as failed:
+        describe(name, STEPS)
+    assert int(str(failed.value).split()[3]) > STEPS
+
+
+def test_a_description_survives_an_environment_that_can_not_be_closed(registered: Register) -> None:
+    """Its real steps were taken, and nobody could use them."""
+    found = describe(registered("Fails-v0", space={"close": lambda _: sys.exit(4)}), STEPS)
+    assert found.found[-1].startswith("Fails-v0 could not be closed: SystemExit: 4 (test_failing")
+    assert found.steps >= STEPS
+
+
+def test_a_refusal_says_how_many_real_steps_it_took(registered: Register) -> None:
+    with pytest.raises(UnknownEnvironment, match=f"infinite rewards or NaN .*; this took {STEPS} real steps"):
+        describe(registered("Fails-v0", space={"step": paying(float("inf"))}), STEPS)
 
 
 def test_a_reset_of_the_old_form_is_not_taken_for_an_observation_and_info(registered: Register) -> None:
@@ -90,7 +132,6 @@ def test_a_reward_of_one_entry_is_a_number(registered: Register) -> None:
     assert simulator.step(np.zeros(1)).reward == 2.0
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("reward", [float("inf"), float("nan")])
 def test_rewards_that_are_no_numbers_are_refused(registered: Register, reward: float) -> None:
     with pytest.raises(UnknownEnvironment, match="Fails-v0 paid infinite rewards or NaN"):

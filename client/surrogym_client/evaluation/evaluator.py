@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.episodes import Episode, Moment, draw
-from surrogym_client.original.errors import EvaluationFailed, PolicyMisfit
+from surrogym_client.original.errors import RAISED, EvaluationFailed, PolicyMisfit
 from surrogym_client.original.protocol import LONGEST_EPISODE
 from surrogym_client.policies.predict import Acting, PerEpisode
 from surrogym_client.runtime.lifetime import signals_between_steps
@@ -156,8 +156,8 @@ def evaluate(
             return run.on(_open(open_episode, run.settings, instances), heed)
     except KeyboardInterrupt:
         raise EvaluationInterrupted(run.begun) from None
-    except Exception as error:
-        if run.begun == 0:
+    except RAISED as error:
+        if run.begun == 0 and not isinstance(error, SystemExit):
             raise
         raise EvaluationFailed(run.begun, error) from error
 

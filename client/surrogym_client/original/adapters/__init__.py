@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from pydantic import ValidationError
 
-from surrogym_client.original.errors import UnknownEnvironment, sentence
+from surrogym_client.original.errors import RAISED, UnknownEnvironment, sentence
 from surrogym_client.original.simulator import Simulator
 
 GYMNASIUM_ID = re.compile(r"(?:[A-Za-z_][\w.]*:)?[\w./-]+-v\d+")  # package:Id-v0 is Gymnasium's own spelling
@@ -108,6 +108,6 @@ def open_simulator(name: str) -> Simulator:
         raise UnknownEnvironment(
             f"{name} can't be specified: {where}: {first['msg'].removeprefix('Value error, ')}"
         ) from error
-    except Exception as error:  # an environment raises any kind
+    except RAISED as error:
         raise UnknownEnvironment(f"{name} can't be opened: {sentence(error)}") from error
     return opened

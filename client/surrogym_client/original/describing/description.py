@@ -5,18 +5,19 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from surrogym_client.original.adapters import open_simulator
-from surrogym_client.original.describing.exploring import RESETS, STEPS, Counted, Seen, explore, moved_by
+from surrogym_client.original.describing.counting import Counted
+from surrogym_client.original.describing.exploring import RESETS, STEPS, Seen, explore, moved_by
 from surrogym_client.original.describing.expressing import express, names_in, shown_by_itself
 from surrogym_client.original.describing.known_rewards import known_reward
 from surrogym_client.original.describing.probing import EXACT, Probed, probe
 from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.protocol import Array
-from surrogym_client.original.simulator import Simulator, Variable
+from surrogym_client.original.simulator import Variable
 from surrogym_client.original.state_parts import VELOCITY
 from surrogym_shared.spec import (
     MAX_DIMENSIONS,
@@ -82,32 +83,48 @@ def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
         UnknownEnvironment: no adapter knows the name, or no specification can express the environment.
         StepFailed: the environment failed at a reset or a step, after a number of real steps.
     """
-    simulator = open_simulator(name)
+    counted = Counted(open_simulator(name), name)
     try:
-        counted, rng = Counted(simulator, name), np.random.default_rng(seed)
-        seen = explore(counted, steps, rng)
-        probed = probe(counted, seen, rng) if simulator.settable else Probed(np.inf, 0.0, 0.0)
-        drafted = _Draft(name, simulator, seen, probed)
-        spec = drafted.spec(rng)
-        if (reward := drafted.known_reward(counted, spec, rng)) is not None:
-            spec = spec.model_copy(update={"reward": reward})
-        found, asked = drafted.found(spec, steps), drafted.asked(spec)
-        return Description(spec, found, asked, counted.steps, counted.resets, simulator.pays)
+        described = _described(name, counted, steps, np.random.default_rng(seed))
+    except UnknownEnvironment as error:
+        took = f"; this took {counted.steps} real steps" if counted.steps else ""
+        raise UnknownEnvironment(f"{error}{took}") from error
     finally:
-        simulator.close()
+        failed = counted.close()
+    return replace(described, found=(*described.found, *failed))
+
+
+def _described(name: str, counted: Counted, steps: int, rng: np.random.Generator) -> Description:
+    """Describe an open environment. Arguments and errors as ``describe``."""
+    simulator = counted.simulator
+    seen = explore(counted, steps, rng)
+    _require_numbers(name, seen)
+    probed = probe(counted, seen, rng) if simulator.settable else Probed(np.inf, 0.0, 0.0)
+    drafted = _Draft(name, counted, seen, probed)
+    spec = drafted.spec(rng)
+    if (reward := drafted.known_reward(spec, rng)) is not None:
+        spec = spec.model_copy(update={"reward": reward})
+    found, asked = drafted.found(spec, steps), drafted.asked(spec)
+    return Description(spec, found, asked, counted.steps, counted.resets, simulator.pays)
+
+
+def _require_numbers(name: str, seen: Seen) -> None:
+    """Raise ``UnknownEnvironment`` if states or rewards are infinite or NaN."""
+    lived = ~seen.ended_at_once
+    if not all(np.isfinite(states).all() for states in (seen.starts, seen.states[lived], seen.next_states[lived])):
+        raise UnknownEnvironment(f"{name} reached states with infinite values or NaN under random actions")
+    if not np.isfinite(seen.rewards[lived]).all():
+        raise UnknownEnvironment(f"{name} paid infinite rewards or NaN under random actions: expected numbers")
 
 
 class _Draft:
     """The specification of one simulator."""
 
-    def __init__(self, name: str, simulator: Simulator, seen: Seen, probed: Probed) -> None:
-        self._name, self._simulator, self._seen, self._probed = name, simulator, seen, probed
+    def __init__(self, name: str, counted: Counted, seen: Seen, probed: Probed) -> None:
+        self._name, self._counted, self._seen, self._probed = name, counted, seen, probed
+        self._simulator = counted.simulator
         lived = ~seen.ended_at_once
         self._all = np.concatenate([seen.starts, seen.states[lived], seen.next_states[lived]])
-        if not np.isfinite(self._all).all():
-            raise UnknownEnvironment(f"{name} reached states with infinite values or NaN under random actions")
-        if not np.isfinite(seen.rewards[lived]).all():
-            raise UnknownEnvironment(f"{name} paid infinite rewards or NaN under random actions: expected numbers")
         self._kept = self._chosen()
         if len(self._kept) > MAX_DIMENSIONS:
             raise UnknownEnvironment(
@@ -133,10 +150,10 @@ class _Draft:
         observation = self._observation(frame, variables, rng)
         return EnvironmentSpec.model_validate({**frame.model_dump(), "observation": observation})
 
-    def known_reward(self, counted: Counted, spec: EnvironmentSpec, rng: np.random.Generator) -> DeclaredReward | None:
+    def known_reward(self, spec: EnvironmentSpec, rng: np.random.Generator) -> DeclaredReward | None:
         """A reward that can be declared, or None."""
         usable = self._simulator.pays and self._probed.settable and not self._probed.noisy
-        return known_reward(counted, self._seen, self._kept, spec, rng) if usable else None
+        return known_reward(self._counted, self._seen, self._kept, spec, rng) if usable else None
 
     def found(self, spec: EnvironmentSpec, steps: int) -> tuple[str, ...]:
         """Findings, one sentence each."""
@@ -336,16 +353,16 @@ class _Draft:
 
     def _observed(self, frame: EnvironmentSpec, rng: np.random.Generator) -> tuple[Array, Array]:
         """Coordinates (n, C) and the simulator's observations there (n, D)."""
-        simulator = self._simulator
-        if not (simulator.shows and self._probed.settable):
+        counted = self._counted
+        if not (self._simulator.shows and self._probed.settable):
             return self._seen.next_states[:, self._kept], self._seen.observations
         ranges = np.array([limits(c.sampling) for c in frame.coordinates])
         places = rng.uniform(ranges[:, 0], ranges[:, 1], (PLACES, len(ranges)))
         observed = []
         for place in places:
-            simulator.place(self._kept, place)
-            place[:] = simulator.read()[self._kept]
-            observed.append(simulator.observe())
+            counted.place(self._kept, place)
+            place[:] = counted.read()[self._kept]
+            observed.append(counted.observe())
         return places, np.stack(observed)
 
 
