@@ -167,8 +167,61 @@ def test_the_forms_of_names_that_can_be_described_are_listed(name: str) -> None:
     assert "factory" not in str(refused.value), "a factory is no environment to describe"
 
 
-@pytest.mark.parametrize("space", [Box(1, 1, (1,)), Box(-1, 1, (0,)), Box(-1e30, 1e30, (1,), np.float64), Discrete(1)])
+@pytest.mark.parametrize("space", [Box(1, 1, (1,)), Box(-1e30, 1e30, (1,), np.float64), Discrete(1)])
 def test_actions_that_no_specification_allows_are_refused_in_one_line(registered: Register, space: Space) -> None:
     with pytest.raises(UnknownEnvironment, match=r"\AFails-v0 can't be specified: .+\Z") as refused:
         open_simulator(registered("Fails-v0", space={"action_space": space}))
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("size", [0, 65, 500])
+def test_an_action_of_no_entries_or_too_many_is_refused_with_a_way_out(registered: Register, size: int) -> None:
+    """The words were Python's: Tuple should have at least 1 item after validation, not 0."""
+    message = f"Fails-v0 has an action of {size} entries: expected 1 to 64; write a wrapper class"
+    with pytest.raises(UnknownEnvironment, match=message):
+        open_simulator(registered("Fails-v0", space={"action_space": Box(-1, 1, (size,))}))
+
+
+def sized(size):
+    """Methods of an environment whose state has this many numbers."""
+
+    def reset(self, *, seed=None, options=None):
+        Spiral.reset(self, seed=seed)
+        self.state = self.np_random.uniform(-1, 1, size)
+        return self.state, {}
+
+    def step(self, action):
+        self.taken = getattr(self, "taken", 0) + 1
+        self.state = 0.9 * self.state
+        return self.state, 0.0, False, False, {}
+
+    return {"reset": reset, "step": step, "observation_space": Box(-1, 1, (size,))}
+
+
+@pytest.mark.parametrize(
+    ("size", "message"),
+    [
+        (0, "Fails-v0 shows no state and observes nothing: expected a state of 1 to 64 numbers; declare them in a"),
+        (65, "Fails-v0 has 65 variables that move: expected at most 64; choose those .* in a class of your own"),
+        (5_000, "Fails-v0 has 5000 variables that move: expected at most 64"),
+    ],
+)
+def test_a_state_of_no_numbers_or_too_many_is_refused_before_any_real_step(
+    registered: Register, size: int, message: str
+) -> None:
+    """An empty one was refused in words of Python, and a large one after 400 real steps."""
+    with pytest.raises(UnknownEnvironment, match=message) as refused:
+        describe(registered("Fails-v0", space=sized(size)), STEPS)
+    assert "real steps" not in str(refused.value)
+
+
+def test_an_environment_in_which_nothing_moves_is_refused_with_a_way_out(registered: Register) -> None:
+    def reset(self, *, seed=None, options=None):
+        Spiral.reset(self, seed=seed)
+        self.state = np.ones(2)
+        return self.state, {}
+
+    space = {"reset": reset, "step": lambda self, _: (self.state, 0.0, False, False, {})}
+    message = rf"no variable of Fails-v0 differed between resets or moved in {STEPS} random steps: .* \(--steps\), or"
+    with pytest.raises(UnknownEnvironment, match=message):
+        describe(registered("Fails-v0", space=space), STEPS)

@@ -24,7 +24,7 @@ class Counted:
         self.simulator = simulator
         self.steps = 0
         self.resets = 0
-        self._name = name
+        self.name = name
 
     def reset(self, seed: int) -> Array:
         """Begin an episode. Returns the state (V,)."""
@@ -75,7 +75,7 @@ class Counted:
         try:
             self.simulator.close()
         except RAISED as error:
-            return (f"{self._name} could not be closed: {sentence(error)}",)
+            return (f"{self.name} could not be closed: {sentence(error)}",)
         return ()
 
     def _read(self) -> Array:
@@ -91,4 +91,4 @@ class Counted:
         except UnknownEnvironment:
             raise
         except RAISED as error:
-            raise StepFailed(f"{self._name} failed after {steps} real steps: {sentence(error)}") from error
+            raise StepFailed(f"{self.name} failed after {steps} real steps: {sentence(error)}") from error

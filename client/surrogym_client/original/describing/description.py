@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from pydantic import ValidationError
 
 from surrogym_client.original.adapters import open_simulator
 from surrogym_client.original.describing.counting import Counted
@@ -15,12 +16,13 @@ from surrogym_client.original.describing.exploring import RESETS, STEPS, Seen, e
 from surrogym_client.original.describing.expressing import express, names_in, shown_by_itself
 from surrogym_client.original.describing.known_rewards import known_reward
 from surrogym_client.original.describing.probing import EXACT, Probed, probe
+from surrogym_client.original.describing.usable import require_coordinates, require_numbers
 from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.protocol import Array
 from surrogym_client.original.simulator import Variable
 from surrogym_client.original.state_parts import VELOCITY
+from surrogym_shared.checks import first_fault
 from surrogym_shared.spec import (
-    MAX_DIMENSIONS,
     Coordinate,
     DeclaredReward,
     EnvironmentSpec,
@@ -86,9 +88,10 @@ def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
     counted = Counted(open_simulator(name), name)
     try:
         described = _described(name, counted, steps, np.random.default_rng(seed))
-    except UnknownEnvironment as error:
+    except (UnknownEnvironment, ValidationError) as error:
+        said = f"{name} can't be specified: {first_fault(error)}" if isinstance(error, ValidationError) else str(error)
         took = f"; this took {counted.steps} real steps" if counted.steps else ""
-        raise UnknownEnvironment(f"{error}{took}") from error
+        raise UnknownEnvironment(f"{said}{took}") from error
     finally:
         failed = counted.close()
     return replace(described, found=(*described.found, *failed))
@@ -98,7 +101,8 @@ def _described(name: str, counted: Counted, steps: int, rng: np.random.Generator
     """Describe an open environment. Arguments and errors as ``describe``."""
     simulator = counted.simulator
     seen = explore(counted, steps, rng)
-    _require_numbers(name, seen)
+    lived = ~seen.ended_at_once
+    require_numbers(name, (seen.starts, seen.states[lived], seen.next_states[lived]), seen.rewards[lived])
     probed = probe(counted, seen, rng) if simulator.settable else Probed(np.inf, 0.0, 0.0)
     drafted = _Draft(name, counted, seen, probed)
     spec = drafted.spec(rng)
@@ -106,15 +110,6 @@ def _described(name: str, counted: Counted, steps: int, rng: np.random.Generator
         spec = spec.model_copy(update={"reward": reward})
     found, asked = drafted.found(spec, steps), drafted.asked(spec)
     return Description(spec, found, asked, counted.steps, counted.resets, simulator.pays)
-
-
-def _require_numbers(name: str, seen: Seen) -> None:
-    """Raise ``UnknownEnvironment`` if states or rewards are infinite or NaN."""
-    lived = ~seen.ended_at_once
-    if not all(np.isfinite(states).all() for states in (seen.starts, seen.states[lived], seen.next_states[lived])):
-        raise UnknownEnvironment(f"{name} reached states with infinite values or NaN under random actions")
-    if not np.isfinite(seen.rewards[lived]).all():
-        raise UnknownEnvironment(f"{name} paid infinite rewards or NaN under random actions: expected numbers")
 
 
 class _Draft:
@@ -126,10 +121,7 @@ class _Draft:
         lived = ~seen.ended_at_once
         self._all = np.concatenate([seen.starts, seen.states[lived], seen.next_states[lived]])
         self._kept = self._chosen()
-        if len(self._kept) > MAX_DIMENSIONS:
-            raise UnknownEnvironment(
-                f"{name} has {len(self._kept)} moving variables: expected at most {MAX_DIMENSIONS}"
-            )
+        require_coordinates(name, len(self._kept), len(seen.rewards))
 
     def spec(self, rng: np.random.Generator) -> EnvironmentSpec:
         """The specification, with the observation in terms of the coordinates."""
