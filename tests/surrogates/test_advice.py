@@ -215,9 +215,10 @@ def test_a_running_or_ready_design_gets_no_advice(phase: str) -> None:
 
 def test_waiting_asks_for_a_sampler_only_if_none_runs() -> None:
     idle = view(output("x", 0.7))
-    assert words_of_waiting(idle).startswith("waiting for a sampler (surrogym sample rig): 0 of 40 real steps")
+    start = "surrogym sample rig --env rig:Rig"
+    assert words_of_waiting(idle, start).startswith(f"waiting for a sampler ({start}): 0 of 40 real steps")
     running = idle.model_copy(update={"samplers": ["beside"]})
-    assert words_of_waiting(running).startswith("waiting for the sampler's answers: 0 of 40 real steps")
+    assert words_of_waiting(running, start).startswith("waiting for the sampler's answers: 0 of 40 real steps")
 
 
 def test_an_uncertain_end_names_index_and_target() -> None:

@@ -251,10 +251,12 @@ def _with_tolerances(spec: EnvironmentSpec, tolerances: dict[str, float]) -> Env
 
 
 def _words(view: SurrogateView, environment: str) -> str:
-    from surrogym_client.original.loading import is_known
+    from surrogym_client.original.loading import is_known, sample_command
 
-    own = f" --env {shlex.quote(environment)}" if environment and not is_known(environment) else ""
+    start = sample_command(view.name, view.environment)
+    if environment:  # its name was typed here
+        start = f"surrogym sample {view.name}" + ("" if is_known(environment) else f" --env {shlex.quote(environment)}")
     return (
         f"{view.name}: {view.environment or 'own environment'}, {len(view.spec.coordinates)} coordinates, "
-        f"budget of {view.budget} real steps, target {view.target:g}; next: surrogym sample {view.name}{own}"
+        f"budget of {view.budget} real steps, target {view.target:g}; next: {start}"
     )

@@ -125,6 +125,11 @@ def env_option(name: str) -> str:
     return f" --env {shlex.quote(name) if opens else PLACEHOLDER}"
 
 
+def sample_command(surrogate: str, environment: str) -> str:
+    """Return the command that starts a sampler of a surrogate, whose environment has this name."""
+    return f"surrogym sample {surrogate}{env_option(environment)}"
+
+
 def has_specification(name: str) -> bool:
     """Whether an environment has its own specification, built in or from its class."""
     return name in TASKS or name in SPECIFICATIONS or adapter_of(name) is None

@@ -30,9 +30,10 @@ def words_of_design(view: SurrogateView) -> str:
     return f"{taken}, {logged}{fidelity}" if view.budget else f"{logged}{fidelity}"
 
 
-def words_of_waiting(view: SurrogateView) -> str:
-    """Describe for what a training waits: for a sampler to be started, or for the answers of one that runs."""
-    awaited = "the sampler's answers" if view.samplers else f"a sampler (surrogym sample {view.name})"
+def words_of_waiting(view: SurrogateView, start: str) -> str:
+    """Describe for what a training waits: for a sampler to be started by the command ``start``, or for the answers of
+    one that runs."""
+    awaited = "the sampler's answers" if view.samplers else f"a sampler ({start})"
     return f"waiting for {awaited}: {words_of_design(view)}"
 
 
