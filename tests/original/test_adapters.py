@@ -93,8 +93,8 @@ def test_a_package_that_is_missing_is_named_with_its_extra(name: str, package: s
 
 
 @installed("pcgym")
-@pytest.mark.filterwarnings("ignore")
 def test_a_reset_shows_the_setpoint_that_the_first_step_is_paid_by() -> None:
+    """Neither opens, resets nor steps with a warning, which would be an error here."""
     tank = open_simulator("pcgym:cstr")
     setpoint = tank.reset(0)[2]
     reward = tank.step(np.zeros(1)).reward
@@ -148,7 +148,6 @@ def test_a_value_of_a_process_that_cannot_be_used_is_named(
 
 
 @installed("pcgym")
-@pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -168,7 +167,6 @@ def test_a_value_that_does_not_fit_the_model_is_named(wrong: dict[str, object], 
 
 
 @installed("pcgym")
-@pytest.mark.filterwarnings("ignore")
 def test_setpoints_after_the_last_sample_do_not_count(tmp_path: Path) -> None:
     file = tmp_path / "process.json"
     file.write_text(json.dumps(TANK | {"SP": {"Ca": [0.85] * 10 + [7.0]}}))

@@ -96,7 +96,6 @@ def test_terminating_steps_make_termination_learned_and_a_question() -> None:
 
 
 @installed("pcgym")
-@pytest.mark.filterwarnings("ignore")
 def test_a_setpoint_is_constant_over_its_whole_range() -> None:
     spec = describe("pcgym:cstr", STEPS).spec
     setpoint = spec.coordinates[2]
@@ -104,7 +103,6 @@ def test_a_setpoint_is_constant_over_its_whole_range() -> None:
 
 
 @installed("pcgym")
-@pytest.mark.filterwarnings("ignore")
 def test_virtual_episodes_begin_with_the_setpoints_of_the_schedule() -> None:
     found = describe("pcgym:cstr", STEPS)
     assert limits(found.spec.start["Ca_setpoint"]) == (0.85, 0.9), "others can't all be reached, and would cost much"
