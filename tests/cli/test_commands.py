@@ -218,6 +218,22 @@ def test_a_policy_of_bins_pushes_ones_own_machine_as_its_surrogate_was_pushed(su
         assert set(diary.read_text().splitlines()) == {"open", "reset 10000", "step -0.5", "close"}
 
 
+def test_equal_episodes_are_told_as_such(surrogym, monkeypatch, tmp_path):
+    """A hundred equal episodes of a deterministic plant looked like a hundred that agree."""
+    (tmp_path / "policy.zip").write_bytes(b"")
+    (tmp_path / "policy.json").write_text(PolicyCard().model_dump_json())
+    monkeypatch.setattr("surrogym_client.policies.files.load_policy", lambda *_, **__: lambda o: np.ones((len(o), 1)))
+    said = surrogym("evaluate", "policy.zip", "--env", "support.moody:Alike", "--episodes", "4")
+    assert said.code == 0, said.err
+    assert said.out.splitlines()[-1] == (
+        "all 4 episodes are equal in every number: nothing in them was random, so fewer episodes show the same return, "
+        "with 5 real steps each"
+    )
+    assert "the first 3 of 4 episodes are equal in every number" in said.err
+    several = surrogym("evaluate", "policy.zip", "--env", "support.moody:Line", "--episodes", "4")
+    assert "equal" not in several.out + several.err
+
+
 def _look_at(on_server, pendulum, tmp_path):
     """The policy that the server keeps, by its commands."""
     assert "production leads to version 1" in on_server("policy", "alias", f"{pendulum}@1", "production").out
