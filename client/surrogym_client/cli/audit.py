@@ -50,6 +50,7 @@ def command(
     """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.policies.card import read_card, write_card
+    from surrogym_client.surrogates.waiting import words_of_audit
     from surrogym_client.training.handover import AuditSettings, Subject, hand_over
     from surrogym_client.training.words import words_of_handover
     from surrogym_client.transport import HttpSurrogate
@@ -72,7 +73,8 @@ def command(
         session = _session(card, view)
         floor = _floor(port, seed, session) if card.untrained is None else card.untrained
         subject = Subject(api, name, port, predict, session, floor, seed)
-        found = hand_over(subject, asked, lambda view: update(None, f"{view.ledger.audit} real steps of audits"))
+        update(None, "computing the promise")
+        found = hand_over(subject, asked, lambda view: update(None, words_of_audit(view)))
     if found.audit is None:
         raise CommandError(_not_made(view, found.reason))
     noted = card.model_copy(update={"surrogate": name, "spec": card.spec or view.spec, **vars(found)})
