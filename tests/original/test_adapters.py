@@ -6,6 +6,7 @@ The adapters of packages run where those are installed: make test-all has an env
 from __future__ import annotations
 
 import json
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -231,3 +232,13 @@ def test_a_state_that_can_not_be_read_leaves_only_resets(registered: Register) -
 def test_spaces_that_no_specification_can_express_are_refused(registered: Register, space, message: str) -> None:
     with pytest.raises(UnknownEnvironment, match=message):
         open_simulator(registered("Odd-v0", space=space))
+
+
+def test_an_id_of_a_module_in_the_working_directory_is_opened(tmp_path, monkeypatch) -> None:
+    """A factory there was found, and the id of a class in the same file was not."""
+    lines = ["import gymnasium", "from support.simulators import Spiral", "gymnasium.register('Here-v0', Spiral)"]
+    (tmp_path / "plant_here.py").write_text("\n".join(lines))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    open_simulator("plant_here:Here-v0").close()
+    gymnasium.registry.pop("Here-v0")
