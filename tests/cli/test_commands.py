@@ -226,8 +226,8 @@ def test_equal_episodes_are_told_as_such(surrogym, monkeypatch, tmp_path):
     said = surrogym("evaluate", "policy.zip", "--env", "support.moody:Alike", "--episodes", "4")
     assert said.code == 0, said.err
     assert said.out.splitlines()[-1] == (
-        "all 4 episodes are equal in every number: nothing in them was random, so fewer episodes show the same return, "
-        "with 5 real steps each"
+        "all 4 episodes are equal in every number: nothing in them was random, so each shows the same return, with 5 "
+        "real steps"
     )
     assert "the first 3 of 4 episodes are equal in every number" in said.err
     several = surrogym("evaluate", "policy.zip", "--env", "support.moody:Line", "--episodes", "4")

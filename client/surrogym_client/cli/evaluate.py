@@ -167,8 +167,8 @@ def _repeated(result: Evaluation) -> list[str]:
     if len(result.returns) < FEW_EQUAL or not result.equal:
         return []
     return [
-        f"all {len(result.returns)} episodes are equal in every number: nothing in them was random, so fewer episodes "
-        f"show the same return, with {result.lengths[0]} real steps each"
+        f"all {len(result.returns)} episodes are equal in every number: nothing in them was random, so each shows the "
+        f"same return, with {result.lengths[0]} real steps"
     ]
 
 

@@ -306,7 +306,7 @@ class _Run:
         if all(_is_equal(first, tally.trace) for tally in over[1:]):
             remark(
                 f"the first {len(over)} of {self.settings.episodes} episodes are equal in every number: if nothing is "
-                "random, fewer (--episodes) show the same return"
+                "random, all will be; --episodes takes fewer"
             )
 
     def _tell(self) -> None:
