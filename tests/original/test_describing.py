@@ -146,3 +146,12 @@ def test_the_file_says_what_was_found_and_holds_the_specification(registered: Re
     assert read["real_steps"] == found.steps
     assert read["asked"] == list(found.asked)
     assert EnvironmentSpec.model_validate_json(json.dumps(read["specification"])) == found.spec
+
+
+def test_an_observation_of_too_many_entries_is_replaced_by_the_coordinates(registered: Register) -> None:
+    """It was refused after all real steps: a specification has at most 64 entries."""
+    weights = np.random.default_rng(0).normal(size=(200, 2))
+    space = {"_get_obs": lambda self: weights @ self.state}
+    found = describe(registered("Spiral-v0", space=space), 60)
+    assert found.spec.observation_names == ("state0", "state1")
+    assert "the observation has 200 entries, more than 64: the policy observes the coordinates instead" in found.found

@@ -15,14 +15,16 @@ from surrogym_client.original.describing.counting import Counted
 from surrogym_client.original.describing.exploring import RESETS, STEPS, Seen, explore, moved_by
 from surrogym_client.original.describing.expressing import express, names_in, shown_by_itself
 from surrogym_client.original.describing.known_rewards import known_reward
-from surrogym_client.original.describing.probing import EXACT, Probed, probe
+from surrogym_client.original.describing.probing import Probed, probe
 from surrogym_client.original.describing.usable import require_coordinates, require_numbers
+from surrogym_client.original.describing.words import listed, words_of_access, words_of_reward
 from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.protocol import Array
 from surrogym_client.original.simulator import Variable
 from surrogym_client.original.state_parts import VELOCITY
 from surrogym_shared.checks import first_fault
 from surrogym_shared.spec import (
+    MAX_DIMENSIONS,
     Coordinate,
     DeclaredReward,
     EnvironmentSpec,
@@ -154,29 +156,36 @@ class _Draft:
         kinds = {kind: [c.name for c in spec.coordinates if c.kind == kind] for kind in ("angle", "constant")}
         lines = [
             f"{len(kept)} coordinates describe the state; {steps} random steps and {RESETS} resets showed their ranges",
-            _words_of_access(probed, self._simulator.fixed),
+            words_of_access(probed, self._simulator.fixed),
             *self._simulator.notes,
         ]
         if probed.shifts:
-            lines.append(f"a shift of {_listed(sorted(probed.shifts))} changes nothing, so it is left out")
+            lines.append(f"a shift of {listed(sorted(probed.shifts))} changes nothing, so it is left out")
         if kinds["angle"]:
             lines.append(
-                f"a whole turn of {_listed(kinds['angle'])} changes nothing, so it is observed as cosine and sine"
+                f"a whole turn of {listed(kinds['angle'])} changes nothing, so it is observed as cosine and sine"
             )
         if drawn := [name for name in kinds["constant"] if name not in self._simulator.scheduled]:
-            lines.append(f"{_listed(drawn)}: constant within an episode, and drawn again at each reset")
+            lines.append(f"{listed(drawn)}: constant within an episode, and drawn again at each reset")
         if not probed.stays:
             lines.append(
                 f"{probed.leaving:.0%} of the steps from random states within the declared limits led far outside: the "
                 "sampling ranges are those that random actions reached, with a margin"
             )
         if isinstance(spec.reward, DeclaredReward):
-            lines.append(f"{_words_of(spec.reward)} explains every reward, so it is declared: no query is spent on it")
-        if still:
-            lines.append(f"left out, because it never moved or repeats another variable: {_listed(still)}")
-        if self._left_out:
             lines.append(
-                f"entries {_listed([str(i) for i in self._left_out])} of the environment's observation are not sums "
+                f"{words_of_reward(spec.reward)} explains every reward, so it is declared: no query is spent on it"
+            )
+        if still:
+            lines.append(f"left out, because it never moved or repeats another variable: {listed(still)}")
+        if self._too_many:
+            lines.append(
+                f"the observation has {self._too_many} entries, more than {MAX_DIMENSIONS}: the policy observes the "
+                "coordinates instead"
+            )
+        elif self._left_out:
+            lines.append(
+                f"entries {listed([str(i) for i in self._left_out])} of the environment's observation are not sums "
                 "of 1, q, sin(q) and cos(q): the policy observes the coordinates instead"
             )
         return tuple(lines)
@@ -191,13 +200,13 @@ class _Draft:
         ended, lines = int(self._seen.terminated.sum()), list[str]()
         if guessed:
             lines.append(
-                f"sampling range of {_listed(guessed)}: does it cover the states that a good policy visits? It covers "
+                f"sampling range of {listed(guessed)}: does it cover the states that a good policy visits? It covers "
                 "what random actions "
                 f"reached, and {FASTER:g} times that for speeds; the design never queries outside it"
             )
         if self._unmoved:
             lines.append(
-                f"{_listed(self._unmoved)}: no random action moved it. If nothing can, declare it constant and leave "
+                f"{listed(self._unmoved)}: no random action moved it. If nothing can, declare it constant and leave "
                 "its velocity out; otherwise give the range of its velocity"
             )
         if ended:
@@ -208,7 +217,7 @@ class _Draft:
             )
         else:
             lines.append("termination: no step ended an episode. If some states should end it, declare them")
-        if scheduled := _listed([name for name in spec.coordinate_names if name in self._simulator.scheduled]):
+        if scheduled := listed([name for name in spec.coordinate_names if name in self._simulator.scheduled]):
             lines.append(
                 f"start of {scheduled}: a schedule sets it in an original episode. A virtual episode keeps one value, "
                 "drawn from those of the schedule. Widen the start if a policy should follow other values"
@@ -341,6 +350,9 @@ class _Draft:
         for name in frame.coordinate_names:
             if name in raw or name not in {n for entry in shown.values() for n in names_in(entry.term)}:
                 shown |= {entry.name: entry for entry in shown_by_itself(name, angle=name in angles)}
+        self._too_many = len(shown) if len(shown) > MAX_DIMENSIONS else 0
+        if self._too_many:
+            return [entry for name in frame.coordinate_names for entry in shown_by_itself(name, angle=name in angles)]
         return list(shown.values())
 
     def _observed(self, frame: EnvironmentSpec, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -361,31 +373,3 @@ class _Draft:
 def _raw(term: Term) -> set[str]:
     """The coordinates that a term reads directly. Such a term jumps where an angle wraps."""
     return {name for part in term.parts if part.function == "linear" for name in part.weights}
-
-
-def _words_of(reward: DeclaredReward) -> str:
-    bonus = reward.terms[0]
-    if bonus.when:
-        return "a threshold of a quantity of the state"
-    return (
-        "an ellipsoid of quantities of the state"
-        if bonus.shape == "ball"
-        else "a quadratic function of coordinates and actions"
-    )
-
-
-def _words_of_access(probed: Probed, fixed: str) -> str:
-    if not np.isfinite(probed.set_error):
-        return fixed
-    if not probed.settable:
-        return (
-            f"a step from a set state differs from the same step within an episode by {probed.set_error:.2g} of "
-            "its range: the environment has memory that can't be set, so it can only be reset"
-        )
-    noise = f"; two steps from one state differ by {probed.repeat_error:.2g}" if probed.noisy else ""
-    same = "that of an episode" if probed.set_error <= EXACT else f"that of an episode within {probed.set_error:.2g}"
-    return f"it can be set to any state: a step from there is {same}{noise}"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names)
