@@ -113,6 +113,21 @@ def test_a_description_survives_an_environment_that_can_not_be_closed(registered
     assert found.steps >= STEPS
 
 
+def test_starts_that_are_no_numbers_are_refused_before_any_real_step(registered: Register) -> None:
+    """Nor do they raise a warning of NumPy, which is an error here."""
+    resets = iter(range(1_000))
+
+    def reset(self, *, seed=None, options=None):
+        Spiral.reset(self, seed=seed)
+        if next(resets) > 5:  # the first ones open it
+            self.state = np.full(2, np.inf)
+        return self.state, {}
+
+    with pytest.raises(UnknownEnvironment, match="reached states with infinite values or NaN") as refused:
+        describe(registered("Fails-v0", space={"reset": reset}), STEPS)
+    assert "real steps" not in str(refused.value)
+
+
 def test_a_refusal_says_how_many_real_steps_it_took(registered: Register) -> None:
     with pytest.raises(UnknownEnvironment, match=f"infinite rewards or NaN .*; this took {STEPS} real steps"):
         describe(registered("Fails-v0", space={"step": paying(float("inf"))}), STEPS)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.original.describing.counting import Counted
-from surrogym_client.original.describing.usable import require_few, require_variables
+from surrogym_client.original.describing.usable import require_few, require_numbers, require_variables
 from surrogym_client.original.protocol import Array
 from surrogym_shared.spec import BoxAction, DiscreteAction
 from surrogym_shared.spec.actions import Action
@@ -74,6 +74,7 @@ def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
     simulator = counted.simulator
     require_variables(counted.name, simulator.variables)
     starts = np.stack([counted.reset(seed) for seed in range(RESETS)])
+    require_numbers(counted.name, (starts,), np.zeros(0))
     require_few(counted.name, simulator.variables, moved_by(starts) > 0)
     rows: list[tuple[Array, Array, Array, float, bool, Array, int]] = []
     length, number = max(1, -(-steps // EPISODES)), 0

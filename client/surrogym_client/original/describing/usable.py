@@ -39,7 +39,7 @@ def require_few(name: str, variables: Sequence[Variable], moved: NDArray[np.bool
 def require_numbers(name: str, states: Sequence[Array], rewards: Array) -> None:
     """Raise ``UnknownEnvironment`` if states, each (n, V), or rewards (n,) are infinite or NaN."""
     if not all(np.isfinite(some).all() for some in states):
-        raise UnknownEnvironment(f"{name} reached states with infinite values or NaN under random actions")
+        raise UnknownEnvironment(f"{name} reached states with infinite values or NaN: expected finite numbers")
     if not np.isfinite(rewards).all():
         raise UnknownEnvironment(f"{name} paid infinite rewards or NaN under random actions: expected numbers")
 
