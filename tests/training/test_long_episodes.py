@@ -11,10 +11,14 @@ from torch import Tensor
 
 from support.models import learn
 from support.plane import Pay, drifting, plane
+from surrogym_client.environments.lanes import Lanes
 from surrogym_client.training import TrainSettings, train
+from surrogym_client.training.fast_ppo import search as searches
 from surrogym_client.training.fast_ppo.learner import Learner, restored
 from surrogym_client.training.fast_ppo.long_episodes import LONG, MORE, NOISE, SHORTER, SIGHT, with_short_episodes
+from surrogym_client.training.fast_ppo.rollouts import Collector
 from surrogym_client.training.fast_ppo.search import units_of
+from surrogym_client.training.proportions import suggested_gamma
 from surrogym_client.training.search import SearchTask
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
@@ -102,3 +106,30 @@ def test_the_settings_of_the_policy_name_starts_and_episodes(tmp_path: Path):
     settings = TrainSettings(total_steps=2 * ROLLOUT * 8, num_envs=8, hyperparameters=small)
     result = train(task().port, tmp_path / "policy.zip", settings)
     assert (result.settings["start_box"], result.settings["time_limit"]) == (1.0, LIMIT // SHORTER)
+
+
+@pytest.mark.parametrize(("chosen", "discounts"), [({}, 2), ({"gamma": 0.9}, 1)], ids=["nobody", "the user"])
+def test_a_second_network_looks_further_if_nobody_chose_the_discount(
+    chosen, discounts: int, tmp_path: Path, monkeypatch
+):
+    """The discount of short episodes serves some tasks, and that of whole episodes others. The better one stays."""
+    seen: list[float] = []
+
+    class Watched(Collector):
+        def __init__(self, lanes: Lanes, gamma: float, gae_lambda: float, seed: int) -> None:
+            seen.append(gamma)
+            super().__init__(lanes, gamma, gae_lambda, seed)
+
+    monkeypatch.setattr(searches, "Collector", Watched)
+    given = task()
+    small = {"n_steps": ROLLOUT, "batch_size": 64, "n_epochs": 1, **chosen}
+    steps = 2 * ROLLOUT * 8
+    settings = TrainSettings(total_steps=steps, num_envs=8, hyperparameters=small, prolong=True)
+    progress: list[int] = []
+    result = train(given.port, tmp_path / "policy.zip", settings, lambda now: progress.append(now.steps))
+    whole, short = suggested_gamma(given.port.spec()), 1 - 1 / (SIGHT * LIMIT / SHORTER)
+    assert seen == ([short, whole] if discounts == 2 else [0.9])
+    assert result.settings["gamma"] in seen
+    assert progress == sorted(progress)
+    assert result.virtual_steps == progress[-1]
+    assert result.networks == 1, "no network was abandoned"

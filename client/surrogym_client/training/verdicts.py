@@ -69,7 +69,7 @@ class Verdicts:
         self.latest: float | None = None
         self.best: float | None = None
         self.given_up = False
-        self.networks = 1  # networks so far
+        self.networks = 1  # networks so far, of which all but the last were abandoned
 
     @property
     def steps(self) -> int:
@@ -117,9 +117,13 @@ class Verdicts:
     def begin(self) -> None:
         """Record that a network begins to learn: the first one, another one, or the same one again."""
         if self.given_up:
-            self._spent, self._now = self.steps, 0
-            self.given_up, self._rollouts = False, 0
+            self.restart()
             self.networks += 1
+
+    def restart(self) -> None:
+        """Record that a new network begins to learn."""
+        self._spent, self._now = self.steps, 0
+        self.given_up, self._rollouts = False, 0
 
     def saw(self, earned: Iterable[float]) -> None:
         """Record the returns of training episodes."""

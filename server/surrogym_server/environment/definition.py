@@ -264,13 +264,13 @@ class EnvironmentDefinition:
         """Saturation bounds, (C,) each. A side without a bound has one ``REACH`` widths of the sampling range beyond
         that range, so that a diverging model stays finite."""
         low, high = self.bounds
-        begin, end = self._sampled
+        begin, end = self.sampled
         room = REACH * (end - begin)
         return torch.maximum(low, begin - room), torch.minimum(high, end + room)
 
     def in_range(self, q: Tensor) -> Tensor:
         """Whether states q (..., C) lie in the sampling range, (...) bool."""
-        low, high = self._sampled
+        low, high = self.sampled
         inside: Tensor = ((q >= low) & (q <= high)).all(-1)
         return inside
 
@@ -300,7 +300,7 @@ class EnvironmentDefinition:
         return torch.tensor(self.starts, dtype=torch.float64, device=self.device).reshape(-1, len(self.coordinates))
 
     @cached
-    def _sampled(self) -> tuple[Tensor, Tensor]:
+    def sampled(self) -> tuple[Tensor, Tensor]:
         """Ends of the sampling range, (C,) each."""
         low, high = self._columns([(c.sampling.low, c.sampling.high) for c in self.coordinates])
         return low, high

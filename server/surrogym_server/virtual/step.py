@@ -53,8 +53,6 @@ def step(
 def _array_steps(model: DynamicsModel, settings: VirtualSettings) -> ArraySteps | None:
     if not settings.compiled:
         return None
-    if model.definition.outside_reward is not None:  # only the reference knows the outside reward
-        return None
     if settings.variant != "pathwise":
         able = offers(model, CompiledSteps)
         return None if able is None else able.compiled()

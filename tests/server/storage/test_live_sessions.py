@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 import pytest
+import sqlalchemy as sa
 
 from surrogym_server.errors import IdempotencyConflict, Unavailable, UnknownSession, UnknownSurrogate
 from surrogym_server.storage.live_sessions import Checkpoint, NewLiveSession, SessionLease, TakenSession
 from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import database
+from surrogym_server.storage.sql.tables import live_sessions
 
 LONG, SHORT, DAY = 60.0, 0.05, 86_400.0
 Until = Callable[[Callable[[], bool]], None]
@@ -77,6 +81,32 @@ def test_a_lease_that_its_owner_does_not_name_ends(storage: Storage, add) -> Non
     ids = [f"id'{number}" for number in range(70_000)]  # more than a statement may have parameters
     assert storage.live_sessions.renew("a", ids, LONG) == frozenset()
     assert seconds_left(storage, "s") <= SHORT
+
+
+@pytest.mark.parametrize("url", [pytest.param("postgresql", marks=pytest.mark.postgresql)], indirect=True)
+def test_an_owner_that_stops_within_a_transaction_locks_its_session_for_some_seconds_only(
+    url: str, storage: Storage, add, until: Until, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stopped process, or a paused machine, does not end its transaction. Nobody else could ever take the session."""
+    monkeypatch.setattr(database, "STALLED_SECONDS", 1)
+    lease, stopped = add(seconds=SHORT), database.connect(url)
+    until(lambda: seconds_left(storage, "s") < 0)
+
+    def is_taken() -> bool:
+        with suppress(Unavailable):
+            return storage.live_sessions.take("s", "b", LONG).lease.owner == "b"
+        return False
+
+    def write_late() -> None:
+        with stopped.write() as connection:
+            connection.execute(sa.update(live_sessions).where(live_sessions.c.id == lease.id).values(seq=5))
+            until(is_taken)
+            connection.execute(sa.select(live_sessions.c.id))
+
+    with pytest.raises(Unavailable, match="the database can't be used now"):
+        write_late()
+    stopped.close()
+    assert storage.live_sessions.take("s", "b", LONG).checkpoint == Checkpoint(0, b"opened")
 
 
 def test_a_released_session_is_free_at_once(storage: Storage, add) -> None:

@@ -182,15 +182,22 @@ def test_deviations_of_many_points_are_left_to_torch(monkeypatch):
     assert in_fastest_form(VirtualSettings(LANES), model).compiled == compiled.available()
 
 
-def test_a_log_model_steps_by_torch_for_the_outside_reward():
+@needs_numba
+@pytest.mark.parametrize("choice", ["mean", "penalty, same step", "drawn functions", "noise, trust, box"])
+@pytest.mark.parametrize("time_limit", [None, 3])
+def test_the_outside_reward_of_compiled_steps_is_that_of_torch(choice, time_limit):
+    """Lanes leave the sampling range, or what is trusted, in this step or in a later one."""
     slow = pendulum().model_dump() | {"outside_reward": -7.0}
     slow["coordinates"][1]["sampling"] = {"kind": "uniform", "low": -1.0, "high": 1.0}
-    spec = EnvironmentSpec.model_validate(slow)
+    spec, rng = EnvironmentSpec.model_validate(slow), np.random.default_rng(0)
     model = gaussian_processes(definition_from_spec(spec), random_steps(spec, 20, seed=0))
-    assert not in_fastest_form(VirtualSettings(LANES), model).compiled
-    settings = VirtualSettings(LANES, compiled=True, time_limit=10)
+    settings = compiled_settings(model, **CHOICES[choice] | {"time_limit": time_limit, "autoreset_mode": "same_step"})
     lanes, _ = reset(model.definition, settings, create(model.definition, settings, 0))
-    fast = replace(lanes, q=torch.tensor([0.0, 6.0], dtype=torch.float64).repeat(LANES, 1))
-    _, transition = step(model, settings, fast, np.zeros((LANES, 1)))
-    assert transition.terminated.all()
-    np.testing.assert_array_equal(transition.reward, -70.0)
+    fast = torch.tensor([[0.0, 6.0], [0.1, 0.2]], dtype=torch.float64).repeat(LANES, 1)[:LANES]
+    left, lanes = 0, replace(lanes, q=fast)
+    for _ in range(STEPS):
+        u = actions(model, rng)
+        made = step(model, settings, lanes, u, deviations=True)
+        require_agreement(made, step(model, replace(settings, compiled=False), lanes, u, deviations=True))
+        left, lanes = left + int(made[1].left.sum()), made[0]
+    assert left >= 4

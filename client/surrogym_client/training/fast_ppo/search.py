@@ -61,6 +61,7 @@ RANGES = {  # whole numbers have whole bounds
 
 HELD = 16  # steps that share the noise of the second network
 
+SECOND_SEED = 3_000_017  # difference between the noise seeds of the two trainings with short episodes
 FINE_SEED = 2_000_003  # difference between the noise seeds of the fine-tuning and of the training before
 FINE = 0.1  # learning rate of the fine-tuning, as a share of the one before
 LOOKS = 1 / 8  # largest share of the fine-tuning that only collects observations
@@ -111,8 +112,9 @@ class FastPpo(PolicySearch):
         with threadpool_limits(limits=task.settings.threads):
             cut = with_short_episodes(task, self.n_steps)
             fine = _from_declared_starts(task) if task.prolong and cut is task else None
+            further = task.prolong and cut is not task and self.gamma is None
             with _lanes(cut) as lanes:
-                return _Training(self, cut, lanes, fine).run()
+                return _Training(self, cut, lanes, fine, further=further).run()
 
     def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:
         if not Network.is_at(policy):
@@ -123,8 +125,11 @@ class FastPpo(PolicySearch):
 class _Training:
     """Networks of one training, and the checks that compare them."""
 
-    def __init__(self, search: FastPpo, task: SearchTask, lanes: Lanes, fine: SearchTask | None) -> None:
+    def __init__(
+        self, search: FastPpo, task: SearchTask, lanes: Lanes, fine: SearchTask | None, *, further: bool
+    ) -> None:
         self._search, self._task, self._fine, self._spec = search, task, fine, task.port.spec()
+        self._further = further
         settings = task.settings
         suggested = suggested_gamma(self._spec) if task.gamma is None else task.gamma
         self._gamma = suggested if search.gamma is None else search.gamma
@@ -157,6 +162,9 @@ class _Training:
                     self._learn(learner, verdicts.left, hold)
                 if self._fine is not None and not verdicts.saturated:
                     self._fine_tune(learner, self._fine)
+                if self._further and not verdicts.saturated:
+                    learner = self._made()
+                    self._look_further(learner)
                 break
             else:
                 return self._by_reference()  # a network is only abandoned if steps are left
@@ -244,6 +252,23 @@ class _Training:
                     self._update(learner, rows, FINE * rate * max(1 - number / rollouts, LAST_RATE))
                     learner.limit_noise(noise, 1 - (1 - QUIET) * number / rollouts)
         self._check(learner)
+
+    def _look_further(self, learner: Learner) -> None:
+        """Train a new network with the discount of whole episodes, after one with that of short episodes.
+
+        Only the imagined returns tell which of the two serves a task. ``with_short_episodes`` says why.
+        """
+        verdicts, search = self._verdicts, self._search
+        kept, gamma = self._kept, self._gamma
+        self._gamma = suggested_gamma(self._spec)
+        self._collector = Collector(self._lanes, self._gamma, search.gae_lambda, self._task.settings.seed + SECOND_SEED)
+        verdicts.extend()
+        verdicts.restart()
+        try:
+            self._learn(learner, verdicts.left, 1)
+        finally:
+            if self._kept is kept:
+                self._gamma = gamma
 
     def _collect(self, learner: Learner, steps: int, hold: int = 1) -> Rollout:
         """Collect the rollout with which the present network will have taken ``steps``, and check it if that is due."""

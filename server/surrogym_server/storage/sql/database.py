@@ -28,11 +28,11 @@ from surrogym_server.storage.sql.filelock import FileLock
 from surrogym_server.storage.sql.write_ahead_log import marks
 
 BUSY_SECONDS = 5  # wait of a statement for locks of other programs or threads
+STALLED_SECONDS = 10  # PostgreSQL ends a transaction whose process has stopped, and its locks with it
 POOL = {"pool_size": 8, "max_overflow": 56, "pool_timeout": BUSY_SECONDS}
 POSTGRESQL = {  # text is UTF-8 whatever the database's encoding; if that is SQL_ASCII, psycopg would return bytes
     "client_encoding": "utf8",
     "connect_timeout": BUSY_SECONDS,
-    "options": f"-c lock_timeout={BUSY_SECONDS}s",
 }
 
 CLOCKS = {
@@ -248,7 +248,8 @@ def _begin_sqlite(connection: Connection) -> None:
 
 def _postgresql(url: URL) -> Database:
     driven = url.set(drivername="postgresql+psycopg")
-    unsaid = {name: value for name, value in POSTGRESQL.items() if name not in url.query}
+    limits = f"-c lock_timeout={BUSY_SECONDS}s -c idle_in_transaction_session_timeout={STALLED_SECONDS}s"
+    unsaid = {name: value for name, value in {**POSTGRESQL, "options": limits}.items() if name not in url.query}
     engine = sa.create_engine(driven, connect_args=unsaid, pool_pre_ping=True, **POOL)
     return Database(engine, way_out="restore a copy")
 

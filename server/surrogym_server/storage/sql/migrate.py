@@ -56,6 +56,7 @@ def _upgrade(connection: Connection) -> None:
 def _take_turn(connection: Connection) -> None:
     if connection.dialect.name == "postgresql":
         connection.execute(sa.text("SET LOCAL lock_timeout = 0"))  # the server before may take its time
+        connection.execute(sa.text("SET LOCAL idle_in_transaction_session_timeout = 0"))  # a migration may compute
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(MIGRATION_LOCK)))
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from surrogym_server.environment.compiled.terms import evaluate
 from surrogym_server.virtual.lanes import ENDED, RUNNING
-from surrogym_shared.compiled.jit import entry
+from surrogym_shared.compiled.jit import entry, inlined
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -35,6 +35,22 @@ def observe(numbers: Floats, places: Ints, q: Floats, observation: Singles) -> N
                 observation[begin + b, d] = np.float32(values[d, b])
 
 
+@inlined
+def _exceeds(deviation: Floats, trust: float, scales: Floats) -> bool:
+    doubtful = False
+    for o in range(len(deviation)):
+        doubtful |= deviation[o] > trust * scales[o]
+    return doubtful
+
+
+@inlined
+def _is_outside(q: Floats, inside: Floats) -> bool:
+    outside = False
+    for c in range(len(q)):
+        outside |= not inside[0, c] <= q[c] <= inside[1, c]
+    return outside
+
+
 @entry(
     types.boolean[::1],
     types.float64[:, ::1],
@@ -46,6 +62,8 @@ def observe(numbers: Floats, places: Ints, q: Floats, observation: Singles) -> N
     types.float64,
     types.float64,
     types.int64,
+    types.float64[:, ::1],
+    types.float64,
     types.float64[:, ::1],
     types.int64[::1],
     types.int8[::1],
@@ -63,6 +81,8 @@ def conclude(
     penalty: float,
     trust: float,
     time_limit: int,
+    inside: Floats,
+    outside_reward: float,
     q: Floats,
     elapsed: Ints,
     phase: Phases,
@@ -73,9 +93,12 @@ def conclude(
 
     Args:
         trust, time_limit: infinite and -1 if there is none.
+        inside: ends of the sampling range, (2, C). A lane outside of it has left. Not read if the next one is NaN.
+        outside_reward: what a lane that has left, or is untrusted, gets for this step and each missing one; NaN if such
+            a lane does not end.
         q, elapsed, phase: of all lanes.
         rewards: penalised rewards and means, (2, N).
-        ends: terminated, truncated, untrusted, and any of them, (4, N).
+        ends: terminated, truncated, untrusted, terminated or truncated, left, (5, N).
 
     Returns:
         The number of lanes that ended.
@@ -88,20 +111,21 @@ def conclude(
         if not moving[n]:
             continue
         mean = pay[row] + terminal_reward if over[row] else pay[row]
-        outputs = deviation.shape[1]
-        doubtful = False
-        if trust < np.inf:
-            for o in range(outputs):
-                doubtful |= deviation[row, o] > trust * scales[o]
+        doubtful = trust < np.inf and _exceeds(deviation[row], trust, scales)
+        left = not (np.isnan(outside_reward) or over[row]) and (doubtful or _is_outside(q_next[row], inside))
+        rewards[1, n] = mean
+        rewards[0, n] = mean if penalty == 0 else mean - penalty * deviation[row, -1]
+        if left:
+            lacking = max(time_limit - elapsed[n], 1) if time_limit >= 0 else 1
+            rewards[0, n] = rewards[1, n] = outside_reward * lacking
         elapsed[n] += 1
         late = time_limit >= 0 and elapsed[n] >= time_limit
-        ends[0, n], ends[1, n], ends[2, n] = over[row], late or doubtful, doubtful
-        ended = over[row] or late or doubtful
+        terminated = over[row] or left
+        ends[0, n], ends[1, n], ends[2, n], ends[4, n] = terminated, late or doubtful, doubtful, left
+        ended = terminated or late or doubtful
         ends[3, n] = ended
         phase[n] = ENDED if ended else RUNNING
         count += ended
-        rewards[1, n] = mean
-        rewards[0, n] = mean if penalty == 0 else mean - penalty * deviation[row, outputs - 1]
         for c in range(q.shape[1]):
             q[n, c] = q_next[row, c]
         row += 1

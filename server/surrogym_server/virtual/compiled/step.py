@@ -32,6 +32,7 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 MODELS = 64  # whose tables are kept
+ANYWHERE = np.zeros((0, 0))  # in the place of the ends of the sampling range
 NO_LANES = np.zeros(0, dtype=np.int64)
 
 
@@ -44,12 +45,12 @@ class _Changed:
     elapsed: Ints  # (N,)
     phase: NDArray[np.int8]  # (N,)
     rewards: Floats  # (2, N) penalised, and mean
-    ends: Bools  # (4, N) terminated, truncated, untrusted, any of them
+    ends: Bools  # (5, N) terminated, truncated, untrusted, terminated or truncated, left
 
     @classmethod
     def of(cls, lanes: LaneState) -> _Changed:
         q, episode, elapsed, phase = (t.numpy().copy() for t in (lanes.q, lanes.episode, lanes.elapsed, lanes.phase))
-        ends = np.empty((4, len(phase)), dtype=np.bool_)
+        ends = np.empty((5, len(phase)), dtype=np.bool_)
         return cls(q, episode, elapsed, phase, np.empty((2, len(phase))), ends)
 
     def lanes(self, before: LaneState) -> LaneState:
@@ -93,6 +94,7 @@ def compiled_step(
         reward_mean=changed.rewards[1],
         deviation=_scattered(running, moved.deviation) if deviations else None,
         untrusted=None if settings.trust is None else changed.ends[2],
+        left=None if definition.outside_reward is None else changed.ends[4],
     )
 
 
@@ -141,7 +143,7 @@ def _concluded(
     model: DynamicsModel, settings: VirtualSettings, moving: Bools, moved: ArrayTransition, changed: _Changed
 ) -> int:
     """Complete the step of the moving lanes, and return how many of them ended."""
-    trust, limit = settings.trust, settings.time_limit
+    trust, limit, outside = settings.trust, settings.time_limit, model.definition.outside_reward
     scales = np.zeros(0) if trust is None else model.scales.numpy()
     return conclude(
         moving,
@@ -154,6 +156,8 @@ def _concluded(
         settings.penalty,
         np.inf if trust is None else trust,
         -1 if limit is None else limit,
+        ANYWHERE if outside is None else torch.stack(model.definition.sampled).numpy(),
+        np.nan if outside is None else outside,
         changed.q,
         changed.elapsed,
         changed.phase,

@@ -162,6 +162,15 @@ def test_an_input_with_a_sample_far_out_gets_no_rate():
     )
 
 
+def test_a_fit_after_a_sample_far_out_has_fewer_rates_than_its_warm_start():
+    """Once a sample is far out, its input may have no rate any more. The earlier rates are then no start."""
+    warm = learn(REACTION, steps(60, 0)).warm
+    assert any("rates" in name for name in warm)
+    samples = steps(60, 0)
+    samples.q[0, 1] = -40.0
+    assert learn(REACTION, samples, warm).model.transitions[0].feature_map.rates[1:2] in ((), (0.0,))
+
+
 def test_predictions_far_from_the_samples_are_finite(model):
     q = torch.tensor([[0.5, 1e6], [0.5, -1e6], [1e6, 0.0]], dtype=torch.float64)
     moved = model.transition(q, torch.zeros(3, 1, dtype=torch.float64), deviations=True)

@@ -74,7 +74,8 @@ def _grown(
     """Log evidence of the output with rates, and the output."""
     plain = output.feature_map
     z, t = inputs[plain][keep], (target[keep] - output.centre) / output.scale
-    rows, key = spread(len(t), subsets.FEW), f"{output.name}|{plain}|rates"
+    rows, among = spread(len(t), subsets.FEW), ",".join(map(str, may.nonzero().ravel().tolist()))
+    key = f"{output.name}|{plain}|rates of {among}"  # a warm start has a rate for each of these inputs
     starts = [learner.thetas[f"{output.name}|{plain}"], *([learner.warm[key]] if key in learner.warm else [])]
     found = fit_growing(z[rows], t[rows], may, learner.options(output.name), starts)
     learner.thetas[key] = found.fitted.theta
