@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, FilePath, ValidationError, mo
 from surrogym_server.errors import InvalidInput
 from surrogym_server.logs import LogFormat
 from surrogym_server.storage.records import Synchronous
+from surrogym_shared.checks import first_fault
 from surrogym_shared.secret_files import parse_token, tokens_in
 from surrogym_shared.wire import MAX_LANES, Role
 
@@ -156,7 +157,5 @@ def _read_tokens(environment: Mapping[str, str], file: str | Path | None) -> dic
 
 
 def _one_sentence(error: ValidationError) -> str:
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    message = first["msg"].removeprefix("Value error, ")
-    return f"setting {where}: {message}" if where and where != "tokens" else message
+    said, place = first_fault(error), error.errors()[0]["loc"]
+    return f"setting {said}" if place and place != ("tokens",) else said.removeprefix("tokens: ")

@@ -7,8 +7,10 @@ from collections.abc import Iterable
 from typing import Annotated
 
 from pydantic import Field, ValidationError
+from pydantic_core import ErrorDetails
 
 LARGEST, NARROWEST = 1e12, 1e-12  # so that squares, products and float32 observations stay finite
+SHOWN = 40  # characters of a wrong value in a message
 RESOLUTION = 1e-9  # narrowest range relative to the size of its numbers; rounding errors dominate below
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False, strict=True)]
@@ -42,8 +44,21 @@ def require_known(where: str, given: Iterable[str], known: Iterable[str]) -> Non
     require(not unknown, f"{where} names unknown {unknown}: expected some of {known}")
 
 
-def first_fault(error: ValidationError) -> str:
-    """The first thing that is wrong, with its place."""
+def first_fault(error: ValidationError, *, got: bool = False) -> str:
+    """The first thing that is wrong, with its place. If ``got``, also the value that came to this place."""
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"])
-    return f"{where}: {first['msg']}" if where else first["msg"]
+    came = f", got {repr(first['input'])[:SHOWN]}" if got and where else ""
+    return f"{where}{': ' if where else ''}{_expected(first)}{came}"
+
+
+def _expected(fault: ErrorDetails) -> str:
+    """What a validation expected. Numbers of entries are written without words of Python."""
+    context = fault.get("ctx", {})
+    match fault["type"]:
+        case "too_short":
+            return f"expected {context['min_length']} or more entries, got {context['actual_length']}"
+        case "too_long" if context["actual_length"] is not None:
+            return f"expected at most {context['max_length']} entries, got {context['actual_length']}"
+        case _:
+            return fault["msg"].removeprefix("Value error, ")

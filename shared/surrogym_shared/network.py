@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field, PositiveInt, ValidationError
 
 from surrogym_shared.archives import Header, read_arrays, read_entries
+from surrogym_shared.checks import first_fault
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
 
 Array = NDArray[np.float64]
@@ -194,8 +195,7 @@ def _read_head(content: bytes) -> _Head:
     try:
         return _Head.model_validate_json(content)
     except ValidationError as error:
-        first = error.errors()[0]
-        raise ValueError(f"{HEAD}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+        raise ValueError(f"{HEAD}: {first_fault(error)}") from error
 
 
 def _require_chain(head: _Head, headers: Mapping[str, Header]) -> None:

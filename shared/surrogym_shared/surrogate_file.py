@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from surrogym_shared.checks import first_fault
 from surrogym_shared.spec import NAME_IN_WORDS, NAME_PATTERN, EnvironmentSpec
 
 FORMAT = 1
@@ -133,9 +134,7 @@ class SurrogateFile:
         except NotASurrogateFile:
             raise
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            raise NotASurrogateFile(f"its specification contradicts itself: {where}: {first['msg']}") from error
+            raise NotASurrogateFile(f"its specification contradicts itself: {first_fault(error)}") from error
         except UNREADABLE as error:
             raise NotASurrogateFile(f"expected a surrogate's file, got {len(data)} bytes: {error!r}") from error
         _require_shapes(spec, samples)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from support.machine import Machine, diary_in
+from surrogym_client import original
 from surrogym_client.original.loading import with_choices
 from surrogym_client.policies import PolicyCard
 from surrogym_client.transport import Api
@@ -51,6 +52,13 @@ def test_register_names_the_next_command(on_server, name):
         f"{name}: CartPole-v1, 4 coordinates, budget of {_budget(said)} real steps, target 0.999; "
         f"next: surrogym sample {name}\n"
     )
+
+
+def test_register_by_a_file_names_the_next_command_with_its_environment(on_server, name, tmp_path):
+    own = original.make("Pendulum-v1").spec().model_copy(update={"environment": "own_line:Env-v0"})
+    (tmp_path / "env.json").write_text(own.model_dump_json())
+    said = on_server("register", name, str(tmp_path / "env.json"))
+    assert said.out.endswith(f"next: surrogym sample {name} --env own_line:Env-v0\n")
 
 
 def test_register_twice_is_harmless_and_another_specification_is_refused(on_server, pendulum):
@@ -148,6 +156,9 @@ def test_ones_own_environment_has_to_be_named_by_the_person(on_server, name, tmp
     monkeypatch.syspath_prepend(str(tmp_path))
     registered = on_server("register", "own_line:Cart", "--name", name)
     assert registered.out.endswith(f"next: surrogym sample {name} --env own_line:Cart\n")
+    hint = f"queries wait for a sampler; next: surrogym sample {name} --env own_line:Cart"
+    assert hint in on_server("status", name).out, "without --env the command is refused"
+    assert f"run surrogym sample {name} --env own_line:Cart," in on_server("train", name).err
     refused = on_server("sample", name, "--once")
     assert refused.code == 1
     assert "expected --env package.module:factory" in refused.err
@@ -205,6 +216,22 @@ def test_a_policy_of_bins_pushes_ones_own_machine_as_its_surrogate_was_pushed(su
         said = surrogym("evaluate", "policy.zip", "--env", "support.machine:Machine", "--episodes", "1")
         assert said.code == 0, said.err
         assert set(diary.read_text().splitlines()) == {"open", "reset 10000", "step -0.5", "close"}
+
+
+def test_equal_episodes_are_told_as_such(surrogym, monkeypatch, tmp_path):
+    """A hundred equal episodes of a deterministic plant looked like a hundred that agree."""
+    (tmp_path / "policy.zip").write_bytes(b"")
+    (tmp_path / "policy.json").write_text(PolicyCard().model_dump_json())
+    monkeypatch.setattr("surrogym_client.policies.files.load_policy", lambda *_, **__: lambda o: np.ones((len(o), 1)))
+    said = surrogym("evaluate", "policy.zip", "--env", "support.moody:Alike", "--episodes", "4")
+    assert said.code == 0, said.err
+    assert said.out.splitlines()[-1] == (
+        "all 4 episodes are equal in every number: nothing in them was random, so each shows the same return, with 5 "
+        "real steps"
+    )
+    assert "the first 3 of 4 episodes are equal in every number" in said.err
+    several = surrogym("evaluate", "policy.zip", "--env", "support.moody:Line", "--episodes", "4")
+    assert "equal" not in several.out + several.err
 
 
 def _look_at(on_server, pendulum, tmp_path):

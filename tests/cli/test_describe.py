@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -70,6 +72,26 @@ def test_a_file_that_holds_no_specification_is_refused(surrogym, tmp_path, conte
     said = surrogym("register", "swimmer", "env.json", "--print-spec")
     assert said.code == 1
     assert message in said.err
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
+def test_a_described_environment_may_come_through_a_pipe(on_server, described: Path, tmp_path: Path, name) -> None:
+    """The file was read three times: ``surrogym register NAME <(surrogym describe ENV)`` ended in a traceback."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    writing = threading.Thread(target=pipe.write_bytes, args=(described.read_bytes(),), daemon=True)
+    writing.start()
+    said = on_server("register", name, str(pipe), "--budget", "20", "--json")
+    writing.join()
+    assert said.code == 0, said.err
+    ledger = on_server("status", name, "--json").json["ledger"]
+    assert ledger["evaluation"] == json.loads(described.read_text())["real_steps"]
+
+
+def test_a_file_that_is_nested_too_deeply_is_no_specification(surrogym, tmp_path: Path) -> None:
+    (tmp_path / "deep.json").write_text(100_000 * "[")
+    said = surrogym("register", "a", str(tmp_path / "deep.json"))
+    assert (said.code, "deep.json is not a specification: " in said.err) == (1, True), said.err
 
 
 def test_two_names_and_two_files_are_refused(surrogym, described: Path) -> None:

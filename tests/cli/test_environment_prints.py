@@ -1,4 +1,4 @@
-"""What an environment prints is not part of a command's output."""
+"""What an environment prints is not part of a command's output, and it does not end the command in silence."""
 
 from __future__ import annotations
 
@@ -44,6 +44,16 @@ def test_output_stays_json_beside_an_environment_that_prints(surrogym, tmp_path,
     said = surrogym(*command)
     assert isinstance(said.json, dict), said.out
     assert "a step" in said.err
+
+
+def test_an_environment_that_exits_while_it_is_closed_is_one_sentence(surrogym, tmp_path, monkeypatch) -> None:
+    """The command ended without a word."""
+    closes = "    def close(self):\n        raise SystemExit('licence expired')\n\ngymnasium.register("
+    (tmp_path / "closing_env.py").write_text(CHATTY.replace("gymnasium.register(", closes).replace("Chatty-v0", "C-v0"))
+    monkeypatch.syspath_prepend(tmp_path)
+    said = surrogym("register", "chatty", "--env", "closing_env:C-v0", "--print-spec")
+    assert said.code == 1
+    assert "error: the environment ended the program: SystemExit: licence expired (closing_env.py:" in said.err
 
 
 FACTORY = """

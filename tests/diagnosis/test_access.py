@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 
 import numpy as np
 import pytest
 
-from surrogym_client.diagnosis.access import Access, examine
+from surrogym_client.diagnosis.access import Access, CheckFailed, examine
 from surrogym_client.original import RealStep
 from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
@@ -125,3 +126,21 @@ def test_one_whose_snapshots_forget_can_only_be_reset() -> None:
     assert access.restore_error is not None
     assert access.restore_error > 0.01
     assert access.mode == "reset only (--access reset)"
+
+
+class Exits(Rail):
+    """Ends its process at its third step."""
+
+    steps = 0
+
+    def step_from(self, coordinates, action):
+        self.steps += 1
+        if self.steps == 3:
+            sys.exit("the licence has expired")
+        return super().step_from(coordinates, action)
+
+
+def test_one_that_fails_says_after_how_many_real_steps() -> None:
+    with pytest.raises(CheckFailed, match="SystemExit: the licence has expired") as failed:
+        looked_at(Exits)
+    assert failed.value.steps == 3

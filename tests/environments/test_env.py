@@ -62,7 +62,7 @@ def test_options_reach_the_session():
 
 
 def test_a_value_out_of_range_is_named():
-    with pytest.raises(ValueError, match=r"'penalty'.*got -1"):
+    with pytest.raises(ValueError, match=r"session options: penalty: .*got -1"):
         RemoteEnv(ExactPendulum(), penalty=-1.0)
 
 

@@ -8,7 +8,7 @@ import pytest
 from support.moody import SPEC
 from surrogym_client.cli.disagreement import Differing
 from surrogym_client.evaluation.audit import Compared
-from surrogym_client.evaluation.comparing import MOST, Disagreements, disagreements, samples_of, steps_of
+from surrogym_client.evaluation.comparing import MOST, Disagreements, disagreements, samples_of, steady, steps_of
 from surrogym_client.evaluation.evaluator import Trace
 
 NAMES = ("x", "reward")
@@ -85,3 +85,19 @@ def test_samples_are_the_worst_of_each_episode_in_turn() -> None:
     ]
     assert len(samples_of(found, 100)) == 4
     assert samples_of(found, 0) == []
+
+
+def test_steps_within_which_a_constant_changed_are_not_compared() -> None:
+    """A model keeps a setpoint. The step at which the plant changed it was shown as the model's error, and learned."""
+    wanted = SPEC.coordinates[0].model_copy(update={"name": "wanted", "kind": "constant"})
+    spec = SPEC.model_copy(update={"coordinates": (*SPEC.coordinates, wanted)})
+    path = np.stack([np.linspace(0, 1, 7), [0.5, 0.5, 0.5 + 1e-9, 0.5, -0.2, -0.2, -0.2]], axis=1)
+    steps = steps_of([Trace(path, np.zeros((6, 1)), np.zeros(6))])
+    assert [step.number for step in steady(spec, steps)] == [0, 1, 2, 4, 5], "a change by rounding is none"
+    assert steady(SPEC, steps) == steps
+    none = Disagreements(5, (), {})
+    said = Differing(none, 0, changed=("wanted",), left_out=1).in_words(spec)
+    assert said[1] == "not compared: 1 real step, in which wanted changed, because the model keeps it constant"
+    said = Differing(none, 0, changed=("wanted",), left_out=3).in_words(spec)
+    assert said[1].startswith("not compared: 3 real steps, in each of which wanted changed")
+    assert Differing(none, 0, left_out=3).as_json()["left_out"] == 3

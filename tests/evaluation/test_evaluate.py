@@ -1,12 +1,13 @@
 """Evaluation takes real steps of the original environment and counts and judges them rightly."""
 
+from dataclasses import replace
 from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
 
-from support.moody import Line
+from support.moody import Alike, Line
 from surrogym_client import original
 from surrogym_client.evaluation.evaluator import (
     EvaluationInterrupted,
@@ -193,3 +194,35 @@ def test_an_interruption_reports_the_real_steps_taken():
     with pytest.raises(EvaluationInterrupted) as interrupted:
         evaluate(pendulum_policy, opener("Pendulum-v1"), EvaluationSettings(episodes=2), interrupt)
     assert interrupted.value.steps == 3 * 2
+
+
+def noting(factory, episodes, **choices):
+    """An evaluation, and its remarks."""
+    remarks = []
+    opener = partial(open_episode, "a line", None, factory)
+    settings = EvaluationSettings(episodes=episodes, **choices)
+    result = evaluate(lambda observation: np.full((len(observation), 1), 0.5), opener, settings, remark=remarks.append)
+    return result, remarks
+
+
+def test_equal_episodes_are_noticed_while_it_saves_real_steps():
+    """A deterministic plant repeated one episode a hundred times without a word."""
+    result, remarks = noting(Alike, 8)
+    assert result.equal
+    assert result.summary()["equal"] is True
+    assert len(remarks) == 1
+    assert remarks[0].startswith("the first 3 of 8 episodes are equal in every number")
+
+
+@pytest.mark.parametrize(("factory", "episodes"), [(Line, 8), (Alike, 1), (Alike, 3)])
+def test_other_episodes_or_few_of_them_get_no_remark(factory, episodes):
+    result, remarks = noting(factory, episodes)
+    assert remarks == []
+    assert result.equal is (factory is Alike and episodes > 1)
+
+
+def test_a_single_different_number_makes_episodes_differ():
+    result, _ = noting(Alike, 4)
+    paid = result.traces[3].reward + np.eye(5)[4] * 1e-12
+    other = replace(result, traces=(*result.traces[:3], replace(result.traces[3], reward=paid)))
+    assert not other.equal

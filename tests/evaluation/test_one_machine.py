@@ -137,11 +137,15 @@ def test_a_second_interrupt_stops_in_the_step_which_counts_and_the_machine_is_cl
     assert diary()[-1] == "close"
 
 
-def test_an_exception_in_the_middle_counts_its_step_and_closes_the_machine(diary):
-    def stall():
-        raise RuntimeError("the motor has stalled")
+@pytest.mark.parametrize("kind", [RuntimeError, SystemExit])
+def test_an_exception_in_the_middle_counts_its_step_and_closes_the_machine(diary, kind):
+    """``sys.exit`` ended the command without a word, and no ledger had the steps."""
 
-    with pytest.raises(EvaluationFailed, match=r"after 3 real steps: RuntimeError: the motor has stalled") as failed:
+    def stall():
+        raise kind("the motor has stalled")
+
+    message = rf"after 3 real steps: {kind.__name__}: the motor has stalled"
+    with pytest.raises(EvaluationFailed, match=message) as failed:
         run(acting(stall))
     assert failed.value.steps == 3
     assert diary()[-1] == "close"

@@ -10,7 +10,7 @@ import pytest
 from support import reactor
 from support.server import ServerProcess
 from surrogym_client.errors import ServerUnreachable, UnknownSurrogate
-from surrogym_client.logs import import_log, importing
+from surrogym_client.logs import UnusableLog, import_log, importing
 from surrogym_client.surrogates.transfer import export_surrogate, import_surrogate
 from surrogym_client.surrogates.waiting import wait_for_model
 from surrogym_client.transport import Api
@@ -106,6 +106,22 @@ def test_rows_beyond_the_surrogates_ranges_are_set_aside(server_process: ServerP
     imported = import_log(damaged.write(tmp_path / "log.csv"), to=name, url=server_process.url)
     assert [line for line, _ in imported.log.rejected] == [9, 11]
     assert imported.sent == ROWS - 2
+
+
+def test_rewards_in_another_unit_than_the_samples_are_refused(
+    server_process: ServerProcess, log: Path, tmp_path: Path, name: str
+):
+    """States of another unit were refused, and rewards went into the model."""
+    import_log(log, register=name, url=server_process.url)
+    further = reactor.log(runs=6, length=20)
+    column = further.heading.index("reward")
+    for row in range(ROWS, 2 * ROWS):
+        further = further.at(row, "reward", str(1_000 * float(further.rows[row][column])))
+    new = reactor.Log(further.heading, further.rows[ROWS:]).write(tmp_path / "new.csv")
+    with pytest.raises(UnusableLog, match=f"the samples of '{name}' have rewards of"):
+        import_log(new, to=name, url=server_process.url)
+    with Api(server_process.url) as api:
+        assert api.surrogate(name).samples == ROWS
 
 
 def test_nothing_is_sent_without_a_name(log: Path):

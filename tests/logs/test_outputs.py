@@ -10,7 +10,7 @@ import pytest
 from support import reactor
 from surrogym_client.cli import main
 from surrogym_client.logs import UnusableLog, import_log
-from surrogym_client.logs.importing import read_log
+from surrogym_client.logs.importing import keep_rejected, read_log
 
 NOWHERE = "http://127.0.0.1:9"  # no server: a refusal comes before a request
 
@@ -80,3 +80,43 @@ def test_a_log_in_a_write_protected_folder_can_be_read(
         main(["import", str(folder / "log.csv")])
     assert not ended.value.code
     assert "is write-protected" in refusal(capsys, folder / "log.csv", "--draft", folder / "draft.json")
+
+
+FOREIGN = "line;note\n7;my own remark\n"
+
+
+@pytest.fixture
+def damaged(tmp_path: Path) -> Path:
+    """A log with a row that can't be used."""
+    return reactor.log(runs=3, length=20).at(4, "temperature", "nan").write(tmp_path / "log.csv")
+
+
+def test_rejected_rows_never_replace_a_file_of_somebody_else(damaged: Path, capsys: pytest.CaptureFixture[str]):
+    """The default name was taken from the log's, so nobody had named the file that was lost."""
+    other = damaged.with_name("log.rejected.csv")
+    other.write_text(FOREIGN)
+    said = refusal(capsys, damaged)
+    assert "1 row of the log can't be used, and" in said
+    assert "is no file of rejected rows: name another one (--rejected)" in said
+    assert other.read_text() == FOREIGN
+    log = read_log(damaged)
+    with pytest.raises(UnusableLog, match="no file of rejected rows"):
+        keep_rejected(damaged, log)
+    assert keep_rejected(damaged, log, other) == other, "a file that was named is replaced"
+    assert keep_rejected(damaged, log) == other, "and is one of rejected rows then"
+
+
+def test_a_file_of_somebody_else_does_not_hinder_a_flawless_log(folder: Path):
+    other = folder / "log.rejected.csv"
+    other.write_text(FOREIGN)
+    assert import_log(folder / "log.csv").rejected_file is None
+    assert other.read_text() == FOREIGN
+
+
+def test_a_log_without_usable_rows_says_both(damaged: Path):
+    lines = damaged.read_text().splitlines()
+    damaged.write_text("\n".join([lines[0], lines[5]]))
+    damaged.with_name("log.rejected.csv").write_text(FOREIGN)
+    with pytest.raises(UnusableLog, match=r"expected two usable steps .* no file of rejected rows"):
+        import_log(damaged)
+    assert damaged.with_name("log.rejected.csv").read_text() == FOREIGN

@@ -30,6 +30,26 @@ def test_two_columns_for_one_name_are_refused(names: list[str], says: str):
 
 
 @pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        (["x", "action", "reward", "r"], "the role reward, got reward and r"),
+        (["x", "action", "Reward", "rewards"], "the role reward, got Reward and rewards"),
+        (["x", "action", "terminated", "done"], "the role terminated, got terminated and done"),
+        (["state_x", "action", "t", "time"], "the role time, got t and time"),
+    ],
+)
+def test_two_columns_for_one_role_are_refused(names: list[str], says: str):
+    """One of them was taken, and the other became a state."""
+    with pytest.raises(UnusableLog, match=f"expected one column for {says}: rename one, or name the columns in a map"):
+        roles_by_name(names)
+
+
+def test_letters_of_other_cases_are_other_columns():
+    roles = roles_by_name(["T", "t", "R", "r", "action"])
+    assert (roles.time, roles.reward, list(roles.state)) == ("t", "r", ["T", "R"])
+
+
+@pytest.mark.parametrize(
     ("changes", "says"),
     [
         ({"reward": "x"}, "one role for the column 'x', got state x and reward"),

@@ -9,7 +9,7 @@ from support import reactor
 from surrogym_client.logs import importing
 from surrogym_client.original.classic import pendulum
 from surrogym_shared.logs.errors import UnusableLog
-from surrogym_shared.logs.units import require_units
+from surrogym_shared.logs.units import require_reward_unit, require_units
 
 
 def states(speed: np.ndarray) -> np.ndarray:
@@ -64,3 +64,30 @@ def test_next_states_in_another_unit_are_refused_too(tmp_path) -> None:
     np.savez(tmp_path / "other.npz", **columns | {f"next_{names[0]}": 1_000 * q_next[:, 0]})
     with pytest.raises(UnusableLog, match=f"next {names[0]}: half of the log lies between"):
         importing.read_log(tmp_path / "other.npz", options)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_rewards_a_thousand_times_those_of_the_samples_are_refused(sign: float) -> None:
+    """Dollars instead of thousands of dollars: the model of both would predict neither."""
+    known = sign * np.linspace(0.5, 2, 50)
+    with pytest.raises(
+        UnusableLog, match=r"reward: half of the log lies between .* the samples of 'tank' have rewards"
+    ):
+        require_reward_unit(1_000 * known, known, "tank")
+    with pytest.raises(UnusableLog, match="reward"):
+        require_reward_unit(1_000 * np.linspace(-1, 1, 50), known, "tank")
+
+
+@pytest.mark.parametrize(
+    "known",
+    [
+        np.linspace(-3.0, 0.0, 50),  # the same unit, and other regions
+        np.zeros(50),  # a sparse reward, which no sample has met
+        np.full(3, 0.001),  # too few samples
+        np.zeros(0),
+    ],
+)
+def test_other_rewards_are_no_other_unit(known: np.ndarray) -> None:
+    paid = np.linspace(-40, 5, 50)
+    paid[:5] = -1e6  # a few crashes
+    require_reward_unit(paid, known, "tank")

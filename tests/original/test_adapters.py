@@ -6,6 +6,7 @@ The adapters of packages run where those are installed: make test-all has an env
 from __future__ import annotations
 
 import json
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -93,8 +94,8 @@ def test_a_package_that_is_missing_is_named_with_its_extra(name: str, package: s
 
 
 @installed("pcgym")
-@pytest.mark.filterwarnings("ignore")
 def test_a_reset_shows_the_setpoint_that_the_first_step_is_paid_by() -> None:
+    """Neither opens, resets nor steps with a warning, which would be an error here."""
     tank = open_simulator("pcgym:cstr")
     setpoint = tank.reset(0)[2]
     reward = tank.step(np.zeros(1)).reward
@@ -148,7 +149,6 @@ def test_a_value_of_a_process_that_cannot_be_used_is_named(
 
 
 @installed("pcgym")
-@pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -168,7 +168,6 @@ def test_a_value_that_does_not_fit_the_model_is_named(wrong: dict[str, object], 
 
 
 @installed("pcgym")
-@pytest.mark.filterwarnings("ignore")
 def test_setpoints_after_the_last_sample_do_not_count(tmp_path: Path) -> None:
     file = tmp_path / "process.json"
     file.write_text(json.dumps(TANK | {"SP": {"Ca": [0.85] * 10 + [7.0]}}))
@@ -233,3 +232,13 @@ def test_a_state_that_can_not_be_read_leaves_only_resets(registered: Register) -
 def test_spaces_that_no_specification_can_express_are_refused(registered: Register, space, message: str) -> None:
     with pytest.raises(UnknownEnvironment, match=message):
         open_simulator(registered("Odd-v0", space=space))
+
+
+def test_an_id_of_a_module_in_the_working_directory_is_opened(tmp_path, monkeypatch) -> None:
+    """A factory there was found, and the id of a class in the same file was not."""
+    lines = ["import gymnasium", "from support.simulators import Spiral", "gymnasium.register('Here-v0', Spiral)"]
+    (tmp_path / "plant_here.py").write_text("\n".join(lines))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    open_simulator("plant_here:Here-v0").close()
+    gymnasium.registry.pop("Here-v0")

@@ -96,7 +96,6 @@ def test_terminating_steps_make_termination_learned_and_a_question() -> None:
 
 
 @installed("pcgym")
-@pytest.mark.filterwarnings("ignore")
 def test_a_setpoint_is_constant_over_its_whole_range() -> None:
     spec = describe("pcgym:cstr", STEPS).spec
     setpoint = spec.coordinates[2]
@@ -104,7 +103,6 @@ def test_a_setpoint_is_constant_over_its_whole_range() -> None:
 
 
 @installed("pcgym")
-@pytest.mark.filterwarnings("ignore")
 def test_virtual_episodes_begin_with_the_setpoints_of_the_schedule() -> None:
     found = describe("pcgym:cstr", STEPS)
     assert limits(found.spec.start["Ca_setpoint"]) == (0.85, 0.9), "others can't all be reached, and would cost much"
@@ -148,3 +146,12 @@ def test_the_file_says_what_was_found_and_holds_the_specification(registered: Re
     assert read["real_steps"] == found.steps
     assert read["asked"] == list(found.asked)
     assert EnvironmentSpec.model_validate_json(json.dumps(read["specification"])) == found.spec
+
+
+def test_an_observation_of_too_many_entries_is_replaced_by_the_coordinates(registered: Register) -> None:
+    """It was refused after all real steps: a specification has at most 64 entries."""
+    weights = np.random.default_rng(0).normal(size=(200, 2))
+    space = {"_get_obs": lambda self: weights @ self.state}
+    found = describe(registered("Spiral-v0", space=space), 60)
+    assert found.spec.observation_names == ("state0", "state1")
+    assert "the observation has 200 entries, more than 64: the policy observes the coordinates instead" in found.found

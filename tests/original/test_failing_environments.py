@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete, Space
@@ -19,6 +21,13 @@ def raises_late(self, action):
     if self.taken > 50:
         raise ZeroDivisionError("valve stuck")
     return Spiral.step(self, action)
+
+
+def exits_late(self, action):
+    try:
+        return raises_late(self, action)
+    except ZeroDivisionError:
+        sys.exit("the licence has expired")
 
 
 def grows(self, action):
@@ -39,6 +48,10 @@ def paying(reward):
     ("step", "message"),
     [
         (raises_late, r"Fails-v0 failed after 50 real steps: ZeroDivisionError: valve stuck \(test_failing"),
+        (
+            exits_late,
+            r"Fails-v0 failed after 50 real steps: SystemExit: the licence has expired \(test_failing",
+        ),
         (
             lambda self, action: Spiral.step(self, action)[:4],
             r"Fails-v0 failed after 0 real steps: expected its step to return 5 values \(observation, .* got 4 values",
@@ -67,6 +80,8 @@ def fails_at_once(self, *, seed=None, options=None):
         ({"reset": fails_at_once}, "Fails-v0 can't be opened: OSError: no device"),
         ({"reset": lambda self: Spiral.reset(self)}, "Fails-v0 can't be opened: TypeError: .*'seed'"),
         ({"__init__": lambda _: 1 / 0}, "Fails-v0 can't be opened: ZeroDivisionError"),
+        ({"__init__": lambda _: sys.exit(3)}, r"Fails-v0 can't be opened: SystemExit: 3 \(test_failing"),
+        ({"reset": lambda _, **__: sys.exit()}, r"Fails-v0 can't be opened: SystemExit \(test_failing"),
     ],
 )
 def test_an_environment_that_cannot_be_opened_says_why(
@@ -74,6 +89,48 @@ def test_an_environment_that_cannot_be_opened_says_why(
 ) -> None:
     with pytest.raises(UnknownEnvironment, match=message):
         open_simulator(registered("Fails-v0", space=space))
+
+
+def shown_once(self):
+    """An observation that can be read in the episodes, and not where the state was set without a step."""
+    if not self.stepped:
+        raise OSError("no picture")
+    return np.zeros(2)
+
+
+def test_what_fails_between_the_steps_says_how_many_there_were(registered: Register) -> None:
+    """The observation of a state that was set was read outside of all counts: it ended in a traceback."""
+    name = registered("Fails-v0", space={"_get_obs": shown_once, "stepped": False})
+    with pytest.raises(StepFailed, match=r"Fails-v0 failed after \d+ real steps: OSError: no picture") as failed:
+        describe(name, STEPS)
+    assert int(str(failed.value).split()[3]) > STEPS
+
+
+def test_a_description_survives_an_environment_that_can_not_be_closed(registered: Register) -> None:
+    """Its real steps were taken, and nobody could use them."""
+    found = describe(registered("Fails-v0", space={"close": lambda _: sys.exit(4)}), STEPS)
+    assert found.found[-1].startswith("Fails-v0 could not be closed: SystemExit: 4 (test_failing")
+    assert found.steps >= STEPS
+
+
+def test_starts_that_are_no_numbers_are_refused_before_any_real_step(registered: Register) -> None:
+    """Nor do they raise a warning of NumPy, which is an error here."""
+    resets = iter(range(1_000))
+
+    def reset(self, *, seed=None, options=None):
+        Spiral.reset(self, seed=seed)
+        if next(resets) > 5:  # the first ones open it
+            self.state = np.full(2, np.inf)
+        return self.state, {}
+
+    with pytest.raises(UnknownEnvironment, match="reached states with infinite values or NaN") as refused:
+        describe(registered("Fails-v0", space={"reset": reset}), STEPS)
+    assert "real steps" not in str(refused.value)
+
+
+def test_a_refusal_says_how_many_real_steps_it_took(registered: Register) -> None:
+    with pytest.raises(UnknownEnvironment, match=f"infinite rewards or NaN .*; this took {STEPS} real steps"):
+        describe(registered("Fails-v0", space={"step": paying(float("inf"))}), STEPS)
 
 
 def test_a_reset_of_the_old_form_is_not_taken_for_an_observation_and_info(registered: Register) -> None:
@@ -90,7 +147,6 @@ def test_a_reward_of_one_entry_is_a_number(registered: Register) -> None:
     assert simulator.step(np.zeros(1)).reward == 2.0
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("reward", [float("inf"), float("nan")])
 def test_rewards_that_are_no_numbers_are_refused(registered: Register, reward: float) -> None:
     with pytest.raises(UnknownEnvironment, match="Fails-v0 paid infinite rewards or NaN"):
@@ -126,8 +182,61 @@ def test_the_forms_of_names_that_can_be_described_are_listed(name: str) -> None:
     assert "factory" not in str(refused.value), "a factory is no environment to describe"
 
 
-@pytest.mark.parametrize("space", [Box(1, 1, (1,)), Box(-1, 1, (0,)), Box(-1e30, 1e30, (1,), np.float64), Discrete(1)])
+@pytest.mark.parametrize("space", [Box(1, 1, (1,)), Box(-1e30, 1e30, (1,), np.float64), Discrete(1)])
 def test_actions_that_no_specification_allows_are_refused_in_one_line(registered: Register, space: Space) -> None:
     with pytest.raises(UnknownEnvironment, match=r"\AFails-v0 can't be specified: .+\Z") as refused:
         open_simulator(registered("Fails-v0", space={"action_space": space}))
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("size", [0, 65, 500])
+def test_an_action_of_no_entries_or_too_many_is_refused_with_a_way_out(registered: Register, size: int) -> None:
+    """The words were Python's: Tuple should have at least 1 item after validation, not 0."""
+    message = f"Fails-v0 has an action of {size} entries: expected 1 to 64; write a wrapper class"
+    with pytest.raises(UnknownEnvironment, match=message):
+        open_simulator(registered("Fails-v0", space={"action_space": Box(-1, 1, (size,))}))
+
+
+def sized(size):
+    """Methods of an environment whose state has this many numbers."""
+
+    def reset(self, *, seed=None, options=None):
+        Spiral.reset(self, seed=seed)
+        self.state = self.np_random.uniform(-1, 1, size)
+        return self.state, {}
+
+    def step(self, action):
+        self.taken = getattr(self, "taken", 0) + 1
+        self.state = 0.9 * self.state
+        return self.state, 0.0, False, False, {}
+
+    return {"reset": reset, "step": step, "observation_space": Box(-1, 1, (size,))}
+
+
+@pytest.mark.parametrize(
+    ("size", "message"),
+    [
+        (0, "Fails-v0 shows no state and observes nothing: expected a state of 1 to 64 numbers; declare them in a"),
+        (65, "Fails-v0 has 65 variables that move: expected at most 64; choose those .* in a class of your own"),
+        (5_000, "Fails-v0 has 5000 variables that move: expected at most 64"),
+    ],
+)
+def test_a_state_of_no_numbers_or_too_many_is_refused_before_any_real_step(
+    registered: Register, size: int, message: str
+) -> None:
+    """An empty one was refused in words of Python, and a large one after 400 real steps."""
+    with pytest.raises(UnknownEnvironment, match=message) as refused:
+        describe(registered("Fails-v0", space=sized(size)), STEPS)
+    assert "real steps" not in str(refused.value)
+
+
+def test_an_environment_in_which_nothing_moves_is_refused_with_a_way_out(registered: Register) -> None:
+    def reset(self, *, seed=None, options=None):
+        Spiral.reset(self, seed=seed)
+        self.state = np.ones(2)
+        return self.state, {}
+
+    space = {"reset": reset, "step": lambda self, _: (self.state, 0.0, False, False, {})}
+    message = rf"no variable of Fails-v0 differed between resets or moved in {STEPS} random steps: .* \(--steps\), or"
+    with pytest.raises(UnknownEnvironment, match=message):
+        describe(registered("Fails-v0", space=space), STEPS)

@@ -21,7 +21,7 @@ from surrogym_client.original.isolated import IsolatedEnvironment
 
 
 class Moody:
-    """Action 0 works, 1 raises, 2 hangs, 3 dies."""
+    """Action 0 works, 1 raises, 2 hangs, 3 dies, 4 exits."""
 
     def spec(self):
         return original.make("Pendulum-v1").spec()
@@ -34,10 +34,23 @@ class Moody:
             time.sleep(3600)
         if mood == 3:
             os._exit(7)
+        if mood == 4:
+            sys.exit("the licence has expired")
         return RealStep(coordinates, action, coordinates, reward=float(os.getpid()))
 
     def close(self):
         pass
+
+
+class Leaving(Moody):
+    """Leaves a file when it is closed."""
+
+    def __init__(self, file):
+        self._file = file
+
+    def close(self):
+        time.sleep(0.3)
+        self._file.touch()
 
 
 def broken():
@@ -66,13 +79,29 @@ def test_a_raised_error_fails_its_step_and_the_child_continues(moody):
     assert step(moody, 0).reward == child
 
 
-@pytest.mark.parametrize(("mood", "error"), [(2, StepTimedOut), (3, EnvironmentDied)])
+@pytest.mark.parametrize(("mood", "error"), [(2, StepTimedOut), (3, EnvironmentDied), (4, EnvironmentDied)])
 def test_one_that_hangs_or_dies_is_replaced(moody, mood, error):
     child = int(step(moody, 0).reward)
     with pytest.raises(error):
         step(moody, mood)
     assert not _alive(child)
     assert int(step(moody, 0).reward) != child
+
+
+def test_one_that_exits_says_why_and_is_closed(tmp_path):
+    """Only an exit code was reported."""
+    with IsolatedEnvironment(partial(Leaving, tmp_path / "closed")) as environment:
+        with pytest.raises(EnvironmentDied, match=r"during step_from: SystemExit: the licence has expired \(test_iso"):
+            step(environment, 4)
+        assert (tmp_path / "closed").exists()
+
+
+def test_a_factory_that_exits_says_why():
+    with (
+        IsolatedEnvironment(partial(sys.exit, "no licence")) as environment,
+        pytest.raises(UnknownEnvironment, match="SystemExit: no licence"),
+    ):
+        environment.spec()
 
 
 def test_the_error_of_a_failing_factory_is_shown():

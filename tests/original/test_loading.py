@@ -1,5 +1,6 @@
 """Names become environments, or one clear sentence."""
 
+import sys
 import textwrap
 
 import pytest
@@ -93,6 +94,22 @@ def test_ones_own_environment_is_loaded_by_name(own_module):
 def test_names_that_give_nothing(own_module, name, message):
     with pytest.raises(UnknownEnvironment, match=message):
         original.make(name)
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("import sys; sys.exit('no licence')", r"ends ended while it was imported: SystemExit: no licence \(ends.py:1"),
+        ("import sys; Cart = sys.exit", "ends:Cart ended while it was made: SystemExit"),
+    ],
+)
+def test_a_module_or_a_factory_that_ends_the_program_is_named(tmp_path, monkeypatch, code, message):
+    """The command ended without a word."""
+    (tmp_path / "ends.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "ends", raising=False)
+    with pytest.raises(UnknownEnvironment, match=message):
+        original.make("ends:Cart")
 
 
 def test_a_servers_specification_can_not_name_a_module():

@@ -116,7 +116,6 @@ def test_a_spiral_with_another_reward_keeps_it_to_be_learned(registered: Registe
 
 
 @installed("pcgym")
-@pytest.mark.filterwarnings("ignore")
 def test_the_stirred_tanks_setpoint_is_found():
     found = describe("pcgym:cstr")
     [term] = found.spec.reward.terms

@@ -12,6 +12,7 @@ from surrogym_shared.spec import (
     Coordinate,
     Design,
     EnvironmentSpec,
+    Fixed,
     ObservationEntry,
     Term,
     Uniform,
@@ -39,6 +40,13 @@ class Line:
 
     def close(self):
         pass
+
+
+class Alike(Line):
+    """Begins every episode at the same state."""
+
+    def spec(self):
+        return SPEC.model_copy(update={"start": {"x": Fixed(value=0.25)}, "time_limit": 5})
 
 
 class RaisesLeft(Line):

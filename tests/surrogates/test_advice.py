@@ -10,7 +10,12 @@ import pytest
 
 from surrogym_client.original.classic import pendulum
 from surrogym_client.surrogates.advice import advice, noise_in_words, verdict
-from surrogym_client.surrogates.waiting import words_of_uncertainty, words_of_waiting
+from surrogym_client.surrogates.waiting import (
+    words_of_audit,
+    words_of_design,
+    words_of_uncertainty,
+    words_of_waiting,
+)
 from surrogym_shared.wire import (
     DoubtfulRegion,
     Fidelity,
@@ -215,9 +220,22 @@ def test_a_running_or_ready_design_gets_no_advice(phase: str) -> None:
 
 def test_waiting_asks_for_a_sampler_only_if_none_runs() -> None:
     idle = view(output("x", 0.7))
-    assert words_of_waiting(idle).startswith("waiting for a sampler (surrogym sample rig): 0 of 40 real steps")
+    start = "surrogym sample rig --env rig:Rig"
+    assert words_of_waiting(idle, start).startswith(f"waiting for a sampler ({start}): 0 of 40 real steps")
     running = idle.model_copy(update={"samplers": ["beside"]})
-    assert words_of_waiting(running).startswith("waiting for the sampler's answers: 0 of 40 real steps")
+    assert words_of_waiting(running, start).startswith("waiting for the sampler's answers: 0 of 40 real steps")
+
+
+def test_a_fit_is_told_because_that_of_a_log_takes_minutes() -> None:
+    """An audit of a policy of 11,000 logged steps was silent for two minutes after its last real step."""
+    fitting = view(output("x", 0.7), phase="fitting")
+    fit = "; a model is being fitted to 40 steps"
+    assert words_of_audit(fitting) == f"0 real steps of audits{fit}"
+    assert words_of_design(fitting).endswith(f"confidence index 0.7000{fit}")
+    assert words_of_waiting(fitting, "start") == words_of_design(fitting), "neither sampler nor answers are missing"
+    asked = fitting.model_copy(update={"queries": QueryCounts(pending=2)})
+    assert words_of_waiting(asked, "start").startswith("waiting for a sampler (start)")
+    assert words_of_audit(view(output("x", 0.7), phase="ready")) == "0 real steps of audits"
 
 
 def test_an_uncertain_end_names_index_and_target() -> None:

@@ -50,6 +50,7 @@ def command(
     """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.policies.card import read_card, write_card
+    from surrogym_client.surrogates.waiting import words_of_audit
     from surrogym_client.training.handover import AuditSettings, Subject, hand_over
     from surrogym_client.training.words import words_of_handover
     from surrogym_client.transport import HttpSurrogate
@@ -72,9 +73,10 @@ def command(
         session = _session(card, view)
         floor = _floor(port, seed, session) if card.untrained is None else card.untrained
         subject = Subject(api, name, port, predict, session, floor, seed)
-        found = hand_over(subject, asked, lambda view: update(None, f"{view.ledger.audit} real steps of audits"))
+        update(None, "computing the promise")
+        found = hand_over(subject, asked, lambda view: update(None, words_of_audit(view)))
     if found.audit is None:
-        raise CommandError(_not_made(name, found.reason))
+        raise CommandError(_not_made(view, found.reason))
     noted = card.model_copy(update={"surrogate": name, "spec": card.spec or view.spec, **vars(found)})
     write_card(policy, noted)
     version = push_or_say(service.server, service.token_for(context), policy, name, quiet=output.quiet)
@@ -82,12 +84,13 @@ def command(
     output.give(result, lambda: words_of_handover(found))
 
 
-def _not_made(name: str, reason: str) -> str:
-    """Say why no audit of the surrogate ``name`` was made."""
+def _not_made(view: SurrogateView, reason: str) -> str:
+    """Say why no audit in a surrogate was made."""
+    from surrogym_client.original.loading import sample_command
     from surrogym_client.training.handover import NO_SAMPLER
 
-    start = f"; start surrogym sample {name} in another terminal" if reason.endswith(NO_SAMPLER) else ""
-    return f"no audit was made, and the card is unchanged: {reason}{start}"
+    start = f"; start {sample_command(view.name, view.environment)} in another terminal"
+    return f"no audit was made, and the card is unchanged: {reason}{start if reason.endswith(NO_SAMPLER) else ''}"
 
 
 def _require_fit(predict: Predict, spec: EnvironmentSpec, misfit: str) -> None:

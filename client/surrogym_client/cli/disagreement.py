@@ -89,13 +89,22 @@ def left(promise: Promise | None, result: Evaluation) -> bool:
 
 def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, learn: int) -> Differing | None:
     """Compare steps with the model, and add at most ``learn`` of those that differ to the surrogate's samples."""
-    from surrogym_client.evaluation.comparing import compared, disagreements, samples_of, steps_of
+    from surrogym_client.evaluation.comparing import (
+        Disagreements,
+        compared,
+        disagreements,
+        samples_of,
+        steady,
+        steps_of,
+    )
 
     view = api.surrogate(surrogate)
     if view.fidelity is None or result.trace.coordinates.shape[1] != len(view.spec.coordinates):
         return None
-    steps = [step for step in steps_of(result.traces) if view.spec.known(step.coordinates)]
-    differing = Differing(disagreements(steps, compared(api, view.spec, view, steps)), first_seed)
+    known = [step for step in steps_of(result.traces) if view.spec.known(step.coordinates)]
+    steps = steady(view.spec, known)
+    found = disagreements(steps, compared(api, view.spec, view, steps)) if steps else Disagreements(0, (), {})
+    differing = Differing(found, first_seed, changed=result.varied, left_out=len(known) - len(steps))
     samples = samples_of(differing.found, learn)
     if samples:
         added = api.add_samples(surrogate, "evaluate", samples, purpose="logged")
@@ -111,11 +120,16 @@ class Differing:
         found: the steps.
         first_seed: reset seed of the first episode; each further episode has the next one.
         learned: number of these steps that were added to the surrogate's samples.
+        changed: names of the constants that changed within an episode.
+        left_out: number of steps within which one of them changed. They are not compared, because a model keeps
+            constants.
     """
 
     found: Disagreements
     first_seed: int
     learned: int = 0
+    changed: tuple[str, ...] = ()
+    left_out: int = 0
 
     def in_words(self, spec: EnvironmentSpec | None) -> list[str]:
         """Return one line about all steps, one for each of the worst episodes, and one for each of the worst steps."""
@@ -123,7 +137,8 @@ class Differing:
 
         found = self.found
         if not found.found:
-            return [f"none of {found.compared} real steps differs from the model by more than the model's uncertainty"]
+            none = f"none of {found.compared} real steps differs from the model by more than the model's uncertainty"
+            return [none, *self._left_out()]
         count = len(found.found)
         lines = [
             f"{count} of {found.compared} real steps differ{'s' * (count == 1)} from the model by more than the "
@@ -137,6 +152,7 @@ class Differing:
             )
         names = () if spec is None else spec.coordinate_names
         lines += [f"  {self._at(one, names)}" for one in found.found[:SHOWN]]
+        lines += self._left_out()
         if self.learned:
             lines.append(f"the model learns from {self.learned} of these steps; train again in the new model")
         return lines
@@ -146,6 +162,7 @@ class Differing:
         counts = self.found.by_episode()
         return {
             "compared": self.found.compared,
+            "left_out": self.left_out,
             "learned": self.learned,
             "episodes": [
                 {"seed": self.first_seed + episode, "steps": counts.get(episode, 0), "missing_reward": missing}
@@ -164,6 +181,14 @@ class Differing:
                 for one in self.found.found
             ],
         }
+
+    def _left_out(self) -> list[str]:
+        """Say how many steps were not compared. Nothing if all were."""
+        if not self.left_out:
+            return []
+        steps = "1 real step, in which" if self.left_out == 1 else f"{self.left_out} real steps, in each of which"
+        names = " or ".join(self.changed) or "a constant"
+        return [f"not compared: {steps} {names} changed, because the model keeps it constant"]
 
     def _at(self, one: Disagreement, names: Sequence[str]) -> str:
         count = len(one.step.coordinates)

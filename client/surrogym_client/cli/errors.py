@@ -64,9 +64,6 @@ def invalid(error: Exception) -> str:
     """Describe the first validation error of a model, with its place."""
     from pydantic import ValidationError
 
-    if not isinstance(error, ValidationError):
-        return str(error)
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    message = first["msg"].removeprefix("Value error, ")
-    return f"{where}: {message}" if where else message
+    from surrogym_shared.checks import first_fault
+
+    return first_fault(error) if isinstance(error, ValidationError) else str(error)

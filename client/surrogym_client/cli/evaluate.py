@@ -149,6 +149,7 @@ def command(
     summary |= {"promise_kept": _kept(judged, result), "version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
     more = [*(found.in_words(card.spec) if found else []), *_why_not_judged(card, settings, result)]
+    more += _repeated(result)
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
 
 
@@ -158,6 +159,18 @@ def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Eval
         return []
     changed = ", ".join(result.varied)
     return [f"the promise is not judged: it is for episodes without a change of {changed}, which changed here"]
+
+
+def _repeated(result: Evaluation) -> list[str]:
+    """Say that the episodes were equal, so that a person takes fewer. Nothing if they differ, or are too few."""
+    from surrogym_client.evaluation.evaluator import FEW_EQUAL
+
+    if len(result.returns) < FEW_EQUAL or not result.equal:
+        return []
+    return [
+        f"all {len(result.returns)} episodes are equal in every number: nothing in them was random, so each shows the "
+        f"same return, with {result.lengths[0]} real steps"
+    ]
 
 
 def _judges(episodes: int) -> bool:
@@ -243,7 +256,8 @@ def _run(
     try:
         with terminations_as_interrupts(), progress("evaluate", quiet=quiet) as update:
             update(0.0, f"reading {what}")
-            return evaluate(load(), opener, settings, _telling(update, settings.episodes))
+            tell = _telling(update, settings.episodes)
+            return evaluate(load(), opener, settings, tell, lambda words: say(words, quiet=quiet))
     except EvaluationFailed as failure:
         enter(failure.steps, 0, "failed")
         raise

@@ -6,6 +6,7 @@ import json
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -189,15 +190,34 @@ def typed(context: typer.Context, without: Sequence[str] = ()) -> str:
     return shlex.join(words)
 
 
+@dataclass(frozen=True)
+class SpecContent:
+    """What a file of a specification contains.
+
+    Attributes:
+        spec: the specification.
+        steps: real steps that ``surrogym describe`` noted in the file; 0 in another file.
+        content: the file's bytes.
+    """
+
+    spec: EnvironmentSpec
+    steps: int
+    content: bytes
+
+
 def read_spec(path: Path | None) -> EnvironmentSpec | None:
-    """Read a specification from its file, or from the output of ``surrogym describe``.
+    """Read a specification from its file, or from the output of ``surrogym describe``. Errors as of
+    ``read_spec_file``."""
+    return None if path is None else read_spec_file(path).spec
+
+
+def read_spec_file(path: Path) -> SpecContent:
+    """Read a file of a specification once, because it may be a pipe.
 
     Raises:
         OSError: the file can't be read.
         CommandError: the file is not a valid specification.
     """
-    if path is None:
-        return None
     from pydantic import ValidationError
 
     from surrogym_client.cli.errors import CommandError, invalid
@@ -206,20 +226,14 @@ def read_spec(path: Path | None) -> EnvironmentSpec | None:
     content = path.read_bytes()
     try:
         read = json.loads(content)
-        if isinstance(read, dict) and "specification" in read:
-            return EnvironmentSpec.model_validate_json(json.dumps(read["specification"]))
-        return EnvironmentSpec.model_validate_json(content)
+        described = isinstance(read, dict) and "specification" in read
+        spec = EnvironmentSpec.model_validate_json(json.dumps(read["specification"]) if described else content)
     except ValidationError as error:
         raise CommandError(f"{path} is not a specification: {invalid(error)}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CommandError(f"{path} is not a specification: {error}") from error
-
-
-def described_steps(path: Path | None) -> int:
-    """Return the real steps that ``surrogym describe`` noted in its output; 0 for another specification file."""
-    read = None if path is None else json.loads(path.read_bytes())
     steps = read.get("real_steps") if isinstance(read, dict) else None
-    return steps if type(steps) is int and steps > 0 else 0
+    return SpecContent(spec, steps if type(steps) is int and steps > 0 else 0, content)
 
 
 def read_tolerances(given: list[str]) -> dict[str, float]:

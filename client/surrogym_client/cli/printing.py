@@ -1,19 +1,31 @@
-"""Prints of environments, kept out of a command's own output."""
+"""Prints of environments, kept out of a command's own output, and their attempts to end it."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from surrogym_client.diagnosis.doctor import Finding
 
 
-def prints_aside() -> AbstractContextManager[object]:
-    """While this is entered, what Python code of an environment prints goes to standard error."""
-    return redirect_stdout(sys.stderr)
+@contextmanager
+def prints_aside() -> Iterator[None]:
+    """While this is entered, what Python code of an environment prints goes to standard error.
+
+    Raises:
+        CommandError: an environment called ``sys.exit`` where nothing else tells of it, such as while it was closed.
+    """
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.original.errors import sentence
+
+    with redirect_stdout(sys.stderr):
+        try:
+            yield
+        except SystemExit as error:
+            raise CommandError(f"the environment ended the program: {sentence(error)}") from error
 
 
 def found_aside(findings: Iterator[Finding]) -> Iterator[Finding]:

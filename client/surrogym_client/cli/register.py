@@ -19,8 +19,7 @@ from surrogym_client.cli.options import (
     SpecFile,
     Tolerances,
     Wait,
-    described_steps,
-    read_spec,
+    read_spec_file,
     read_tolerances,
 )
 
@@ -142,7 +141,8 @@ def command(
     from surrogym_client.original.loading import has_specification
 
     environment, name, spec = _sorted_out(environment, file, env, name, spec)
-    given, steps = read_spec(spec), described_steps(spec)
+    read = None if spec is None else read_spec_file(spec)
+    given, steps = (None, 0) if read is None else (read.spec, read.steps)
     if given is None and environment is not None and not has_specification(environment):
         with prints_aside():
             open_simulator(environment).close()  # a name that can't be opened is an error without a server too
@@ -160,7 +160,7 @@ def command(
     with service.connect(context, wait, quiet=output.quiet) as api:
         view = api.create_surrogate(name or default_name(chosen.environment or environment or ""), chosen)
         if steps:
-            key = None if spec is None else _key(view.name, spec)
+            key = None if read is None else _key(view.name, read.content)
             api.report_steps(view.name, steps, note="description", idempotency_key=key)
     output.give(view.model_dump(mode="json"), lambda: _words(view, environment or ""))
 
@@ -182,9 +182,9 @@ def _sorted_out(
     return env, environment or name, spec
 
 
-def _key(name: str, file: Path) -> str:
+def _key(name: str, described: bytes) -> str:
     """Return the key of a described file's steps, so that registering it twice counts them once."""
-    return hashlib.sha256(name.encode() + b"\n" + file.read_bytes()).hexdigest()[:32]
+    return hashlib.sha256(name.encode() + b"\n" + described).hexdigest()[:32]
 
 
 def _require_free(api: Api, name: str) -> None:
@@ -255,10 +255,12 @@ def _with_tolerances(spec: EnvironmentSpec, tolerances: dict[str, float]) -> Env
 
 
 def _words(view: SurrogateView, environment: str) -> str:
-    from surrogym_client.original.loading import is_known
+    from surrogym_client.original.loading import is_known, sample_command
 
-    own = f" --env {shlex.quote(environment)}" if environment and not is_known(environment) else ""
+    start = sample_command(view.name, view.environment)
+    if environment:  # its name was typed here
+        start = f"surrogym sample {view.name}" + ("" if is_known(environment) else f" --env {shlex.quote(environment)}")
     return (
         f"{view.name}: {view.environment or 'own environment'}, {len(view.spec.coordinates)} coordinates, "
-        f"budget of {view.budget} real steps, target {view.target:g}; next: surrogym sample {view.name}{own}"
+        f"budget of {view.budget} real steps, target {view.target:g}; next: {start}"
     )

@@ -161,6 +161,8 @@ def _steps(seen: SurrogateSummary) -> str:
 
 def _hint(view: SurrogateView) -> str | None:
     """Return what a person has to do next, if nothing proceeds without them."""
+    from surrogym_client.original.loading import sample_command
+
     if view.phase == "from_log":
         return (
             f"the model is fitted to the log, and the design requests no real steps; next: surrogym train {view.name}"
@@ -169,7 +171,8 @@ def _hint(view: SurrogateView) -> str | None:
         return f"the design requests no real steps, and there is no log yet; next: surrogym import LOG --to {view.name}"
     if view.queries.pending and not view.samplers and not view.paused:
         logged = "; until then, the model of the log is served" if view.ledger.logged and view.model_version else ""
-        return f"{view.queries.pending} queries wait for a sampler{logged}; next: surrogym sample {view.name}"
+        start = sample_command(view.name, view.environment)
+        return f"{view.queries.pending} queries wait for a sampler{logged}; next: {start}"
     return None
 
 

@@ -159,6 +159,7 @@ def _trainable(
     With ``wait``, the packages of the policy search are imported in the meantime.
     """
     from surrogym_client.cli.errors import CommandError
+    from surrogym_client.original.loading import sample_command
     from surrogym_client.surrogates.phases import COMPLETED
     from surrogym_client.surrogates.waiting import (
         share_of_design,
@@ -179,10 +180,10 @@ def _trainable(
                     api, surrogate, wait, lambda view: update(share_of_design(view), words_of_design(view))
                 )
         if view.model_version is None:
-            learn = "surrogym import LOG --to" if view.budget == 0 else "surrogym sample"
+            imports = f"surrogym import LOG --to {surrogate}"
+            learn = imports if view.budget == 0 else sample_command(surrogate, view.environment)
             raise CommandError(
-                f"{surrogate!r} has no model yet, its phase is {view.phase}: "
-                f"run {learn} {surrogate}, or give --wait SECONDS"
+                f"{surrogate!r} has no model yet, its phase is {view.phase}: run {learn}, or give --wait SECONDS"
             )
         if view.phase == "over_budget":
             say(words_of_uncertainty(view), quiet=quiet)
@@ -254,9 +255,10 @@ def _train(
 
 def _waiting(update: Update) -> Callable[[SurrogateView], None]:
     """Show a round's real steps while a sampler takes them. The progress bar keeps the training's position."""
+    from surrogym_client.original.loading import sample_command
     from surrogym_client.surrogates.waiting import words_of_waiting
 
-    return lambda view: update(None, words_of_waiting(view))
+    return lambda view: update(None, words_of_waiting(view, sample_command(view.name, view.environment)))
 
 
 def _write_card(

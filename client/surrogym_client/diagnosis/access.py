@@ -25,6 +25,18 @@ CLOSE = 1e-2  # of a range: the largest error of a state that can be set
 FEW = 3.0  # factor for noise that was estimated from few steps
 
 
+class CheckFailed(StepFailed):
+    """The environment failed after ``steps`` real steps had begun."""
+
+    def __init__(self, message: str, steps: int) -> None:
+        super().__init__(message)
+        self.steps = steps
+        self._arguments = (message, steps)
+
+    def __reduce__(self) -> tuple[type[CheckFailed], tuple[str, int]]:
+        return type(self), self._arguments
+
+
 @dataclass(frozen=True)
 class Access:
     """Results of repeated steps and resets. Errors are shares of the sampling ranges, the largest of all. None if the
@@ -85,13 +97,16 @@ def examine(environment: IsolatedEnvironment | Executable | Simulated, spec: Env
     """Take some real steps twice.
 
     Raises:
-        StepFailed: a step failed for a reason that does not depend on the mode.
+        CheckFailed: a step failed for a reason that does not depend on the mode.
     """
     looking = _Looking(environment, spec)
-    if spec.query == "step":
-        looking.set_states()
-    looking.begin_again()
-    looking.come_back()
+    try:
+        if spec.query == "step":
+            looking.set_states()
+        looking.begin_again()
+        looking.come_back()
+    except StepFailed as error:
+        raise CheckFailed(str(error), looking.access().steps) from error
     return looking.access()
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_client.diagnosis.access import EXACT, Access, examine
+from surrogym_client.diagnosis.access import EXACT, Access, CheckFailed, examine
 from surrogym_client.diagnosis.history import History, declared, look_back
 from surrogym_client.errors import ProblemError, ProtocolMismatch, Refused, ServerUnreachable, SurrogymClientError
 from surrogym_client.original.episodes import draw
@@ -127,8 +127,9 @@ def _access_of(original: IsolatedEnvironment | Executable | Simulated, spec: Env
     """Exactness of the environment, and the recommended mode."""
     try:
         access = examine(original, spec)
-    except StepFailed as error:
-        yield Finding("mode", str(error), "a sampler would fail in the same way: mend the environment first")
+    except CheckFailed as error:
+        said = f"{error}; this took {error.steps + 1} real steps"
+        yield Finding("mode", said, "a sampler would fail in the same way: mend the environment first")
         return
     if access.set_error is not None:
         read, again = _error(access.set_error), _error(access.repeat_error)

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 
 from surrogym_client.errors import SessionLost, SurrogymClientError
 from surrogym_shared.acting import ActingPolicy, NoiseKey
+from surrogym_shared.checks import first_fault
 from surrogym_shared.port import (
     Bools,
     Floats,
@@ -67,10 +68,7 @@ def session_request(num_envs: int, mode: AutoresetMode, options: dict[str, Any])
     try:
         return OpenSession(num_envs=num_envs, autoreset_mode=mode, **options)
     except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"])
-        said = f"session option {name!r}: {first['msg']}, got {first['input']!r}" if name else first["msg"]
-        raise ValueError(said) from error
+        raise ValueError(f"session options: {first_fault(error, got=True)}") from error
 
 
 class Lanes:

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from surrogym_client.evaluation.audit import ALARM, Compared, chi_squared, differences
-from surrogym_client.evaluation.evaluator import Trace
+from surrogym_client.evaluation.evaluator import ROUNDING, Trace, span
 from surrogym_client.transport.api import Api
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import NewSample, OutputFidelity, SurrogateView
@@ -90,6 +90,12 @@ def steps_of(traces: Sequence[Trace]) -> list[StepOfEpisode]:
     places = [(episode, t) for episode, trace in enumerate(traces) for t in range(len(trace.reward))]
     kept = np.unique(np.linspace(0, len(places) - 1, min(len(places), MOST)).astype(int))
     return [_step(traces[episode], episode, t) for episode, t in (places[i] for i in kept)]
+
+
+def steady(spec: EnvironmentSpec, steps: Sequence[StepOfEpisode]) -> list[StepOfEpisode]:
+    """Return the steps within which no constant changed, such as a setpoint. A model keeps constants."""
+    held = [(i, ROUNDING * span(c)) for i, c in enumerate(spec.coordinates) if c.kind == "constant"]
+    return [one for one in steps if all(abs(one.next_coordinates[i] - one.coordinates[i]) <= most for i, most in held)]
 
 
 def _step(trace: Trace, episode: int, t: int) -> StepOfEpisode:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.episodes import Episode, Moment, draw
-from surrogym_client.original.errors import EvaluationFailed, PolicyMisfit
+from surrogym_client.original.errors import RAISED, EvaluationFailed, PolicyMisfit
 from surrogym_client.original.protocol import LONGEST_EPISODE
 from surrogym_client.policies.predict import Acting, PerEpisode
 from surrogym_client.runtime.lifetime import signals_between_steps
-from surrogym_shared.spec import EnvironmentSpec, Success, limits
+from surrogym_shared.spec import Coordinate, EnvironmentSpec, Success, limits
 from surrogym_shared.terms import holds
 from surrogym_shared.wire import TraceRank
 
@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[float, int], None]  # arguments: share done in [0, 1], number of episodes that terminated
 
 FIRST_SEED = 10_000
+FEW_EQUAL = 3  # equal episodes after which a person is told
 ROUNDING = 1e-6  # share of its range by which a constant may change within an episode
 
 
@@ -93,6 +94,11 @@ class Evaluation:
         return int(self.lengths.sum())
 
     @property
+    def equal(self) -> bool:
+        """Whether several episodes are equal in every number, so that one of them would have shown as much."""
+        return len(self.traces) > 1 and all(_is_equal(self.trace, other) for other in self.traces[1:])
+
+    @property
     def success_rate(self) -> float | None:
         return None if self.success is None else float(self.success.mean())
 
@@ -109,8 +115,16 @@ class Evaluation:
             "success_rate": self.success_rate,
             "steps": self.steps,
             "varied": list(self.varied),
+            "equal": self.equal,
             "per_episode": [float(r) for r in self.returns],
         }
+
+
+def _is_equal(one: Trace, other: Trace) -> bool:
+    """Whether two episodes are equal in every number."""
+    return one.terminated == other.terminated and all(
+        np.array_equal(getattr(one, name), getattr(other, name)) for name in ("coordinates", "action", "reward")
+    )
 
 
 class EvaluationInterrupted(KeyboardInterrupt):
@@ -126,6 +140,7 @@ def evaluate(
     open_episode: Callable[[], Episode],
     settings: EvaluationSettings | None = None,
     progress: Progress | None = None,
+    remark: Callable[[str], None] | None = None,
 ) -> Evaluation:
     """Run N real episodes with a policy.
 
@@ -139,6 +154,7 @@ def evaluate(
         open_episode: opens one instance of the environment.
         settings: number of episodes, their starts and the environment's perturbation.
         progress: called after every step.
+        remark: called with a sentence, once, if the first episodes are equal and others are still to begin.
 
     Returns:
         returns and successes of each episode, in the order of their seeds. The number of instances has an effect only
@@ -150,14 +166,14 @@ def evaluate(
         EvaluationFailed: the environment or the policy raised an error after real steps, which are counted.
         EvaluationInterrupted: Ctrl-C was pressed; real steps so far are counted.
     """
-    run = _Run(policy, settings or EvaluationSettings(), progress)
+    run = _Run(policy, settings or EvaluationSettings(), progress, remark)
     try:
         with signals_between_steps() as heed, ExitStack() as instances:
             return run.on(_open(open_episode, run.settings, instances), heed)
     except KeyboardInterrupt:
         raise EvaluationInterrupted(run.begun) from None
-    except Exception as error:
-        if run.begun == 0:
+    except RAISED as error:
+        if run.begun == 0 and not isinstance(error, SystemExit):
             raise
         raise EvaluationFailed(run.begun, error) from error
 
@@ -204,6 +220,12 @@ class _Tally:
     def over(self) -> bool:
         return self.moment.terminated or self.moment.truncated or self.length >= self.limit
 
+    @property
+    def trace(self) -> Trace:
+        """The episode so far, with at least one step."""
+        ended = self.moment.terminated
+        return Trace(np.stack(self.path), np.stack(self.actions), np.array(self.rewards), ended)
+
     def step(self, action: Array) -> None:
         """Take one real step."""
         self.moment = moment = self.episode.step(action)
@@ -218,11 +240,18 @@ class _Tally:
 class _Run:
     """Runs episodes in the order of their seeds, each as soon as an instance is free."""
 
-    def __init__(self, policy: Acting, settings: EvaluationSettings, progress: Progress | None) -> None:
+    def __init__(
+        self,
+        policy: Acting,
+        settings: EvaluationSettings,
+        progress: Progress | None,
+        remark: Callable[[str], None] | None,
+    ) -> None:
         self.settings = settings
         self.begun = 0  # real steps begun, including interrupted and failed ones
         self._policy = policy
         self._progress = progress
+        self._remark = remark
         self._tallies: list[_Tally] = []
 
     def on(self, instances: Sequence[Episode], between_steps: Callable[[], None]) -> Evaluation:
@@ -234,6 +263,7 @@ class _Run:
             free = [tally.episode for tally in running if tally.over]
             if free:
                 running = [tally for tally in running if not tally.over]
+                self._look_for_equal_ones()
             self._tell()
             between_steps()
         return _account(self._tallies)
@@ -266,6 +296,19 @@ class _Run:
             return self._policy.actions([tally.number for tally in running], observations)
         return self._policy(observations)
 
+    def _look_for_equal_ones(self) -> None:
+        """Say that the first episodes are equal, while it can still save real steps."""
+        over = [tally for tally in self._tallies if tally.over]
+        if self._remark is None or len(over) < FEW_EQUAL or len(self._tallies) == self.settings.episodes:
+            return
+        remark, self._remark = self._remark, None
+        first = over[0].trace
+        if all(_is_equal(first, tally.trace) for tally in over[1:]):
+            remark(
+                f"the first {len(over)} of {self.settings.episodes} episodes are equal in every number: if nothing is "
+                "random, all will be; --episodes takes fewer"
+            )
+
     def _tell(self) -> None:
         if self._progress is not None:
             shares = (1.0 if tally.over else tally.length / tally.limit for tally in self._tallies)
@@ -290,20 +333,23 @@ def _account(tallies: Sequence[_Tally]) -> Evaluation:
         returns=np.array([t.total for t in tallies]),
         lengths=np.array([t.length for t in tallies], dtype=np.int64),
         success=None if criterion is None else np.array([_succeeds(criterion, t) for t in tallies]),
-        traces=tuple(
-            Trace(np.stack(t.path), np.stack(t.actions), np.array(t.rewards), t.moment.terminated) for t in tallies
-        ),
+        traces=tuple(tally.trace for tally in tallies),
         varied=_varied(spec, tallies),
     )
+
+
+def span(coordinate: Coordinate) -> float:
+    """Width of a coordinate's sampling range."""
+    low, high = limits(coordinate.sampling)
+    return high - low
 
 
 def _varied(spec: EnvironmentSpec, tallies: Sequence[_Tally]) -> tuple[str, ...]:
     """Return the names of constants that changed within an episode, such as setpoints of a schedule."""
     names = []
     for i, coordinate in enumerate(spec.coordinates):
-        low, high = limits(coordinate.sampling)
         moved = max(float(np.ptp(np.stack(t.path)[:, i])) for t in tallies)
-        if coordinate.kind == "constant" and moved > ROUNDING * (high - low):
+        if coordinate.kind == "constant" and moved > ROUNDING * span(coordinate):
             names.append(coordinate.name)
     return tuple(names)
 

@@ -5,24 +5,29 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from surrogym_client.logs.outputs import rejected_file, require_outputs
 from surrogym_client.logs.reading import read
 from surrogym_client.transport.api import Api
-from surrogym_shared.logs.checking import ReadLog, check_log, draft_log, write_rejected
+from surrogym_shared.logs.checking import ReadLog, check_log, draft_log, is_of_rejected, write_rejected
 from surrogym_shared.logs.columns import Roles, roles_by_file, roles_by_map, roles_by_name
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.table import Floats, Table
-from surrogym_shared.logs.too_few import TooFewSteps
+from surrogym_shared.logs.too_few import TooFewSteps, counted
 from surrogym_shared.logs.transitions import Transitions
+from surrogym_shared.logs.units import require_reward_unit
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.spec.base import NAME_PATTERN
 from surrogym_shared.wire import NewSample
 
 BATCH = 2_000  # steps between two reports of progress
 SAMPLER = "log"
+MOST_KNOWN = 2_000  # samples of a surrogate that show how large its rewards are
 
 Progress = Callable[[float, str], None]
 Mapping_ = Mapping[str, Any]
@@ -117,8 +122,8 @@ def import_log(
 
     Raises:
         ValueError: both ``register`` and ``to``, or ``to`` with ``spec``.
-        UnusableLog: no log, columns without a clear role, ``register`` is no name of a surrogate, or ``rejected`` is
-            the log or the mapping.
+        UnusableLog: no log, columns without a clear role, ``register`` is no name of a surrogate, ``rejected`` is
+            the log or the mapping, or the file beside the log is not one of rejected rows.
         TooFewSteps: no usable step, or a single one where a specification is to be drafted.
         SurrogymClientError: as every request.
 
@@ -142,6 +147,8 @@ def import_log(
         if to is not None:
             options = replace(options, spec=api.surrogate(to).spec)
         log, kept = _read_or_keep(Path(path), options, rejected)
+        if to is not None:
+            _require_reward_unit(log, api, to)
         if register is not None:
             api.create_surrogate(register, log.spec)
         name = register or to or ""
@@ -157,15 +164,33 @@ def _require_name(name: str) -> None:
         )
 
 
+def _require_reward_unit(log: ReadLog, api: Api, name: str) -> None:
+    """Refuse rewards that seem to be in another unit than those of the surrogate's samples. A declared reward
+    is not learned, so the log may pay by another rule."""
+    if log.spec.reward.kind == "learned":
+        known = [sample.reward for sample in islice(api.samples(name), MOST_KNOWN)]
+        require_reward_unit(log.reward, np.array(known), name)
+
+
 def keep_rejected(path: Path, log: ReadLog, where: str | Path | None = None) -> Path | None:
-    """Write the rows that were set aside beside the log; None where there are none and no such file stands there."""
+    """Write the rows that were set aside beside the log; None where there are none and no such file stands there.
+
+    Raises:
+        UnusableLog: the file beside the log is another one, and ``where`` names none.
+    """
     return _keep(path, log.table, log.steps, where)
 
 
 def _keep(path: Path, table: Table, steps: Transitions, where: str | Path | None) -> Path | None:
     file = rejected_file(path, where)
-    if not steps.rejected and not file.exists():
+    foreign = where is None and file.exists() and not is_of_rejected(file)
+    if not steps.rejected and (foreign or not file.exists()):
         return None
+    if foreign:
+        raise UnusableLog(
+            f"{counted(len(steps.rejected), 'row')} of the log can't be used, and {file}, where they would go, is no "
+            "file of rejected rows: name another one (--rejected)"
+        )
     write_rejected(file, table, steps)
     return file
 
@@ -175,8 +200,11 @@ def _read_or_keep(path: Path, options: Options, where: str | Path | None) -> tup
     try:
         log = read_log(path, options)
     except TooFewSteps as error:
-        file = _keep(path, error.table, error.steps, where)
-        words = f"{error}; all of these rows are in {file}" if error.steps.rejected else str(error)
+        try:
+            file = _keep(path, error.table, error.steps, where)
+            words = f"{error}; all of these rows are in {file}" if error.steps.rejected else str(error)
+        except UnusableLog as other:
+            words = f"{error}; {other}"
         raise TooFewSteps(words, error.table, error.steps) from error
     return log, keep_rejected(path, log, where)
 

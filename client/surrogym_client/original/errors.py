@@ -24,6 +24,8 @@ from __future__ import annotations
 import os
 import traceback
 
+RAISED = (Exception, SystemExit)  # what the code of somebody's environment raises; Ctrl-C is not its own
+
 
 class OriginalError(Exception):
     """Base of this tree. ``str(error)`` is one sentence for a person."""
@@ -76,12 +78,12 @@ class MachineFails(OriginalError):
 class EvaluationFailed(OriginalError):
     """An error (see ``__cause__``) occurred after ``steps`` real steps had been begun."""
 
-    def __init__(self, steps: int, cause: Exception) -> None:
+    def __init__(self, steps: int, cause: BaseException) -> None:
         super().__init__(f"the evaluation failed after {steps} real steps: {sentence(cause)}")
         self.steps = steps
         self._arguments = (steps, cause)
 
-    def __reduce__(self) -> tuple[type[EvaluationFailed], tuple[int, Exception]]:
+    def __reduce__(self) -> tuple[type[EvaluationFailed], tuple[int, BaseException]]:
         return type(self), self._arguments
 
 
@@ -109,10 +111,11 @@ class RequestRefused(StepFailed):
         return type(self), self._arguments
 
 
-def sentence(error: Exception) -> str:
+def sentence(error: BaseException) -> str:
     """Describe an exception of somebody's environment: its type, its message, and the line that raised it."""
     if isinstance(error, OriginalError):  # complete by itself; the line does not help the environment's author
         return str(error)
     frame = traceback.extract_tb(error.__traceback__)[-1:]
     where = f" ({os.path.basename(frame[0].filename)}:{frame[0].lineno})" if frame else ""
-    return f"{type(error).__name__}: {error}{where}"
+    message = f": {error}" if str(error) else ""
+    return f"{type(error).__name__}{message}{where}"

@@ -14,7 +14,14 @@ from multiprocessing.process import BaseProcess
 from types import FrameType, TracebackType
 from typing import Any, Self
 
-from surrogym_client.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment, sentence
+from surrogym_client.original.errors import (
+    RAISED,
+    EnvironmentDied,
+    StepFailed,
+    StepTimedOut,
+    UnknownEnvironment,
+    sentence,
+)
 from surrogym_client.original.protocol import Array, Environment, Factory, RealStep
 from surrogym_client.original.rollouts import answering
 from surrogym_shared.spec import EnvironmentSpec
@@ -99,6 +106,11 @@ class IsolatedEnvironment:
             self._kill()
             raise StepTimedOut(f"{method} took longer than {limit:g} s and was killed")
         ok, value = answer
+        if ok is None:
+            assert self._process is not None
+            self._process.join(self._step_limit + CLOSE_LIMIT)  # it closes the environment
+            self._kill()
+            raise EnvironmentDied(f"the environment ended its process during {method}: {value}")
         if not ok:
             raise StepFailed(value)
         return value
@@ -145,7 +157,7 @@ class IsolatedEnvironment:
         return process.exitcode
 
 
-def _await_answer(pipe: Connection, number: int, limit: float) -> tuple[bool, Any] | None:
+def _await_answer(pipe: Connection, number: int, limit: float) -> tuple[bool | None, Any] | None:
     """The answer (ok, value) to one request; None after ``limit`` seconds. Answers to earlier requests are skipped."""
     deadline = time.monotonic() + limit
     while pipe.poll(max(0.0, deadline - time.monotonic())):
@@ -187,12 +199,12 @@ def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_exit_after_parent, args=(step_limit + CLOSE_LIMIT,), daemon=True).start()
     working = _Ending()
-    try:
-        with working:
+    with working:
+        try:
             environment = answering(factory())
-    except Exception as error:
-        pipe.send((False, sentence(error)))
-        return
+        except RAISED as error:
+            pipe.send((False, sentence(error)))
+            return
     closed = False
     try:
         pipe.send((True, None))
@@ -206,19 +218,26 @@ def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
 
 
 def _serve_one(pipe: Connection, environment: Environment, working: _Ending) -> str:
-    """Answer one request, and return its method."""
+    """Answer one request, and return its method. Raises ``SystemExit`` if the environment asked for the end."""
     number, method, arguments = pipe.recv()
     with working:
-        pipe.send((number, *_answer(environment, method, arguments)))
+        ok, value = _answer(environment, method, arguments)
+        pipe.send((number, ok, value))
+        if ok is None:
+            sys.exit()  # ``_serve`` closes the environment
     return str(method)
 
 
-def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -> tuple[bool, Any]:
+def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -> tuple[bool | None, Any]:
+    """The answer (ok, value). ``ok`` is None if the environment asked for the end of its process, as ``sys.exit``
+    does."""
     try:
         value = getattr(environment, method)(*arguments)
         return True, value.model_dump() if isinstance(value, EnvironmentSpec) else value
     except Exception as error:
         return False, sentence(error)
+    except SystemExit as error:
+        return None, sentence(error)
 
 
 def _exit_after_parent(seconds: float) -> None:

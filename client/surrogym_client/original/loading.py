@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from surrogym_client.original.adapters import adapter_of, is_same, is_trusted, open_simulator
 from surrogym_client.original.classic import TASKS
-from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.errors import UnknownEnvironment, sentence
 from surrogym_client.original.executables import Executable, is_executable, open_executable
 from surrogym_client.original.gymnasium import GymnasiumEnvironment, task_for
 from surrogym_client.original.isolated import IsolatedEnvironment
@@ -79,7 +79,7 @@ def make(
     if is_executable(name):
         return open_executable(name, spec, choose, step_limit)
     if is_own(name):
-        return _own(load_factory(name)(), spec, choose)
+        return _own(_made(name), spec, choose)
     return _known(name, spec, choose, preset or "default", step_limit)
 
 
@@ -123,6 +123,11 @@ def env_option(name: str) -> str:
         return " --env exec:COMMAND"
     opens = ":" in name or adapter_of(name) is not None
     return f" --env {shlex.quote(name) if opens else PLACEHOLDER}"
+
+
+def sample_command(surrogate: str, environment: str) -> str:
+    """Return the command that starts a sampler of a surrogate, whose environment has this name."""
+    return f"surrogym sample {surrogate}{env_option(environment)}"
 
 
 def has_specification(name: str) -> bool:
@@ -202,6 +207,8 @@ def load_factory(name: str) -> Any:
         factory = getattr(importlib.import_module(module_name), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise UnknownEnvironment(f"expected package.module:factory, got {name!r}: {error}") from error
+    except SystemExit as error:
+        raise UnknownEnvironment(f"{module_name} ended while it was imported: {sentence(error)}") from error
     if not callable(factory):
         raise UnknownEnvironment(f"expected {name!r} to be callable, got a {type(factory).__name__}")
     return factory
@@ -238,6 +245,15 @@ class _Respecified:
 
     def spec(self) -> EnvironmentSpec:
         return self._spec
+
+
+def _made(name: str) -> Any:
+    """Call a user's factory. Raises ``UnknownEnvironment`` if the name has none, or if it ended by ``sys.exit``."""
+    factory = load_factory(name)
+    try:
+        return factory()
+    except SystemExit as error:
+        raise UnknownEnvironment(f"{name} ended while it was made: {sentence(error)}") from error
 
 
 def _own(made: Any, spec: EnvironmentSpec | None, choose: Choose) -> Environment:

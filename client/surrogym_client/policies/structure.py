@@ -30,6 +30,7 @@ from surrogym_client.environments.spaces import space
 from surrogym_client.policies.networks import PaperPolicy, Standardise, decaying
 from surrogym_client.policies.saved_settings import PolicySettings
 from surrogym_shared.archives import read_entries, stored
+from surrogym_shared.checks import first_fault
 from surrogym_shared.wire import ActionSpace, BoxSpace, DiscreteSpace, MultiDiscreteSpace
 
 ENTRY = "surrogym-policy.json"
@@ -189,8 +190,7 @@ def _settings(data: Mapping[str, Any], replaced: set[str]) -> PolicySettings:
     try:
         return PolicySettings.model_validate({name: value for name, value in data.items() if name not in replaced})
     except ValidationError as error:
-        first = error.errors()[0]
-        raise ValueError(f"data: {first['loc'][0]}: {first['msg']}, got {str(first['input'])[:40]!r}") from error
+        raise ValueError(f"data: {first_fault(error, got=True)}") from error
 
 
 def _entry(entries: Mapping[str, bytes], name: str) -> bytes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from surrogym_client.original.loading import env_option, is_known
+from surrogym_client.original.loading import env_option, is_known, sample_command
 from surrogym_client.report.known import PREFERRED, Known
 from surrogym_client.report.prediction import outcome_of
 from surrogym_client.report.wording import plural, starts_of
@@ -54,8 +54,12 @@ def next_steps(known: Known) -> list[str]:
     view, policy, real = known.view, known.policy, known.real
     name = view.name
     if policy is None:
-        first = f"Train a controller: surrogym train {name}"
-        return [first if known.models else f"Let a sampler answer the first queries: surrogym sample {name}"]
+        start = sample_command(name, view.environment)
+        return [
+            f"Train a controller: surrogym train {name}"
+            if known.models
+            else f"Let a sampler answer the first queries: {start}"
+        ]
     run = f"surrogym evaluate policy.zip{_where(known)}"
     fetch = f"Fetch its file for the next commands: surrogym policy get {name}@{policy.version} --out policy.zip"
     if real is None:

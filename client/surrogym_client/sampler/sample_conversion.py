@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from surrogym_client.original.errors import StepFailed
 from surrogym_client.original.protocol import RealStep
+from surrogym_shared.checks import first_fault
 from surrogym_shared.wire import NewSample, Query, StepQuery
 
 
@@ -65,5 +66,4 @@ def _entries(values: Any) -> list[float] | None:
 def _first(error: Exception) -> str:
     if not isinstance(error, ValidationError):
         return str(error)
-    first = error.errors()[0]
-    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}, got {first['input']}"
+    return first_fault(error, got=True)

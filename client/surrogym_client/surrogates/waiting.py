@@ -25,14 +25,27 @@ def words_of_design(view: SurrogateView) -> str:
     fidelity = "" if view.fidelity is None else f", confidence index {view.fidelity.confidence_index:.4f}"
     taken = f"{ledger.total} of {view.budget} real steps ({ledger.adaptive} adaptive)"
     logged = f"{ledger.logged} logged steps"
-    if not ledger.logged:
-        return f"{taken}{fidelity}"
-    return f"{taken}, {logged}{fidelity}" if view.budget else f"{logged}{fidelity}"
+    parts = [*([taken] if view.budget or not ledger.logged else []), *([logged] if ledger.logged else [])]
+    return f"{', '.join(parts)}{fidelity}{_words_of_fit(view)}"
 
 
-def words_of_waiting(view: SurrogateView) -> str:
-    """Describe for what a training waits: for a sampler to be started, or for the answers of one that runs."""
-    awaited = "the sampler's answers" if view.samplers else f"a sampler (surrogym sample {view.name})"
+def words_of_audit(view: SurrogateView) -> str:
+    """Describe the present state of an audit: its real steps, and whether the server learns from them."""
+    return f"{view.ledger.audit} real steps of audits{_words_of_fit(view)}"
+
+
+def _words_of_fit(view: SurrogateView) -> str:
+    """Say that the server fits a model, which takes a minute or more for the steps of a long log; empty if it does
+    not."""
+    return f"; a model is being fitted to {view.samples} steps" if view.phase == "fitting" else ""
+
+
+def words_of_waiting(view: SurrogateView, start: str) -> str:
+    """Describe for what a training waits: for a sampler to be started by the command ``start``, for the answers of one
+    that runs, or for a model."""
+    if view.phase == "fitting" and not _under_way(view):
+        return words_of_design(view)
+    awaited = "the sampler's answers" if view.samplers else f"a sampler ({start})"
     return f"waiting for {awaited}: {words_of_design(view)}"
 
 

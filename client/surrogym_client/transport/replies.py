@@ -8,6 +8,7 @@ from pydantic import ValidationError
 
 from surrogym_client.errors import ProtocolMismatch
 from surrogym_shared import wire
+from surrogym_shared.checks import first_fault
 
 R = TypeVar("R", bound=wire.Reply)
 
@@ -21,6 +22,4 @@ def parse(reply: type[R], content: bytes, path: str) -> R:
     try:
         return reply.model_validate_json(content)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "body"
-        raise ProtocolMismatch(f"unexpected answer of {path}: {where}: {first['msg']}") from error
+        raise ProtocolMismatch(f"unexpected answer of {path}: {first_fault(error)}") from error

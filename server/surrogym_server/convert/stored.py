@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from surrogym_server.errors import Damaged
+from surrogym_shared.checks import first_fault
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -25,6 +26,4 @@ def read_stored(model: type[M], what: str, stored: dict[str, Any]) -> M:
     try:
         return model.model_validate(stored)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise Damaged(f"{what} can't be read: {where}: {first['msg']}") from error
+        raise Damaged(f"{what} can't be read: {first_fault(error)}") from error

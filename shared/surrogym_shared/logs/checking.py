@@ -24,6 +24,9 @@ from surrogym_shared.logs.units import require_units
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.terms import terminates
 
+HEADING = ("line", "reason")  # of a file of rejected rows, before the columns of its log
+OURS = ",".join(HEADING).encode() + b","
+
 
 @dataclass(frozen=True)
 class ReadLog:
@@ -70,7 +73,7 @@ def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
     """Check the rows of a log against a specification.
 
     Raises:
-        UnusableLog: the columns don't fit the specification.
+        UnusableLog: the columns don't fit the specification, or are in other units.
         TooFewSteps: no step is usable.
     """
     roles = _of_spec(roles, spec)
@@ -109,9 +112,18 @@ def write_rejected(path: Path, table: Table, steps: Transitions) -> None:
     """Write the rows that were set aside as CSV: line, reason, and the cells as in the log."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(["line", "reason", *table.names])
+        writer.writerow([*HEADING, *table.names])
         for row, reason in steps.rejected.items():
             writer.writerow([table.lines[row], reason, *table.row(row)])
+
+
+def is_of_rejected(path: Path) -> bool:
+    """Whether ``write_rejected`` wrote a file, or the file is empty. Its heading tells this."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(len(OURS) + 1)
+    return not head or head.startswith(OURS)
 
 
 def _of_spec(roles: Roles, spec: EnvironmentSpec) -> Roles:

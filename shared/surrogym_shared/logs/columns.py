@@ -141,9 +141,9 @@ def roles_by_name(names: Sequence[str]) -> Roles:
     """Find the roles of columns by their names; see the how-to page on logs.
 
     Raises:
-        UnusableLog: states or actions have no column, too many, or two for one name.
+        UnusableLog: states or actions have no column, too many, or two for one name, or another role has two.
     """
-    single: dict[str, Any] = {role: _first(names, known) for role, known in SINGLE.items()}
+    single: dict[str, Any] = {role: _only(role, names, known) for role, known in SINGLE.items()}
     left = [name for name in names if name not in single.values()]
     action = _single("action", [(_part(match) or "0", name) for name in left if (match := ACTION.match(name))])
     left = [name for name in left if name not in action.values()]
@@ -320,10 +320,18 @@ def _require(names: Iterable[str], state: Mapping[str, str], action: Mapping[str
             )
 
 
-def _first(names: Iterable[str], known: Sequence[str]) -> str | None:
-    """Return the first column with a known name. Case only matters for single letters: t is a time, T a temperature."""
-    written = {name.lower() if len(name) > 1 else name: name for name in reversed(list(names))}
-    return next((written[name] for name in known if name in written), None)
+def _only(role: str, names: Iterable[str], known: Sequence[str]) -> str | None:
+    """Return the column with a known name of a role; None without one. Raises ``UnusableLog`` if there are several.
+
+    Case only matters for single letters: t is a time, T a temperature.
+    """
+    found = [name for name in names if (name.lower() if len(name) > 1 else name) in known]
+    if len(found) > 1:
+        raise UnusableLog(
+            f"expected one column for the role {role}, got {' and '.join(found)}: rename one, or name the "
+            "columns in a mapping file (--map)"
+        )
+    return found[0] if found else None
 
 
 def _part(match: re.Match[str] | None) -> str:

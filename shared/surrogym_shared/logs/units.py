@@ -1,4 +1,4 @@
-"""Detect columns of a log that are in another unit than the specification's."""
+"""Detect columns of a log that are in another unit than the specification's, or than known rewards."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from surrogym_shared.logs.table import Floats
 from surrogym_shared.spec import EnvironmentSpec, limits
 
 BEYOND = 20.0  # distance outside a coordinate's range, in widths of the range, that no real plant reaches
+FEWEST = 8  # known rewards that show how large rewards are
 
 
 def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:
@@ -36,3 +37,29 @@ def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:
                 f"{which}{coordinate.name}: half of the log lies between {first:.4g} and {last:.4g}, its range is "
                 f"{low:.4g} to {high:.4g}: is the column in another unit? Convert it, or name another column (--map)"
             )
+
+
+def require_reward_unit(paid: Floats, known: Floats, name: str) -> None:
+    """Refuse rewards that seem to be in another unit than those of a surrogate's samples.
+
+    Rewards of 0 have no unit, and few samples may all have small rewards by chance. Neither tells anything.
+
+    Args:
+        paid: rewards of the log, (m,).
+        known: rewards of the samples, (n,).
+        name: name of the surrogate.
+
+    Raises:
+        UnusableLog: the middle half of ``paid`` is ``BEYOND`` times as large as all known rewards, or spreads as far.
+    """
+    largest = float(np.abs(known).max(initial=0.0))
+    if len(known) < FEWEST or largest == 0:
+        return
+    first, last = np.quantile(paid, [0.25, 0.75])
+    far = BEYOND * largest
+    if first > far or last < -far or last - first > far:
+        raise UnusableLog(
+            f"reward: half of the log lies between {first:.4g} and {last:.4g}, the samples of {name!r} have rewards of "
+            f"{known.min():.4g} to {known.max():.4g}: is the column in another unit? Convert it, or name another "
+            "column (--map)"
+        )

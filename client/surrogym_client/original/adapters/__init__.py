@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 from pydantic import ValidationError
 
-from surrogym_client.original.errors import UnknownEnvironment, sentence
+from surrogym_client.original.errors import RAISED, UnknownEnvironment, sentence
 from surrogym_client.original.simulator import Simulator
+from surrogym_shared.checks import first_fault
 
 GYMNASIUM_ID = re.compile(r"(?:[A-Za-z_][\w.]*:)?[\w./-]+-v\d+")  # package:Id-v0 is Gymnasium's own spelling
 WITH_SPECIFICATION = re.compile(r"exec:.*|[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # a program, or package.module:factory
@@ -103,11 +104,7 @@ def open_simulator(name: str) -> Simulator:
     except UnknownEnvironment:
         raise
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "its spaces"
-        raise UnknownEnvironment(
-            f"{name} can't be specified: {where}: {first['msg'].removeprefix('Value error, ')}"
-        ) from error
-    except Exception as error:  # an environment raises any kind
+        raise UnknownEnvironment(f"{name} can't be specified: {first_fault(error)}") from error
+    except RAISED as error:
         raise UnknownEnvironment(f"{name} can't be opened: {sentence(error)}") from error
     return opened

@@ -7,6 +7,8 @@ The goal of a goal environment (Gymnasium-Robotics) is a part of the state, in i
 from __future__ import annotations
 
 import inspect
+import os
+import sys
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,7 @@ from surrogym_client.original.state_parts import (
     mujoco_parts,
 )
 
+ROBOTICS = "gymnasium_robotics"  # a name of it from a server is opened without consent, so never from anywhere
 SYMBOLS = ("Discrete", "MultiDiscrete", "MultiBinary", "Text", "Graph", "Sequence")  # spaces without numbers
 STEP = ("observation", "reward", "terminated", "truncated", "info")
 
@@ -54,13 +57,16 @@ def settable(name: str, env: Any, limit: int | None = None) -> GymnasiumSimulato
 
 
 def make(name: str) -> Any:
-    """Make the environment, and reset it once.
+    """Make the environment, and reset it once. The package of ``package:Id-v0`` may be in the working directory.
 
     Raises:
         UnknownEnvironment: it can't be made.
     """
     import gymnasium
 
+    package, colon, _ = name.partition(":")
+    if colon and package != ROBOTICS and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
     try:
         env: Any = gymnasium.make(name, disable_env_checker=True)
     except (ImportError, gymnasium.error.Error) as error:
@@ -73,7 +79,7 @@ def _way_out(name: str) -> str:
     import gymnasium
 
     package = name.partition(":")[0]
-    if package == "gymnasium_robotics":
+    if package == ROBOTICS:
         return "(pip install 'surrogym[robotics]')"
     entry = gymnasium.registry.get(name)
     if entry is not None and str(entry.entry_point).startswith("gymnasium.envs.mujoco"):

@@ -11,7 +11,7 @@ from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.protocol import Array
 from surrogym_client.original.simulator import Simulator, random_factor
 from surrogym_client.original.state_parts import StatePart
-from surrogym_shared.spec import BoxAction, DiscreteAction, MultiDiscreteAction
+from surrogym_shared.spec import MAX_DIMENSIONS, BoxAction, DiscreteAction, MultiDiscreteAction
 from surrogym_shared.spec.actions import Action
 
 
@@ -60,6 +60,12 @@ def action_of(name: str, space: Any) -> Action:
         UnknownEnvironment: a space, or bounds, that no specification can express.
     """
     kind = type(space).__name__
+    shape: tuple[int, ...] = getattr(space, "shape", None) or ()
+    if len(shape) == 1 and not 1 <= shape[0] <= MAX_DIMENSIONS:
+        raise UnknownEnvironment(
+            f"{name} has an action of {shape[0]} entries: expected 1 to {MAX_DIMENSIONS}; write a wrapper class that "
+            "chooses them (docs/how-to/own-environment.md)"
+        )
     if kind == "Box" and len(space.shape) == 1 and np.isfinite([space.low, space.high]).all():
         return BoxAction(low=tuple(map(float, space.low)), high=tuple(map(float, space.high)))
     if kind == "Discrete" and int(space.start) == 0:

@@ -6,6 +6,9 @@ they keep the values that were set.
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +47,14 @@ def open_simulator(name: str) -> Simulator:
         ImportError: pc-gym is not installed.
     """
     parameters = parameters_of(name.partition(":")[2])
-    from pcgym import make_env, model_classes
+    with _silence():
+        from pcgym import make_env, model_classes
 
     _require_model(name, parameters["model"], model_classes)
+    _as_before()
     try:
-        env = make_env(parameters)
+        with _silence():
+            env = make_env(parameters)
         check_model(name, parameters, env.model.info())
         return Process(name, env)
     except (ImportError, OriginalError):
@@ -58,6 +64,23 @@ def open_simulator(name: str) -> Simulator:
             f"pc-gym refused the parameters of {name}: {type(error).__name__}: {error}; its documentation lists what "
             "make_env needs"
         ) from error
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Silence warnings that a user of pc-gym can do nothing about: of its packages' syntax, and of its own spaces."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SyntaxWarning)
+        warnings.filterwarnings("ignore", ".*precision lowered by casting", UserWarning)
+        yield
+
+
+def _as_before() -> None:
+    """Let CasADi answer calls of NumPy as when pc-gym was written. Newer versions do so with a warning otherwise."""
+    from casadi import GlobalOptions
+
+    with suppress(AttributeError):  # older versions know no other way
+        GlobalOptions.setNumpyMode(-1)
 
 
 def _require_model(name: str, model: str, classes: Any) -> None:
@@ -100,7 +123,8 @@ class Process(OfParts):
 
     def __init__(self, name: str, env: Any) -> None:
         self._name, self._env = name, env
-        env.reset()
+        with _silence():
+            env.reset()
         self._schedule = (env.SP, getattr(env, "disturbances", {}))
         super().__init__([_State(env)])
         setpoints, disturbances = self._schedule
@@ -115,7 +139,8 @@ class Process(OfParts):
         self._env.SP, disturbances = self._schedule
         if disturbances:
             self._env.disturbances = disturbances
-        self._env.reset()
+        with _silence():  # each reset makes the spaces anew
+            self._env.reset()
         self._show_setpoints()
         return self.observe()
 

@@ -5,19 +5,24 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from pydantic import ValidationError
 
 from surrogym_client.original.adapters import open_simulator
-from surrogym_client.original.describing.exploring import RESETS, STEPS, Counted, Seen, explore, moved_by
+from surrogym_client.original.describing.counting import Counted
+from surrogym_client.original.describing.exploring import RESETS, STEPS, Seen, explore, moved_by
 from surrogym_client.original.describing.expressing import express, names_in, shown_by_itself
 from surrogym_client.original.describing.known_rewards import known_reward
-from surrogym_client.original.describing.probing import EXACT, Probed, probe
+from surrogym_client.original.describing.probing import Probed, probe
+from surrogym_client.original.describing.usable import require_coordinates, require_numbers
+from surrogym_client.original.describing.words import listed, words_of_access, words_of_reward
 from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.protocol import Array
-from surrogym_client.original.simulator import Simulator, Variable
+from surrogym_client.original.simulator import Variable
 from surrogym_client.original.state_parts import VELOCITY
+from surrogym_shared.checks import first_fault
 from surrogym_shared.spec import (
     MAX_DIMENSIONS,
     Coordinate,
@@ -82,37 +87,43 @@ def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
         UnknownEnvironment: no adapter knows the name, or no specification can express the environment.
         StepFailed: the environment failed at a reset or a step, after a number of real steps.
     """
-    simulator = open_simulator(name)
+    counted = Counted(open_simulator(name), name)
     try:
-        counted, rng = Counted(simulator, name), np.random.default_rng(seed)
-        seen = explore(counted, steps, rng)
-        probed = probe(counted, seen, rng) if simulator.settable else Probed(np.inf, 0.0, 0.0)
-        drafted = _Draft(name, simulator, seen, probed)
-        spec = drafted.spec(rng)
-        if (reward := drafted.known_reward(counted, spec, rng)) is not None:
-            spec = spec.model_copy(update={"reward": reward})
-        found, asked = drafted.found(spec, steps), drafted.asked(spec)
-        return Description(spec, found, asked, counted.steps, counted.resets, simulator.pays)
+        described = _described(name, counted, steps, np.random.default_rng(seed))
+    except (UnknownEnvironment, ValidationError) as error:
+        said = f"{name} can't be specified: {first_fault(error)}" if isinstance(error, ValidationError) else str(error)
+        took = f"; this took {counted.steps} real steps" if counted.steps else ""
+        raise UnknownEnvironment(f"{said}{took}") from error
     finally:
-        simulator.close()
+        failed = counted.close()
+    return replace(described, found=(*described.found, *failed))
+
+
+def _described(name: str, counted: Counted, steps: int, rng: np.random.Generator) -> Description:
+    """Describe an open environment. Arguments and errors as ``describe``."""
+    simulator = counted.simulator
+    seen = explore(counted, steps, rng)
+    lived = ~seen.ended_at_once
+    require_numbers(name, (seen.starts, seen.states[lived], seen.next_states[lived]), seen.rewards[lived])
+    probed = probe(counted, seen, rng) if simulator.settable else Probed(np.inf, 0.0, 0.0)
+    drafted = _Draft(name, counted, seen, probed)
+    spec = drafted.spec(rng)
+    if (reward := drafted.known_reward(spec, rng)) is not None:
+        spec = spec.model_copy(update={"reward": reward})
+    found, asked = drafted.found(spec, steps), drafted.asked(spec)
+    return Description(spec, found, asked, counted.steps, counted.resets, simulator.pays)
 
 
 class _Draft:
     """The specification of one simulator."""
 
-    def __init__(self, name: str, simulator: Simulator, seen: Seen, probed: Probed) -> None:
-        self._name, self._simulator, self._seen, self._probed = name, simulator, seen, probed
+    def __init__(self, name: str, counted: Counted, seen: Seen, probed: Probed) -> None:
+        self._name, self._counted, self._seen, self._probed = name, counted, seen, probed
+        self._simulator = counted.simulator
         lived = ~seen.ended_at_once
         self._all = np.concatenate([seen.starts, seen.states[lived], seen.next_states[lived]])
-        if not np.isfinite(self._all).all():
-            raise UnknownEnvironment(f"{name} reached states with infinite values or NaN under random actions")
-        if not np.isfinite(seen.rewards[lived]).all():
-            raise UnknownEnvironment(f"{name} paid infinite rewards or NaN under random actions: expected numbers")
         self._kept = self._chosen()
-        if len(self._kept) > MAX_DIMENSIONS:
-            raise UnknownEnvironment(
-                f"{name} has {len(self._kept)} moving variables: expected at most {MAX_DIMENSIONS}"
-            )
+        require_coordinates(name, len(self._kept), len(seen.rewards))
 
     def spec(self, rng: np.random.Generator) -> EnvironmentSpec:
         """The specification, with the observation in terms of the coordinates."""
@@ -133,10 +144,10 @@ class _Draft:
         observation = self._observation(frame, variables, rng)
         return EnvironmentSpec.model_validate({**frame.model_dump(), "observation": observation})
 
-    def known_reward(self, counted: Counted, spec: EnvironmentSpec, rng: np.random.Generator) -> DeclaredReward | None:
+    def known_reward(self, spec: EnvironmentSpec, rng: np.random.Generator) -> DeclaredReward | None:
         """A reward that can be declared, or None."""
         usable = self._simulator.pays and self._probed.settable and not self._probed.noisy
-        return known_reward(counted, self._seen, self._kept, spec, rng) if usable else None
+        return known_reward(self._counted, self._seen, self._kept, spec, rng) if usable else None
 
     def found(self, spec: EnvironmentSpec, steps: int) -> tuple[str, ...]:
         """Findings, one sentence each."""
@@ -145,29 +156,36 @@ class _Draft:
         kinds = {kind: [c.name for c in spec.coordinates if c.kind == kind] for kind in ("angle", "constant")}
         lines = [
             f"{len(kept)} coordinates describe the state; {steps} random steps and {RESETS} resets showed their ranges",
-            _words_of_access(probed, self._simulator.fixed),
+            words_of_access(probed, self._simulator.fixed),
             *self._simulator.notes,
         ]
         if probed.shifts:
-            lines.append(f"a shift of {_listed(sorted(probed.shifts))} changes nothing, so it is left out")
+            lines.append(f"a shift of {listed(sorted(probed.shifts))} changes nothing, so it is left out")
         if kinds["angle"]:
             lines.append(
-                f"a whole turn of {_listed(kinds['angle'])} changes nothing, so it is observed as cosine and sine"
+                f"a whole turn of {listed(kinds['angle'])} changes nothing, so it is observed as cosine and sine"
             )
         if drawn := [name for name in kinds["constant"] if name not in self._simulator.scheduled]:
-            lines.append(f"{_listed(drawn)}: constant within an episode, and drawn again at each reset")
+            lines.append(f"{listed(drawn)}: constant within an episode, and drawn again at each reset")
         if not probed.stays:
             lines.append(
                 f"{probed.leaving:.0%} of the steps from random states within the declared limits led far outside: the "
                 "sampling ranges are those that random actions reached, with a margin"
             )
         if isinstance(spec.reward, DeclaredReward):
-            lines.append(f"{_words_of(spec.reward)} explains every reward, so it is declared: no query is spent on it")
-        if still:
-            lines.append(f"left out, because it never moved or repeats another variable: {_listed(still)}")
-        if self._left_out:
             lines.append(
-                f"entries {_listed([str(i) for i in self._left_out])} of the environment's observation are not sums "
+                f"{words_of_reward(spec.reward)} explains every reward, so it is declared: no query is spent on it"
+            )
+        if still:
+            lines.append(f"left out, because it never moved or repeats another variable: {listed(still)}")
+        if self._too_many:
+            lines.append(
+                f"the observation has {self._too_many} entries, more than {MAX_DIMENSIONS}: the policy observes the "
+                "coordinates instead"
+            )
+        elif self._left_out:
+            lines.append(
+                f"entries {listed([str(i) for i in self._left_out])} of the environment's observation are not sums "
                 "of 1, q, sin(q) and cos(q): the policy observes the coordinates instead"
             )
         return tuple(lines)
@@ -182,13 +200,13 @@ class _Draft:
         ended, lines = int(self._seen.terminated.sum()), list[str]()
         if guessed:
             lines.append(
-                f"sampling range of {_listed(guessed)}: does it cover the states that a good policy visits? It covers "
+                f"sampling range of {listed(guessed)}: does it cover the states that a good policy visits? It covers "
                 "what random actions "
                 f"reached, and {FASTER:g} times that for speeds; the design never queries outside it"
             )
         if self._unmoved:
             lines.append(
-                f"{_listed(self._unmoved)}: no random action moved it. If nothing can, declare it constant and leave "
+                f"{listed(self._unmoved)}: no random action moved it. If nothing can, declare it constant and leave "
                 "its velocity out; otherwise give the range of its velocity"
             )
         if ended:
@@ -199,7 +217,7 @@ class _Draft:
             )
         else:
             lines.append("termination: no step ended an episode. If some states should end it, declare them")
-        if scheduled := _listed([name for name in spec.coordinate_names if name in self._simulator.scheduled]):
+        if scheduled := listed([name for name in spec.coordinate_names if name in self._simulator.scheduled]):
             lines.append(
                 f"start of {scheduled}: a schedule sets it in an original episode. A virtual episode keeps one value, "
                 "drawn from those of the schedule. Widen the start if a policy should follow other values"
@@ -332,51 +350,26 @@ class _Draft:
         for name in frame.coordinate_names:
             if name in raw or name not in {n for entry in shown.values() for n in names_in(entry.term)}:
                 shown |= {entry.name: entry for entry in shown_by_itself(name, angle=name in angles)}
+        self._too_many = len(shown) if len(shown) > MAX_DIMENSIONS else 0
+        if self._too_many:
+            return [entry for name in frame.coordinate_names for entry in shown_by_itself(name, angle=name in angles)]
         return list(shown.values())
 
     def _observed(self, frame: EnvironmentSpec, rng: np.random.Generator) -> tuple[Array, Array]:
         """Coordinates (n, C) and the simulator's observations there (n, D)."""
-        simulator = self._simulator
-        if not (simulator.shows and self._probed.settable):
+        counted = self._counted
+        if not (self._simulator.shows and self._probed.settable):
             return self._seen.next_states[:, self._kept], self._seen.observations
         ranges = np.array([limits(c.sampling) for c in frame.coordinates])
         places = rng.uniform(ranges[:, 0], ranges[:, 1], (PLACES, len(ranges)))
         observed = []
         for place in places:
-            simulator.place(self._kept, place)
-            place[:] = simulator.read()[self._kept]
-            observed.append(simulator.observe())
+            counted.place(self._kept, place)
+            place[:] = counted.read()[self._kept]
+            observed.append(counted.observe())
         return places, np.stack(observed)
 
 
 def _raw(term: Term) -> set[str]:
     """The coordinates that a term reads directly. Such a term jumps where an angle wraps."""
     return {name for part in term.parts if part.function == "linear" for name in part.weights}
-
-
-def _words_of(reward: DeclaredReward) -> str:
-    bonus = reward.terms[0]
-    if bonus.when:
-        return "a threshold of a quantity of the state"
-    return (
-        "an ellipsoid of quantities of the state"
-        if bonus.shape == "ball"
-        else "a quadratic function of coordinates and actions"
-    )
-
-
-def _words_of_access(probed: Probed, fixed: str) -> str:
-    if not np.isfinite(probed.set_error):
-        return fixed
-    if not probed.settable:
-        return (
-            f"a step from a set state differs from the same step within an episode by {probed.set_error:.2g} of "
-            "its range: the environment has memory that can't be set, so it can only be reset"
-        )
-    noise = f"; two steps from one state differ by {probed.repeat_error:.2g}" if probed.noisy else ""
-    same = "that of an episode" if probed.set_error <= EXACT else f"that of an episode within {probed.set_error:.2g}"
-    return f"it can be set to any state: a step from there is {same}{noise}"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names)

@@ -5,16 +5,14 @@ Shapes: n steps, R resets, V variables of the state, F action entries, D observa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.original.errors import StepFailed, UnknownEnvironment, sentence
+from surrogym_client.original.describing.counting import Counted
+from surrogym_client.original.describing.usable import require_few, require_numbers, require_variables
 from surrogym_client.original.protocol import Array
-from surrogym_client.original.simulator import Simulator, Taken
 from surrogym_shared.spec import BoxAction, DiscreteAction
 from surrogym_shared.spec.actions import Action
 
@@ -59,59 +57,6 @@ class Seen:
         return ended
 
 
-class Counted:
-    """A simulator whose real steps and resets are counted.
-
-    Whatever the simulator raises becomes ``StepFailed``, with the number of real steps before it.
-    """
-
-    def __init__(self, simulator: Simulator, name: str = "the environment") -> None:
-        self.simulator = simulator
-        self.steps = 0
-        self.resets = 0
-        self._name = name
-
-    def reset(self, seed: int) -> Array:
-        """Begin an episode. Returns the state (V,)."""
-        self.resets += 1
-        with self._failures(self.steps):
-            self.simulator.reset(seed)
-            return self._read()
-
-    def step(self, action: Array) -> Taken:
-        """Take a step."""
-        self.steps += 1
-        with self._failures(self.steps - 1):
-            return self.simulator.step(action)
-
-    def read(self) -> Array:
-        """The state (V,)."""
-        with self._failures(self.steps):
-            return self._read()
-
-    def step_from(self, state: Array, action: Array) -> tuple[Array, Taken]:
-        """Set the state (V,) and take a step. Returns the next state and the step's results."""
-        with self._failures(self.steps):
-            self.simulator.write(state)
-        taken = self.step(action)
-        return self.read(), taken
-
-    def _read(self) -> Array:
-        state, expected = self.simulator.read(), len(self.simulator.variables)
-        if len(state) != expected:
-            raise StepFailed(f"expected a state of {expected} numbers, as after its first reset, got {len(state)}")
-        return state
-
-    @contextmanager
-    def _failures(self, steps: int) -> Iterator[None]:
-        try:
-            yield
-        except UnknownEnvironment:
-            raise
-        except Exception as error:  # an environment raises any kind
-            raise StepFailed(f"{self._name} failed after {steps} real steps: {sentence(error)}") from error
-
-
 def moved_by(values: Array) -> Array:
     """The range of each column (n, ...), and 0 where it is so small that rounding explains it."""
     ranges = np.ptp(values, axis=0)
@@ -127,14 +72,17 @@ def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
     that they did not reach are those from which something falls fastest.
     """
     simulator = counted.simulator
+    require_variables(counted.name, simulator.variables)
     starts = np.stack([counted.reset(seed) for seed in range(RESETS)])
+    require_numbers(counted.name, (starts,), np.zeros(0))
+    require_few(counted.name, simulator.variables, moved_by(starts) > 0)
     rows: list[tuple[Array, Array, Array, float, bool, Array, int]] = []
     length, number = max(1, -(-steps // EPISODES)), 0
     while len(rows) < steps:
         state = counted.reset(RESETS + number)
         if number % 2 and simulator.settable:
             visited = np.array([row[0] for row in rows] + [rows[-1][2]])
-            state = _far_from(simulator, visited, state, rng)
+            state = _far_from(counted, visited, state, rng)
         for action in _actions(simulator.action, number, min(length, steps - len(rows)), rng):
             taken = counted.step(action)
             reached = counted.read()
@@ -147,31 +95,32 @@ def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
     return Seen(starts, *columns)
 
 
-def _far_from(simulator: Simulator, visited: Array, state: Array, rng: np.random.Generator) -> Array:
+def _far_from(counted: Counted, visited: Array, state: Array, rng: np.random.Generator) -> Array:
     """Of random positions within their limits without contacts, the one that is farthest from visited states (n, V).
 
     A distance is the norm of the positions' differences, each as a share of its range. If all have contacts, the state
     stays unchanged.
     """
-    turns = np.array([v.motion == "turn" and not v.limited for v in simulator.variables])
-    at = [i for i, v in enumerate(simulator.variables) if v.motion == "turn" or (v.motion == "slide" and v.limited)]
-    bounds = [(simulator.variables[i].low, simulator.variables[i].high) for i in at]
+    variables = counted.simulator.variables
+    turns = np.array([v.motion == "turn" and not v.limited for v in variables])
+    at = [i for i, v in enumerate(variables) if v.motion == "turn" or (v.motion == "slide" and v.limited)]
+    bounds = [(variables[i].low, variables[i].high) for i in at]
     low = np.array([-np.pi if lowest is None else lowest for lowest, _ in bounds])
     high = np.array([np.pi if highest is None else highest for _, highest in bounds])
     best, farthest = state, -1.0
     for _ in range(PLACES_TRIED):
         placed = state.copy()
         placed[at] = rng.uniform(low, high)
-        simulator.write(placed)
-        if simulator.touches():
+        counted.write(placed)
+        if counted.touches():
             continue
         shares = (visited[:, at] - placed[at]) / np.maximum(high - low, 1e-12)
         shares = np.where(turns[at], shares - np.round(shares), shares)  # the shorter way round
         distance = float(np.sqrt((shares**2).sum(1)).min())
         if distance > farthest:
-            best, farthest = simulator.read(), distance
-    simulator.write(best)
-    return simulator.read()
+            best, farthest = counted.read(), distance
+    counted.write(best)
+    return counted.read()
 
 
 def _actions(space: Action, number: int, count: int, rng: np.random.Generator) -> list[Array]:

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surrogym_client.original.describing.exploring import Counted, Seen
+from surrogym_client.original.describing.counting import Counted
+from surrogym_client.original.describing.exploring import Seen
 from surrogym_client.original.describing.rewarding import ENOUGH, Paid, coefficients, may_be_quadratic, quadratic_reward
 from surrogym_client.original.describing.thresholds import threshold_reward
 from surrogym_client.original.gymnasium import wrapped
@@ -68,13 +69,13 @@ class _Anywhere:
 
     def steps(self, places: Array, actions: Array) -> Paid:
         """Steps from states (n, C) with actions (n, F). Those that end an episode are left out."""
-        simulator, n = self.counted.simulator, len(actions)
+        counted, n = self.counted, len(actions)
         read, reward = np.zeros((n, 2, len(self.kept))), np.full(n, np.nan)
         for i, (place, u) in enumerate(zip(places, actions, strict=True)):
-            simulator.place(self.kept, place)
-            read[i, 0] = simulator.read()[self.kept]
-            step = self.counted.step(u)
+            counted.place(self.kept, place)
+            read[i, 0] = counted.read()[self.kept]
+            step = counted.step(u)
             if not step.terminated:
-                read[i, 1], reward[i] = simulator.read()[self.kept], step.reward
+                read[i, 1], reward[i] = counted.read()[self.kept], step.reward
         lived = np.isfinite(reward)
         return Paid(wrapped(self.spec, read[:, 0]), actions, wrapped(self.spec, read[:, 1]), reward).at(lived)

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surrogym_client.original.describing.exploring import RESETS, Counted, Seen, moved_by
+from surrogym_client.original.describing.counting import Counted
+from surrogym_client.original.describing.exploring import RESETS, Seen, moved_by
 from surrogym_client.original.errors import StepFailed
 from surrogym_client.original.protocol import Array
 

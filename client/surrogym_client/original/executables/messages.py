@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from surrogym_client.original.errors import RequestRefused, StepFailed, UnknownEnvironment
 from surrogym_client.original.protocol import Array
+from surrogym_shared.checks import first_fault
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.spec.actions import Action
 
@@ -136,11 +137,7 @@ def specification_in(reply: Reply) -> EnvironmentSpec:
     try:
         return EnvironmentSpec.model_validate_json(json.dumps(reply.get("spec")))
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "spec"
-        raise UnknownEnvironment(
-            f"expected a valid specification from the program, got one with an error in {place}: {first['msg']}"
-        ) from error
+        raise UnknownEnvironment(f"expected a valid specification from the program: {first_fault(error)}") from error
 
 
 def _is_number(value: object) -> bool:

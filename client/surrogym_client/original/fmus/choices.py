@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.fmus.archive import Archive, Declared
-from surrogym_shared.checks import Number
+from surrogym_shared.checks import Number, first_fault
 
 PREFIX = "fmu:"
 Value = bool | int | float | str
@@ -66,9 +66,7 @@ def read_choices(name: str) -> tuple[Path, Choices]:
     try:
         given = _File.model_validate(json.loads(path.read_text(encoding="utf-8")))
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        wrong = f"{place}: {first['msg']}" if place else "not a JSON object"
+        wrong = first_fault(error) if error.errors()[0]["loc"] else "not a JSON object"
         raise UnknownEnvironment(
             f"{path}: {wrong}; expected fmu, and optionally step, actions, coordinates and start"
         ) from error

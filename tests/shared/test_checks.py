@@ -1,0 +1,37 @@
+"""The first fault of a validation is one sentence for a person."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from support.moody import SPEC
+from surrogym_shared.checks import first_fault
+from surrogym_shared.spec import EnvironmentSpec
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"coordinates": []}, "coordinates: expected 1 or more entries, got 0"),
+        ({"coordinates": 70 * [{}]}, "coordinates.0.name: Field required"),
+        ({"starts": 257 * [[0.0]]}, "starts: expected at most 256 entries, got 257"),
+        ({"time_limit": "long"}, "time_limit: Input should be a valid integer"),
+        ({"action": {"kind": "box", "low": [1.0], "high": [0.0]}}, "action.box: action 0 crosses: expected low < high"),
+    ],
+)
+def test_a_fault_has_its_place_and_no_words_of_python(fields: dict[str, Any], says: str):
+    """``Tuple should have at least 1 item after validation`` and ``Value error,`` tell a person nothing."""
+    with pytest.raises(ValidationError) as found:
+        EnvironmentSpec.model_validate(SPEC.model_dump() | fields)
+    assert first_fault(found.value).startswith(says)
+
+
+def test_the_value_that_came_is_cut():
+    with pytest.raises(ValidationError) as found:
+        EnvironmentSpec.model_validate(SPEC.model_dump() | {"time_limit": 1_000 * "x"})
+    said = first_fault(found.value, got=True)
+    assert said.startswith("time_limit: Input should be a valid integer, got 'xxx")
+    assert len(said) < 120
