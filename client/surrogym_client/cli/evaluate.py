@@ -148,8 +148,7 @@ def command(
     summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference)}
     summary |= {"promise_kept": _kept(judged, result), "version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
-    more = [*(found.in_words(card.spec) if found else []), *_why_not_judged(card, settings, result)]
-    more += _repeated(result)
+    more = [*(found.in_words(card.spec) if found else []), *_why_not_judged(card, settings, result), *_repeated(result)]
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
 
 

@@ -99,6 +99,15 @@ class DesignChoices:
     ] = None
 
 
+PrintSpec = Annotated[
+    bool,
+    typer.Option(
+        "--print-spec",
+        help="Print the specification, and register nothing. If it has to be drafted, this takes real steps.",
+    ),
+]
+
+
 def command(
     context: typer.Context,
     environment: Annotated[
@@ -118,13 +127,7 @@ def command(
     *,
     choices: DesignChoices,
     tolerance: Tolerances = None,
-    print_spec: Annotated[
-        bool,
-        typer.Option(
-            "--print-spec",
-            help="Print the specification, and register nothing. If it has to be drafted, this takes real steps.",
-        ),
-    ] = False,
+    print_spec: PrintSpec = False,
     wait: Wait = 0.0,
     service: Service,
     output: Output,
