@@ -78,7 +78,8 @@ class FastPpo(PolicySearch):
     nothing after a quarter of the steps is abandoned, and another one takes the remaining steps. For continuous actions
     its noise is held for ``HELD`` steps. If it is abandoned as well, one of Stable-Baselines3's ``PPO`` follows, with
     state-dependent noise. If episodes are long and nothing ends them, training episodes are short and begin anywhere
-    (``with_short_episodes``).
+    (``with_short_episodes``). If nobody chose steps or discount, a second network then has the discount of whole
+    episodes.
 
     If nobody chose the number of steps, and training episodes are not short, as many steps follow for fine-tuning. All
     of their episodes begin at declared starts. Inputs are standardised by the observations that the policy meets, and
