@@ -136,7 +136,8 @@ def _improved(
             return np.inf, np.zeros_like(values)
         return cost.item(), slope
 
-    limits = {"maxiter": settings.iterations, "maxfun": 2 * settings.iterations, "ftol": 1e-10, "gtol": 1e-8}
+    # The cost is flat until the tip comes near its goal. The authors' search has no tolerances, at which it would end.
+    limits = {"maxiter": settings.iterations, "maxfun": 2 * settings.iterations, "ftol": 0, "gtol": 0}
     best: Array = minimize(value_and_slope, theta, jac=True, method="L-BFGS-B", options=limits).x
     return best
 
