@@ -3,7 +3,13 @@
 import numpy as np
 import torch
 
-from surrogym_client.experiments.peers.methods.gaussian_process import conditioned, fit, kernel, negative_log_evidence
+from surrogym_client.experiments.peers.methods.gaussian_process import (
+    conditioned,
+    fit,
+    kernel,
+    lowest,
+    negative_log_evidence,
+)
 from surrogym_client.experiments.peers.methods.moments import (
     saturating_cost,
     squashed,
@@ -93,6 +99,19 @@ def test_the_gradient_of_the_evidence_is_its_slope():
     steps = 1e-5 * np.eye(5)
     rises = [negative_log_evidence(x, y, theta + h)[0] - negative_log_evidence(x, y, theta - h)[0] for h in steps]
     np.testing.assert_allclose(slope, np.array(rises) / 2e-5, rtol=1e-6, atol=1e-6)
+
+
+def test_a_search_goes_on_after_a_step_too_far():
+    """The first step from 10 meets no value. A search that ended there would stay."""
+
+    def objective(at):
+        return (at[0] - np.log(at[0]), 1 - 1 / at) if at[0] > 0 else (np.nan, np.zeros(1))
+
+    def steep(at):
+        value, slope = objective(at)
+        return 100 * value, 100 * slope
+
+    np.testing.assert_allclose(lowest(steep, np.array([10.0])), 1, atol=1e-3)
 
 
 def test_a_fitted_process_predicts_and_knows_how_well():

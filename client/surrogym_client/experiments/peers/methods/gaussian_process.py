@@ -5,7 +5,7 @@ Shapes: n samples, m points, I inputs, E outputs. M. P. Deisenroth, C. E. Rasmus
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -134,14 +134,42 @@ def _fit_one(x: Array, y: Array, check: Callable[[], None]) -> tuple[Array, floa
         check()
         try:
             loss, slope = negative_log_evidence(x, y, theta)
-        except LinAlgError:  # no Cholesky factor: a trial step of the line search went too far
-            return np.inf, np.zeros_like(theta)
+        except LinAlgError:  # no Cholesky factor
+            return np.nan, np.zeros_like(theta)
         penalty, further = _penalty(theta, spread)
         return loss + penalty, slope + further
 
-    bounds = [(v - 7, v + 7) for v in start]
-    found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS})
-    return np.exp(found.x[:-2]), *np.exp(found.x[-2:])
+    found = lowest(objective, start, [(v - 7, v + 7) for v in start], maxiter=ITERATIONS)
+    return np.exp(found[:-2]), *np.exp(found[-2:])
+
+
+def lowest(
+    objective: Callable[[Array], tuple[float, Array]],
+    start: Array,
+    bounds: Sequence[tuple[float, float]] | None = None,
+    **options: float,
+) -> Array:
+    """Argument with the lowest value that L-BFGS finds.
+
+    A trial step of a line search may go so far that the objective has no finite value or slope. There it counts as
+    flat and worse than at the start, so that the line search takes a smaller step. An infinite value would end it.
+
+    Args:
+        objective: value and slope.
+        start: where the objective has a value.
+        bounds: of each entry.
+        options: of SciPy's L-BFGS-B.
+    """
+    worst = objective(start)[0] + 1
+
+    def finite(at: Array) -> tuple[float, Array]:
+        value, slope = objective(at)
+        if np.isfinite(value) and np.isfinite(slope).all():
+            return value, slope
+        return worst, np.zeros_like(at)
+
+    found: Array = minimize(finite, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
+    return found
 
 
 def negative_log_evidence(x: Array, y: Array, theta: Array) -> tuple[float, Array]:

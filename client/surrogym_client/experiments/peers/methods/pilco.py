@@ -13,12 +13,10 @@ from functools import partial
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.optimize import minimize
 from torch import Tensor
 
 from surrogym_client.experiments.peers.methods.belief import Imagination, expected_cost
-from surrogym_client.experiments.peers.methods.gaussian_process import Processes, conditioned, fit
+from surrogym_client.experiments.peers.methods.gaussian_process import Processes, conditioned, fit, lowest
 from surrogym_client.experiments.peers.methods.states import Control, Held, States, Transitions, episode, random_control
 from surrogym_client.experiments.peers.methods.told import told
 from surrogym_client.experiments.peers.port import NotApplicable, Real
@@ -128,18 +126,14 @@ def _improved(
         parameters = torch.from_numpy(values).requires_grad_()
         try:
             cost = objective(_policy(states, parameters))
-            cost.backward()  # type: ignore[no-untyped-call]
-        except RuntimeError:  # no Cholesky factor: a trial step of the line search went too far
-            return np.inf, np.zeros_like(values)
-        slope: NDArray[np.float64] | None = None if parameters.grad is None else parameters.grad.numpy()
-        if slope is None or not (np.isfinite(slope).all() and np.isfinite(cost.item())):
-            return np.inf, np.zeros_like(values)
-        return cost.item(), slope
+        except RuntimeError:  # the policy has no Cholesky factor
+            return np.nan, np.zeros_like(values)
+        cost.backward()  # type: ignore[no-untyped-call]
+        assert parameters.grad is not None
+        return cost.item(), parameters.grad.numpy()
 
     # The cost is flat until the tip comes near its goal. The authors' search has no tolerances, at which it would end.
-    limits = {"maxiter": settings.iterations, "maxfun": 2 * settings.iterations, "ftol": 0, "gtol": 0}
-    best: Array = minimize(value_and_slope, theta, jac=True, method="L-BFGS-B", options=limits).x
-    return best
+    return lowest(value_and_slope, theta, maxiter=settings.iterations, maxfun=2 * settings.iterations, ftol=0, gtol=0)
 
 
 def _acting(states: States, policy: Processes) -> Control:
