@@ -14,7 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogym_client.experiments.peers.methods.fast_pilco.beliefs import Exact, backward, forward
+from surrogym_client.experiments.peers.methods.fast_pilco.beliefs import Exact
+from surrogym_client.experiments.peers.methods.fast_pilco.beliefs import backward as passed_back
+from surrogym_client.experiments.peers.methods.fast_pilco.beliefs import forward as followed
 from surrogym_client.experiments.peers.methods.gaussian_process import Processes
 from surrogym_client.experiments.peers.methods.moments import (
     Moments,
@@ -110,7 +112,7 @@ class Imagination:
 
 class _Imagined(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any,
         x: Tensor,
         lengthscale: Tensor,
@@ -130,15 +132,16 @@ class _Imagined(torch.autograd.Function):
         means[0], own[0] = mean.numpy(), covariance.numpy()
         ctx.policy = tuple(np.ascontiguousarray(part.detach().numpy()) for part in (x, lengthscale, signal, weights))
         ctx.through, ctx.passed = through, (joints, covariances, slopes)
-        forward(through.model, through.by_pairs, ctx.policy, through.places, *ctx.passed, means, own)
+        followed(through.model, through.by_pairs, ctx.policy, through.places, joints, covariances, slopes, means, own)
         return torch.from_numpy(means[1:]), torch.from_numpy(own[1:])
 
     @staticmethod
-    def backward(ctx: Any, by_means: Tensor, by_own: Tensor) -> Any:  # type: ignore[override]
-        x, lengthscale, _, weights = ctx.policy
+    def backward(ctx: Any, by_means: Tensor, by_own: Tensor) -> Any:
+        (x, lengthscale, _, weights), (joints, covariances, slopes) = ctx.policy, ctx.passed
         by_policy = np.zeros_like(x), np.zeros_like(lengthscale), np.zeros_like(weights)
-        given = [np.concatenate([np.zeros_like(part[:1]), part]) for part in (by_means.numpy(), by_own.numpy())]
-        backward(ctx.through.model, ctx.policy, ctx.through.places, *ctx.passed, *given, by_policy)
+        means, own = (np.concatenate([np.zeros_like(part[:1]), part]) for part in (by_means.numpy(), by_own.numpy()))
+        through = ctx.through
+        passed_back(through.model, ctx.policy, through.places, joints, covariances, slopes, means, own, by_policy)
         return *map(torch.from_numpy, by_policy), *(None,) * 5
 
 

@@ -12,10 +12,10 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg.cython_blas  # noqa: F401  # numba calls it
 from numba import types
-from numpy.typing import NDArray
 
 from surrogym_client.experiments.peers.methods.fast_pilco.angles import angles, angles_back, squashed, squashed_back
 from surrogym_client.experiments.peers.methods.fast_pilco.processes import (
+    Ints,
     free_pair_back,
     logs,
     mean_and_gain,
@@ -25,13 +25,12 @@ from surrogym_client.experiments.peers.methods.fast_pilco.processes import (
 from surrogym_client.original.protocol import Array
 from surrogym_shared.compiled.jit import compiled, entry
 
-Ints = NDArray[np.int64]
 Exact = tuple[Array, Array, Array, Array]
 """Samples (n, I), length scales (E, I), signals (E,) and weights (E, n) of processes."""
 
 PLACES, VECTOR = types.int64[::1], types.float64[::1]
 ROWS, BLOCKS, FOURFOLD = types.float64[:, ::1], types.float64[:, :, ::1], types.float64[:, :, :, ::1]
-PROCESSES = types.Tuple((ROWS, ROWS, VECTOR, ROWS))
+PROCESSES = types.Tuple((ROWS, ROWS, VECTOR, ROWS))  # type: ignore[no-untyped-call]
 
 
 @compiled
@@ -288,7 +287,7 @@ def behind(
     add_at(by_joint, by_covariance, turning, mean, own)
 
 
-FIVE = types.UniTuple(PLACES, 5)
+FIVE, THREE = types.UniTuple(PLACES, 5), types.UniTuple(ROWS, 3)  # type: ignore[no-untyped-call]
 
 
 @entry(PROCESSES, BLOCKS, PROCESSES, FIVE, BLOCKS, FOURFOLD, FOURFOLD, BLOCKS, FOURFOLD)
@@ -327,7 +326,7 @@ def forward(
                     own[step + 1, k, i, j] = covariance[i, j] + cross + covariance[changes[i], changes[j]]
 
 
-@entry(PROCESSES, PROCESSES, FIVE, BLOCKS, FOURFOLD, FOURFOLD, BLOCKS, FOURFOLD, types.Tuple((ROWS, ROWS, ROWS)))
+@entry(PROCESSES, PROCESSES, FIVE, BLOCKS, FOURFOLD, FOURFOLD, BLOCKS, FOURFOLD, THREE)
 def backward(
     model: Exact,
     policy: Exact,

@@ -11,9 +11,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surrogym_client.original.protocol import Array
 from surrogym_shared.compiled.jit import compiled, summing
+
+Ints = NDArray[np.int64]
 
 LOG2E, LN2_HIGH, LN2_LOW = 1.4426950408889634, 0.6931471803691238, 1.9082149292705877e-10
 MAGIC = 6755399441055744.0  # 1.5 * 2^52; a sum with it has the nearest whole number in its last bits
@@ -22,7 +25,7 @@ BIAS, SHIFT = 1023, 52  # of a double's exponent
 
 
 @compiled
-def exponentials(x: Array, y: Array, powers: Array, bits: Array) -> None:
+def exponentials(x: Array, y: Array, powers: Array, bits: Ints) -> None:
     """Write e^x (n,) to y, to about one unit in the last place. ``powers`` and ``bits`` (integers) are the same
     memory, and are overwritten."""
     for i in range(x.size):
@@ -198,7 +201,7 @@ def shared(precision: Array, other: Array, covariance: Array) -> tuple[Array, Ar
 
 @compiled
 def products(
-    alpha: Array, beta: Array, log_a: Array, log_b: Array, q: Array, exponents: Array, found: Array, bits: Array
+    alpha: Array, beta: Array, log_a: Array, log_b: Array, q: Array, exponents: Array, found: Array, bits: Ints
 ) -> None:
     """Write e to (log_a + log_b + (alpha + beta)' Q (alpha + beta) / 2) of each pair of samples (n, n)."""
     turned = product(alpha, q)
@@ -226,7 +229,7 @@ def pair(
     other: Array,
     covariance: Array,
     room: Array,
-    bits: Array,
+    bits: Ints,
     slope: Array,
 ) -> float:
     """Return sum of ``by`` (n, n) times the means of products of two kernels, equations 18, 22 and 23.
@@ -251,7 +254,7 @@ def pair(
         for j in range(n):
             columns[j] += line[j]
         rows[i] = total_of(line)
-    value = rows.sum() / root
+    value: float = rows.sum() / root
     mixed = np.dot(found, beta)  # (n, I)
     by_q, along = np.zeros((size, size)), np.zeros(size)
     for i in range(n):
@@ -303,7 +306,7 @@ def free_pair_back(
     by_weights: Array,
     by_covariance: Array,
     room: Array,
-    bits: Array,
+    bits: Ints,
 ) -> None:
     """Pass back the derivative ``by`` of the second moment of outputs a and b of certain functions, to samples, length
     scales and weights too."""
