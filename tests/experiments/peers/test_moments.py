@@ -3,7 +3,13 @@
 import numpy as np
 import torch
 
-from surrogym_client.experiments.peers.methods.gaussian_process import conditioned, fit
+from surrogym_client.experiments.peers.methods.gaussian_process import (
+    conditioned,
+    fit,
+    kernel,
+    lowest,
+    negative_log_evidence,
+)
 from surrogym_client.experiments.peers.methods.moments import (
     saturating_cost,
     squashed,
@@ -74,6 +80,38 @@ def test_the_expected_cost_is_the_mean_of_costs():
     distance = ((draws(mean, covariance) - goal) ** 2).sum(-1)
     expected = (1 - torch.exp(-distance / (2 * 0.6**2))).mean(0)
     np.testing.assert_allclose(saturating_cost(mean, covariance, goal, 0.6), expected, atol=0.01, rtol=0.01)
+
+
+def test_predictions_are_those_of_the_covariances():
+    """Inverses in blocks of rows are the same as solving, with a number of samples that no block divides."""
+    model, at = processes(n=150), torch.from_numpy(np.random.default_rng(4).uniform(-3, 3, (40, 2)))
+    k = kernel(at, model.x, model.lengthscale, model.signal)
+    mean, deviation = model.predict(at)
+    np.testing.assert_allclose(mean, (k @ model.weights[..., None])[..., 0].T, atol=1e-9)
+    explained = ((k @ model.inverse) * k).sum(-1)
+    np.testing.assert_allclose(deviation**2, (model.signal[:, None] ** 2 - explained).T, atol=1e-9)
+
+
+def test_the_gradient_of_the_evidence_is_its_slope():
+    rng = np.random.default_rng(6)
+    x, y, theta = rng.uniform(-2, 2, (25, 3)), rng.standard_normal(25), rng.uniform(-1, 0.5, 5)
+    _, slope = negative_log_evidence(x, y, theta)
+    steps = 1e-5 * np.eye(5)
+    rises = [negative_log_evidence(x, y, theta + h)[0] - negative_log_evidence(x, y, theta - h)[0] for h in steps]
+    np.testing.assert_allclose(slope, np.array(rises) / 2e-5, rtol=1e-6, atol=1e-6)
+
+
+def test_a_search_goes_on_after_a_step_too_far():
+    """The first step from 10 meets no value. A search that ended there would stay."""
+
+    def objective(at):
+        return (at[0] - np.log(at[0]), 1 - 1 / at) if at[0] > 0 else (np.nan, np.zeros(1))
+
+    def steep(at):
+        value, slope = objective(at)
+        return 100 * value, 100 * slope
+
+    np.testing.assert_allclose(lowest(steep, np.array([10.0])), 1, atol=1e-3)
 
 
 def test_a_fitted_process_predicts_and_knows_how_well():

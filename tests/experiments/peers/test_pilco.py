@@ -1,15 +1,17 @@
-"""PILCO's belief follows the policy and the model, its gradient is the cost's slope, and starts are covered."""
+"""PILCO's belief follows the policy and the model, compiled as in torch, its gradient is the cost's slope, and starts
+are covered."""
 
 from functools import partial
 
 import numpy as np
 import torch
 
-from surrogym_client.experiments.peers.methods import pilco
+from surrogym_client.experiments.peers.methods import belief, pilco
 from surrogym_client.experiments.peers.methods.gaussian_process import conditioned
 from surrogym_client.experiments.peers.methods.states import States
 from surrogym_client.experiments.peers.methods.told import TOLD
 from surrogym_client.original import make
+from surrogym_shared.spec import BoxAction
 
 SPEC = make("Pendulum-v1").spec()
 STATES = States(SPEC)
@@ -31,7 +33,7 @@ def parameters(basis=6):
 def test_a_narrow_belief_moves_as_the_model_says():
     policy, at = pilco._policy(STATES, parameters()), np.array([[0.4, -0.7]])
     narrow = 1e-8 * torch.eye(2).double()[None]
-    mean, covariance = pilco._next_belief(STATES, model(), policy, torch.from_numpy(at), narrow)
+    mean, covariance = belief.next_belief(STATES, model(), policy, torch.from_numpy(at), narrow)
     inputs = np.concatenate([STATES.featured(at), pilco._acting(STATES, policy)(at)], 1)
     change, deviation = model().predict(torch.from_numpy(inputs))
     np.testing.assert_allclose(mean, torch.from_numpy(at) + change, atol=1e-5, rtol=1e-5)
@@ -40,7 +42,11 @@ def test_a_narrow_belief_moves_as_the_model_says():
 
 def test_the_gradient_is_the_slope_of_the_cost():
     objective = partial(
-        pilco._expected_cost, STATES, model(), TOLD["Pendulum-v1"].cost, pilco.start_beliefs(SPEC, 2), 4
+        belief.expected_cost,
+        belief.Imagination(STATES, model()),
+        TOLD["Pendulum-v1"].cost,
+        pilco.start_beliefs(SPEC, 2),
+        4,
     )
     theta = parameters()
     along = np.random.default_rng(2).standard_normal(len(theta)) * 1e-5
@@ -50,9 +56,45 @@ def test_the_gradient_is_the_slope_of_the_cost():
     np.testing.assert_allclose((ahead - behind) / 2, leaf.grad.numpy() @ along, rtol=1e-4)
 
 
+def test_compiled_episodes_are_those_of_torch():
+    """Values and gradients, with two angles and two controls, whose covariances a single one would not have."""
+    action = BoxAction(low=(-1.0, -1.0), high=(1.0, 1.0))
+    states, rng = States(make("Acrobot-v1").spec().model_copy(update={"action": action})), np.random.default_rng(5)
+    x, y = rng.uniform(-1, 1, (20, 8)), 0.3 * rng.standard_normal((20, 4))
+    lengthscale, signal = rng.uniform(0.7, 2, (4, 8)), rng.uniform(0.5, 1.5, 4)
+    learned = conditioned(*map(torch.from_numpy, (x, y, lengthscale, signal, 0.1 * signal)))
+    theta = rng.standard_normal(7 * 6 + 7 * 2 + 6) / 2
+    root = 0.3 * rng.standard_normal((2, 4, 4))
+    start = torch.from_numpy(rng.standard_normal((2, 4))), torch.from_numpy(root @ root.transpose(0, 2, 1))
+    by_means, by_covariances = (torch.from_numpy(rng.standard_normal((3, 2, *shape))) for shape in ((4,), (4, 4)))
+    by_covariances = by_covariances + by_covariances.mT
+
+    def imagined(policy):
+        found = [start]
+        for _ in range(3):
+            found.append(belief.next_belief(states, learned, policy, *found[-1]))
+        return tuple(torch.stack(part) for part in zip(*found[1:], strict=True))
+
+    def compiled(policy):
+        return belief.Imagination(states, learned)(policy, *start, 3)
+
+    slopes = []
+    for follow in (imagined, compiled):
+        leaf = torch.from_numpy(theta).requires_grad_()
+        means, covariances = follow(pilco._policy(states, leaf))
+        ((means * by_means).sum() + (covariances * by_covariances).sum()).backward()
+        slopes.append((means.detach(), covariances.detach(), leaf.grad))
+    for wanted, got in zip(*slopes, strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-10)
+
+
 def test_a_search_lowers_the_cost():
     objective = partial(
-        pilco._expected_cost, STATES, model(), TOLD["Pendulum-v1"].cost, pilco.start_beliefs(SPEC, 2), 4
+        belief.expected_cost,
+        belief.Imagination(STATES, model()),
+        TOLD["Pendulum-v1"].cost,
+        pilco.start_beliefs(SPEC, 2),
+        4,
     )
     theta = parameters()
     found = pilco._improved(objective, theta, STATES, pilco.Settings(iterations=5), lambda: None)

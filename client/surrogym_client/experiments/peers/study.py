@@ -168,5 +168,7 @@ def _outcome(result: Evaluation) -> Outcome:
 
 def _single_thread() -> None:
     import torch
+    from threadpoolctl import threadpool_limits
 
     torch.set_num_threads(1)
+    threadpool_limits(1)

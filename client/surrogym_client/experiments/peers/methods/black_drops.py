@@ -103,17 +103,18 @@ class Imagined:
         Each step is drawn from the processes' distribution there (equation 10 of the paper)."""
         policies, each = len(theta), rollouts or self._rollouts
         starts = np.stack([draw(self.states.spec, rng, wide=False) for _ in range(each)])
-        q = np.tile(starts, (policies, 1, 1))
-        total, alive = np.zeros((policies, each)), np.ones((policies, each))
-        for _ in range(self._known.horizon):
-            u = self.states.snapped(self.controls(theta, q))
-            noise = np.tile(rng.standard_normal((each, q.shape[-1])), (policies, 1))
-            flat, flat_u = q.reshape(-1, q.shape[-1]), u.reshape(policies * each, -1)
-            reached = self._drawn(flat, flat_u, noise)
-            total += alive * self._known.reward(flat, flat_u, reached).reshape(policies, each)
-            alive *= survives(self.states.spec, reached).reshape(policies, each)
-            q = reached.reshape(q.shape)
-        earned: Array = total.mean(1)
+        q = np.tile(starts, (policies, 1))  # (P * R, C)
+        total, alive = np.zeros(len(q)), np.arange(len(q))
+        for noise in rng.standard_normal((self._known.horizon, *starts.shape)):
+            u = self.states.snapped(self.controls(theta, q.reshape(policies, each, -1)))
+            before, acting = q[alive], u.reshape(len(q), -1)[alive]
+            reached = self._drawn(before, acting, np.tile(noise, (policies, 1))[alive])
+            total[alive] += self._known.reward(before, acting, reached)
+            q[alive] = reached
+            alive = alive[survives(self.states.spec, reached) > 0]
+            if not len(alive):
+                break
+        earned: Array = total.reshape(policies, each).mean(1)
         return earned
 
     def _drawn(self, q: Array, u: Array, noise: Array) -> Array:

@@ -5,11 +5,14 @@ Shapes: n samples, m points, I inputs, E outputs. M. P. Deisenroth, C. E. Rasmus
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
+from numpy.linalg import LinAlgError
+from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 from torch import Tensor
 
@@ -19,6 +22,7 @@ MOST = 300  # samples; PILCO's authors take 300 inducing points beyond, we take 
 SIGNAL_TO_NOISE, SPREAD, POWER = 500.0, 100.0, 30  # limits of hyperparameters as in the authors' penalty
 ITERATIONS = 200
 JITTER = 1e-9  # relative to the signal's variance
+BLOCK = 64  # rows of a factor's inverse that are multiplied at once
 
 
 @dataclass(frozen=True)
@@ -45,12 +49,46 @@ class Processes:
         return torch.cholesky_inverse(self.factor)
 
     def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation (m, E) of the functions at points (m, I), without noise (equations 6 and 7)."""
-        k = kernel(x, self.x, self.lengthscale, self.signal)  # (E, m, n)
-        mean = (k @ self.weights[..., None])[..., 0]
-        half = torch.linalg.solve_triangular(self.factor, k.mT, upper=False)  # (E, n, m)
-        variance = self.signal[:, None] ** 2 - (half**2).sum(1)
-        return mean.T, variance.clamp_min(1e-12).sqrt().T
+        """Mean and standard deviation (m, E) of the functions at points (m, I), without noise (equations 6 and 7).
+        Not for gradients."""
+        mean, deviation = self._predictor(x.numpy())
+        return torch.from_numpy(mean), torch.from_numpy(deviation)
+
+    @cached_property
+    def _predictor(self) -> _Predictor:
+        return _Predictor(self)
+
+
+class _Predictor:
+    """What predictions need of processes, in NumPy: the Cholesky factors' inverses, whose products with many points
+    are faster than solving, in blocks of rows, which skip most of the zeros."""
+
+    def __init__(self, model: Processes) -> None:
+        eye = torch.eye(len(model.x), dtype=model.x.dtype).expand_as(model.factor)
+        roots = torch.linalg.solve_triangular(model.factor, eye, upper=False).numpy()
+        ends = [(begin, min(begin + BLOCK, len(model.x))) for begin in range(0, len(model.x), BLOCK)]
+        self._parts = [[np.ascontiguousarray(root[begin:end, :end]) for begin, end in ends] for root in roots]
+        self._weights = model.weights.numpy()
+        self._scale, self._variance = 1 / model.lengthscale.numpy(), model.signal.numpy() ** 2
+        scaled = model.x.numpy() * self._scale[:, None]
+        squared = np.log(self._variance)[:, None] - (scaled**2).sum(-1) / 2
+        self._points = np.concatenate([scaled, squared[..., None], np.ones((*scaled.shape[:2], 1))], -1)  # (E, n, I+2)
+
+    def __call__(self, x: Array) -> tuple[Array, Array]:
+        """Means and standard deviations (m, E) at points (m, I)."""
+        shape = len(x), len(self._scale)
+        mean, deviation, one = np.empty(shape), np.empty(shape), np.ones((len(x), 1))
+        for output, points in enumerate(self._points):
+            scaled = x * self._scale[output]
+            k = points @ np.concatenate([scaled, one, -(scaled**2).sum(1, keepdims=True) / 2], 1).T  # (n, m)
+            np.exp(np.minimum(k, np.log(self._variance[output]), out=k), out=k)
+            mean[:, output] = self._weights[output] @ k
+            explained = np.zeros(len(x))
+            for part in self._parts[output]:
+                half = part @ k[: part.shape[1]]
+                explained += np.einsum("nm,nm->m", half, half)
+            deviation[:, output] = np.sqrt(np.maximum(self._variance[output] - explained, 1e-12))
+        return mean, deviation
 
 
 def kernel(a: Tensor, b: Tensor, lengthscale: Tensor, signal: Tensor) -> Tensor:
@@ -81,44 +119,87 @@ def fit(x: Array, y: Array, rng: np.random.Generator, check: Callable[[], None] 
     if len(x) > MOST:
         kept = rng.choice(len(x), MOST, replace=False)
         x, y = x[kept], y[kept]
-    inputs, outputs = torch.from_numpy(x), torch.from_numpy(y)
-    found = [_fit_one(inputs, column, check) for column in outputs.T]
-    lengthscale, signal, noise = (torch.stack(part) for part in zip(*found, strict=True))
-    return conditioned(inputs, outputs, lengthscale, signal, noise)
+    found = [_fit_one(x, column, check) for column in y.T]
+    lengthscale, signal, noise = (torch.from_numpy(np.stack(part)) for part in zip(*found, strict=True))
+    return conditioned(torch.from_numpy(x), torch.from_numpy(y), lengthscale, signal, noise)
 
 
-def _fit_one(x: Tensor, y: Tensor, check: Callable[[], None]) -> tuple[Tensor, Tensor, Tensor]:
+def _fit_one(x: Array, y: Array, check: Callable[[], None]) -> tuple[Array, float, float]:
     """Length scales (I,), signal and noise of one output (n,)."""
-    spread = x.std(0).clamp_min(1e-3)
-    level = y.std().clamp_min(1e-6)
-    start = torch.cat([spread.log(), level.log()[None], (level / 10).log()[None]])
+    spread = np.maximum(x.std(0, ddof=1), 1e-3)
+    level = max(y.std(ddof=1), 1e-6)
+    start = np.log([*spread, level, level / 10])
 
-    def objective(values: Array) -> tuple[float, Array]:
+    def objective(theta: Array) -> tuple[float, Array]:
         check()
-        theta = torch.from_numpy(values).requires_grad_()
-        loss = _negative_log_evidence(x, y, theta) + _penalty(theta, spread)
-        loss.backward()  # type: ignore[no-untyped-call]
-        assert theta.grad is not None
-        return loss.item(), theta.grad.numpy()
+        try:
+            loss, slope = negative_log_evidence(x, y, theta)
+        except LinAlgError:  # no Cholesky factor
+            return np.nan, np.zeros_like(theta)
+        penalty, further = _penalty(theta, spread)
+        return loss + penalty, slope + further
 
-    bounds = [(float(v) - 7, float(v) + 7) for v in start]
-    found = minimize(
-        objective, start.numpy(), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS}
-    )
-    theta = torch.from_numpy(found.x)
-    return theta[:-2].exp(), theta[-2].exp(), theta[-1].exp()
+    found = lowest(objective, start, [(v - 7, v + 7) for v in start], maxiter=ITERATIONS)
+    return np.exp(found[:-2]), *np.exp(found[-2:])
 
 
-def _negative_log_evidence(x: Tensor, y: Tensor, theta: Tensor) -> Tensor:
-    lengthscale, signal, noise = theta[None, :-2].exp(), theta[-2:-1].exp(), theta[-1:].exp()
-    model = conditioned(x, y[:, None], lengthscale, signal, noise)
-    return y @ model.weights[0] / 2 + model.factor[0].diagonal().log().sum()
+def lowest(
+    objective: Callable[[Array], tuple[float, Array]],
+    start: Array,
+    bounds: Sequence[tuple[float, float]] | None = None,
+    **options: float,
+) -> Array:
+    """Argument with the lowest value that L-BFGS finds.
+
+    A trial step of a line search may go so far that the objective has no finite value or slope. There it counts as
+    flat and worse than at the start, so that the line search takes a smaller step. An infinite value would end it.
+
+    Args:
+        objective: value and slope.
+        start: where the objective has a value.
+        bounds: of each entry.
+        options: of SciPy's L-BFGS-B.
+    """
+    worst = objective(start)[0] + 1
+
+    def finite(at: Array) -> tuple[float, Array]:
+        value, slope = objective(at)
+        if np.isfinite(value) and np.isfinite(slope).all():
+            return value, slope
+        return worst, np.zeros_like(at)
+
+    found: Array = minimize(finite, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
+    return found
 
 
-def _penalty(theta: Tensor, spread: Tensor) -> Tensor:
-    """Grows steeply where the signal is 500 times the noise, or a length scale 100 times the inputs' deviation or a
-    hundredth of it (the authors' ``hypCurb``)."""
-    ratio = (theta[-2] - theta[-1]) / np.log(SIGNAL_TO_NOISE)
-    scales = (theta[:-2] - spread.log()) / np.log(SPREAD)
-    penalty: Tensor = ratio**POWER + (scales**POWER).sum()
-    return penalty
+def negative_log_evidence(x: Array, y: Array, theta: Array) -> tuple[float, Array]:
+    """Negative log evidence of an output (n,), without its constant, and its gradient.
+
+    Args:
+        x: inputs (n, I).
+        y: the output.
+        theta: logarithms of the length scales, signal and noise (I + 2,).
+
+    Raises:
+        LinAlgError: the covariances have no Cholesky factor.
+    """
+    signal, noise = np.exp(2 * theta[-2:])  # variances
+    z = x * np.exp(-theta[:-2])
+    squared = (z**2).sum(1)
+    k = signal * np.exp(np.minimum(z @ z.T - squared[:, None] / 2 - squared / 2, 0))
+    factor = cholesky(k + (noise + JITTER * signal) * np.eye(len(x)), lower=True, check_finite=False)
+    root = solve_triangular(factor, np.eye(len(x)), lower=True, check_finite=False)
+    weights = root.T @ (root @ y)
+    by_k = root.T @ root - np.outer(weights, weights)  # twice the derivative by the covariances
+    trace, by_log_k = np.trace(by_k), by_k * k
+    by_scales = by_log_k.sum(1) @ z**2 - (z * (by_log_k @ z)).sum(0)
+    slope = [*by_scales, by_log_k.sum() + JITTER * signal * trace, noise * trace]
+    return float(y @ weights / 2 + np.log(np.diag(factor)).sum()), np.array(slope)
+
+
+def _penalty(theta: Array, spread: Array) -> tuple[float, Array]:
+    """A penalty and its gradient. It grows steeply where the signal is 500 times the noise, or a length scale 100
+    times the inputs' deviation or a hundredth of it (the authors' ``hypCurb``)."""
+    over = np.append((theta[:-2] - np.log(spread)) / np.log(SPREAD), (theta[-2] - theta[-1]) / np.log(SIGNAL_TO_NOISE))
+    slope = POWER * over ** (POWER - 1) / np.append(np.full(len(spread), np.log(SPREAD)), np.log(SIGNAL_TO_NOISE))
+    return float((over**POWER).sum()), np.append(slope, -slope[-1])

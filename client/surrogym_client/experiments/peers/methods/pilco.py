@@ -7,34 +7,24 @@ Shapes: K beliefs, C coordinates, G angles, A features, F controls, B basis func
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.optimize import minimize
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
-from surrogym_client.experiments.peers.methods.gaussian_process import Processes, conditioned, fit
-from surrogym_client.experiments.peers.methods.moments import (
-    Moments,
-    saturating_cost,
-    squashed,
-    through_angles,
-    through_processes,
-)
+from surrogym_client.experiments.peers.methods.belief import Imagination, expected_cost
+from surrogym_client.experiments.peers.methods.gaussian_process import Processes, conditioned, fit, lowest
 from surrogym_client.experiments.peers.methods.states import Control, Held, States, Transitions, episode, random_control
-from surrogym_client.experiments.peers.methods.told import TipCost, told
+from surrogym_client.experiments.peers.methods.told import told
 from surrogym_client.experiments.peers.port import NotApplicable, Real
 from surrogym_client.original.protocol import Array
 from surrogym_client.policies.predict import Acting
 from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform
 
 HALF_TURN = np.pi
-KEPT = 150  # samples up to which intermediate results are kept for the gradient; beyond, they are computed twice
 
 
 @dataclass(frozen=True)
@@ -42,7 +32,7 @@ class Settings:
     """Settings of PILCO. 50 basis functions are those of the paper's cart-pole (305 parameters)."""
 
     basis: int = 50
-    iterations: int = 75  # of L-BFGS after each episode; the authors' program takes 150 line searches
+    iterations: int = 150  # of L-BFGS after each episode; the authors' line searches
     horizon: int = 60  # the longest
     modes: int = 4  # normal distributions that cover starts anywhere on a circle; the paper has one start
 
@@ -66,7 +56,7 @@ class Pilco:
         while True:
             data.append(episode(real, states, control, horizon, known.repeat))
             model = _model(states, Transitions.joined(data), rng, real.clock.check)
-            objective = partial(_expected_cost, states, model, known.cost, beliefs, horizon)
+            objective = partial(expected_cost, Imagination(states, model), known.cost, beliefs, horizon)
             theta = _improved(objective, theta, states, self._settings, real.clock.check)
             control = _acting(states, _policy(states, theta))
             yield Held(states, control, known.repeat)
@@ -122,72 +112,6 @@ def _model(states: States, data: Transitions, rng: np.random.Generator, check: C
     return fit(inputs, states.change(data.q, data.reached), rng, check)
 
 
-class _Joint:
-    """A belief over a growing list of variables: mean (K, V) and covariance (K, V, V)."""
-
-    def __init__(self, mean: Tensor, covariance: Tensor) -> None:
-        self.mean = mean
-        self.covariance = covariance
-
-    def of(self, at: Sequence[int]) -> tuple[Tensor, Tensor]:
-        return self.mean[:, at], self.covariance[:, at][:, :, at]
-
-    def append(self, at: Sequence[int], new: Moments) -> list[int]:
-        """Append outputs of a function of the variables ``at``. Returns their places."""
-        cross = self.covariance[:, :, at] @ new.gain
-        first = self.mean.shape[1]
-        self.mean = torch.cat([self.mean, new.mean], 1)
-        upper = torch.cat([self.covariance, cross], 2)
-        self.covariance = torch.cat([upper, torch.cat([cross.mT, new.covariance], 2)], 1)
-        return list(range(first, self.mean.shape[1]))
-
-
-def _next_belief(
-    states: States, model: Processes, policy: Processes, mean: Tensor, covariance: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Belief over the coordinates after one control (equations 9 to 11 of the paper)."""
-    joint, size = _Joint(mean, covariance), mean.shape[1]
-    angles = np.flatnonzero(states.angles).tolist()
-    trigonometric = joint.append(angles, through_angles(*joint.of(angles)))
-    sines, cosines = trigonometric[: len(angles)], trigonometric[len(angles) :]
-    features = [*np.flatnonzero(~states.angles).tolist(), *cosines, *sines]
-    wanted = joint.append(features, through_processes(policy, *joint.of(features), certain=True))
-    controls = joint.append(wanted, squashed(*joint.of(wanted)))
-    inputs = [*features, *controls]
-    changes = joint.append(inputs, through_processes(model, *joint.of(inputs)))
-    before, both = list(range(size)), joint.covariance
-    cross = both[:, before][:, :, changes]
-    reached = both[:, before][:, :, before] + cross + cross.mT + both[:, changes][:, :, changes]
-    return joint.mean[:, before] + joint.mean[:, changes], (reached + reached.mT) / 2
-
-
-def _cost(cost: TipCost, mean: Tensor, covariance: Tensor) -> Tensor:
-    """Expected costs (K,) of beliefs over coordinates."""
-    angles, linear, sines, cosines = map(torch.from_numpy, (cost.angles, cost.linear, cost.sines, cost.cosines))
-    joint, at = _Joint(mean, covariance), list(range(mean.shape[1]))
-    turned = Moments(mean @ angles.T, angles @ covariance @ angles.T, angles.T.expand(len(mean), -1, -1))
-    places = joint.append(at, turned)
-    joint.append(places, through_angles(*joint.of(places)))
-    tip = torch.cat([linear, torch.zeros_like(sines), sines, cosines], 1)
-    return saturating_cost(joint.mean @ tip.T, tip @ joint.covariance @ tip.T, torch.from_numpy(cost.goal), cost.width)
-
-
-def _expected_cost(
-    states: States, model: Processes, cost: TipCost, beliefs: tuple[Tensor, Tensor], horizon: int, policy: Processes
-) -> Tensor:
-    """Expected cost of an episode, mean over the beliefs of starts (equation 2 of the paper)."""
-    (mean, covariance), total = beliefs, torch.zeros((), dtype=torch.float64)
-    step = partial(_next_belief, states, model, policy)
-    many = len(model.x) > KEPT
-    for _ in range(horizon):
-        if many:
-            mean, covariance = checkpoint(step, mean, covariance, use_reentrant=False)
-        else:
-            mean, covariance = step(mean, covariance)
-        total = total + _cost(cost, mean, covariance).mean()
-    return total
-
-
 def _improved(
     objective: Callable[[Processes], Tensor],
     theta: Array,
@@ -202,17 +126,14 @@ def _improved(
         parameters = torch.from_numpy(values).requires_grad_()
         try:
             cost = objective(_policy(states, parameters))
-            cost.backward()  # type: ignore[no-untyped-call]
-        except RuntimeError:  # no Cholesky factor: a trial step of the line search went too far
-            return np.inf, np.zeros_like(values)
-        slope: NDArray[np.float64] | None = None if parameters.grad is None else parameters.grad.numpy()
-        if slope is None or not np.isfinite(slope).all():
-            return np.inf, np.zeros_like(values)
-        return cost.item(), slope
+        except RuntimeError:  # the policy has no Cholesky factor
+            return np.nan, np.zeros_like(values)
+        cost.backward()  # type: ignore[no-untyped-call]
+        assert parameters.grad is not None
+        return cost.item(), parameters.grad.numpy()
 
-    limits = {"maxiter": settings.iterations, "maxfun": 2 * settings.iterations}
-    best: Array = minimize(value_and_slope, theta, jac=True, method="L-BFGS-B", options=limits).x
-    return best
+    # The cost is flat until the tip comes near its goal. The authors' search has no tolerances, at which it would end.
+    return lowest(value_and_slope, theta, maxiter=settings.iterations, maxfun=2 * settings.iterations, ftol=0, gtol=0)
 
 
 def _acting(states: States, policy: Processes) -> Control:
