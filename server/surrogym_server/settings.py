@@ -48,7 +48,9 @@ class Settings(BaseModel):
     tls_certificate: FilePath | None = Field(default=None, description="chain of certificates, as PEM")
     tls_key: FilePath | None = Field(default=None, description="its private key, as PEM")
     device: Annotated[Literal["cpu", "cuda"], Field(description="what steps sessions; fits use the CPU")] = "cpu"
-    threads: Annotated[int, Field(ge=1, le=1024, description="of one torch operation")] = 1
+    threads: Annotated[
+        int, Field(ge=1, le=1024, description="of one torch operation, and of a compiled step of a large model")
+    ] = 1
     engine: Annotated[Literal["local", "ray"], Field(description="where sessions are")] = "local"
     ray_address: Annotated[str, Field(min_length=1, description="of the cluster; auto finds it")] = "auto"
     ray_hosts: Annotated[int, Field(ge=1, le=1_000, description="processes that hold sessions, each with a CPU")] = 2

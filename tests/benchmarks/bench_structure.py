@@ -59,7 +59,7 @@ from surrogym_server.gp.selection import select_inputs
 from surrogym_server.models.gaussian_process.censoring import usable
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.learning.dropping import FEWEST, LESS, ODDS, WIN
-from surrogym_server.models.gaussian_process.learning.output_learner import EXPLAINED
+from surrogym_server.models.gaussian_process.learning.many import EXPLAINED
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.sampling.design import DesignState, Request, advance, initial_design
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points

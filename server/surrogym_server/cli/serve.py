@@ -42,7 +42,12 @@ TlsKey = Annotated[Path | None, typer.Option(help="PEM file with the certificate
 Device = Annotated[
     str | None, typer.Option(help="Device that steps sessions: cpu, or cuda if torch supports it. [default: cpu]")
 ]
-Threads = Annotated[int | None, typer.Option(help="Number of threads of one torch operation. [default: 1]")]
+Threads = Annotated[
+    int | None,
+    typer.Option(
+        help="Number of threads of one torch operation, and of a compiled step of a large model. [default: 1]"
+    ),
+]
 SessionIdleSeconds = Annotated[
     float | None, typer.Option(help="Seconds without a request after which a session expires. [default: 3600]")
 ]

@@ -15,20 +15,13 @@ beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 ========  ======================  =========================================================
 """
 
-from surrogym_server.gp.fit import (
-    MOST_NOISE,
-    NOISE_FLOOR,
-    FitOptions,
-    Fitted,
-    fit,
-    noisy_explanation,
-    refine,
-    refine_where_hard,
-)
+from surrogym_server.gp.bound import Fewer, fewer_inputs, fit_bound
+from surrogym_server.gp.fit import Fitted, fit, noisy_explanation, refine, refine_where_hard
 from surrogym_server.gp.growth import fit_growing
 from surrogym_server.gp.hyperparameter_samples import hyperparameter_samples
 from surrogym_server.gp.joint import Joint
 from surrogym_server.gp.kernel import Hyperparameters, Reflection, covariance
+from surrogym_server.gp.parameters import MOST_NOISE, NOISE_FLOOR, FitOptions
 from surrogym_server.gp.pathwise import Pathwise
 from surrogym_server.gp.posterior import LeftOut, Posterior, Sparse, condition
 from surrogym_server.gp.selection import Selection, select_inputs
@@ -40,6 +33,7 @@ __all__ = [
     "MOST_NOISE",
     "NOISE_FLOOR",
     "Censored",
+    "Fewer",
     "FitOptions",
     "Fitted",
     "Hyperparameters",
@@ -56,7 +50,9 @@ __all__ = [
     "condition_many",
     "condition_sparse",
     "covariance",
+    "fewer_inputs",
     "fit",
+    "fit_bound",
     "fit_growing",
     "hyperparameter_samples",
     "noisy_explanation",

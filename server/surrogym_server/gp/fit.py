@@ -1,7 +1,5 @@
 """Hyperparameters by maximum marginal likelihood with priors (maximum a posteriori), L-BFGS with analytic gradients.
 
-Free parameters are logarithms, theta = [log lengthscale (d), log sigma_f^2, log sigma_l^2 (if linear),
-log sigma_q^2 (if quadratic), log sigma_n^2].
 d log p(y) / d theta_j = 1/2 tr((beta beta^T - (K + sigma_n^2 I)^-1) dK/d theta_j); R&W (2006), eq. 5.9.
 """
 
@@ -15,43 +13,20 @@ from typing import Protocol
 
 import numpy as np
 import scipy  # its parts are loaded on first use: a server that fits nothing starts without them
-import torch
-from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
 from surrogym_server.gp.kernel import Hyperparameters, Polynomial, Reflection
+from surrogym_server.gp.parameters import Array, FitOptions, Parameters
 from surrogym_server.gp.posterior import Posterior, condition
 from surrogym_server.gp.sparse import hardest
 from surrogym_server.gp.subsets import FEW, SOME, spread
 
-NOISE_FLOOR, MOST_NOISE = 1e-8, 2.0  # bounds of the noise, of the output's variance
 NOISY = 1e-2  # noise of a start from noise, of the output's variance
 MANY_POINTS = 24
 REFINEMENTS = ((1_000, 20), (2_000, 10))  # most points of further searches, and iterations: each begins near its end
 HARD, HARD_ITERATIONS = 1_000, 20  # points of a search where a process errs most, and its iterations
 SHORTER = 0.5  # logarithm of the second start's length scales, below the first's
-
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class FitOptions:
-    """Parts of the kernel, and the normal priors on logarithms: (mean, deviation). Inputs and outputs are standardised.
-
-    The length scale's prior grows with sqrt(d), as distances do (Hvarfner et al., ICML 2024).
-    """
-
-    linear: bool = True  # parts beside the squared exponential
-    quadratic: bool = False
-    lengthscale_prior: tuple[float, float] = (math.log(2.0), 1.2)
-    signal_prior: tuple[float, float] = (0.0, 2.0)
-    linear_prior: tuple[float, float] = (0.0, 2.0)
-    quadratic_prior: tuple[float, float] = (-2.0, 2.0)
-    noise_prior: tuple[float, float] = (math.log(1e-7), 6.0)
-    noise_floor: float = NOISE_FLOOR
-    most_noise: float = MOST_NOISE
-    max_iterations: int = 100
 
 
 @dataclass(frozen=True)
@@ -189,7 +164,7 @@ class Evaluated:
     weights: Array  # (n,) beta
 
 
-class _Objective:
+class _Objective(Parameters):
     """Negative log evidence with priors, and its gradient.
 
     A fit makes thousands of evaluations on a few dozen points. So symmetric matrices are kept once, as pairs i >= j of
@@ -198,9 +173,9 @@ class _Objective:
     """
 
     def __init__(self, x: Tensor, y: Tensor, options: FitOptions, reflection: Reflection | None) -> None:
-        self.options, self.reflection = options, reflection
-        n, d = x.shape
-        self.n, self.d, self.x, self.y = n, d, x.numpy(), y.numpy()
+        super().__init__(x.shape[1], options, reflection)
+        n = len(x)
+        self.n, self.x, self.y = n, x.numpy(), y.numpy()
         self.rows, self.columns = np.tril_indices(n)
         self.places = self.rows * n + self.columns  # of the pairs in a matrix by rows
         self.twice = np.where(self.rows == self.columns, 1.0, 2.0)  # how often a pair occurs in a symmetric matrix
@@ -210,17 +185,7 @@ class _Objective:
         self.parity = 0 if reflection is None else reflection.parity
         self.linear = self._pairs(Polynomial.of(1.0, 0.0, reflection, x)(x, x))
         self.quadratic = self._pairs(Polynomial.of(0.0, 1.0, reflection, x)(x, x))
-        lengthscale = (options.lengthscale_prior[0] + 0.5 * math.log(d), options.lengthscale_prior[1])
-        priors = [lengthscale] * d + [options.signal_prior]
-        priors += [options.linear_prior] * options.linear + [options.quadratic_prior] * options.quadratic
-        self.prior = np.array([*priors, options.noise_prior])
-        size = len(self.prior)
-        self.lower, self.upper = np.full(size, math.log(1e-8)), np.full(size, math.log(1e4))
-        self.lower[:d], self.upper[:d] = math.log(0.02), math.log(1e3)
-        self.lower[-1], self.upper[-1] = math.log(options.noise_floor), math.log(options.most_noise)
-        self.default_start = self.prior[:, 0].copy()
-        self.default_start[-1] = math.log(1e-4)
-        self.constant = 0.5 * n * math.log(2 * math.pi) + float(np.log(self.prior[:, 1]).sum())
+        self.constant = 0.5 * n * math.log(2 * math.pi) + self.prior_constant
 
     @property
     def noisy_starts(self) -> list[Array]:
@@ -236,26 +201,13 @@ class _Objective:
         start[-1] = math.log(noise)
         return [start]
 
-    def theta(self, hyper: Hyperparameters) -> Array:
-        """The free parameters theta of hyperparameters, within the bounds; the inverse of ``hyper``."""
-        variances = [hyper.signal_variance]
-        variances += [hyper.linear_variance] * self.options.linear
-        variances += [hyper.quadratic_variance] * self.options.quadratic
-        values = np.array([*hyper.lengthscale.tolist(), *variances, hyper.noise_variance])
-        clipped: Array = np.clip(np.log(values), self.lower, self.upper)
-        return clipped
-
-    def hyper(self, theta: Array) -> Hyperparameters:
-        lengthscale, signal, linear, quadratic, noise = self._values(theta)
-        return Hyperparameters(torch.from_numpy(lengthscale), signal, linear, quadratic, noise, self.reflection)
-
     def __call__(self, theta: Array) -> tuple[float, Array]:
         found = self.evaluated(theta)
         return (1e10, np.zeros_like(theta)) if found is None else (found.value, found.slopes)
 
     def evaluated(self, theta: Array) -> Evaluated | None:
         """Value and gradient at theta. None if float64 can't factor K: a very large cost then stops the line search."""
-        lengthscale, signal, linear, quadratic, noise = self._values(theta)
+        lengthscale, signal, linear, quadratic, noise = self.values(theta)
         precision = lengthscale**-2
         smooth = (-0.5 * precision) @ self.squared
         np.exp(smooth, out=smooth)
@@ -278,27 +230,20 @@ class _Objective:
         slopes += [[linear * (half @ self.linear)]] * self.options.linear
         slopes += [[quadratic * (half @ self.quadratic)]] * self.options.quadratic
         trace = 0.5 * (weights @ weights - inverse.trace())
-        z = (theta - self.prior[:, 0]) / self.prior[:, 1]
+        z = self.in_deviations(theta)
         value = 0.5 * (self.y @ weights + z @ z) + log_root + self.constant
         gradient = z / self.prior[:, 1] - np.concatenate([*slopes, [noise * trace]])
         return Evaluated(float(value), gradient, half, weighted, weights)
 
     def over_inputs(self, theta: Array, found: Evaluated) -> Array:
         """Gradient of the value over the inputs x, (n, d). Only without a reflection and a quadratic part."""
-        lengthscale, _, linear, _, _ = self._values(theta)
+        lengthscale, _, linear, _, _ = self.values(theta)
         smooth, line = np.zeros((self.n, self.n)), np.zeros((self.n, self.n))
         smooth.ravel()[self.places], line.ravel()[self.places] = found.weighted[0], found.half
         smooth, line = smooth + smooth.T, line + line.T  # each pair counts for both of its points
         pulled = (smooth.sum(1)[:, None] * self.x - smooth @ self.x) * lengthscale**-2
         slopes: Array = pulled - linear * (line @ self.x)
         return slopes
-
-    def _values(self, theta: Array) -> tuple[Array, float, float, float, float]:
-        """Length scales, and the variances of the three parts and of the noise."""
-        values = np.exp(theta)
-        linear = float(values[self.d + 1]) if self.options.linear else 0.0
-        quadratic = float(values[-2]) if self.options.quadratic else 0.0
-        return values[: self.d], float(values[self.d]), linear, quadratic, float(values[-1])
 
     def _solve(self, matrix: Array) -> tuple[Array, Array, float] | None:
         """From a matrix K, given by its lower half: the inverse (its lower half is valid), K^-1 y, and half of K's log

@@ -26,7 +26,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogym_server.gp.fit import FitOptions, Fitted, _blas, _minimum, _Objective
+from surrogym_server.gp.fit import Fitted, _blas, _minimum, _Objective
+from surrogym_server.gp.parameters import FitOptions
 from surrogym_server.gp.posterior import condition
 from surrogym_server.tensors.bending import EDGE, STEEPEST, amplitude, bend
 

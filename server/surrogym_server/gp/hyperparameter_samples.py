@@ -13,8 +13,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_server.gp.fit import MOST_NOISE, NOISE_FLOOR, FitOptions, _blas, _minimum, _Objective
+from surrogym_server.gp.fit import _blas, _minimum, _Objective
 from surrogym_server.gp.kernel import Hyperparameters
+from surrogym_server.gp.parameters import MOST_NOISE, NOISE_FLOOR, FitOptions
 from surrogym_server.gp.posterior import Posterior
 
 BURN_IN, THINNING = 30, 10  # updates before the first sample, and between samples

@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from surrogym_server.gp.fit import Array, FitOptions, _blas, _minimum, _Objective
+from surrogym_server.gp.fit import _blas, _minimum, _Objective
 from surrogym_server.gp.kernel import Hyperparameters
+from surrogym_server.gp.parameters import Array, FitOptions
 from surrogym_server.gp.posterior import Posterior
 
 

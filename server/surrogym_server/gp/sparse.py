@@ -88,13 +88,19 @@ def condition_many(
     return min(found if earlier is None else [earlier, *found], key=misfit)
 
 
-def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
-    """Condition a process on x (n, d) and y (n,) through inducing points, in O(n m^2).
+def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor, most: int | None = None) -> Posterior:
+    """Condition a process on x (n, d) and y (n,) through at most ``most`` inducing points, by default ``INDUCING``, in
+    O(n m^2).
 
     Raises:
         NumericalFailure: as ``condition``.
     """
-    return _projected(hyper, x, y, _pivots(hyper, x))
+    return _projected(hyper, x, y, _pivots(hyper, x, most))
+
+
+def pivots(hyper: Hyperparameters, x: Tensor, most: int) -> Tensor:
+    """Numbers of at most ``most`` of the points x (n, d): each is the one that those before it explain least, (m,)."""
+    return _pivots(hyper, x, most)[0]
 
 
 def hardest(posterior: Posterior, x: Tensor, y: Tensor, most: int) -> Tensor:

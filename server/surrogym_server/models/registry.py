@@ -5,10 +5,12 @@ from __future__ import annotations
 from surrogym_server.models.ensemble import NetworkEnsembles
 from surrogym_server.models.gaussian_process import GaussianProcesses
 from surrogym_server.models.port import Learner
+from surrogym_server.models.sparse_gaussian_process import SparseGaussianProcesses
 from surrogym_server.plugins import Choice, Registry
 
 GROUP = "surrogym.models"
-GAUSSIAN_PROCESS = "gaussian_process"
+GAUSSIAN_PROCESS, SPARSE_GAUSSIAN_PROCESS = "gaussian_process", "sparse_gaussian_process"
+PROCESSES = (GAUSSIAN_PROCESS, SPARSE_GAUSSIAN_PROCESS)  # families with the settings of Gaussian processes
 
 MODELS: Registry[Learner] = Registry(
     "model",
@@ -16,6 +18,7 @@ MODELS: Registry[Learner] = Registry(
     Learner,
     {
         GAUSSIAN_PROCESS: GaussianProcesses,
+        SPARSE_GAUSSIAN_PROCESS: SparseGaussianProcesses,
         "ensemble": NetworkEnsembles,
     },
     noun="model family",

@@ -67,6 +67,7 @@ class ModelCase:
 
     name: str
     definition: EnvironmentDefinition
+    count: int = SAMPLES  # of samples to learn from
 
     def __str__(self) -> str:
         return self.name
@@ -78,7 +79,7 @@ class ModelCase:
     @cached_property
     def samples(self) -> Samples:
         """Real steps to learn from."""
-        return _real_steps(self, SAMPLES, seed=0)
+        return _real_steps(self, self.count, seed=0)
 
     @cached_property
     def unseen(self) -> Samples:
@@ -102,11 +103,15 @@ class ModelCase:
         return torch.randn(*shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
 
-def model_cases(family: str, settings: Mapping[str, float | bool | str] | None = None) -> tuple[ModelCase, ...]:
-    """The environments, to be learned by a family with this name and settings."""
+def model_cases(
+    family: str, settings: Mapping[str, float | bool | str] | None = None, samples: int = SAMPLES
+) -> tuple[ModelCase, ...]:
+    """The environments, to be learned by a family with this name and settings from so many samples."""
     design = {"model": {"name": family, "settings": dict(settings or {})}, "monte_carlo": 64, "initial": SAMPLES}
     return tuple(
-        ModelCase(name, definition_from_spec(EnvironmentSpec.model_validate(PENDULUM | changes | {"design": design})))
+        ModelCase(
+            name, definition_from_spec(EnvironmentSpec.model_validate(PENDULUM | changes | {"design": design})), samples
+        )
         for name, changes in VARIATIONS.items()
     )
 

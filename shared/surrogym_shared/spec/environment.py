@@ -50,8 +50,8 @@ class Design(Frozen):
     ``tip`` take what tells most of the optimal trajectory, ``opax`` what tells most of the dynamics on an optimistic
     way. A package on the server may add others.
 
-    ``model``: family of models: ``gaussian_process``, the default, ``ensemble`` (of networks), or one from a package on
-    the server.
+    ``model``: family of models: ``gaussian_process``, the default, ``sparse_gaussian_process`` for thousands of steps,
+    ``ensemble`` (of networks), or one from a package on the server.
 
     ``tolerance``: numerator of eq. 9 for outputs without a declared tolerance. ``relative`` is 5 % of the output's
     standard deviation over the initial design, ``raw`` is 1 in the output's own unit, as published.

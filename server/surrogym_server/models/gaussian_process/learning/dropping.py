@@ -1,16 +1,18 @@
-"""Choice by evidence which inputs an output does not read, see ``gp.selection``."""
+"""Choice by evidence which inputs an output does not read, see ``gp.selection`` and ``gp.bound``."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from surrogym_server.environment.features import features
+from surrogym_server.environment.features import FeatureMap, features
 from surrogym_server.errors import NumericalFailure
 from surrogym_server.gp import Posterior, Selection, condition, select_inputs, spread, subsets
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner, is_unexplained
+from surrogym_server.models.gaussian_process.learning.rates import inputs_of
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
 ODDS = -1.0  # log odds of each input that is left out, before any data
@@ -19,12 +21,16 @@ LESS = 0.5  # share of the leave-one-out error with all inputs that may be left
 FEWEST = 20  # samples: of fewer, some gave such odds to wrong inputs
 
 
-def without_inputs(learner: OutputLearner, output: OutputModel) -> OutputModel:
-    """The output without the inputs that it does not read, from the same samples."""
+def without_inputs(
+    learner: OutputLearner, output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], used: Tensor
+) -> OutputModel:
+    """The output without the inputs that it does not read, from the same samples, those of ``used`` (n,)."""
     may, posterior = _may_be_dropped(learner, output), output.posterior
     if posterior is None or not bool(may.any()):
         return output
     try:
+        if posterior.sparse is not None:
+            return _of_many(learner, output, posterior, may, target[used], inputs_of(output, inputs)[used])
         rows = spread(len(posterior.y), subsets.FEW)
         some = condition(posterior.hyper, posterior.x[rows], posterior.y[rows])
         found = select_inputs(some, learner.options(output.name), may, ODDS)
@@ -32,6 +38,20 @@ def without_inputs(learner: OutputLearner, output: OutputModel) -> OutputModel:
         return _with_fewer(learner, output, posterior, found) if wins else output
     except NumericalFailure:
         return output
+
+
+def _of_many(
+    learner: OutputLearner, output: OutputModel, posterior: Posterior, may: Tensor, target: Tensor, x: Tensor
+) -> OutputModel:
+    """The output of a process through inducing points, learned from targets (n,) at x (n, d)."""
+    assert posterior.sparse is not None
+    if posterior.sparse.points != len(x):  # it has learned from further samples, which ended at limits
+        return output
+    y = output.standardised(target, x)
+    found = learner.many.fewer_inputs(x, y, learner.options(output.name), posterior, may, ODDS)
+    if found is None:
+        return output
+    return replace(output, feature_map=_without(output.feature_map, found.kept), posterior=found.posterior)
 
 
 def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
@@ -46,18 +66,14 @@ def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
     none = torch.zeros_like(may)
     if posterior is None or not learner.settings.drop_inputs:
         return none
-    return may if len(posterior.y) >= FEWEST and is_unexplained(posterior) else none
+    enough = posterior.sparse is not None or is_unexplained(posterior)
+    return may if len(posterior.y) >= FEWEST and enough else none
 
 
 def _with_fewer(learner: OutputLearner, output: OutputModel, posterior: Posterior, found: Selection) -> OutputModel:
     """The output with the inputs that were found, if with these all samples are foretold better by the others."""
     kept, x, y = found.kept, posterior.x[:, found.kept], posterior.y
-    rates = output.feature_map.rates
-    feature_map = replace(
-        output.feature_map,
-        dropped=tuple((~kept).nonzero()[:, 0].tolist()),
-        rates=tuple(rate for rate, left in zip(rates, kept.tolist(), strict=False) if left),
-    )
+    feature_map = _without(output.feature_map, kept)
     if len(y) <= subsets.FEW:
         fewer = condition(found.hyper, x, y)
     else:
@@ -66,3 +82,9 @@ def _with_fewer(learner: OutputLearner, output: OutputModel, posterior: Posterio
         return output
     scores = (*output.scores, (str(feature_map), found.score))
     return replace(output, feature_map=feature_map, posterior=fewer, scores=scores)
+
+
+def _without(feature_map: FeatureMap, kept: Tensor) -> FeatureMap:
+    """The map with the features kept (d,)."""
+    rates = tuple(rate for rate, left in zip(feature_map.rates, kept.tolist(), strict=False) if left)
+    return replace(feature_map, dropped=tuple((~kept).nonzero()[:, 0].tolist()), rates=rates)

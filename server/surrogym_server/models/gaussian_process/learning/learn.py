@@ -13,6 +13,7 @@ from surrogym_server.models.gaussian_process.feature_maps import candidates
 from surrogym_server.models.gaussian_process.learning.angle_prediction import learn_drift
 from surrogym_server.models.gaussian_process.learning.dropping import without_inputs
 from surrogym_server.models.gaussian_process.learning.limits import held, past_limits
+from surrogym_server.models.gaussian_process.learning.many import BySubsets, ManySamples
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.rates import output_with_rates
 from surrogym_server.models.gaussian_process.learning.region import learn_termination
@@ -25,11 +26,21 @@ from surrogym_server.models.port import Learned, Warm
 MIN_POINTS = 2
 
 
-def learn(settings: Settings, definition: EnvironmentDefinition, samples: Samples, warm: Warm) -> Learned:
-    """Learn as ``Learner.learn`` says. Raises ``InvalidInput`` for fewer than two samples."""
+def learn(
+    settings: Settings,
+    definition: EnvironmentDefinition,
+    samples: Samples,
+    warm: Warm,
+    many: ManySamples | None = None,
+) -> Learned:
+    """Learn as ``Learner.learn`` says. ``many`` fits processes to many samples, by default ``BySubsets``.
+
+    Raises:
+        InvalidInput: fewer than two samples.
+    """
     if len(samples) < MIN_POINTS:
         raise InvalidInput(f"a model needs at least {MIN_POINTS} samples, got {len(samples)}")
-    learner = OutputLearner(definition, settings, warm, {})
+    learner = OutputLearner(definition, settings, warm, {}, many or BySubsets())
     transitions = _transitions(learner, samples)
     paying, terminal_reward, jumps = learn_reward(learner, samples)
     ends = learn_termination(learner, samples) if definition.learns_termination else None
@@ -66,5 +77,5 @@ def _transitions(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
         output = past_limits(learner, output, target, inputs, keep, keep_lead, more, side)
         used = more if output.past_limits else keep
         output = held(learner, output, target, inputs, used, side)
-        outputs.append(without_inputs(learner, output))
+        outputs.append(without_inputs(learner, output, target, inputs, used))
     return tuple(outputs)

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import Joint, Posterior, condition_sparse
+from surrogym_server.gp import Joint, Posterior
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.rates import inputs_of, output_with_rates
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
@@ -93,7 +93,7 @@ def held(
         if output.posterior.sparse is None:
             again = output_with_rates(learner, name + HELD, target, plain, more, more, side)
         else:
-            again = _with_samples(output, target, inputs, more)
+            again = _with_samples(learner, output, target, inputs, more)
         found = replace(again, name=name, past_limits=past, at_limit=_sides(again, side[more]))
         if _misfit(found, target, inputs, more, side) > WORSE * _misfit(output, target, inputs, keep, side):
             break
@@ -128,13 +128,13 @@ def _misfit(
 
 
 def _with_samples(
-    output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], keep: Tensor
+    learner: OutputLearner, output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], keep: Tensor
 ) -> OutputModel:
     """The output with its own hyperparameters, learned from samples ``keep`` (n,). To fit many samples again takes
     long, and a few more of them change no hyperparameter."""
     assert output.posterior is not None
     x = inputs_of(output, inputs)[keep]
-    posterior = condition_sparse(output.posterior.hyper, x, output.standardised(target[keep], x))
+    posterior = learner.many.conditioned(output.posterior.hyper, x, output.standardised(target[keep], x))
     return replace(output, posterior=posterior)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,19 +11,9 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import (
-    Censored,
-    FitOptions,
-    Fitted,
-    Posterior,
-    condition_many,
-    fit,
-    refine,
-    refine_where_hard,
-    spread,
-    subsets,
-)
+from surrogym_server.gp import Censored, FitOptions, Fitted, Posterior, fit, spread, subsets
 from surrogym_server.models.gaussian_process.feature_maps import reflection
+from surrogym_server.models.gaussian_process.learning.many import EXPLAINED, BySubsets, ManySamples
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE
 from surrogym_server.models.gaussian_process.settings import Settings
@@ -35,7 +25,6 @@ from surrogym_server.models.port import Warm
 LEAD_ODDS, ALONE_ODDS, PARITY_ODDS, PLACE_ODDS = 3.0, -6.0, -3.0, 3.0
 CONSTANT = 1e-9  # an output whose deviation is below this share of its own size never varied
 SMALLEST = 1e-100  # deviation of an output: squares of a smaller one underflow
-EXPLAINED = 0.01  # of the targets' deviation: a process that foretells its samples as well needs no other structure
 PEAK = "reward peak"  # the logarithm of a reward
 
 
@@ -47,6 +36,7 @@ class OutputLearner:
     settings: Settings
     warm: Warm  # hyperparameters of earlier fits by "output|feature map"
     thetas: dict[str, NDArray[np.float64]]  # hyperparameters of this fit
+    many: ManySamples = field(default_factory=BySubsets)  # what is done with more than ``subsets.FEW`` samples
 
     def allowed(self, maps: tuple[FeatureMap, ...]) -> tuple[FeatureMap, ...]:
         """The maps that the settings allow to compare."""
@@ -115,15 +105,9 @@ class OutputLearner:
         theta: NDArray[np.float64],
         at_limit: Censored | None = None,
     ) -> Posterior:
-        """The process of all points x (n, d), y (n,), with the hyperparameters of a subset.
-
-        Hyperparameters of the hard points are tried too, if the points are many and not foretold well from the others.
-        """
-        mirror, options = reflection(self.definition, feature_map), self.options(name)
-        found = condition_many(refine(x, y, options, theta, mirror), x, y, at_limit)
-        if found.sparse is None or found.left_out.error <= EXPLAINED:
-            return found
-        return condition_many([refine_where_hard(found, x, y, options)], x, y, at_limit, earlier=found)
+        """The process of all points x (n, d), y (n,); ``theta`` was fitted to a subset."""
+        mirror = reflection(self.definition, feature_map)
+        return self.many.fitted(x, y, self.options(name), theta, mirror, at_limit)
 
     def options(self, name: str) -> FitOptions:
         """Dynamics tend to be near linear, and costs to be quadratic."""

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+import torch
 from numba import types
 from numpy.typing import NDArray
 
 from surrogym_server.compiled.tables import Tables, TablesBuilder, matrix
+from surrogym_server.compiled.threads import side_by_side
 from surrogym_server.environment.compiled.features import add_features, encode
 from surrogym_server.environment.compiled.reward import add_declared, add_reward
 from surrogym_server.environment.compiled.rules import add_inverse, add_rules, clipped, recover, repeat, settle
@@ -312,6 +314,7 @@ def step(
 
 
 NO_ROWS = np.zeros((0, 0))
+SPLIT = 4_000_000  # covariances of one call, some ms: more are computed in several threads
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,12 +325,14 @@ class StepsOfModel(ArraySteps):
     tables: Tables
     outputs: int
     has_regions: bool  # whether an ending or a jump of the reward is learned
+    points: int  # of all processes, mirror images included
 
     @classmethod
     def of(cls, predictor: Predictor, ending: Region | None) -> Self:
         """Compile a model. ``ending`` is the region in which episodes end, if that is learned."""
         regions = ending is not None or bool(predictor.jumps)
-        return cls(predictor.definition, tables_of(predictor, ending), len(predictor.transitions) + 1, regions)
+        points = sum(group.serving.exponents.shape[1] for group in predictor._groups if group)
+        return cls(predictor.definition, tables_of(predictor, ending), len(predictor.transitions) + 1, regions, points)
 
     def __call__(
         self,
@@ -344,20 +349,28 @@ class StepsOfModel(ArraySteps):
         moved = ArrayTransition(
             np.empty_like(q), np.empty(count), np.empty((count, self.outputs)), np.empty(count, dtype=np.bool_)
         )
-        step(
-            *self.tables,
-            q,
-            u,
-            NO_ROWS if noise is None else noise,
-            NO_ROWS if process is None else process,
-            NO_ROWS if paths is None else paths,
-            deviations,
-            reward_deviation,
-            moved.q_next,
-            moved.reward,
-            moved.deviation,
-            moved.terminated,
-        )
+        noise, process, paths = (NO_ROWS if given is None else given for given in (noise, process, paths))
+
+        def rows(at: slice) -> None:
+            step(
+                *self.tables,
+                q[at],
+                u[at],
+                noise[at],
+                process[at],
+                paths[at],
+                deviations,
+                reward_deviation,
+                moved.q_next[at],
+                moved.reward[at],
+                moved.deviation[at],
+                moved.terminated[at],
+            )
+
+        if count * self.points < SPLIT:
+            rows(slice(None))
+        else:
+            side_by_side(rows, count, BLOCK, torch.get_num_threads())
         if self.has_regions:
             from surrogym_server.models.gaussian_process.prediction.compiled.regions import judge
 

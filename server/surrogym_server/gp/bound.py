@@ -1,0 +1,286 @@
+"""Variational lower bound of the evidence of many points, through m inducing ones, and its gradient.
+
+With K_uu of the inducing points Z, K_uf of Z and the n points X, Q = K_uf^T K_uu^-1 K_uf, and K_ff of the points,
+
+    F = log N(y | 0, Q + sigma_n^2 I) - tr(K_ff - Q) / (2 sigma_n^2) <= log p(y).
+
+The trace counts what the inducing points leave unexplained, so hyperparameters that maximise F do not take it for
+something that was learned: the noise grows by it. With all points as inducing ones F is the evidence. At the optimum of
+the variational distribution predictions are those of the projected process, see ``gp.sparse``.
+
+With L L^T = K_uu, V = L^-1 K_uf, S = V V^T + sigma_n^2 I, a = S^-1 V y and alpha = (y - V^T a) / sigma_n^2, all is
+computed in O(n m^2), and
+
+    dF/dK_uf = L^-T (a alpha^T + (I - sigma_n^2 S^-1) V / sigma_n^2),
+    dF/dK_uu = -1/2 L^-T (a a^T + S / sigma_n^2 - 2 I + sigma_n^2 S^-1) L^-1.
+
+Z are some of the X, and stay where they are in a search. Those that the others explain least are a good choice
+(``gp.sparse``), because F is at most tr(K_ff - Q) |y|^2 / (2 sigma_n^4) below the evidence.
+
+References: Titsias, "Variational learning of inducing variables in sparse Gaussian processes", AISTATS 2009; Burt,
+Rasmussen, van der Wilk, "Convergence of sparse variational inference in Gaussian processes regression", JMLR 21 (2020).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy  # its parts are loaded on first use
+import torch
+from torch import Tensor
+
+from surrogym_server.gp.fit import SHORTER, _blas, _minimum
+from surrogym_server.gp.kernel import Hyperparameters, Polynomial, Reflection
+from surrogym_server.gp.parameters import Array, FitOptions, Parameters
+from surrogym_server.gp.posterior import Posterior, condition
+from surrogym_server.gp.sparse import condition_sparse, pivots
+from surrogym_server.gp.subsets import SOME, spread
+
+SEARCHES = ((2_000, 40), (None, 15))  # most points of each search, None for all, and its iterations
+HARDLY, TRIES = 0.3, 6  # of the noise: largest effect of an input that may be left out; and searches
+JITTER = 1e-9  # of the points' mean prior variance: added to the diagonal of K_uu
+
+
+def fit_bound(
+    x: Tensor, y: Tensor, options: FitOptions, theta: Array, inducing: int, reflection: Reflection | None = None
+) -> Posterior:
+    """Fit a process to x (n, d) and y (n,), both standardised, through at most ``inducing`` points.
+
+    The search begins at ``theta``, which was fitted to some of the points, and at shorter length scales. It sees some
+    of the points first, and then all. Each time the inducing points are chosen anew. Runs on the CPU.
+
+    Raises:
+        NumericalFailure: as ``condition``.
+    """
+    shorter = theta.copy()
+    shorter[: x.shape[1]] -= SHORTER
+    shorter[-1] = Parameters(x.shape[1], options, reflection).default_start[-1]
+    starts = [theta, shorter]
+    with _blas().limit(limits=1):
+        for most, iterations in SEARCHES:
+            rows = spread(len(y), len(y) if most is None else most)
+            few = replace(options, max_iterations=iterations)
+            found = [_searched(x[rows], y[rows], few, start, inducing, reflection) for start in starts]
+            starts = [min(found, key=lambda pair: pair[0])[1]]
+            if len(rows) == len(y):
+                break
+        hyper = Parameters(x.shape[1], options, reflection).hyper(starts[0])
+        return condition(hyper, x, y) if len(y) <= inducing else condition_sparse(hyper, x, y, inducing)
+
+
+@dataclass(frozen=True)
+class Fewer:
+    """A process of some of the inputs."""
+
+    kept: Tensor  # (d,) bool
+    posterior: Posterior
+
+
+def fewer_inputs(
+    x: Tensor, y: Tensor, posterior: Posterior, options: FitOptions, inducing: int, may: Tensor, odds: float
+) -> Fewer | None:
+    """Leave out inputs of a process of x (n, d) and y (n,) that hardly change its mean, if the bound with priors is
+    greater without them; None if all are kept. Runs on the CPU.
+
+    All such inputs are tried at once. A set that is kept is halved, the inputs that matter least first, and its halves
+    are tried beside those that were left out, in ``TRIES`` searches at most.
+
+    Args:
+        posterior: the process with all inputs.
+        may: (d,) bool, the inputs that may be left out. One is kept at least.
+        odds: log odds before any data that one input more is left out.
+    """
+    effect = _effects(posterior, x[spread(len(y), SOME)])
+    most = HARDLY * math.sqrt(posterior.hyper.noise_variance)
+    ordered = [j for j in effect.argsort().tolist() if bool(may[j]) and float(effect[j]) < most]
+    sets = [ordered[: x.shape[1] - 1]] if ordered else []
+    with _blas().limit(limits=1):
+        inputs = _Inputs(x, y, replace(options, max_iterations=SEARCHES[-1][1]), inducing, posterior.hyper)
+        for _ in range(TRIES):
+            if not sets:
+                break
+            out = sets.pop()
+            if not inputs.without(out, odds) and len(out) > 1:
+                sets += [out[len(out) // 2 :], out[: len(out) // 2]]
+        return None if bool(inputs.kept.all()) else inputs.process()
+
+
+class _Inputs:
+    """The inputs that a process keeps, and the free parameters with which its bound is greatest."""
+
+    def __init__(self, x: Tensor, y: Tensor, options: FitOptions, inducing: int, hyper: Hyperparameters) -> None:
+        self._x, self._y, self._options, self._inducing, self._mirror = x, y, options, inducing, hyper.reflection
+        self._theta = Parameters(x.shape[1], options, hyper.reflection).theta(hyper)
+        self._cost, _ = Bound(x, y, pivots(hyper, x, inducing), options, hyper.reflection)(self._theta)
+        self.kept = torch.ones(x.shape[1], dtype=torch.bool)
+
+    def without(self, out: Sequence[int], odds: float) -> bool:
+        """Leave out further inputs, if that makes the cost less."""
+        kept = self.kept.index_fill(0, torch.tensor(out), value=False)
+        mirror = self._reflection(kept)
+        if mirror is not None and mirror.parity < 0 and bool((mirror.signs > 0).all()):
+            return False  # such a function is zero
+        others = np.ones(len(self._theta) - int(self.kept.sum()), dtype=bool)
+        start = self._theta[np.concatenate([kept[self.kept].numpy(), others])]
+        cost, theta = _searched(self._x[:, kept], self._y, self._options, start, self._inducing, mirror)
+        if cost - odds * len(out) >= self._cost:
+            return False
+        self._cost, self._theta, self.kept = cost, theta, kept
+        return True
+
+    def process(self) -> Fewer:
+        x = self._x[:, self.kept]
+        hyper = Parameters(x.shape[1], self._options, self._reflection(self.kept)).hyper(self._theta)
+        return Fewer(self.kept, condition_sparse(hyper, x, self._y, self._inducing))
+
+    def _reflection(self, kept: Tensor) -> Reflection | None:
+        return None if self._mirror is None else replace(self._mirror, signs=self._mirror.signs[kept])
+
+
+def _effects(posterior: Posterior, x: Tensor) -> Tensor:
+    """By how much the mean at x (m, d) changes if one input has the value of another row, root mean squares (d,)."""
+    mean, found = posterior.mean(x), []
+    for j in range(x.shape[1]):
+        changed = x.clone()
+        changed[:, j] = x[:, j].roll(1)
+        found.append((posterior.mean(changed) - mean).square().mean().sqrt())
+    return torch.stack(found)
+
+
+def _searched(
+    x: Tensor, y: Tensor, options: FitOptions, start: Array, inducing: int, reflection: Reflection | None
+) -> tuple[float, Array]:
+    """The least cost from a start, and its theta, with the inducing points that suit the start."""
+    parameters = Parameters(x.shape[1], options, reflection)
+    clipped = np.clip(start, parameters.lower, parameters.upper)
+    chosen = pivots(parameters.hyper(clipped), x, inducing)
+    return _minimum(Bound(x, y, chosen, options, reflection), clipped)
+
+
+class Bound(Parameters):
+    """Negative bound with priors, and its gradient."""
+
+    def __init__(
+        self, x: Tensor, y: Tensor, chosen: Tensor, options: FitOptions, reflection: Reflection | None
+    ) -> None:
+        """Prepare the bound of x (n, d) and y (n,); ``chosen`` (m,) are the numbers of the inducing points."""
+        super().__init__(x.shape[1], options, reflection)
+        self.x, self.y, self.chosen = x.numpy(), y.numpy(), chosen.numpy()
+        self.z = self.x[self.chosen]
+        self.parity = 0 if reflection is None else reflection.parity
+        self.signs = np.ones(self.d) if reflection is None else reflection.signs.numpy()
+        self._lines = Polynomial.of(1.0, 0.0, reflection, x)
+        self._squares = Polynomial.of(0.0, 1.0, reflection, x)
+        self._constant = 0.5 * len(y) * math.log(2 * math.pi) + self.prior_constant
+
+    def __call__(self, theta: Array) -> tuple[float, Array]:
+        """Value and gradient at theta. If float64 can't factor a matrix, a very large cost stops the line search."""
+        covariances = self._covariances(theta)
+        k, noise = covariances.k, self.values(theta)[-1]
+        n, m, prior = len(self.y), len(self.z), float(covariances.diagonal.sum())
+        inner = k[:, self.chosen].copy()
+        inner.flat[:: m + 1] += JITTER * prior / n
+        if (lower := _factor(inner)) is None:
+            return 1e10, np.zeros_like(theta)
+        known = _solved(lower, k)  # V
+        square = known @ known.T
+        s = square.copy()
+        s.flat[:: m + 1] += noise
+        if (root := _factor(s)) is None:
+            return 1e10, np.zeros_like(theta)
+        weights = scipy.linalg.cho_solve((root, True), known @ self.y, check_finite=False)  # a
+        inverse = scipy.linalg.cho_solve((root, True), np.eye(m), check_finite=False)
+        alpha = (self.y - weights @ known) / noise
+        left = prior - float(square.trace())
+        logs = (n - m) * math.log(noise) + 2 * float(np.log(root.diagonal()).sum())
+        z = self.in_deviations(theta)
+        value = 0.5 * (logs + self.y @ alpha + left / noise + z @ z) + self._constant
+
+        back = scipy.linalg.solve_triangular(lower, np.eye(m), lower=True, trans=1, check_finite=False)  # L^-T
+        outer = (back @ (np.eye(m) / noise - inverse)) @ known
+        outer += np.outer(back @ weights, alpha)
+        within = np.outer(weights, weights) + s / noise - 2 * np.eye(m) + noise * inverse
+        within = -0.5 * back @ within @ back.T
+        outer[:, self.chosen] += within
+        each = -0.5 / noise + JITTER * float(within.trace()) / n  # of the diagonal of K_ff
+        gradient = self._gradient(theta, covariances, outer, each)
+        taken = n - m + noise * float(inverse.trace())
+        gradient[-1] = 0.5 * (noise * float(alpha @ alpha) - taken + left / noise)
+        return float(value), z / self.prior[:, 1] - gradient
+
+    def _covariances(self, theta: Array) -> _Covariances:
+        lengthscale, signal, linear, quadratic, _ = self.values(theta)
+        a, b = self.z / lengthscale, self.x / lengthscale
+        smooth = [signal * _exponential(a, b)]
+        diagonal = np.full(len(b), signal)
+        if self.parity:
+            smooth.append(self.parity * signal * _exponential(a, b * self.signs))
+            mirrored = self.parity * signal * np.exp(np.square(b) @ (self.signs - 1))
+            diagonal = diagonal + mirrored
+        else:
+            mirrored = np.zeros(0)
+        k = smooth[0] + smooth[1] if self.parity else smooth[0].copy()
+        if linear:
+            k += linear * self._polynomial(self._lines)
+            diagonal = diagonal + linear * self._lines.diagonal(torch.from_numpy(self.x)).numpy()
+        if quadratic:
+            k += quadratic * self._polynomial(self._squares)
+            diagonal = diagonal + quadratic * self._squares.diagonal(torch.from_numpy(self.x)).numpy()
+        return _Covariances(k, smooth, diagonal, mirrored)
+
+    def _polynomial(self, part: Polynomial) -> Array:
+        found: Array = part(torch.from_numpy(self.z), torch.from_numpy(self.x)).numpy()
+        return found
+
+    def _gradient(self, theta: Array, covariances: _Covariances, outer: Array, each: float) -> Array:
+        """Gradient over theta, given those over K_uf (m, n), K_uu included, and over each entry of K_ff's diagonal."""
+        lengthscale, signal, linear, quadratic, _ = self.values(theta)
+        gradient, n = np.zeros_like(theta), len(self.y)
+        gradient[self.d] = each * (n * signal + float(covariances.mirrored.sum()))
+        for smooth, signs in zip(covariances.smooth, (np.ones(self.d), self.signs), strict=False):
+            weighted, x = outer * smooth, self.x * signs
+            gradient[self.d] += weighted.sum()
+            squared = weighted.sum(1) @ np.square(self.z) + weighted.sum(0) @ np.square(x)
+            gradient[: self.d] += (squared - 2 * ((weighted @ x) * self.z).sum(0)) / lengthscale**2
+        if self.parity:
+            turned = -2 * (self.signs - 1) / lengthscale**2
+            gradient[: self.d] += each * turned * (covariances.mirrored @ np.square(self.x))
+        x, place = torch.from_numpy(self.x), self.d + 1
+        for variance, part in ((linear, self._lines), (quadratic, self._squares)):
+            if variance:
+                own = (outer * self._polynomial(part)).sum() + each * float(part.diagonal(x).sum())
+                gradient[place] = variance * own
+                place += 1
+        return gradient
+
+
+@dataclass(frozen=True)
+class _Covariances:
+    k: Array  # (m, n) of inducing points and points
+    smooth: list[Array]  # its squared exponential, and that of the points' mirror images
+    diagonal: Array  # (n,) of the points
+    mirrored: Array  # (n,) the share of each point's own mirror image in it; empty without a reflection
+
+
+def _exponential(a: Array, b: Array) -> Array:
+    """exp(-1/2 |a_i - b_j|^2) of a (m, d) and b (n, d), (m, n)."""
+    k = a @ b.T
+    k -= 0.5 * np.square(a).sum(1)[:, None]
+    k -= 0.5 * np.square(b).sum(1)
+    found: Array = np.exp(k, out=k)
+    return found
+
+
+def _factor(matrix: Array) -> Array | None:
+    """Lower Cholesky factor; None if there is none."""
+    lower, info = scipy.linalg.lapack.dpotrf(matrix, lower=1, clean=1)
+    return None if info else np.ascontiguousarray(lower)
+
+
+def _solved(lower: Array, k: Array) -> Array:
+    """L^-1 k for k (m, n) by rows."""
+    known: Array = scipy.linalg.blas.dtrsm(1.0, lower.T, k.T, side=1, lower=0).T
+    return known

@@ -1,0 +1,200 @@
+"""The bound is a lower bound of the evidence with the right gradient, and what maximises it predicts and is not too
+sure."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from surrogym_server.gp import (
+    FitOptions,
+    Hyperparameters,
+    Posterior,
+    Reflection,
+    condition,
+    condition_sparse,
+    fewer_inputs,
+    fit,
+    fit_bound,
+)
+from surrogym_server.gp.bound import Bound
+from surrogym_server.gp.fit import _Objective
+from surrogym_server.gp.sparse import pivots
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", DeprecationWarning)  # of torch.jit, at import
+    import gpytorch
+    from gpytorch.kernels import InducingPointKernel, LinearKernel, RBFKernel, ScaleKernel
+
+FLAT = (0.0, 1e4)  # a prior that says nothing
+WITHOUT_PRIORS = {f"{name}_prior": FLAT for name in ("lengthscale", "signal", "linear", "quadratic", "noise")}
+NOISE = 0.05
+
+
+def points(count: int, inputs: int, seed: int) -> tuple[Tensor, Tensor]:
+    rng = np.random.default_rng(seed)
+    x = torch.from_numpy(rng.uniform(-1.7, 1.7, (count, inputs)))
+    return x, torch.sin(2 * x[:, 0]) + 0.5 * x[:, 1] + NOISE * torch.from_numpy(rng.normal(size=count))
+
+
+kernels = given(
+    linear=st.booleans(),
+    quadratic=st.booleans(),
+    seed=st.integers(0, 2**32 - 1),
+    noise=st.floats(-6.0, 0.0),
+    parity=st.sampled_from([0, 1, -1]),
+)
+
+
+def drawn(
+    linear: bool, quadratic: bool, seed: int, noise: float, parity: int
+) -> tuple[Tensor, Tensor, FitOptions, Reflection | None, np.ndarray]:
+    """Points, a kernel and its free parameters."""
+    reflection = Reflection(torch.tensor([-1.0, 1.0], dtype=torch.float64), parity) if parity else None
+    options, (x, y) = FitOptions(linear=linear, quadratic=quadratic), points(20, 2, seed)
+    theta = np.random.default_rng(seed).uniform(-1.0, 1.0, 4 + linear + quadratic)
+    theta[-1] = noise
+    return x, y, options, reflection, theta
+
+
+@settings(max_examples=40)
+@kernels
+def test_the_gradient_is_that_of_finite_differences(linear, quadratic, seed, noise, parity):
+    x, y, options, reflection, theta = drawn(linear, quadratic, seed, noise, parity)
+    bound = Bound(x, y, torch.arange(0, 20, 3), options, reflection)
+    _, gradient = bound(theta)
+    step = 1e-5
+    for i, direction in enumerate(np.eye(len(theta))):
+        difference = (bound(theta + step * direction)[0] - bound(theta - step * direction)[0]) / (2 * step)
+        assert gradient[i] == pytest.approx(difference, rel=1e-4, abs=1e-4)
+
+
+@settings(max_examples=40)
+@kernels
+def test_it_never_exceeds_the_evidence(linear, quadratic, seed, noise, parity):
+    x, y, options, reflection, theta = drawn(linear, quadratic, seed, noise, parity)
+    negative, _ = _Objective(x, y, options, reflection)(theta)
+    costs = [Bound(x, y, torch.arange(m), options, reflection)(theta)[0] for m in (1, 3, 8, 20)]
+    assert costs == sorted(costs, reverse=True), "more inducing points never lower it"
+    assert costs[-1] >= negative - 1e-9 * abs(negative)
+
+
+@settings(max_examples=40)
+@kernels
+def test_with_all_points_it_is_the_evidence(linear, quadratic, seed, noise, parity):
+    """But for the jitter, which is as small as 1e-9 of the prior's variance."""
+    x, y, options, reflection, theta = drawn(linear, quadratic, seed, noise, parity)
+    whole = Bound(x, y, torch.arange(len(y)), options, reflection)
+    for ours, theirs in zip(whole(theta), _Objective(x, y, options, reflection)(theta), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-3)
+
+
+class Reference(gpytorch.models.ExactGP):
+    """GPyTorch's process through inducing points."""
+
+    def __init__(self, x: Tensor, y: Tensor, z: Tensor, hyper: Hyperparameters) -> None:
+        likelihood = gpytorch.likelihoods.GaussianLikelihood()
+        likelihood.noise = hyper.noise_variance
+        super().__init__(x, y, likelihood)
+        self.mean_module = gpytorch.means.ZeroMean()
+        smooth = ScaleKernel(RBFKernel(ard_num_dims=x.shape[1]))
+        smooth.outputscale, smooth.base_kernel.lengthscale = hyper.signal_variance, hyper.lengthscale
+        line = LinearKernel()
+        line.variance = hyper.linear_variance
+        constant = gpytorch.kernels.ConstantKernel()
+        constant.constant = torch.tensor([hyper.linear_variance])
+        self.covar_module = InducingPointKernel(smooth + line + constant, inducing_points=z, likelihood=likelihood)
+        self.double()
+
+    def forward(self, x: Tensor) -> gpytorch.distributions.MultivariateNormal:
+        return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
+
+
+def test_it_is_gpytorchs_bound():
+    x, y = points(60, 3, seed=0)
+    hyper = Hyperparameters(torch.tensor([0.8, 1.7, 3.1], dtype=torch.float64), 1.6, 0.7, 0.0, 0.02)
+    chosen = pivots(hyper, x, 12)
+    bound = Bound(x, y, chosen, FitOptions(**WITHOUT_PRIORS), None)
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.no_grad(), gpytorch.settings.fast_computations(False, False, False):
+            reference = Reference(x, y, x[chosen], hyper)
+            reference.train()
+            margin = gpytorch.mlls.ExactMarginalLogLikelihood(reference.likelihood, reference)
+            theirs = float(margin(reference(x), y)) * len(y)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert bound.prior_constant - bound(bound.theta(hyper))[0] == pytest.approx(theirs, rel=1e-5)
+
+
+def fitted(x: Tensor, y: Tensor, inducing: int) -> Posterior:
+    start = fit(x[:100], y[:100], FitOptions()).theta
+    return fit_bound(x, y, FitOptions(), start, inducing)
+
+
+def test_a_fit_learns_the_function_and_the_noise():
+    x, y = points(3_000, 2, seed=1)
+    scale = y.std(correction=0)
+    found, (at, _) = fitted(x, (y - y.mean()) / scale, 60), points(1_000, 2, seed=2)
+    assert found.sparse is not None
+    assert (found.sparse.points, len(found.y) <= 60) == (3_000, True)
+    truth = (torch.sin(2 * at[:, 0]) + 0.5 * at[:, 1] - y.mean()) / scale
+    assert float((found.mean(at) - truth).square().mean().sqrt()) < 0.3 * NOISE
+    assert math.sqrt(found.hyper.noise_variance) * float(scale) == pytest.approx(NOISE, rel=0.05)
+
+
+def test_what_inducing_points_leave_counts_as_noise():
+    """A fit to a subset would take six points for enough, and be sure of what they leave."""
+    x, y = points(600, 2, seed=3)
+    y = (y - y.mean()) / y.std(correction=0)
+    few = fitted(x, y, 6)
+    mean, variance = few.mean_and_variance(x)
+    within = (mean - y).abs() <= 2 * (variance + few.hyper.noise_variance).sqrt()
+    assert len(few.y) == 6
+    assert float(within.double().mean()) > 0.9
+
+
+def test_a_process_of_so_few_points_is_exact():
+    x, y = points(40, 2, seed=4)
+    found = fitted(x, y, 40)
+    exact = condition(found.hyper, x, y)
+    assert found.sparse is None
+    torch.testing.assert_close(found.weights, exact.weights, rtol=0, atol=0)
+
+
+def test_inputs_that_are_not_read_are_left_out():
+    x, y = points(1_500, 6, seed=5)
+    y = (y - y.mean()) / y.std(correction=0)
+    whole, may = fitted(x, y, 60), torch.ones(6, dtype=torch.bool)
+    found = fewer_inputs(x, y, whole, FitOptions(), 60, may, -1.0)
+    assert found is not None
+    assert found.kept.tolist() == [True, True, False, False, False, False]
+    assert found.posterior.x.shape[1] == 2
+    may[4] = False
+    again = fewer_inputs(x, y, whole, FitOptions(), 60, may, -1.0)
+    assert again is not None
+    assert again.kept.tolist() == [True, True, False, False, True, False]
+
+
+def test_inputs_that_are_read_are_kept():
+    x, y = points(1_500, 2, seed=6)
+    y = (y - y.mean()) / y.std(correction=0)
+    assert fewer_inputs(x, y, fitted(x, y, 60), FitOptions(), 60, torch.ones(2, dtype=torch.bool), -1.0) is None
+
+
+def test_an_odd_process_keeps_an_input_that_turns():
+    """Of a function that is zero everywhere else nothing would be left."""
+    x, _ = points(600, 2, seed=7)
+    y = 0.01 * torch.from_numpy(np.random.default_rng(0).normal(size=600))
+    odd = Reflection(torch.tensor([-1.0, 1.0], dtype=torch.float64), -1)
+    hyper = Hyperparameters(torch.full((2,), 2.0, dtype=torch.float64), 1e-6, 1e-6, 0.0, 1e-2, odd)
+    whole, may = condition_sparse(hyper, x, y, 30), torch.ones(2, dtype=torch.bool)
+    found = fewer_inputs(x, y, whole, FitOptions(), 30, may, 100.0)
+    assert found is None or bool(found.kept[0])

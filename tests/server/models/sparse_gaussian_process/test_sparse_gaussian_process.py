@@ -1,0 +1,199 @@
+"""Sparse processes: exact with few samples, near to exact ones with many, sure of no more than they know, and small."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from support.models import learn
+from support.real_steps import random_steps
+from surrogym_client.experiments.unseen.machine import Array, Machine
+from surrogym_client.original.classic import pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.samples import Samples, increments
+from surrogym_server.errors import InvalidInput, InvalidSpec
+from surrogym_server.models.files import from_bytes, to_bytes
+from surrogym_server.models.gaussian_process.codec.model import GaussianProcessCodec
+from surrogym_server.models.registry import learner_of
+from surrogym_server.models.sparse_gaussian_process import SparseGaussianProcesses
+from surrogym_server.models.sparse_gaussian_process.codec import SparseGaussianProcessCodec
+from surrogym_server.models.sparse_gaussian_process.learning import ByBound
+from surrogym_server.models.sparse_gaussian_process.model import SparseGaussianProcessModel
+from surrogym_server.plugins import Choice
+from surrogym_shared import compiled
+from surrogym_shared.spec import EnvironmentSpec, ModelChoice
+
+NOISE = 0.02
+
+
+class Springs(Machine):
+    """Three masses in a row between walls. Each reads its neighbours alone; the first is pushed, and their speeds are
+    noisy."""
+
+    ranges = {f"{kind}{i}": (-1, 1) for kind in ("x", "v") for i in range(3)}  # noqa: RUF012
+    start = ranges
+
+    def formula(self, q: Array, u: Array) -> tuple[Array, Array]:
+        x, v = q[..., :3], q[..., 3:]
+        walls = np.zeros_like(x[..., :1])
+        stretch = np.diff(np.concatenate([walls, x, walls], -1), axis=-1)
+        force = np.diff(stretch + 3 * stretch**3, axis=-1) - 0.2 * v
+        force[..., 0] += 2 * u[..., 0]
+        return np.concatenate([x + 0.1 * v, v + 0.1 * force], -1), -(x**2).sum(-1)
+
+
+def designed(spec: EnvironmentSpec, family: str, **settings: int) -> EnvironmentSpec:
+    chosen = ModelChoice(name=family, settings=settings)
+    return spec.model_copy(update={"design": spec.design.model_copy(update={"model": chosen})})
+
+
+def steps(count: int, seed: int, noise: float = 0.0) -> Samples:
+    rng, machine = np.random.default_rng(seed), Springs()
+    q, u = rng.uniform(-1, 1, (count, 6)), rng.uniform(-1, 1, (count, 1))
+    after, pay = machine.formula(q, u)
+    after[:, 3:] += noise * rng.normal(size=(count, 3))
+    arrays = (torch.from_numpy(part) for part in (q, u, after, pay))
+    return Samples(*arrays, torch.zeros(count, dtype=torch.bool))
+
+
+@cache
+def model(inducing: int = 120) -> SparseGaussianProcessModel:
+    definition = definition_from_spec(designed(Springs().spec(), "sparse_gaussian_process", inducing=inducing))
+    found = learn(definition, steps(1_200, seed=0, noise=NOISE)).model
+    assert isinstance(found, SparseGaussianProcessModel)
+    return found
+
+
+def test_with_few_samples_it_is_the_exact_family():
+    spec = pendulum()
+    samples = random_steps(spec, 40, seed=0)
+    exact, sparse = (
+        learn(definition_from_spec(designed(spec, family)), samples).model
+        for family in ("gaussian_process", "sparse_gaussian_process")
+    )
+    unseen = random_steps(spec, 20, seed=1)
+    ours, theirs = (m.transition(unseen.q, unseen.u, deviations=True) for m in (sparse, exact))
+    assert torch.equal(ours.q_next, theirs.q_next)
+    assert torch.equal(ours.deviation, theirs.deviation)
+    assert sparse.description == exact.description
+
+
+def test_it_learns_the_step_and_its_noise_through_a_few_of_the_samples():
+    found, unseen = model(), steps(500, seed=1)
+    sizes = [len(o.posterior.y) for o in found.transitions if o.posterior is not None]
+    assert max(sizes) <= 120
+    off = found.means(unseen.q, unseen.u)[:, :-1] - increments(found.definition, unseen)
+    assert float(off[:, 3:].square().mean().sqrt()) < 0.4 * NOISE
+    assert float(off[:, :3].square().mean().sqrt()) < 1e-4
+    assert found.noise_deviations[3:6] == pytest.approx([NOISE] * 3, rel=0.1)
+
+
+def test_its_intervals_hold_what_they_promise():
+    found, unseen = model(), steps(2_000, seed=2)
+    made = found.transition(unseen.q, unseen.u, deviations=True)
+    off = (made.q_next - unseen.q_next)[:, 3:]
+    within = (off.abs() <= 1.645 * made.deviation[:, 3:]).double().mean()
+    assert 0.8 < float(within) <= 1
+
+
+def test_inputs_that_an_output_does_not_read_are_left_out():
+    """The last mass' speed reads its neighbour, its own place and its own speed, of seven inputs."""
+    assert model().transitions[5].feature_map.dropped == (0, 3, 4, 6)
+
+
+def test_a_stored_model_predicts_the_same_and_is_of_no_other_family():
+    found, unseen = model(), steps(20, seed=3)
+    loaded = from_bytes(found.definition, to_bytes(found))
+    assert isinstance(loaded, SparseGaussianProcessModel)
+    assert torch.equal(loaded.means(unseen.q, unseen.u), found.means(unseen.q, unseen.u))
+    with pytest.raises(TypeError, match="of Gaussian processes, got SparseGaussianProcessModel"):
+        GaussianProcessCodec().encode(found)
+    with pytest.raises(TypeError, match="of sparse Gaussian processes, got GaussianProcessModel"):
+        SparseGaussianProcessCodec().encode(found.plain)
+    with pytest.raises(InvalidInput, match="the family 'gaussian_process'"):
+        from_bytes(definition_from_spec(Springs().spec()), to_bytes(found))
+
+
+def test_drawn_functions_scatter_as_deviations_say():
+    found = model(20)
+    unseen = steps(4, seed=4)
+    noise = torch.randn(400, found.path_size, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    paths, made = found.draw(noise), found.transition(unseen.q, unseen.u, deviations=True)
+    for i in range(len(unseen)):
+        drawn = found.transition_along(paths, unseen.q[i].expand(400, -1), unseen.u[i].expand(400, -1))
+        torch.testing.assert_close(drawn.q_next[:, 3:].std(0), made.deviation[i, 3:], rtol=0.25, atol=1e-4)
+
+
+def test_fewer_inducing_points_are_less_sure():
+    unseen = steps(200, seed=5)
+    few, many = (model(m).transition(unseen.q, unseen.u, deviations=True).deviation for m in (20, 120))
+    noises = [np.array(model(m).noise_deviations[3:6]) for m in (20, 120)]
+    assert (
+        float(few[:, 3:].square().mean()) + (noises[0] ** 2).mean()
+        > float(many[:, 3:].square().mean()) + (noises[1] ** 2).mean()
+    )
+
+
+def test_a_warm_start_leads_to_the_same_accuracy():
+    definition, samples, unseen = model().definition, steps(1_200, seed=0, noise=NOISE), steps(500, seed=1)
+    first = learn(definition, steps(600, seed=0, noise=NOISE))
+    again = learn(definition, samples, first.warm).model
+    errors = [
+        float((m.means(unseen.q, unseen.u)[:, :-1] - increments(definition, unseen)).square().mean().sqrt())
+        for m in (model(), again)
+    ]
+    assert errors[1] < 1.5 * errors[0]
+
+
+def test_a_process_that_learns_again_from_more_samples_has_no_more_inducing_points():
+    """As one does that met limits of its output."""
+    posterior, rng = model().transitions[3].posterior, np.random.default_rng(0)
+    assert posterior is not None
+    x = torch.from_numpy(rng.uniform(-1.7, 1.7, (300, posterior.x.shape[1])))
+    again = ByBound(30).conditioned(posterior.hyper, x, posterior.mean(x))
+    assert again.sparse is not None
+    assert (again.sparse.points, len(again.y)) == (300, 30)
+
+
+def test_what_the_design_says_of_processes_holds_for_sparse_ones():
+    spec = designed(Springs().spec(), "sparse_gaussian_process", inducing=50)
+    chosen = spec.design.model_copy(update={"symmetry": "none", "preset": "paper"})
+    learner = learner_of(definition_from_spec(spec.model_copy(update={"design": chosen})).learning.model)
+    assert isinstance(learner, SparseGaussianProcesses)
+    assert (learner.symmetry, learner.kernel, learner.inducing) == ("none", "squared_exponential", 50)
+
+
+@pytest.mark.skipif(not compiled.available(), reason="numba is not installed, or switched off")
+def test_large_steps_are_divided_between_threads_to_the_same_bits(monkeypatch):
+    from surrogym_server.models.gaussian_process.prediction.compiled import step
+
+    move, unseen = model().compiled(), steps(100, seed=6)
+    assert move is not None
+    noise = np.random.default_rng(0).normal(size=(100, 6))
+    wanted: dict[str, Any] = {"process": None, "paths": None, "deviations": True, "reward_deviation": True}
+    whole = move(unseen.q.numpy(), unseen.u.numpy(), noise=noise, **wanted)
+    monkeypatch.setattr(step, "SPLIT", 0)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    divided = move(unseen.q.numpy(), unseen.u.numpy(), noise=noise, **wanted)
+    for field in fields(whole):
+        np.testing.assert_array_equal(getattr(divided, field.name), getattr(whole, field.name))
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"inducing": 9}, "inducing to be a whole number from 10 to 2000, got 9"),
+        ({"inducing": 2_001}, "inducing to be a whole number from 10 to 2000"),
+        ({"inducing": True}, "expected inducing to be a whole number, got True"),
+        ({"kernel": "matern"}, "expected kernel to be one of"),
+        ({"points": 3}, "inducing, got 'points'"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings, said):
+    with pytest.raises(InvalidSpec, match=said):
+        learner_of(Choice("sparse_gaussian_process", tuple(settings.items())))
