@@ -61,6 +61,18 @@ def test_register_by_a_file_names_the_next_command_with_its_environment(on_serve
     assert said.out.endswith(f"next: surrogym sample {name} --env own_line:Env-v0\n")
 
 
+def test_a_design_without_real_steps_sends_nobody_to_a_sampler(on_server, name):
+    """register named the sampler as the next step, and sample --until-done waited without a word."""
+    words = "the design requests no real steps, and there is no log yet; next: surrogym import LOG --to " + name
+    said = on_server("register", "Pendulum-v1", "--name", name, "--budget", "0")
+    assert said.out == f"{name}: Pendulum-v1, 2 coordinates; {words}\n"
+    assert on_server("sample", name, "--until-done").out == f"{words}\n"
+    assert on_server("sample", name, "--until-done", "--json").json["steps"] == 0
+    waits = on_server("sample", name, "--time-limit", "0.5")
+    assert f"{words}; this sampler waits for queries, Ctrl-C ends it" in waits.err
+    assert words in on_server("status", name).out
+
+
 def test_register_twice_is_harmless_and_another_specification_is_refused(on_server, pendulum):
     again = on_server("register", "Pendulum-v1", "--name", pendulum, "--budget", "8", "--initial", "4")
     assert again.code == 0
