@@ -163,6 +163,10 @@ def test_the_command_drafts_registers_and_waits(
         (["--name", "x"], "is a log: give --register NAME or --to NAME, not --name"),
         (["--register", "a", "--to", "b"], "expected --register or --to, got both"),
         (
+            ["--to", "a", "--budget", "0"],
+            "expected --budget without --to, whose surrogate has a budget, got both: surrogym change a --budget N",
+        ),
+        (
             ["--register", "my tank"],
             "expected a name of at most 64 letters, digits, '.', '_' and '-' for the surrogate",
         ),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from surrogym_client.cli.groups import Output, Service, add
-from surrogym_client.cli.options import SpecFile, Wait, connect, read_spec, typed
+from surrogym_client.cli.options import SpecFile, Wait, connect, given_here, read_spec, typed
 
 if TYPE_CHECKING:
     from surrogym_client.logs import Imported, ReadLog
@@ -118,6 +118,11 @@ def command(
         raise CommandError("expected --register or --to, got both")
     if log.to and log.spec:
         raise CommandError("expected --spec without --to, whose surrogate has a specification, got both")
+    if log.to and given_here(context, "budget"):
+        raise CommandError(
+            "expected --budget without --to, whose surrogate has a budget, got both: surrogym change "
+            f"{shlex.quote(log.to)} --budget N changes it"
+        )
     _require_outputs(file, log)
     _import_log(context, file, log, wait, service, output)
 
