@@ -177,14 +177,13 @@ def _import_log(context: typer.Context, file: Path, log: OfLogs, wait: float, se
             spec=read_spec(log.spec),
             budget=log.budget,
             rejected=log.rejected,
+            draft=log.draft,
             url=service.server,
             token=token,
             progress=update,
         )
     if log.picture is not None:
         _draw(imported.log, log.picture)
-    if log.draft is not None:
-        log.draft.write_text(imported.log.spec.model_dump_json(indent=2) + "\n", encoding="utf-8")
     view = None
     if imported.surrogate is not None and wait > 0:
         view = _await_model(imported.surrogate, wait, service.server, token, quiet=output.quiet)
