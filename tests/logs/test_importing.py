@@ -49,6 +49,14 @@ def test_the_same_log_twice_changes_nothing(server_process: ServerProcess, log: 
     assert (second.round, second.samples, second.phase) == (first.round, first.samples, "from_log")
 
 
+def test_steps_that_were_there_are_sent_and_not_stored(server_process: ServerProcess, log: Path, name: str):
+    """The progress said that 60 of 60 steps were stored, and the result that none of them was new."""
+    said: list[str] = []
+    for _ in range(2):
+        import_log(log, register=name, url=server_process.url, progress=lambda _, words: said.append(words))
+    assert said[-1] == f"{ROWS} of {ROWS} steps sent"
+
+
 def test_an_interrupted_import_is_taken_up(
     server_process: ServerProcess, log: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ):

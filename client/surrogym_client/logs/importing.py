@@ -90,7 +90,7 @@ def send(api: Api, name: str, log: ReadLog, progress: Progress = lambda _share, 
         batch = [_sample(steps, reward, row) for row in rows]
         added = api.add_samples(name, SAMPLER, batch, purpose="logged", complete=rows.stop == len(steps))
         duplicates += added.duplicates
-        progress(rows.stop / len(steps), f"{rows.stop} of {len(steps)} steps stored")
+        progress(rows.stop / len(steps), f"{rows.stop} of {len(steps)} steps sent")
     return len(steps), duplicates
 
 
