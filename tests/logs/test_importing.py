@@ -215,3 +215,31 @@ def test_the_next_command_has_the_options_of_this_one(
         told = capsys.readouterr().out.splitlines()[-1]
         common = "nothing was stored; next: surrogym import log.csv --map 'my map.json' --budget 5 --rejected r.csv"
         assert told == f"{common}{kept} --register NAME"
+
+
+def test_a_log_without_a_reward_leads_to_its_declaration(
+    server_process: ServerProcess,
+    tmp_path: Path,
+    name: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """The last line led to a surrogate with a reward of 0, and to its training."""
+    from surrogym_client.cli import main
+
+    def last(*options: str) -> str:
+        with pytest.raises(SystemExit) as ended:
+            main(["import", "log.csv", *options])
+        assert not ended.value.code
+        return capsys.readouterr().out.splitlines()[-1]
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SURROGYM_URL", server_process.url)
+    reactor.log(runs=3, length=20).without("reward").write(tmp_path / "log.csv")
+    draft = "surrogym import log.csv --draft spec.json"
+    assert last() == f"nothing was stored; the log has no reward, so declare it in the draft: {draft}"
+    stored = f"{name} has a reward of 0, so there is nothing to train; declare the reward in a draft, and register it "
+    assert last("--register", name) == f"{stored}under another name: {draft}"
+    then = "declare the reward in spec.json, and then: surrogym import log.csv --spec spec.json --register NAME"
+    assert last("--draft", "spec.json") == f"nothing was stored; next: {then}"
+    assert last("--spec", "spec.json").endswith("next: surrogym import log.csv --spec spec.json --register NAME")
