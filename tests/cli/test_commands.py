@@ -144,6 +144,20 @@ def test_a_surrogate_without_a_model_can_not_be_exported(on_server, pendulum):
     assert "has no model yet" in said.err
 
 
+def test_train_without_a_model_names_the_sampler_or_the_wait(on_server, pendulum):
+    """It told a person to start a sampler while one was running."""
+    missing = f"error: '{pendulum}' has no model yet, its phase is "
+    said = on_server("train", pendulum, "--quiet")
+    assert said.err.startswith(missing)
+    assert said.err.endswith(f"run surrogym sample {pendulum}, or give --wait SECONDS\n")
+    assert on_server("sample", pendulum, "--max-queries", "1", "--quiet").code == 0
+    said = on_server("train", pendulum, "--quiet")
+    assert said.err.startswith(missing)
+    assert said.err.endswith(
+        ", and a sampler is connected: give --wait 120, and the training begins after the design\n"
+    )
+
+
 def test_improve_asks_for_more(on_server, pendulum):
     assert on_server("improve", pendulum, "--queries", "3").code == 0
 
