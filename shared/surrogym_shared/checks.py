@@ -6,8 +6,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Annotated
 
-from pydantic import Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails
+
+from surrogym_shared.entries import of_unknown
 
 LARGEST, NARROWEST = 1e12, 1e-12  # so that squares, products and float32 observations stay finite
 SHOWN = 40  # characters of a wrong value in a message
@@ -44,11 +46,22 @@ def require_known(where: str, given: Iterable[str], known: Iterable[str]) -> Non
     require(not unknown, f"{where} names unknown {unknown}: expected some of {known}")
 
 
-def first_fault(error: ValidationError, *, got: bool = False) -> str:
-    """The first thing that is wrong, with its place. If ``got``, also the value that came to this place."""
-    first = error.errors()[0]
+def first_fault(error: ValidationError, *, got: bool = False, of: type[BaseModel] | None = None) -> str:
+    """Describe the first thing that is wrong, with its place.
+
+    Args:
+        error: the error.
+        got: whether to add the value that came to this place.
+        of: model of the input. An unknown entry is then described by the allowed ones, and precedes a missing entry,
+            because it may be that one with a wrong name.
+    """
+    faults = error.errors()
+    unknown = next((fault for fault in faults if fault["type"] == "extra_forbidden"), None)
+    first = unknown if of is not None and unknown is not None and faults[0]["type"] == "missing" else faults[0]
     where = ".".join(str(part) for part in first["loc"])
     came = f", got {repr(first['input'])[:SHOWN]}" if got and where else ""
+    if of is not None and first["type"] == "extra_forbidden":
+        return f"{where}: {of_unknown(of, first['loc'])}{came}"
     return f"{where}{': ' if where else ''}{_expected(first)}{came}"
 
 

@@ -61,6 +61,18 @@ def test_register_by_a_file_names_the_next_command_with_its_environment(on_serve
     assert said.out.endswith(f"next: surrogym sample {name} --env own_line:Env-v0\n")
 
 
+def test_a_design_without_real_steps_sends_nobody_to_a_sampler(on_server, name):
+    """register named the sampler as the next step, and sample --until-done waited without a word."""
+    words = "the design requests no real steps, and there is no log yet; next: surrogym import LOG --to " + name
+    said = on_server("register", "Pendulum-v1", "--name", name, "--budget", "0")
+    assert said.out == f"{name}: Pendulum-v1, 2 coordinates; {words}\n"
+    assert on_server("sample", name, "--until-done").out == f"{words}\n"
+    assert on_server("sample", name, "--until-done", "--json").json["steps"] == 0
+    waits = on_server("sample", name, "--time-limit", "0.5")
+    assert f"{words}; this sampler waits for queries, Ctrl-C ends it" in waits.err
+    assert words in on_server("status", name).out
+
+
 def test_register_twice_is_harmless_and_another_specification_is_refused(on_server, pendulum):
     again = on_server("register", "Pendulum-v1", "--name", pendulum, "--budget", "8", "--initial", "4")
     assert again.code == 0
@@ -130,6 +142,20 @@ def test_a_surrogate_without_a_model_can_not_be_exported(on_server, pendulum):
     said = on_server("export", pendulum, "--out", "pendulum.surrogate")
     assert (said.code, said.out) == (1, "")
     assert "has no model yet" in said.err
+
+
+def test_train_without_a_model_names_the_sampler_or_the_wait(on_server, pendulum):
+    """It told a person to start a sampler while one was running."""
+    missing = f"error: '{pendulum}' has no model yet, its phase is "
+    said = on_server("train", pendulum, "--quiet")
+    assert said.err.startswith(missing)
+    assert said.err.endswith(f"run surrogym sample {pendulum}, or give --wait SECONDS\n")
+    assert on_server("sample", pendulum, "--max-queries", "1", "--quiet").code == 0
+    said = on_server("train", pendulum, "--quiet")
+    assert said.err.startswith(missing)
+    assert said.err.endswith(
+        ", and a sampler is connected: give --wait 120, and the training begins after the design\n"
+    )
 
 
 def test_improve_asks_for_more(on_server, pendulum):

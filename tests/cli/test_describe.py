@@ -65,7 +65,15 @@ def test_a_name_of_no_environment_is_one_sentence(surrogym) -> None:
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("{", "env.json is not a specification: "), (json.dumps({"specification": {}}), "is not a specification: ")],
+    [
+        (
+            '{"coordinates": [',
+            "env.json is not a specification: no JSON from line 1, column 18 on (Expecting value)",
+        ),
+        (" \n", "env.json is not a specification: it is empty"),
+        (json.dumps({"specification": {}}), "is not a specification: "),
+        (json.dumps({"colour": 1}), "env.json is not a specification: colour: unknown entry; expected some of "),
+    ],
 )
 def test_a_file_that_holds_no_specification_is_refused(surrogym, tmp_path, content: str, message: str) -> None:
     (tmp_path / "env.json").write_text(content)

@@ -49,6 +49,14 @@ def test_the_same_log_twice_changes_nothing(server_process: ServerProcess, log: 
     assert (second.round, second.samples, second.phase) == (first.round, first.samples, "from_log")
 
 
+def test_steps_that_were_there_are_sent_and_not_stored(server_process: ServerProcess, log: Path, name: str):
+    """The progress said that 60 of 60 steps were stored, and the result that none of them was new."""
+    said: list[str] = []
+    for _ in range(2):
+        import_log(log, register=name, url=server_process.url, progress=lambda _, words: said.append(words))
+    assert said[-1] == f"{ROWS} of {ROWS} steps sent"
+
+
 def test_an_interrupted_import_is_taken_up(
     server_process: ServerProcess, log: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ):
@@ -163,6 +171,10 @@ def test_the_command_drafts_registers_and_waits(
         (["--name", "x"], "is a log: give --register NAME or --to NAME, not --name"),
         (["--register", "a", "--to", "b"], "expected --register or --to, got both"),
         (
+            ["--to", "a", "--budget", "0"],
+            "expected --budget without --to, whose surrogate has a budget, got both: surrogym change a --budget N",
+        ),
+        (
             ["--register", "my tank"],
             "expected a name of at most 64 letters, digits, '.', '_' and '-' for the surrogate",
         ),
@@ -203,3 +215,31 @@ def test_the_next_command_has_the_options_of_this_one(
         told = capsys.readouterr().out.splitlines()[-1]
         common = "nothing was stored; next: surrogym import log.csv --map 'my map.json' --budget 5 --rejected r.csv"
         assert told == f"{common}{kept} --register NAME"
+
+
+def test_a_log_without_a_reward_leads_to_its_declaration(
+    server_process: ServerProcess,
+    tmp_path: Path,
+    name: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """The last line led to a surrogate with a reward of 0, and to its training."""
+    from surrogym_client.cli import main
+
+    def last(*options: str) -> str:
+        with pytest.raises(SystemExit) as ended:
+            main(["import", "log.csv", *options])
+        assert not ended.value.code
+        return capsys.readouterr().out.splitlines()[-1]
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SURROGYM_URL", server_process.url)
+    reactor.log(runs=3, length=20).without("reward").write(tmp_path / "log.csv")
+    draft = "surrogym import log.csv --draft spec.json"
+    assert last() == f"nothing was stored; the log has no reward, so declare it in the draft: {draft}"
+    stored = f"{name} has a reward of 0, so there is nothing to train; declare the reward in a draft, and register it "
+    assert last("--register", name) == f"{stored}under another name: {draft}"
+    then = "declare the reward in spec.json, and then: surrogym import log.csv --spec spec.json --register NAME"
+    assert last("--draft", "spec.json") == f"nothing was stored; next: {then}"
+    assert last("--spec", "spec.json").endswith("next: surrogym import log.csv --spec spec.json --register NAME")

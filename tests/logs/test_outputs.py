@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 
 from support import reactor
+from support.server import ServerProcess
 from surrogym_client.cli import main
 from surrogym_client.logs import UnusableLog, import_log
 from surrogym_client.logs.importing import keep_rejected, read_log
+from surrogym_client.transport import Api
 
 NOWHERE = "http://127.0.0.1:9"  # no server: a refusal comes before a request
 
@@ -120,3 +122,27 @@ def test_a_log_without_usable_rows_says_both(damaged: Path):
     with pytest.raises(UnusableLog, match=r"expected two usable steps .* no file of rejected rows"):
         import_log(damaged)
     assert damaged.with_name("log.rejected.csv").read_text() == FOREIGN
+
+
+def test_a_draft_never_replaces_an_edited_one(folder: Path, capsys: pytest.CaptureFixture[str]):
+    """The specification that a person had edited was lost without a word, and the log was stored."""
+    drafted = folder / "drafted.json"
+    for _ in range(2):  # the same draft again is no loss
+        with pytest.raises(SystemExit) as ended:
+            main(["import", str(folder / "log.csv"), "--draft", str(drafted)])
+        assert not ended.value.code
+        capsys.readouterr()
+    edited = drafted.read_text().replace('"reward"', ' "reward"')
+    drafted.write_text(edited)
+    said = refusal(capsys, folder / "log.csv", "--draft", drafted)
+    assert f"--draft: {drafted} exists, and differs from the specification that would be written" in said
+    assert said.rstrip().endswith("give another name, or remove the file")
+    assert drafted.read_text() == edited
+
+
+def test_no_step_is_sent_if_the_draft_is_refused(server_process: ServerProcess, folder: Path):
+    (folder / "drafted.json").write_text("{}")
+    with pytest.raises(UnusableLog, match=r"--draft: .* exists"):
+        import_log(folder / "log.csv", register="refused-draft", draft=folder / "drafted.json", url=server_process.url)
+    with Api(server_process.url) as api:
+        assert "refused-draft" not in [one.name for one in api.surrogates()]

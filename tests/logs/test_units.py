@@ -1,13 +1,17 @@
-"""A column in another unit is named with the way out; a wide log, or a few wild rows, are not taken for one."""
+"""A column in another unit, or outside its range, is named with the way out; wide logs and a few wild rows are not."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from support import reactor
+from support.server import ServerProcess
 from surrogym_client.logs import importing
 from surrogym_client.original.classic import pendulum
+from surrogym_client.transport import Api
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.units import require_reward_unit, require_units
 
@@ -32,6 +36,71 @@ def test_a_few_wild_rows_and_missing_ones_are_no_other_unit() -> None:
     speeds = np.linspace(-12, 12, 50)
     speeds[:5], speeds[5:8] = 1e6, np.nan
     require_units(states(speeds), pendulum())
+
+
+CELSIUS = -273.15
+
+
+def celsius(tmp_path: Path) -> tuple[Path, Path]:
+    """A log of the reactor, and the same log with temperatures in degrees Celsius."""
+    log = reactor.log(runs=3, length=20)
+    other = log
+    for column in ("temperature", "next_temperature"):
+        place = log.heading.index(column)
+        for row, cells in enumerate(log.rows):
+            other = other.at(row, column, repr(float(cells[place]) + CELSIUS))
+    return log.write(tmp_path / "kelvin.csv"), other.write(tmp_path / "celsius.csv")
+
+
+def test_celsius_is_refused_where_the_range_is_in_kelvin(tmp_path: Path) -> None:
+    """It lies only three widths of the range away: 60 steps went into the model of a surrogate in kelvin."""
+    log, other = celsius(tmp_path)
+    spec = importing.read_log(log).spec
+    assert len(importing.read_log(log, importing.Options(spec=spec)).steps)
+    with pytest.raises(UnusableLog) as refused:
+        importing.read_log(other, importing.Options(spec=spec))
+    said = str(refused.value)
+    assert said.startswith("temperature: half of the log lies between ")
+    assert "outside its sampling range of " in said
+    assert "is the column in another unit? Convert it, or name another column (--map)" in said
+    assert said.endswith("If the values are right, widen the sampling range in a new specification (--spec)")
+
+
+def test_celsius_is_refused_before_a_step_is_sent(server_process: ServerProcess, tmp_path: Path) -> None:
+    log, other = celsius(tmp_path)
+    importing.import_log(log, register="in-kelvin", url=server_process.url)
+    with pytest.raises(UnusableLog, match="outside its sampling range"):
+        importing.import_log(other, to="in-kelvin", url=server_process.url)
+    spec = importing.read_log(log).spec
+    with pytest.raises(UnusableLog, match="outside its sampling range"):
+        importing.import_log(other, register="no-celsius", spec=spec, url=server_process.url)
+    with Api(server_process.url) as api:
+        assert api.surrogate("in-kelvin").samples == 60
+        assert "no-celsius" not in [one.name for one in api.surrogates()]
+
+
+@pytest.mark.parametrize(("low", "high"), [(8.1, 12.0), (-12.0, -8.1)])
+def test_a_column_just_outside_its_range_is_refused(low: float, high: float) -> None:
+    with pytest.raises(UnusableLog, match=r"speed: half of the log lies between .*, outside its sampling range of -8"):
+        require_units(states(np.linspace(low, high, 50)), pendulum())
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        (7.0, 7.5),  # one operating region
+        (4.0, 18.0),  # less than a third of it within the range
+        (8.0 + 1e-6, 8.0 + 1e-6),  # a constant at an end, in single precision
+        (-30.0, 30.0),
+    ],
+)
+def test_a_log_that_reaches_the_range_is_taken(low: float, high: float) -> None:
+    require_units(states(np.linspace(low, high, 50)), pendulum())
+
+
+def test_angles_of_other_turns_are_taken() -> None:
+    turns = np.stack([np.linspace(30.0, 40.0, 50), np.zeros(50)], axis=1)
+    require_units(turns, pendulum())
 
 
 def test_a_log_in_another_unit_is_refused_as_it_is_read(tmp_path) -> None:

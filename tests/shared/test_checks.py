@@ -35,3 +35,40 @@ def test_the_value_that_came_is_cut():
     said = first_fault(found.value, got=True)
     assert said.startswith("time_limit: Input should be a valid integer, got 'xxx")
     assert len(said) < 120
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        (
+            {"success": {"min_retrun": 1.0}},
+            "success.min_retrun: unknown entry; expected some of hold, ",
+        ),
+        ({"colour": 1}, "colour: unknown entry; expected some of environment, coordinates, observation, action, start"),
+        ({"design": {"bugdet": 3}}, "design.bugdet: unknown entry; expected some of preset, budget, "),
+        (
+            {"action": {"kind": "discrete", "n": 2, "bin": 3}},
+            "action.discrete.bin: unknown entry; expected some of kind, n",
+        ),
+        (
+            {"coordinates": [{"name": "x", "sampling": {"kind": "uniform", "low": 0.0, "hihg": 1.0}}]},
+            "coordinates.0.sampling.uniform.hihg: unknown entry; expected some of kind, low, high; did you mean",
+        ),
+    ],
+)
+def test_an_unknown_entry_is_named_with_the_allowed_ones(fields: dict[str, Any], says: str):
+    """``Extra inputs are not permitted`` left a person to guess the name."""
+    with pytest.raises(ValidationError) as found:
+        EnvironmentSpec.model_validate(SPEC.model_dump() | fields)
+    assert first_fault(found.value, of=EnvironmentSpec).startswith(says)
+
+
+def test_the_entry_that_is_meant_is_named_before_those_that_miss():
+    """A wrong name of a required entry gave ``Field required`` for the right one."""
+    fields = SPEC.model_dump()
+    fields["coordinate"] = fields.pop("coordinates")
+    with pytest.raises(ValidationError) as found:
+        EnvironmentSpec.model_validate(fields)
+    said = first_fault(found.value, of=EnvironmentSpec)
+    assert said.startswith("coordinate: unknown entry; expected some of environment, coordinates, ")
+    assert said.endswith("; did you mean 'coordinates'?")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from surrogym_client.cli.groups import Output, Service, add
-from surrogym_client.cli.options import SpecFile, Wait, connect, read_spec, typed
+from surrogym_client.cli.options import SpecFile, Wait, connect, given_here, read_spec, typed
 
 if TYPE_CHECKING:
     from surrogym_client.logs import Imported, ReadLog
@@ -118,6 +118,11 @@ def command(
         raise CommandError("expected --register or --to, got both")
     if log.to and log.spec:
         raise CommandError("expected --spec without --to, whose surrogate has a specification, got both")
+    if log.to and given_here(context, "budget"):
+        raise CommandError(
+            "expected --budget without --to, whose surrogate has a budget, got both: surrogym change "
+            f"{shlex.quote(log.to)} --budget N changes it"
+        )
     _require_outputs(file, log)
     _import_log(context, file, log, wait, service, output)
 
@@ -172,19 +177,18 @@ def _import_log(context: typer.Context, file: Path, log: OfLogs, wait: float, se
             spec=read_spec(log.spec),
             budget=log.budget,
             rejected=log.rejected,
+            draft=log.draft,
             url=service.server,
             token=token,
             progress=update,
         )
     if log.picture is not None:
         _draw(imported.log, log.picture)
-    if log.draft is not None:
-        log.draft.write_text(imported.log.spec.model_dump_json(indent=2) + "\n", encoding="utf-8")
     view = None
     if imported.surrogate is not None and wait > 0:
         view = _await_model(imported.surrogate, wait, service.server, token, quiet=output.quiet)
-    again = _again(context, log)
-    output.give(_as_json(imported, view), lambda: "\n".join(_words(file, imported, view, again)))
+    following = _following(context, log, imported, view)
+    output.give(_as_json(imported, view), lambda: "\n".join([*_words(file, imported, view), following]))
 
 
 def _draw(log: ReadLog, file: Path) -> None:
@@ -195,10 +199,32 @@ def _draw(log: ReadLog, file: Path) -> None:
     draw_coverage(coverage_of(log.spec, log.steps.q, log.steps.u)).savefig(file, dpi=150)
 
 
+def _following(context: typer.Context, log: OfLogs, imported: Imported, view: SurrogateView | None) -> str:
+    """Return the last line of the output, with the next step."""
+    name = imported.surrogate
+    unpaid = log.to is None and log.spec is None and imported.log.roles.reward is None
+    if unpaid and log.draft is None:
+        without = ["token", "as_json", "quiet", "register", "wait"]
+        command = f"surrogym import {typed(context, without)} --draft spec.json"
+        if name is None:
+            return f"nothing was stored; the log has no reward, so declare it in the draft: {command}"
+        return (
+            f"{name} has a reward of 0, so there is nothing to train; declare the reward in a draft, and register it "
+            f"under another name: {command}"
+        )
+    again = _again(context, log)
+    if unpaid:
+        stored = "nothing was stored" if name is None else f"{name} has a reward of 0, so there is nothing to train"
+        return f"{stored}; next: declare the reward in {log.draft}, and then: {again}"
+    if name is None:
+        return f"nothing was stored; next: {again}"
+    return f"next: surrogym train {name}" if view is not None else f"next: surrogym status {name}"
+
+
 def _again(context: typer.Context, log: OfLogs) -> str:
     """Return the command line that repeats this import and stores the log. It reads the drafted specification, as
     edited."""
-    without = ["token", "as_json", "quiet", *(["draft"] if log.draft is not None else [])]
+    without = ["token", "as_json", "quiet", "register", *(["draft"] if log.draft is not None else [])]
     drafted = "" if log.draft is None else f" --spec {shlex.quote(str(log.draft))}"
     if drafted:
         without.append("spec")
@@ -248,7 +274,7 @@ def _covered(log: ReadLog) -> dict[str, float]:
     return {" by ".join(coverage.names[i] for i in pair): coverage.share(pair) for pair in coverage.counts}
 
 
-def _words(file: Path, imported: Imported, view: SurrogateView | None, again: str) -> list[str]:
+def _words(file: Path, imported: Imported, view: SurrogateView | None) -> list[str]:
     from surrogym_client.report.coverage import coverage_of
     from surrogym_shared.logs.too_few import counted, has
 
@@ -261,15 +287,14 @@ def _words(file: Path, imported: Imported, view: SurrogateView | None, again: st
     lines += [*_columns(log), *_rejected(imported), *_specified(log.spec, log.notes), covered]
     name = imported.surrogate
     if name is None:
-        return [*lines, f"nothing was stored; next: {again}"]
+        return lines
     were = "was" if imported.duplicates == 1 else "were"
     there = f", {imported.duplicates} {were} there before" if imported.duplicates else ""
     lines.append(f"{name}: {counted(imported.taken, 'new logged step')}{there}")
     if view is not None and view.fidelity is not None:
         index = view.fidelity.confidence_index
         lines.append(f"model {view.model_version} of {counted(view.samples, 'step')}: confidence index {index:.4f}")
-    after = f"surrogym train {name}" if view is not None else f"surrogym status {name}"
-    return [*lines, f"next: {after}"]
+    return lines
 
 
 def _columns(log: ReadLog) -> list[str]:

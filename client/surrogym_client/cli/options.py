@@ -220,16 +220,25 @@ def read_spec_file(path: Path) -> SpecContent:
     """
     from pydantic import ValidationError
 
-    from surrogym_client.cli.errors import CommandError, invalid
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_shared.checks import first_fault
     from surrogym_shared.spec import EnvironmentSpec
 
     content = path.read_bytes()
+    if not content.strip():
+        raise CommandError(f"{path} is not a specification: it is empty")
     try:
         read = json.loads(content)
         described = isinstance(read, dict) and "specification" in read
         spec = EnvironmentSpec.model_validate_json(json.dumps(read["specification"]) if described else content)
     except ValidationError as error:
-        raise CommandError(f"{path} is not a specification: {invalid(error)}") from error
+        raise CommandError(f"{path} is not a specification: {first_fault(error, of=EnvironmentSpec)}") from error
+    except json.JSONDecodeError as error:
+        raise CommandError(
+            f"{path} is not a specification: no JSON from line {error.lineno}, column {error.colno} on ({error.msg})"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise CommandError(f"{path} is not a specification: expected JSON as text in UTF-8") from error
     except (ValueError, RecursionError) as error:
         raise CommandError(f"{path} is not a specification: {error}") from error
     steps = read.get("real_steps") if isinstance(read, dict) else None

@@ -259,11 +259,12 @@ def _with_tolerances(spec: EnvironmentSpec, tolerances: dict[str, float]) -> Env
 
 def _words(view: SurrogateView, environment: str) -> str:
     from surrogym_client.original.loading import is_known, sample_command
+    from surrogym_client.surrogates.phases import awaits_log, words_of_no_log
 
+    registered = f"{view.name}: {view.environment or 'own environment'}, {len(view.spec.coordinates)} coordinates"
+    if awaits_log(view):
+        return f"{registered}; {words_of_no_log(view.name)}"
     start = sample_command(view.name, view.environment)
     if environment:  # its name was typed here
         start = f"surrogym sample {view.name}" + ("" if is_known(environment) else f" --env {shlex.quote(environment)}")
-    return (
-        f"{view.name}: {view.environment or 'own environment'}, {len(view.spec.coordinates)} coordinates, "
-        f"budget of {view.budget} real steps, target {view.target:g}; next: {start}"
-    )
+    return f"{registered}, budget of {view.budget} real steps, target {view.target:g}; next: {start}"

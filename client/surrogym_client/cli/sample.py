@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from surrogym_client.sampler.settings import Outcome, SamplerReport, SamplerSettings
     from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
-    from surrogym_shared.wire import Phase, Query
+    from surrogym_shared.wire import Phase, Query, SurrogateView
 
     Tell = Callable[[Line], None]
 
@@ -128,7 +128,10 @@ def command(
         bounds=Bounds(keeping.most_snapshots, keeping.most_bytes),
     )
     with service.connect(context, wait, quiet=output.quiet) as api:
-        asked = awaited_surrogate(api, surrogate, wait, quiet=output.quiet).spec
+        view = awaited_surrogate(api, surrogate, wait, quiet=output.quiet)
+        if _without_queries(view, output, until_done=until_done):
+            return
+        asked = view.spec
         name, replaced = _environment(_named(env, program), read_spec(spec), asked)
         token = service.token_for(context)
         plan = SamplerPlan(api.url, token, surrogate, name, replaced, step_limit, settings)
@@ -250,6 +253,22 @@ def _telling(api: Api, surrogate: str, *, quiet: bool) -> Iterator[Tell | None]:
         yield tell
 
 
+def _without_queries(view: SurrogateView, output: Output, *, until_done: bool) -> bool:
+    """Say that the design has no queries until a log is imported. Returns whether the command has done its work."""
+    from surrogym_client.sampler.settings import SamplerReport
+    from surrogym_client.surrogates.phases import awaits_log, words_of_no_log
+    from surrogym_shared.terminal import say
+
+    if not awaits_log(view):
+        return False
+    if until_done:
+        nothing = SamplerReport(0, 0, 0, 0, 0, steps=0, seconds=0.0, phase=view.phase)
+        output.give(asdict(nothing), lambda: words_of_no_log(view.name))
+    else:
+        say(f"{words_of_no_log(view.name)}; this sampler waits for queries, Ctrl-C ends it", quiet=output.quiet)
+    return until_done
+
+
 def _words_of_end(surrogate: str, phase: Phase) -> str:
     """Describe the end of a design while the sampler waits for further queries, such as those of an audit."""
     from surrogym_client.surrogates.phases import COMPLETED, IN_WORDS
@@ -263,7 +282,7 @@ def _words_of_end(surrogate: str, phase: Phase) -> str:
 def _words_of_interruption(report: SamplerReport) -> str:
     return (
         f"interrupted after {report.answered} queries answered with {report.steps} real steps; all of them are stored, "
-        "unfinished queries went back into the queue, and the same command continues"
+        "unfinished queries, if any, went back into the queue, and the same command continues"
     )
 
 

@@ -162,13 +162,14 @@ def _steps(seen: SurrogateSummary) -> str:
 def _hint(view: SurrogateView) -> str | None:
     """Return what a person has to do next, if nothing proceeds without them."""
     from surrogym_client.original.loading import sample_command
+    from surrogym_client.surrogates.phases import awaits_log, words_of_no_log
 
     if view.phase == "from_log":
         return (
             f"the model is fitted to the log, and the design requests no real steps; next: surrogym train {view.name}"
         )
-    if view.budget == 0 and view.model_version is None and not view.samples:
-        return f"the design requests no real steps, and there is no log yet; next: surrogym import LOG --to {view.name}"
+    if awaits_log(view):
+        return words_of_no_log(view.name)
     if view.queries.pending and not view.samplers and not view.paused:
         logged = "; until then, the model of the log is served" if view.ledger.logged and view.model_version else ""
         start = sample_command(view.name, view.environment)

@@ -159,7 +159,6 @@ def _trainable(
     With ``wait``, the packages of the policy search are imported in the meantime.
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.original.loading import sample_command
     from surrogym_client.surrogates.phases import COMPLETED
     from surrogym_client.surrogates.waiting import (
         share_of_design,
@@ -180,11 +179,7 @@ def _trainable(
                     api, surrogate, wait, lambda view: update(share_of_design(view), words_of_design(view))
                 )
         if view.model_version is None:
-            imports = f"surrogym import LOG --to {surrogate}"
-            learn = imports if view.budget == 0 else sample_command(surrogate, view.environment)
-            raise CommandError(
-                f"{surrogate!r} has no model yet, its phase is {view.phase}: run {learn}, or give --wait SECONDS"
-            )
+            raise CommandError(_words_without_model(view))
         if view.phase == "over_budget":
             say(words_of_uncertainty(view), quiet=quiet)
         if view.phase not in COMPLETED and not view.paused:
@@ -192,6 +187,19 @@ def _trainable(
                 f"the design of {surrogate!r} continues; training starts with model {view.model_version}", err=True
             )
         return view.spec, api.url
+
+
+def _words_without_model(view: SurrogateView) -> str:
+    """Say what to do about a surrogate that has no model yet: wait, or get samples for one."""
+    from surrogym_client.original.loading import sample_command
+
+    missing = f"{view.name!r} has no model yet, its phase is {view.phase}"
+    if view.phase == "fitting":
+        return f"{missing}: give --wait 120, and the training begins after the design"
+    if view.samplers:
+        return f"{missing}, and a sampler is connected: give --wait 120, and the training begins after the design"
+    learn = f"surrogym import LOG --to {view.name}" if view.budget == 0 else sample_command(view.name, view.environment)
+    return f"{missing}: run {learn}, or give --wait SECONDS"
 
 
 @contextmanager

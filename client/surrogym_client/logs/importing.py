@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_client.logs.outputs import rejected_file, require_outputs
+from surrogym_client.logs.outputs import rejected_file, require_outputs, write_draft
 from surrogym_client.logs.reading import read
 from surrogym_client.transport.api import Api
 from surrogym_shared.logs.checking import ReadLog, check_log, draft_log, is_of_rejected, write_rejected
@@ -90,7 +90,7 @@ def send(api: Api, name: str, log: ReadLog, progress: Progress = lambda _share, 
         batch = [_sample(steps, reward, row) for row in rows]
         added = api.add_samples(name, SAMPLER, batch, purpose="logged", complete=rows.stop == len(steps))
         duplicates += added.duplicates
-        progress(rows.stop / len(steps), f"{rows.stop} of {len(steps)} steps stored")
+        progress(rows.stop / len(steps), f"{rows.stop} of {len(steps)} steps sent")
     return len(steps), duplicates
 
 
@@ -103,6 +103,7 @@ def import_log(
     spec: EnvironmentSpec | None = None,
     budget: int = 0,
     rejected: str | Path | None = None,
+    draft: str | Path | None = None,
     url: str | None = None,
     token: str | None = None,
     progress: Progress = lambda _share, _words: None,
@@ -117,13 +118,15 @@ def import_log(
         spec: the specification that the rows are checked against; None drafts one.
         budget: real steps that the design of a drafted one may ask for; 0 where there is no machine.
         rejected: where the rows go that can't be used; by default beside the log.
+        draft: file to which the specification is written, before anything is sent.
         url, token: of the server, as ``Api`` takes them.
         progress: called with a share in [0, 1] and a few words.
 
     Raises:
         ValueError: both ``register`` and ``to``, or ``to`` with ``spec``.
         UnusableLog: no log, columns without a clear role, ``register`` is no name of a surrogate, ``rejected`` is
-            the log or the mapping, or the file beside the log is not one of rejected rows.
+            the log or the mapping, the file beside the log is not one of rejected rows, or ``draft`` is a file with
+            another specification.
         TooFewSteps: no usable step, or a single one where a specification is to be drafted.
         SurrogymClientError: as every request.
 
@@ -142,6 +145,8 @@ def import_log(
     options = Options(given, spec, budget, progress=lambda share, words: progress(0.3 * share, words))
     if register is None and to is None:
         log, kept = _read_or_keep(Path(path), options, rejected)
+        if draft is not None:
+            write_draft(Path(draft), log.spec)
         return Imported(log, rejected_file=kept)
     with Api(url, token) as api:
         if to is not None:
@@ -149,6 +154,8 @@ def import_log(
         log, kept = _read_or_keep(Path(path), options, rejected)
         if to is not None:
             _require_reward_unit(log, api, to)
+        if draft is not None:
+            write_draft(Path(draft), log.spec)
         if register is not None:
             api.create_surrogate(register, log.spec)
         name = register or to or ""

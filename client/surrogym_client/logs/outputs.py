@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.spec import EnvironmentSpec
 
 PICTURES = (".png", ".svg", ".pdf")
 DATA = "data"  # folder of a Minari data set with its files
@@ -50,6 +51,23 @@ def require_picture(words: str, file: Path) -> None:
     """Raise ``UnusableLog`` if the ending of a picture's name is of no known kind."""
     if file.suffix not in PICTURES:
         raise UnusableLog(f"{words}: expected a name that ends in .png, .svg or .pdf, got {file.name!r}")
+
+
+def write_draft(file: Path, spec: EnvironmentSpec) -> None:
+    """Write a drafted specification, and never over another one, which may have been edited.
+
+    Raises:
+        UnusableLog: the file exists, and is another specification.
+        OSError: the file can't be written.
+    """
+    text = spec.model_dump_json(indent=2) + "\n"
+    there = file.read_bytes().strip() if file.is_file() else b""
+    if there and there != text.strip().encode():
+        raise UnusableLog(
+            f"--draft: {file} exists, and differs from the specification that would be written: give another name, or "
+            "remove the file"
+        )
+    file.write_text(text, encoding="utf-8")
 
 
 def _same(output: Path, other: Path) -> bool:

@@ -1,8 +1,8 @@
-"""Phases in which a design has ended."""
+"""Phases in which a design has ended, and surrogates whose design waits for a log."""
 
 from __future__ import annotations
 
-from surrogym_shared.wire import Phase
+from surrogym_shared.wire import Phase, SurrogateView
 
 COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "from_log")  # the model will not improve by itself
 ENDED: tuple[Phase, ...] = (*COMPLETED, "failed")  # a sampler has nothing left to do
@@ -12,3 +12,14 @@ IN_WORDS: dict[Phase, str] = {
     "from_log": "the model is fitted to the log, and the design requests no real steps",
     "failed": "the design has failed",
 }
+
+
+def awaits_log(view: SurrogateView) -> bool:
+    """Whether nothing happens until a log is imported: the budget is 0, and there are neither samples nor queries."""
+    asked = view.queries.pending + view.queries.leased
+    return view.budget == 0 and view.model_version is None and not view.samples and not asked
+
+
+def words_of_no_log(name: str) -> str:
+    """Describe a surrogate that awaits a log, with the next command."""
+    return f"the design requests no real steps, and there is no log yet; next: surrogym import LOG --to {name}"

@@ -1,10 +1,11 @@
-"""Detect columns of a log that are in another unit than the specification's, or than known rewards."""
+"""Detect columns of a log that are outside a specification's ranges, or in another unit than known rewards."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.rows import SLACK
 from surrogym_shared.logs.table import Floats
 from surrogym_shared.spec import EnvironmentSpec, limits
 
@@ -13,7 +14,10 @@ FEWEST = 8  # known rewards that show how large rewards are
 
 
 def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:
-    """Refuse states q (n, C) with a column that seems to be in another unit than its coordinate.
+    """Refuse states q (n, C) with a column that is not in its coordinate's unit, or not in its sampling range.
+
+    A log outside the sampling range shows nothing of the states that the surrogate is for. Angles are not checked,
+    because they wrap.
 
     Args:
         q: the states.
@@ -21,7 +25,7 @@ def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:
         which: what a message says before the name of a coordinate.
 
     Raises:
-        UnusableLog: the middle half of a column lies far outside the coordinate's range, or is far wider than it.
+        UnusableLog: the middle half of a column lies outside the coordinate's range, or is far wider than it.
     """
     for index, coordinate in enumerate(spec.coordinates):
         column = q[np.isfinite(q[:, index]), index]
@@ -29,13 +33,16 @@ def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:
             continue
         low, high = limits(coordinate.sampling)
         first, last = np.quantile(column, [0.25, 0.75])
+        half = f"{which}{coordinate.name}: half of the log lies between {first:.4g} and {last:.4g}"
+        unit = "is the column in another unit? Convert it, or name another column (--map)"
         far = BEYOND * (high - low)
-        outside = first > high + far or last < low - far
-        wide = last - first > far
-        if outside or wide:
+        if first > high + far or last < low - far or last - first > far:
+            raise UnusableLog(f"{half}, its range is {low:.4g} to {high:.4g}: {unit}")
+        rounding = SLACK * max(high - low, abs(low), abs(high))
+        if first > high + rounding or last < low - rounding:
             raise UnusableLog(
-                f"{which}{coordinate.name}: half of the log lies between {first:.4g} and {last:.4g}, its range is "
-                f"{low:.4g} to {high:.4g}: is the column in another unit? Convert it, or name another column (--map)"
+                f"{half}, outside its sampling range of {low:.4g} to {high:.4g}: {unit}. If the values are right, "
+                "widen the sampling range in a new specification (--spec)"
             )
 
 
