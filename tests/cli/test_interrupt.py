@@ -13,6 +13,7 @@ from surrogym_client.evaluation import EvaluationInterrupted
 from surrogym_client.original.errors import EvaluationFailed
 from surrogym_client.policies import load_policy
 from surrogym_client.transport import Api
+from surrogym_shared.archives import stored
 
 INTERRUPTED = 130
 
@@ -67,7 +68,7 @@ def test_an_evaluation_that_does_not_end_enters_its_real_steps(
     on_server, server_process, name, monkeypatch, tmp_path, ending, code, words
 ):
     assert on_server("register", "Pendulum-v1", "--name", name).code == 0
-    (tmp_path / "policy.zip").write_bytes(b"")
+    (tmp_path / "policy.zip").write_bytes(stored({}))
     (tmp_path / "policy.json").write_text(json.dumps({"surrogate": name}))
 
     def ends(*_):

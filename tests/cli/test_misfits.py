@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from support.machine import Machine, diary_in
-from surrogym_client.original.classic import pendulum
+from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.policies.card import PolicyCard
+from surrogym_shared.archives import stored
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 
 MACHINE = ("--env", "support.machine:Machine", "--episodes", "2")
@@ -22,7 +24,7 @@ def policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("surrogym_client.policies.files.load_policy", lambda *_, **__: lambda o: np.ones((len(o), 1)))
 
     def write(spec: EnvironmentSpec | None, name: str = "policy") -> None:
-        (tmp_path / f"{name}.zip").write_bytes(b"")
+        (tmp_path / f"{name}.zip").write_bytes(stored({}))
         (tmp_path / f"{name}.json").write_text(PolicyCard(spec=spec).model_dump_json())
 
     return write
@@ -76,3 +78,31 @@ def test_a_given_specification_that_the_policy_does_not_fit_opens_nothing(surrog
     said = surrogym("evaluate", "policy.zip", *MACHINE, "--spec", "rail.json")
     assert "expected coordinates (theta, speed) and a box action of 1, got coordinates (x)" in said.err
     assert diary.read_text() == ""
+
+
+@pytest.mark.parametrize("given", [(), ("--spec", "other.json")], ids=["by its name", "with a specification"])
+def test_another_task_of_a_library_is_refused_by_what_the_policy_is_for(surrogym, policy, tmp_path, given) -> None:
+    """It asked for a specification, and with one it ended in NumPy's words about operands."""
+    pytest.importorskip("dm_control")
+    policy(pendulum().model_copy(update={"environment": "dm_control:pendulum-swingup"}))
+    other = cartpole().model_copy(update={"environment": "dm_control:cartpole-swingup"})
+    (tmp_path / "other.json").write_text(other.model_dump_json())
+    said = surrogym("evaluate", "policy.zip", "--env", "dm_control:cartpole-swingup", *given)
+    assert said.code == 1
+    assert re.match(
+        r"error: the policy (is|does not fit the environment, it is) for dm_control:pendulum-swingup", said.err
+    )
+    assert "coordinates (theta, speed) and a box action of 1" in said.err
+
+
+def test_a_training_starts_from_no_policy_of_another_environment(on_server, policy, name, monkeypatch) -> None:
+    """It failed after 17 s, with the shapes of arrays."""
+    policy(pendulum())
+    trainable = (Machine.spec(None), "http://127.0.0.1:9")
+    monkeypatch.setattr("surrogym_client.cli.train._trainable", lambda *_, **__: trainable)
+    said = on_server("train", name, "--start-from", "policy.zip", "--out", "next.zip")
+    assert (said.code, said.out) == (1, "")
+    assert said.err == (
+        "error: the policy does not fit the surrogate, it is for Pendulum-v1: expected coordinates (theta, speed) and "
+        "a box action of 1, got coordinates (x) and a box action of 1\n"
+    )

@@ -13,6 +13,7 @@ from surrogym_client.cli.beside import Beside
 from surrogym_client.cli.disagreement import Differences
 from surrogym_client.cli.filming import film
 from surrogym_client.cli.groups import Output, PolicyReading, Service, add
+from surrogym_client.cli.opening import opener_for_policy
 from surrogym_client.cli.options import NAMES, SpecFile, read_spec
 from surrogym_client.cli.pushing import push_or_say
 
@@ -126,11 +127,11 @@ def command(
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 10 --learn 16
     """
-    from surrogym_client.cli.opening import opener_for_policy
-    from surrogym_client.policies.card import card_path, read_card
+    from surrogym_client.policies.card import card_path
+    from surrogym_client.policies.files import card_of_policy
     from surrogym_shared.terminal import give
 
-    card, settings, token = read_card(policy), episodes.settings(), service.token_for(context)
+    card, settings, token = card_of_policy(policy), episodes.settings(), service.token_for(context)
     differences.check(settings)
     opener = opener_for_policy(env, read_spec(spec), card, quiet=output.quiet)
     ledger = _ledger(surrogate, service.server, card, card_path(policy), quiet=output.quiet)

@@ -14,6 +14,22 @@ ROUNDING = 1e-6  # share of the larger limit; float32 rounds by less
 Range: TypeAlias = tuple[float, float]
 
 
+def check_shape(trained: EnvironmentSpec, own: EnvironmentSpec, called: str) -> None:
+    """Check that another specification has the coordinates and the kind of action that a policy was trained for.
+
+    Args:
+        trained: specification that the policy was trained for.
+        own: the other specification.
+        called: what the message calls it, such as "the environment".
+
+    Raises:
+        PolicyMisfit: they differ.
+    """
+    expected, got = shape_in_words(trained), shape_in_words(own)
+    if expected != got:
+        raise PolicyMisfit(f"{_misfit(trained, called)}: expected {expected}, got {got}")
+
+
 def check_policy(trained: EnvironmentSpec, own: EnvironmentSpec) -> None:
     """Check that an environment has what a policy was trained for: coordinates, action and observation.
 
@@ -27,22 +43,19 @@ def check_policy(trained: EnvironmentSpec, own: EnvironmentSpec) -> None:
     Raises:
         PolicyMisfit: the environment does not fit.
     """
-    expected, got = shape_in_words(trained), shape_in_words(own)
-    if expected != got:
-        raise PolicyMisfit(f"{_misfit(trained)}: expected {expected}, got {got}")
+    misfit = _misfit(trained, "the environment")
+    check_shape(trained, own, "the environment")
     asked, allowed = action_ranges(trained), action_ranges(own)
     both = zip(asked, allowed, strict=True)
     if not all(is_within(a, b) and (_bins(own) is None or is_within(b, a)) for a, b in both):
-        raise PolicyMisfit(
-            f"{_misfit(trained)}: expected actions from {range_in_words(asked)}, got {range_in_words(allowed)}"
-        )
+        raise PolicyMisfit(f"{misfit}: expected actions from {range_in_words(asked)}, got {range_in_words(allowed)}")
     expected, got = _observation_in_words(trained), _observation_in_words(own)
     if len(trained.observation) != len(own.observation):
-        raise PolicyMisfit(f"{_misfit(trained)}: expected observation ({expected}), got ({got})")
+        raise PolicyMisfit(f"{misfit}: expected observation ({expected}), got ({got})")
     for a, b in zip(trained.observation, own.observation, strict=True):
         if a.term != b.term:
             raise PolicyMisfit(
-                f"{_misfit(trained)}: expected observation ({expected}), got ({got}), in which {b.name!r} is another "
+                f"{misfit}: expected observation ({expected}), got ({got}), in which {b.name!r} is another "
                 f"term than {a.name!r}"
             )
 
@@ -81,10 +94,10 @@ def meant_in_words(spec: EnvironmentSpec) -> str:
     return f"{name} with {shape_in_words(spec)}"
 
 
-def _misfit(trained: EnvironmentSpec) -> str:
+def _misfit(trained: EnvironmentSpec, called: str) -> str:
     name = trained.environment
     meant = "" if not name or is_executable(name) else f", it is for {name}"
-    return f"the policy does not fit the environment{meant}"
+    return f"the policy does not fit {called}{meant}"
 
 
 def _observation_in_words(spec: EnvironmentSpec) -> str:
