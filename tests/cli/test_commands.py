@@ -162,7 +162,7 @@ def test_ones_own_environment_has_to_be_named_by_the_person(on_server, name, tmp
     assert f"run surrogym sample {name} --env own_line:Cart," in on_server("train", name).err
     refused = on_server("sample", name, "--once")
     assert refused.code == 1
-    assert "expected --env package.module:factory" in refused.err
+    assert "expected --env own_line:Cart" in refused.err
     said = on_server("sample", name, "--env", "own_line:Cart", "--max-queries", "4", "--time-limit", "60", "--json")
     assert said.json["answered"] == 4
 
