@@ -12,6 +12,7 @@ from surrogym_client import original
 from surrogym_client.original.loading import with_choices
 from surrogym_client.policies import PolicyCard
 from surrogym_client.transport import Api
+from surrogym_shared.archives import stored
 
 OWN = """
 from surrogym_client.original import RealStep
@@ -187,7 +188,7 @@ def test_ones_own_environment_has_to_be_named_by_the_person(on_server, name, tmp
     assert f"run surrogym sample {name} --env own_line:Cart," in on_server("train", name).err
     refused = on_server("sample", name, "--once")
     assert refused.code == 1
-    assert "expected --env package.module:factory" in refused.err
+    assert "expected --env own_line:Cart" in refused.err
     said = on_server("sample", name, "--env", "own_line:Cart", "--max-queries", "4", "--time-limit", "60", "--json")
     assert said.json["answered"] == 4
 
@@ -235,7 +236,7 @@ def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum
 
 def test_a_policy_of_bins_pushes_ones_own_machine_as_its_surrogate_was_pushed(surrogym, monkeypatch, tmp_path):
     spec = with_choices(Machine.spec(None), {}, bins=5)
-    (tmp_path / "policy.zip").write_bytes(b"")
+    (tmp_path / "policy.zip").write_bytes(stored({}))
     (tmp_path / "policy.json").write_text(PolicyCard(spec=spec).model_dump_json())
     monkeypatch.setattr("surrogym_client.policies.files.load_policy", lambda *_, **__: lambda o: np.ones(len(o)))
     with diary_in(tmp_path, monkeypatch) as diary:
@@ -246,7 +247,7 @@ def test_a_policy_of_bins_pushes_ones_own_machine_as_its_surrogate_was_pushed(su
 
 def test_equal_episodes_are_told_as_such(surrogym, monkeypatch, tmp_path):
     """A hundred equal episodes of a deterministic plant looked like a hundred that agree."""
-    (tmp_path / "policy.zip").write_bytes(b"")
+    (tmp_path / "policy.zip").write_bytes(stored({}))
     (tmp_path / "policy.json").write_text(PolicyCard().model_dump_json())
     monkeypatch.setattr("surrogym_client.policies.files.load_policy", lambda *_, **__: lambda o: np.ones((len(o), 1)))
     said = surrogym("evaluate", "policy.zip", "--env", "support.moody:Alike", "--episodes", "4")

@@ -3,6 +3,7 @@
 import pytest
 
 from support.scripted_server import problem, reply, scripted_server
+from surrogym_shared.archives import stored
 from surrogym_shared.codes import Code
 
 NOBODY = ("--server", "http://127.0.0.1:9")
@@ -62,11 +63,14 @@ def test_an_invalid_address_is_refused(surrogym):
         ),
         (("change", "pendulum", "--tolerance", "theta=small"), "expected output=number, such as theta=0.01"),
         (("evaluate", "missing.zip", "--env", "Pendulum-v1"), "missing.zip: no such policy file"),
-        (("evaluate", "junk.zip", "--env", "Pendulum-v1", "--quiet"), "junk.zip is not a policy of PPO"),
-        (("evaluate", "junk.zip"), "expected --env with the original environment, got none"),
-        (("evaluate", "junk.zip", "--env", "Nowhere-v1"), "Nowhere-v1 can't be made: "),
+        (("evaluate", "junk.zip", "--env", "Pendulum-v1"), "error: junk.zip is not a policy: expected a ZIP file"),
+        (("evaluate", "junk.csv"), "error: junk.csv is not a policy: expected a ZIP file"),
+        (("train", "pendulum", "--start-from", "junk.csv"), "error: junk.csv is not a policy: expected a ZIP file"),
+        (("evaluate", "empty.zip", "--env", "Pendulum-v1", "--quiet"), "empty.zip is not a policy of PPO"),
+        (("evaluate", "empty.zip"), "expected --env with the original environment, got none"),
+        (("evaluate", "empty.zip", "--env", "Nowhere-v1"), "Nowhere-v1 can't be made: "),
         (
-            ("evaluate", "junk.zip", "--env", "Pendulum-v1", "--algorithm", "Magic"),
+            ("evaluate", "empty.zip", "--env", "Pendulum-v1", "--algorithm", "Magic"),
             "Stable-Baselines3 has no algorithm 'Magic'",
         ),
         (("import", "missing.surrogate"), "missing.surrogate: No such file or directory"),
@@ -87,7 +91,10 @@ def test_what_is_not_there_or_wrong(surrogym, tmp_path, arguments, message):
     (tmp_path / "crossed.json").write_text(
         '{"coordinates": [{"name": "x", "sampling": {"kind": "uniform", "low": 1, "high": -1}}]}'
     )
-    (tmp_path / "junk.zip").write_bytes(b"this is no zip file")
+    for junk in ("junk.zip", "junk.csv"):
+        (tmp_path / junk).write_bytes(b"this is no zip file")
+    (tmp_path / "junk.json").write_text('{"state": {"c": "concentration"}}')  # a mapping of the log, and no card
+    (tmp_path / "empty.zip").write_bytes(stored({}))
     assert message in refused(surrogym(*arguments))
 
 

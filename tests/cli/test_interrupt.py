@@ -13,6 +13,7 @@ from surrogym_client.evaluation import EvaluationInterrupted
 from surrogym_client.original.errors import EvaluationFailed
 from surrogym_client.policies import load_policy
 from surrogym_client.transport import Api
+from surrogym_shared.archives import stored
 
 INTERRUPTED = 130
 
@@ -67,7 +68,7 @@ def test_an_evaluation_that_does_not_end_enters_its_real_steps(
     on_server, server_process, name, monkeypatch, tmp_path, ending, code, words
 ):
     assert on_server("register", "Pendulum-v1", "--name", name).code == 0
-    (tmp_path / "policy.zip").write_bytes(b"")
+    (tmp_path / "policy.zip").write_bytes(stored({}))
     (tmp_path / "policy.json").write_text(json.dumps({"surrogate": name}))
 
     def ends(*_):
@@ -80,3 +81,49 @@ def test_an_evaluation_that_does_not_end_enters_its_real_steps(
         assert api.surrogate(name).ledger.evaluation == 7
     assert (ended.code, ended.out) == (code, "")
     assert words in ended.err
+
+
+INTERRUPTS = """
+import gymnasium
+import numpy as np
+
+class Interrupts(gymnasium.Env):
+    action_space = gymnasium.spaces.Box(-1, 1, (1,))
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,))
+    steps = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.uniform(-1, 1, 2), {}
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 7:
+            raise KeyboardInterrupt
+        return self.np_random.uniform(-1, 1, 2), 0.0, False, False, {}
+
+gymnasium.register("Interrupts-v0", entry_point=Interrupts)
+"""
+
+
+def test_a_description_says_how_many_real_steps_it_took(surrogym, tmp_path, monkeypatch):
+    """They ended without a word."""
+    (tmp_path / "interrupts.py").write_text(INTERRUPTS)
+    monkeypatch.syspath_prepend(tmp_path)
+    for command, outcome in (
+        (("describe", "interrupts:Interrupts-v0"), "nothing was described or registered"),
+        (("register", "interrupts:Interrupts-v0", "--print-spec"), "nothing was registered"),
+    ):
+        ended = surrogym(*command)
+        assert (ended.code, ended.out) == (INTERRUPTED, "")
+        assert ended.err == f"interrupted after 7 real steps, which no ledger counts; {outcome}\n"
+
+
+def test_an_interruption_before_the_first_real_step_says_so(surrogym, monkeypatch):
+    def interrupts(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("surrogym_client.original.loading.make", interrupts)
+    ended = surrogym("register", "Pendulum-v1")
+    assert (ended.code, ended.out) == (INTERRUPTED, ""), ended.err
+    assert ended.err == "interrupted before the first real step; nothing was registered\n"

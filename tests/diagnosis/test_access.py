@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import surrogym_client.cli
 from surrogym_client.diagnosis.access import Access, CheckFailed, examine
+from surrogym_client.diagnosis.doctor import environment
 from surrogym_client.original import RealStep
 from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
+CLI = Path(surrogym_client.cli.__file__).parent
+PAGES = Path(__file__).parents[2] / "docs" / "how-to"
 RANGE = Uniform(low=-1, high=1)
 
 
@@ -119,6 +125,17 @@ def test_one_that_remembers_and_saves_all_of_it_returns_to_snapshots() -> None:
     access = looked_at(SavedRail, inertia=3.0)
     assert (access.can_set, access.restore_error) == (False, 0)
     assert access.mode == "snapshots (--access snapshot)"
+
+
+def test_one_that_can_do_everything_takes_the_real_steps_that_help_and_pages_name() -> None:
+    """They said 14, and the check took 18."""
+    with IsolatedEnvironment(SavedRail) as opened:
+        said = [finding.said for finding in environment(lambda: opened)]
+    assert said[-1] == "set any state; this took 18 real steps and 4 resets at most"
+    told = (CLI / "doctor.py", *(PAGES / f"{name}.md" for name in ("environments-by-name", "own-environment")))
+    for path in told:
+        assert re.search(r"\b18 (real steps )?(at most|if)", text := path.read_text(encoding="utf-8")), path
+        assert "14 real steps at most" not in text
 
 
 def test_one_whose_snapshots_forget_can_only_be_reset() -> None:

@@ -10,15 +10,17 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from support.moody import SPEC, Line
 from support.policies import left_alone, network_file
 from support.server import ServerProcess
 from surrogym_client.evaluation.reference import Reference
 from surrogym_client.original.classic import pendulum
-from surrogym_client.original.episodes import GymnasiumEpisode
+from surrogym_client.original.episodes import GymnasiumEpisode, open_episode
 from surrogym_client.policies import load_policy
 from surrogym_client.transport import Api
 from surrogym_client.work.reporter import JobStopped, Stand
@@ -137,6 +139,22 @@ def test_a_job_that_fails_says_why_and_the_worker_goes_on(api: Api, run_one):
     task = wire.EvaluateTask(kind="evaluate", policy=str(version), episodes=1)
     job = run_one(task, Environment(pendulum(), broken, 10))
     assert (job.status, job.error) == ("failed", "RuntimeError: no power at all")
+
+
+def test_an_environment_of_another_surrogate_is_not_even_reset(api: Api, run_one):
+    version = api.policies.push(NAME, wire.PushedCard(algorithm="CMAES"), [], "zip", network_file(seed=6)).version
+    task = wire.EvaluateTask(kind="evaluate", policy=str(version), episodes=1)
+    other = Environment(SPEC, partial(open_episode, "a line", None, NeverMoved), 10)
+    job = run_one(task, other)
+    assert job.status == "failed"
+    assert "the policy does not fit the environment, it is for Pendulum-v1" in str(job.error)
+
+
+class NeverMoved(Line):
+    """Would be broken by a step."""
+
+    def step_from(self, coordinates, action):
+        raise AssertionError("it was moved")
 
 
 def test_a_cancelled_evaluation_counts_the_real_steps_that_it_took(api: Api, tmp_path: Path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from surrogym_client.original.episodes import Episode
     from surrogym_client.policies.card import PolicyCard
     from surrogym_client.policies.predict import Acting, Predict
+    from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import Controller
 
 Compare = Literal["zero", "random"]
@@ -46,16 +48,29 @@ class Beside:
         """Return loaders of whatever chooses the actions, the policy first.
 
         Raises:
+            PolicyMisfit: the reference controller is a policy of another environment, which was opened and not reset.
             OriginalError: there is no such reference controller; nothing was run.
         """
+        from surrogym_client.original.fitting import check_policy
+
         found: dict[Controller, Callable[[], Acting]] = {"policy": lambda: reading.load(policy, card)}
         compare = self.compare
         if compare is not None:
             found[compare] = lambda: _baseline(opener, compare)
         if self.reference is not None:
             reference = reference_of(self.reference, reading)
+            if (trained_for := spec_of_reference(self.reference)) is not None:
+                with closing(opener()) as episode:
+                    check_policy(trained_for, episode.spec)
             found["reference"] = lambda: reference
         return found
+
+
+def spec_of_reference(given: str) -> EnvironmentSpec | None:
+    """Return the specification in the card of a reference policy's file; None without one, and for a module's code."""
+    from surrogym_client.policies.card import read_card
+
+    return read_card(Path(given)).spec if Path(given).exists() else None
 
 
 def _baseline(opener: Callable[[], Episode], compare: Compare) -> Predict:

@@ -37,12 +37,13 @@ def command(
 
     Example: surrogym describe Swimmer-v5 > env.json
     """
-    from surrogym_client.cli.printing import prints_aside
-    from surrogym_client.original.describing import describe
+    from surrogym_client.cli.printing import prints_aside, unregistered
     from surrogym_shared.terminal import say
 
     del as_json  # a specification is JSON in any case
-    with prints_aside():
+    with unregistered(lambda: 0, "nothing was described or registered"), prints_aside():
+        from surrogym_client.original.describing import describe  # it may take seconds
+
         description = describe(environment, steps, seed)
     typer.echo(description.text())
     for line in description.words():

@@ -31,7 +31,7 @@ def command(
     env: Annotated[
         str | None,
         typer.Option(
-            help=f"Also check this environment, by 14 real steps at most: {NAMES}. Without --spec, one that has no "
+            help=f"Also check this environment, by 18 real steps at most: {NAMES}. Without --spec, one that has no "
             "specification of its own is described first, by 400 real steps or more."
         ),
     ] = None,

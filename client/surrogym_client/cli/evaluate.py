@@ -13,6 +13,7 @@ from surrogym_client.cli.beside import Beside
 from surrogym_client.cli.disagreement import Differences
 from surrogym_client.cli.filming import film
 from surrogym_client.cli.groups import Output, PolicyReading, Service, add
+from surrogym_client.cli.opening import opener_for_policy
 from surrogym_client.cli.options import NAMES, SpecFile, read_spec
 from surrogym_client.cli.pushing import push_or_say
 
@@ -126,17 +127,17 @@ def command(
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 10 --learn 16
     """
-    from surrogym_client.policies.card import card_path, read_card
+    from surrogym_client.policies.card import card_path
+    from surrogym_client.policies.files import card_of_policy
     from surrogym_shared.terminal import give
 
-    card, settings = read_card(policy), episodes.settings()
+    card, settings, token = card_of_policy(policy), episodes.settings(), service.token_for(context)
     differences.check(settings)
-    opener = opener_of(env, read_spec(spec), card, quiet=output.quiet)
+    opener = opener_for_policy(env, read_spec(spec), card, quiet=output.quiet)
     ledger = _ledger(surrogate, service.server, card, card_path(policy), quiet=output.quiet)
-    token = service.token_for(context)
     enter = partial(_enter, ledger, service.server, token, quiet=output.quiet)
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
-    reports = _reports(beside.controllers(policy, card, reading, opener), run, enter, settings, policy)
+    reports = _reports(beside.controllers(policy, card, reading, opener), card.spec, run, enter, settings, policy)
     result = reports[0][1]
     if stored := push and ledger is not None:
         _keep(policy, reports, settings, quiet=output.quiet)
@@ -192,6 +193,7 @@ def _summary(reports: Sequence[tuple[Controller, Evaluation]], reference: str | 
 
 def _reports(
     controllers: Mapping[Controller, Callable[[], Acting]],
+    trained_for: EnvironmentSpec | None,
     run: Callable[..., Evaluation],
     enter: Callable[[int, int, str], None],
     settings: EvaluationSettings,
@@ -201,7 +203,7 @@ def _reports(
     reports: list[tuple[Controller, Evaluation]] = []
     for controller, load in controllers.items():
         actions = {"policy": "", "reference": "the reference controller"}.get(controller, f"{controller} actions")
-        result = run(load, what=actions or str(policy))
+        result = run(load, trained_for if controller == "policy" else None, what=actions or str(policy))
         note = f"{settings.episodes} episodes from seed {settings.first_seed}"
         enter(result.steps, settings.episodes, f"{note}, {actions}" if actions else note)
         reports.append((controller, result))
@@ -239,6 +241,7 @@ def _keep(
 
 def _run(
     load: Callable[[], Acting],
+    trained_for: EnvironmentSpec | None,
     what: str,
     opener: Callable[[], Episode],
     settings: EvaluationSettings,
@@ -256,7 +259,7 @@ def _run(
         with terminations_as_interrupts(), progress("evaluate", quiet=quiet) as update:
             update(0.0, f"reading {what}")
             tell = _telling(update, settings.episodes)
-            return evaluate(load(), opener, settings, tell, lambda words: say(words, quiet=quiet))
+            return evaluate(load(), opener, settings, tell, lambda words: say(words, quiet=quiet), trained_for)
     except EvaluationFailed as failure:
         enter(failure.steps, 0, "failed")
         raise
@@ -267,55 +270,6 @@ def _run(
         )
         enter(interruption.steps, 0, "interrupted")
         raise
-
-
-def opener_of(
-    env: str | None, given: EnvironmentSpec | None, card: PolicyCard, *, quiet: bool
-) -> Callable[[], Episode]:
-    """Return a function that opens an episode. An environment named by a card alone is opened only if it is Gymnasium's
-    own, because a module would run code.
-    """
-    from surrogym_client.cli.errors import CommandError
-    from surrogym_client.original.episodes import open_episode
-    from surrogym_client.original.loading import fits, is_known, is_own, make
-
-    noted = card.spec
-    name = env or (noted.environment if noted is not None else None)
-    if name is None or (env is None and not is_known(name)):
-        raise CommandError(f"expected --env with the original environment, got none (noted beside the policy: {name})")
-    if is_own(name):
-        bins = _bins(noted) if given is None else None
-        return lambda: open_episode(name, given, lambda: make(name, spec=given, bins=bins))
-    if given is None and noted is not None and fits(noted.environment, name):
-        given = _limited(noted, name, quiet=quiet)
-    spec = given or make(name).spec()
-    return lambda: open_episode(name, spec, lambda: make(name, spec=spec))
-
-
-def _limited(noted: EnvironmentSpec, name: str, *, quiet: bool) -> EnvironmentSpec:
-    """Shorten the environment's time limit to that of the card. A card can't lengthen it, as this would cost real
-    steps."""
-    from surrogym_client.original.loading import own_time_limit
-    from surrogym_shared.terminal import say
-
-    own = own_time_limit(name)
-    if noted.time_limit is not None and noted.time_limit <= own:
-        return noted
-    asked = "none" if noted.time_limit is None else f"{noted.time_limit} steps"
-    say(
-        f"the policy's card has a time limit of {asked}, that of {noted.environment} is {own}: episodes end after "
-        f"{own} steps; --spec FILE chooses another limit",
-        quiet=quiet,
-    )
-    return noted.model_copy(update={"time_limit": own})
-
-
-def _bins(spec: EnvironmentSpec | None) -> int | None:
-    """Number of values of each continuous action that the policy chooses from; None without discretisation."""
-    from surrogym_shared.spec import BoxAction
-
-    action = None if spec is None else spec.action
-    return action.bins[0] if isinstance(action, BoxAction) and action.bins else None
 
 
 def _telling(update: Update, episodes: int) -> Progress:

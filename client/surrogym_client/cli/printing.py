@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from typing import TYPE_CHECKING
 
@@ -26,6 +26,26 @@ def prints_aside() -> Iterator[None]:
             yield
         except SystemExit as error:
             raise CommandError(f"the environment ended the program: {sentence(error)}") from error
+
+
+@contextmanager
+def unregistered(steps: Callable[[], int], what: str) -> Iterator[None]:
+    """Context that says after Ctrl-C how many real steps a description took, and what did not come of it. It raises the
+    interruption again.
+
+    Args:
+        steps: gives the real steps of a description that has ended.
+        what: what was not done, such as "nothing was registered".
+    """
+    from surrogym_shared.terminal import say
+
+    try:
+        yield
+    except KeyboardInterrupt as interruption:
+        taken = getattr(interruption, "steps", steps())
+        took = f"after {taken} real steps, which no ledger counts" if taken else "before the first real step"
+        say(f"interrupted {took}; {what}")
+        raise
 
 
 def found_aside(findings: Iterator[Finding]) -> Iterator[Finding]:

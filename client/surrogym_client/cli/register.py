@@ -139,22 +139,19 @@ def command(
 
     Example: surrogym register Pendulum-v1 --name pendulum --budget 30
     """
-    from surrogym_client.cli.printing import prints_aside
-    from surrogym_client.original.adapters import open_simulator
-    from surrogym_client.original.loading import has_specification
+    from surrogym_client.cli.printing import prints_aside, unregistered
 
     environment, name, spec = _sorted_out(environment, file, env, name, spec)
     read = None if spec is None else read_spec_file(spec)
     given, steps = (None, 0) if read is None else (read.spec, read.steps)
-    if given is None and environment is not None and not has_specification(environment):
+    with unregistered(lambda: 0 if read else steps, "nothing was registered"):
+        if given is None and environment is not None and _lacks_specification(environment):
+            if not print_spec:
+                with service.connect(context, wait, quiet=output.quiet) as api:
+                    _require_free(api, name or default_name(environment))
+            given, steps = _described(environment, quiet=output.quiet)
         with prints_aside():
-            open_simulator(environment).close()  # a name that can't be opened is an error without a server too
-        if not print_spec:
-            with service.connect(context, wait, quiet=output.quiet) as api:
-                _require_free(api, name or default_name(environment))
-        given, steps = _described(environment, quiet=output.quiet)
-    with prints_aside():
-        chosen = _specification(environment, given, **vars(choices))
+            chosen = _specification(environment, given, **vars(choices))
     if tolerance:
         chosen = _with_tolerances(chosen, read_tolerances(tolerance))
     if print_spec:
@@ -183,6 +180,19 @@ def _sorted_out(
     if environment is not None and name is not None:
         raise CommandError(f"expected one name, got {environment!r} and --name {name!r}")
     return env, environment or name, spec
+
+
+def _lacks_specification(environment: str) -> bool:
+    """Whether an environment has to be described. A name that can't be opened is an error without a server too."""
+    from surrogym_client.cli.printing import prints_aside
+    from surrogym_client.original.adapters import open_simulator
+    from surrogym_client.original.loading import has_specification
+
+    if has_specification(environment):
+        return False
+    with prints_aside():
+        open_simulator(environment).close()
+    return True
 
 
 def _key(name: str, described: bytes) -> str:

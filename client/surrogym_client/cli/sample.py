@@ -219,13 +219,26 @@ def _environment(
     from surrogym_client.original.loading import is_known, is_own
 
     if env is None and not is_known(asked.environment):
-        raise CommandError(
-            f"the surrogate's environment {asked.environment!r} has no built-in adapter: "
-            "expected --env package.module:factory, --env fmu:PLANT.fmu, or --exec COMMAND"
-        )
+        raise CommandError(_words_of_consent(asked.environment))
     name = env or asked.environment
     own = is_own(name) and given is None
     return name, None if own else given or asked
+
+
+def _words_of_consent(name: str) -> str:
+    """Say why an environment's name from a server is not enough, and with which option it is opened."""
+    from surrogym_client.original.executables import is_executable
+    from surrogym_client.original.loading import env_option, opens
+
+    if not is_executable(name) and opens(name):
+        return (
+            f"the surrogate's environment {name!r} may run a file of yours, so its name has to come from you: "
+            f"expected{env_option(name)}"
+        )
+    return (
+        f"the surrogate's environment {name!r} can't be opened by this name alone: expected --env "
+        "package.module:factory, --env pcgym:FILE.json, --env fmu:PLANT.fmu, or --exec COMMAND"
+    )
 
 
 @contextmanager

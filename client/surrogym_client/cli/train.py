@@ -67,6 +67,7 @@ def command(
 
     Example: surrogym train pendulum --out policy.zip --seed 0
     """
+    from surrogym_client.original.fitting import check_shape
     from surrogym_client.original.loading import env_option
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_client.surrogates.budget import words_of_rounds
@@ -76,9 +77,11 @@ def command(
 
     if exit_with_parent:
         watch_parent()
-    settings = _settings(search, session, start, log)
+    settings, learned = _settings(search, session, start, log), start.learned()
     token = service.token_for(context)
     spec, url = _trainable(surrogate, service.server, token, wait, settings, quiet=output.quiet)
+    if learned is not None:
+        check_shape(learned, spec, "the surrogate")
     settings = with_algorithm(settings, spec)
     if loop.improve:
         with connect(service.server, token) as api:
@@ -101,12 +104,9 @@ def command(
 
 def _settings(search: SearchOptions, session: SessionOptions, start: StartOptions, log: LogOptions) -> TrainSettings:
     """Return the settings of the training. Errors that can be found without a server are raised here."""
-    from surrogym_client.cli.errors import CommandError
     from surrogym_client.training import TrainSettings
 
     given = session.fields()
-    if start.start_from is not None and not start.start_from.exists():
-        raise CommandError(f"{start.start_from}: no such policy file")
     hyperparameters = search.hyperparameters()
     algorithm = None if search.algorithm is None else require_known(search.algorithm)
     return TrainSettings(

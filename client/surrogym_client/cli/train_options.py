@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from surrogym_client.training.closed_loop import LoopSettings
     from surrogym_client.training.handover import AuditSettings
     from surrogym_client.training.settings import Tracker
+    from surrogym_shared.spec import EnvironmentSpec
 
 Variant = Literal["deterministic", "probabilistic", "pathwise"]
 Propagation = Literal["mean", "sample"]
@@ -173,6 +174,18 @@ class StartOptions:
             show_default=False,
         ),
     ] = None
+
+    def learned(self) -> EnvironmentSpec | None:
+        """Return the specification that the policy of ``--start-from`` was trained for, from its card; None without
+        one.
+
+        Raises:
+            UnusablePolicy: the file can't be a policy, or its card is none.
+            FileNotFoundError: there is no such file.
+        """
+        from surrogym_client.policies.files import card_of_policy
+
+        return None if self.start_from is None else card_of_policy(self.start_from).spec
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ def _environment(
     quiet: bool,
 ) -> Environment | None:
     """Return the environment to evaluate in, after a check that it fits the surrogate; None if there is none."""
-    from surrogym_client.cli.evaluate import opener_of
+    from surrogym_client.cli.opening import opener_of
     from surrogym_client.original.loading import is_known
     from surrogym_client.policies.card import PolicyCard
     from surrogym_client.sampler.query_limits import check_environment
@@ -128,14 +128,17 @@ def _with_reference(environment: Environment | None, reference: str | None) -> E
     Raises:
         CommandError, OriginalError, UnusablePolicy: there is no such controller, or no environment for it.
     """
-    from surrogym_client.cli.beside import reference_of
+    from surrogym_client.cli.beside import reference_of, spec_of_reference
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.cli.groups import PolicyReading
+    from surrogym_client.original.fitting import check_policy
 
     if reference is None:
         return environment
     if environment is None:
         raise CommandError("--reference: expected a worker that evaluates, got one that only trains")
+    if (trained_for := spec_of_reference(reference)) is not None:
+        check_policy(trained_for, environment.spec)
     load = partial(reference_of, reference, PolicyReading())
     load()
     return replace(environment, reference=load)

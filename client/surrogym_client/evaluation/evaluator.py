@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.episodes import Episode, Moment, draw
 from surrogym_client.original.errors import RAISED, EvaluationFailed, PolicyMisfit
+from surrogym_client.original.fitting import check_policy
 from surrogym_client.original.protocol import LONGEST_EPISODE
 from surrogym_client.policies.predict import Acting, PerEpisode
 from surrogym_client.runtime.lifetime import signals_between_steps
@@ -141,6 +142,7 @@ def evaluate(
     settings: EvaluationSettings | None = None,
     progress: Progress | None = None,
     remark: Callable[[str], None] | None = None,
+    trained_for: EnvironmentSpec | None = None,
 ) -> Evaluation:
     """Run N real episodes with a policy.
 
@@ -155,6 +157,7 @@ def evaluate(
         settings: number of episodes, their starts and the environment's perturbation.
         progress: called after every step.
         remark: called with a sentence, once, if the first episodes are equal and others are still to begin.
+        trained_for: specification that the policy was trained for, such as that of its card. The environment must fit.
 
     Returns:
         returns and successes of each episode, in the order of their seeds. The number of instances has an effect only
@@ -162,14 +165,15 @@ def evaluate(
         the policy answers a batch of observations differently from single ones, usually in the last bits.
 
     Raises:
-        PolicyMisfit: the policy gave actions that are not the environment's; nothing was sent.
+        PolicyMisfit: the policy was trained for another environment, which was then not even reset; or it gave actions
+            that are not the environment's, and nothing was sent.
         EvaluationFailed: the environment or the policy raised an error after real steps, which are counted.
         EvaluationInterrupted: Ctrl-C was pressed; real steps so far are counted.
     """
     run = _Run(policy, settings or EvaluationSettings(), progress, remark)
     try:
         with signals_between_steps() as heed, ExitStack() as instances:
-            return run.on(_open(open_episode, run.settings, instances), heed)
+            return run.on(_open(open_episode, run.settings, instances, trained_for), heed)
     except KeyboardInterrupt:
         raise EvaluationInterrupted(run.begun) from None
     except RAISED as error:
@@ -178,8 +182,17 @@ def evaluate(
         raise EvaluationFailed(run.begun, error) from error
 
 
-def _open(open_episode: Callable[[], Episode], settings: EvaluationSettings, instances: ExitStack) -> list[Episode]:
-    """Open as many instances as may be open at once, at most one for each episode. ``instances`` closes them."""
+def _open(
+    open_episode: Callable[[], Episode],
+    settings: EvaluationSettings,
+    instances: ExitStack,
+    trained_for: EnvironmentSpec | None,
+) -> list[Episode]:
+    """Open as many instances as may be open at once, at most one for each episode. ``instances`` closes them.
+
+    Raises:
+        PolicyMisfit: the environment is another one than ``trained_for``. One instance was opened.
+    """
 
     def open_one() -> Episode:
         episode = open_episode()
@@ -187,6 +200,8 @@ def _open(open_episode: Callable[[], Episode], settings: EvaluationSettings, ins
         return episode
 
     first = open_one()
+    if trained_for is not None:
+        check_policy(trained_for, first.spec)
     allowed = settings.parallel or (settings.episodes if first.parallel else 1)
     return [first, *(open_one() for _ in range(min(allowed, settings.episodes) - 1))]
 

@@ -6,7 +6,7 @@ OriginalError
 ├── NotSettable             it can only be reset and acted on
 ├── NotRenderable           no picture of its states can be made here
 ├── NotParallel             one instance is open, and the environment does not say that another may be
-├── PolicyMisfit            the policy gives actions that the environment does not have
+├── PolicyMisfit            the policy was trained for another environment, or gives actions that this one does not have
 ├── QueryRefused            a query asks for what the environment does not allow; nothing was sent to it
 ├── SnapshotGone            a query begins at a snapshot that can't be used; the design chooses another query
 ├── SnapshotNotKept         a state can't be saved or written; no query will begin there
@@ -52,7 +52,7 @@ class NotParallel(OriginalError):
 
 
 class PolicyMisfit(OriginalError, ValueError):
-    """A policy gave actions that the environment does not have."""
+    """A policy was trained for another environment, or gave actions that this one does not have."""
 
 
 class QueryRefused(OriginalError):

@@ -121,8 +121,12 @@ def env_option(name: str) -> str:
         return ""
     if is_executable(name):
         return " --env exec:COMMAND"
-    opens = ":" in name or adapter_of(name) is not None
-    return f" --env {shlex.quote(name) if opens else PLACEHOLDER}"
+    return f" --env {shlex.quote(name) if opens(name) else PLACEHOLDER}"
+
+
+def opens(name: str) -> bool:
+    """Whether a name may open an environment: an adapter's, a factory's or a program's. Others are mere words."""
+    return ":" in name or adapter_of(name) is not None
 
 
 def sample_command(surrogate: str, environment: str) -> str:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import pickle
+import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.policies.card import DEFAULT_ALGORITHM, UnusablePolicy
+from surrogym_client.policies.card import DEFAULT_ALGORITHM, PolicyCard, UnusablePolicy, read_card
 from surrogym_client.policies.onnx_files import load_onnx
 from surrogym_client.policies.predict import Predict
 from surrogym_shared.network import Network
@@ -19,6 +20,28 @@ if TYPE_CHECKING:
 
 BUFFERLESS = {"n_envs": 1, "n_steps": 1, "buffer_size": 1}  # a policy that only acts needs no memory for experience
 ONNX = ".onnx"
+
+
+def require_policy(path: Path) -> None:
+    """Refuse a file that can't be a policy, by its first bytes, before anything is done for it.
+
+    Raises:
+        UnusablePolicy: it is neither a ZIP file nor called ``.onnx``.
+        FileNotFoundError: there is no such file.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(2, "no such policy file", str(path))
+    if path.suffix.lower() != ONNX and not zipfile.is_zipfile(path):
+        raise UnusablePolicy(
+            f"{path} is not a policy: expected a ZIP file of surrogym train or Stable-Baselines3, or a file ending in "
+            f"{ONNX}"
+        )
+
+
+def card_of_policy(path: Path) -> PolicyCard:
+    """Read the card of a file that may be a policy. Raises as ``require_policy`` and ``read_card``."""
+    require_policy(path)
+    return read_card(path)
 
 
 def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM, *, trust: bool = False) -> Predict:

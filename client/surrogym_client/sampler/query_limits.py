@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
 
 from surrogym_client.original.errors import QueryRefused, UnknownEnvironment
-from surrogym_shared.spec import MAX_ROLLOUT_QUERY, Access, BoxAction, DiscreteAction, EnvironmentSpec
+from surrogym_client.original.fitting import Range, action_ranges, is_within, range_in_words
+from surrogym_shared.spec import MAX_ROLLOUT_QUERY, Access, BoxAction, EnvironmentSpec
 from surrogym_shared.spec import limits as sampled
 from surrogym_shared.wire import Query, StepQuery
 
-ROUNDING = 1e-6  # share of the larger limit; float32 rounds by less
-
 IN_WORDS: dict[Access, str] = {"any": "any state", "snapshot": "snapshots", "reset": "resets alone"}
-
-Range: TypeAlias = tuple[float, float]
 
 
 def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSpec) -> None:
@@ -28,7 +24,7 @@ def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSp
         raise UnknownEnvironment(
             f"the environment does not fit surrogate {surrogate!r}: expected {expected}, got {got}"
         )
-    _check_ranges("actions", _action_ranges(asked), _action_ranges(own))
+    _check_ranges("actions", action_ranges(asked), action_ranges(own))
     _check_ranges("coordinates", [sampled(c.sampling) for c in asked.coordinates], _coordinate_ranges(own))
 
 
@@ -57,7 +53,7 @@ def check_query(own: EnvironmentSpec, query: Query) -> None:
 
 
 def _check_action(own: EnvironmentSpec, action: Sequence[float]) -> None:
-    _check_values("action", [f"action {i}" for i in range(own.action.size)], action, _action_ranges(own))
+    _check_values("action", [f"action {i}" for i in range(own.action.size)], action, action_ranges(own))
     if not isinstance(own.action, BoxAction) and not all(float(value).is_integer() for value in action):
         raise QueryRefused(f"expected the numbers of discrete actions, got {list(action)}")
 
@@ -66,30 +62,16 @@ def _check_values(what: str, names: Sequence[str], values: Sequence[float], rang
     if len(values) != len(ranges):
         raise QueryRefused(f"{what}: expected {len(ranges)} numbers, got {len(values)}")
     for name, value, allowed in zip(names, values, ranges, strict=True):
-        if not _within((value, value), allowed):
+        if not is_within((value, value), allowed):
             raise QueryRefused(f"{name}: expected a value in [{allowed[0]:g}, {allowed[1]:g}], got {value:g}")
 
 
 def _check_ranges(what: str, asked: Sequence[Range], own: Sequence[Range]) -> None:
-    if not all(map(_within, asked, own)):
+    if not all(map(is_within, asked, own)):
         raise UnknownEnvironment(
-            f"the surrogate's {what} are not the environment's: expected {what} from {_words(own)}, "
-            f"got {_words(asked)}; register it under another name"
+            f"the surrogate's {what} are not the environment's: expected {what} from {range_in_words(own)}, "
+            f"got {range_in_words(asked)}; register it under another name"
         )
-
-
-def _within(asked: Range, allowed: Range) -> bool:
-    """Whether a range lies in another one, apart from rounding. A range with NaN lies in none."""
-    slack = ROUNDING * max(map(abs, allowed))
-    return allowed[0] - slack <= asked[0] and asked[1] <= allowed[1] + slack
-
-
-def _action_ranges(spec: EnvironmentSpec) -> list[Range]:
-    action = spec.action
-    if isinstance(action, BoxAction):
-        return list(zip(action.low, action.high, strict=True))
-    counts = (action.n,) if isinstance(action, DiscreteAction) else action.nvec
-    return [(0, n - 1) for n in counts]
 
 
 def _coordinate_ranges(spec: EnvironmentSpec) -> list[Range]:
@@ -100,8 +82,3 @@ def _shape(spec: EnvironmentSpec) -> str:
     names = ", ".join(spec.coordinate_names)
     access = IN_WORDS[spec.access]
     return f"coordinates ({names}), a {spec.action.kind} action of {spec.action.size}, and access to {access}"
-
-
-def _words(ranges: Sequence[Range]) -> str:
-    low, high = (", ".join(f"{bound:g}" for bound in bounds) for bounds in zip(*ranges, strict=True))
-    return f"[{low}] to [{high}]"

@@ -120,6 +120,7 @@ def run_episodes(
 
     Raises:
         ValueError: the task has more episodes than the worker takes, or asks for a reference controller that it lacks.
+        PolicyMisfit: the environment is not that of the surrogate, whose policies learned for it; it was not reset.
         UnusablePolicy: the file can't be read without running code in it.
         KeyboardInterrupt: the evaluation was stopped.
         EvaluationFailed: the environment or the policy raised an error after real steps.
@@ -130,13 +131,14 @@ def run_episodes(
     gathered.version = found.version
     settings = EvaluationSettings(task.episodes, task.first_seed, task.wide)
     controllers = _controllers(task, environment, _loaded(api, surrogate, found, folder))
+    trained_for = api.surrogate(surrogate).spec
     results: dict[wire.Controller, Evaluation] = {}
     for done, (controller, predict) in enumerate(controllers.items()):
 
         def tell(share: float, _: int, done: int = done) -> None:
             reporter.at("evaluating", (done + share) / len(controllers))
 
-        results[controller] = _counted(predict, environment, settings, controller, tell, gathered)
+        results[controller] = _counted(predict, environment, settings, controller, tell, gathered, trained_for)
     paired = paired_start(results["policy"], settings.episodes)
     gathered.evaluations = [
         as_reported(result, settings, uuid4().hex, controller=controller, paired=paired)
@@ -181,6 +183,7 @@ def _counted(
     controller: wire.Controller,
     tell: Callable[[float, int], None],
     gathered: Gathered,
+    trained_for: EnvironmentSpec,
 ) -> Evaluation:
     """Run the episodes of one controller, and note their real steps."""
 
@@ -193,7 +196,7 @@ def _counted(
             )
 
     try:
-        result = evaluate(predict, environment.opener, settings, tell)
+        result = evaluate(predict, environment.opener, settings, tell, trained_for=trained_for)
     except EvaluationFailed as failure:
         note(failure.steps, 0, "failed")
         raise

@@ -3,7 +3,7 @@
 The steps show ranges, limits and coordinates. The file asks a person for everything that steps can't show.
 """
 
-from surrogym_client.original.describing.description import Description, describe
+from surrogym_client.original.describing.description import Description, DescriptionInterrupted, describe
 from surrogym_client.original.describing.exploring import STEPS
 
-__all__ = ["STEPS", "Description", "describe"]
+__all__ = ["STEPS", "Description", "DescriptionInterrupted", "describe"]

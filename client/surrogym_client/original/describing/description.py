@@ -86,6 +86,7 @@ def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
     Raises:
         UnknownEnvironment: no adapter knows the name, or no specification can express the environment.
         StepFailed: the environment failed at a reset or a step, after a number of real steps.
+        DescriptionInterrupted: Ctrl-C was pressed; real steps so far are counted.
     """
     counted = Counted(open_simulator(name), name)
     try:
@@ -94,6 +95,8 @@ def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
         said = f"{name} can't be specified: {first_fault(error)}" if isinstance(error, ValidationError) else str(error)
         took = f"; this took {counted.steps} real steps" if counted.steps else ""
         raise UnknownEnvironment(f"{said}{took}") from error
+    except KeyboardInterrupt:
+        raise DescriptionInterrupted(counted.steps) from None
     finally:
         failed = counted.close()
     return replace(described, found=(*described.found, *failed))
@@ -112,6 +115,14 @@ def _described(name: str, counted: Counted, steps: int, rng: np.random.Generator
         spec = spec.model_copy(update={"reward": reward})
     found, asked = drafted.found(spec, steps), drafted.asked(spec)
     return Description(spec, found, asked, counted.steps, counted.resets, simulator.pays)
+
+
+class DescriptionInterrupted(KeyboardInterrupt):
+    """Ctrl-C interrupted a description after ``steps`` real steps had begun."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
 
 
 class _Draft:

@@ -1,0 +1,26 @@
+"""A name from a server opens no file of a person's; the refusal says which option does."""
+
+from __future__ import annotations
+
+import pytest
+
+from support.rail import SPEC
+from surrogym_client.cli.errors import CommandError
+from surrogym_client.cli.sample import _environment
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("pcgym:tank.json", "expected --env pcgym:tank.json"),
+        ("fmu:a plant.fmu", "expected --env 'fmu:a plant.fmu'"),
+        ("rail:Rail", "expected --env rail:Rail"),
+        ("exec:./plant --port 7", "--env fmu:PLANT.fmu, or --exec COMMAND"),
+        ("a rail", "--env pcgym:FILE.json, --env fmu:PLANT.fmu, or --exec COMMAND"),
+    ],
+)
+def test_the_option_that_opens_a_surrogates_environment_is_named(name: str, expected: str) -> None:
+    """For a file of pc-gym it named every option but the one that is needed."""
+    with pytest.raises(CommandError) as refused:
+        _environment(None, None, SPEC.model_copy(update={"environment": name}))
+    assert str(refused.value).endswith(expected)

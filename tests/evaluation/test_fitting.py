@@ -1,0 +1,86 @@
+"""A policy acts only where its specification says what it observes and does."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from support.moody import SPEC as LINE
+from support.moody import Line
+from support.rail import SPEC as RAIL
+from surrogym_client.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_client.original.classic import pendulum
+from surrogym_client.original.episodes import open_episode
+from surrogym_client.original.errors import PolicyMisfit
+from surrogym_client.original.fitting import check_policy
+from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, ObservationEntry, Term
+
+
+def changed(**fields: object) -> EnvironmentSpec:
+    return LINE.model_copy(update=fields)
+
+
+def acting(low: float, high: float, bins: int | None = None) -> EnvironmentSpec:
+    return changed(action=BoxAction(low=(low,), high=(high,), bins=None if bins is None else (bins,)))
+
+
+def test_evaluation_refuses_a_policy_of_another_environment_before_it_resets() -> None:
+    begun = []
+
+    class Noting(Line):
+        def step_from(self, coordinates, action):
+            begun.append(action)
+            return super().step_from(coordinates, action)
+
+    run = partial(
+        evaluate,
+        lambda o: np.ones((len(o), 1)),
+        partial(open_episode, "a line", None, Noting),
+        EvaluationSettings(episodes=1),
+    )
+    with pytest.raises(PolicyMisfit, match=r"it is for Pendulum-v1: expected coordinates \(theta, speed\)"):
+        run(trained_for=pendulum())
+    assert begun == []
+    run(trained_for=LINE)
+    assert len(begun) == 20
+
+
+@pytest.mark.parametrize(
+    ("trained", "message"),
+    [
+        (changed(action=DiscreteAction(n=2)), "a discrete action of 1, got .* a box action of 1"),
+        (acting(-1, 1, bins=5), "a box action of 1 in 5 bins, got .* a box action of 1$"),
+        (acting(-2, 1), r"expected actions from \[-2\] to \[1\], got \[-1\] to \[1\]"),
+        (
+            changed(observation=(*LINE.observation, ObservationEntry(name="x2", term=Term.linear(x=2)))),
+            r"expected observation \(x, x2\), got \(x\)$",
+        ),
+        (
+            changed(observation=(ObservationEntry(name="x", term=Term.linear(x=2)),)),
+            "'x' is another term than 'x'",
+        ),
+    ],
+    ids=["discrete", "bins", "stronger", "observes more", "observes otherwise"],
+)
+def test_what_does_not_fit_is_named(trained: EnvironmentSpec, message: str) -> None:
+    with pytest.raises(PolicyMisfit, match=message):
+        check_policy(trained, LINE)
+
+
+def test_bins_of_other_limits_are_refused_because_they_would_be_other_actions() -> None:
+    with pytest.raises(PolicyMisfit, match=r"expected actions from \[-1\] to \[1\], got \[-2\] to \[2\]"):
+        check_policy(acting(-1, 1, bins=5), acting(-2, 2, bins=5))
+
+
+def test_weaker_actions_and_other_access_fit() -> None:
+    """A log shows fewer actions than the plant has, and steps from any state of a plant that can only be reset."""
+    check_policy(acting(-0.5, 0.9), LINE)
+    check_policy(LINE, RAIL)
+
+
+def test_the_command_of_a_stranger_is_not_repeated() -> None:
+    with pytest.raises(PolicyMisfit) as refused:
+        check_policy(pendulum().model_copy(update={"environment": "exec:rm -rf /"}), LINE)
+    assert "rm" not in str(refused.value)
