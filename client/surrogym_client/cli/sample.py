@@ -102,8 +102,7 @@ def command(
 
     For each query, the sampler sets the original environment to a state, takes one real step and reports the sample. If
     the environment can't be set to any state, the sampler resets it, or returns to a snapshot, and takes a sequence of
-    actions. Ctrl-C ends the
-    command.
+    actions. Ctrl-C ends the command.
 
     Example: surrogym sample pendulum --until-done
 
@@ -131,14 +130,12 @@ def command(
         view = awaited_surrogate(api, surrogate, wait, quiet=output.quiet)
         if _without_queries(view, output, until_done=until_done):
             return
-        asked = view.spec
-        name, replaced = _environment(_named(env, program), read_spec(spec), asked)
-        token = service.token_for(context)
-        plan = SamplerPlan(api.url, token, surrogate, name, replaced, step_limit, settings)
+        name, replaced = _environment(_named(env, program), read_spec(spec), view.spec)
+        plan = SamplerPlan(api.url, service.token_for(context), surrogate, name, replaced, step_limit, settings)
         if cluster.on_ray is None:
             _sample_here(api, plan, output)
         else:
-            _require_shared(asked, settings)
+            _require_shared(view.spec, settings)
             _sample_on_ray(api, plan, cluster, output)
 
 

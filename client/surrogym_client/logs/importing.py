@@ -133,20 +133,14 @@ def import_log(
     Examples:
         >>> import_log("reactor.csv", register="reactor").taken
     """
-    if (register is not None and to is not None) or (to is not None and spec is not None):
-        raise ValueError("expected either register or to, and spec only together with register")
-    if register is not None:
-        _require_name(register)
+    _require_one_name(register, to, spec)
     given = Path(mapping) if isinstance(mapping, str) else mapping
-    require_outputs(
-        {"the file of rejected rows": None if rejected is None else Path(rejected)},
-        {"the log": Path(path), "the mapping": given if isinstance(given, Path) else None},
-    )
+    inputs = {"the log": Path(path), "the mapping": given if isinstance(given, Path) else None}
+    require_outputs({"the file of rejected rows": None if rejected is None else Path(rejected)}, inputs)
     options = Options(given, spec, budget, progress=lambda share, words: progress(0.3 * share, words))
     if register is None and to is None:
         log, kept = _read_or_keep(Path(path), options, rejected)
-        if draft is not None:
-            write_draft(Path(draft), log.spec)
+        _write_draft(draft, log)
         return Imported(log, rejected_file=kept)
     with Api(url, token) as api:
         if to is not None:
@@ -154,13 +148,24 @@ def import_log(
         log, kept = _read_or_keep(Path(path), options, rejected)
         if to is not None:
             _require_reward_unit(log, api, to)
-        if draft is not None:
-            write_draft(Path(draft), log.spec)
+        _write_draft(draft, log)
         if register is not None:
             api.create_surrogate(register, log.spec)
         name = register or to or ""
         sent, duplicates = send(api, name, log, lambda share, words: progress(0.3 + 0.7 * share, words))
     return Imported(log, name, sent, duplicates, kept)
+
+
+def _require_one_name(register: str | None, to: str | None, spec: EnvironmentSpec | None) -> None:
+    if to is not None and (register is not None or spec is not None):
+        raise ValueError("expected either register or to, and spec only together with register")
+    if register is not None:
+        _require_name(register)
+
+
+def _write_draft(draft: str | Path | None, log: ReadLog) -> None:
+    if draft is not None:
+        write_draft(Path(draft), log.spec)
 
 
 def _require_name(name: str) -> None:
