@@ -86,9 +86,8 @@ AnyReward = Annotated[
 class Success(Frozen):
     """Criteria of a successful evaluation episode. All given ones must hold.
 
-    ``hold``: inequalities that all hold in each of the last ``hold_steps`` steps. ``min_steps``, ``max_steps``: limits
-    on the episode's length. ``terminated``: whether the episode has to end by termination. ``min_return``: smallest
-    return.
+    ``hold``: inequalities that all hold in each of the last ``hold_steps`` steps. ``min_steps``: smallest length of the
+    episode. ``terminated``: whether the episode has to end by termination. ``min_return``: smallest return.
     """
 
     hold: tuple[Inequality, ...] = Field(default=(), max_length=MAX_INEQUALITIES)

@@ -113,9 +113,9 @@ class FastPpo(PolicySearch):
         with threadpool_limits(limits=task.settings.threads):
             cut = with_short_episodes(task, self.n_steps)
             fine = _from_declared_starts(task) if task.prolong and cut is task else None
-            further = task.prolong and cut is not task and self.gamma is None
+            twice = task.prolong and cut is not task and self.gamma is None
             with _lanes(cut) as lanes:
-                return _Training(self, cut, lanes, fine, further=further).run()
+                return _Training(self, cut, lanes, fine, twice=twice).run()
 
     def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:
         if not Network.is_at(policy):
@@ -127,10 +127,10 @@ class _Training:
     """Networks of one training, and the checks that compare them."""
 
     def __init__(
-        self, search: FastPpo, task: SearchTask, lanes: Lanes, fine: SearchTask | None, *, further: bool
+        self, search: FastPpo, task: SearchTask, lanes: Lanes, fine: SearchTask | None, *, twice: bool
     ) -> None:
         self._search, self._task, self._fine, self._spec = search, task, fine, task.port.spec()
-        self._further = further
+        self._twice = twice  # whether a second network follows, with another discount
         settings = task.settings
         suggested = suggested_gamma(self._spec) if task.gamma is None else task.gamma
         self._gamma = suggested if search.gamma is None else search.gamma
@@ -163,9 +163,9 @@ class _Training:
                     self._learn(learner, verdicts.left, hold)
                 if self._fine is not None and not verdicts.saturated:
                     self._fine_tune(learner, self._fine)
-                if self._further and not verdicts.saturated:
+                if self._twice and not verdicts.saturated:
                     learner = self._made()
-                    self._look_further(learner)
+                    self._learn_again(learner)
                 break
             else:
                 return self._by_reference()  # a network is only abandoned if steps are left
@@ -254,7 +254,7 @@ class _Training:
                     learner.limit_noise(noise, 1 - (1 - QUIET) * number / rollouts)
         self._check(learner)
 
-    def _look_further(self, learner: Learner) -> None:
+    def _learn_again(self, learner: Learner) -> None:
         """Train a new network with the discount of whole episodes, after one with that of short episodes.
 
         Only the imagined returns tell which of the two serves a task. ``with_short_episodes`` says why.
