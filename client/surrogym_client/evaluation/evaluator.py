@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[float, int], None]  # arguments: share done in [0, 1], number of episodes that terminated
 
 FIRST_SEED = 10_000
-FEW_EQUAL = 3  # equal episodes after which a person is told
+FEW_EQUAL = 3  # episodes that are compared; if they are equal, the evaluation says so
 ROUNDING = 1e-6  # share of its range by which a constant may change within an episode
 
 

@@ -106,7 +106,7 @@ class ModelCase:
 def model_cases(
     family: str, settings: Mapping[str, float | bool | str] | None = None, samples: int = SAMPLES
 ) -> tuple[ModelCase, ...]:
-    """The environments, to be learned by a family with this name and settings from so many samples."""
+    """Environments with ``samples`` real steps each. Their specifications name this family and these settings."""
     design = {"model": {"name": family, "settings": dict(settings or {})}, "monte_carlo": 64, "initial": SAMPLES}
     return tuple(
         ModelCase(
