@@ -1,5 +1,7 @@
 """A finished cell is not run again, a failed one is, and every cell says why it ended."""
 
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -93,3 +95,16 @@ def test_a_users_environment_is_a_task_without_a_target():
 def test_model_free_rounds_end_at_fixed_steps():
     assert goals(20_000) == [1_000, 2_000, 5_000, 10_000, 20_000]
     assert goals(700) == [700]
+
+
+def test_a_cell_computes_in_one_thread_in_libraries_that_load_later_too():
+    """SciPy's own BLAS loads with the methods. Its second thread would wait by spinning, and the wait would count."""
+    code = """
+from surrogym_client.experiments.peers import study
+study._single_thread()
+import scipy.linalg
+from threadpoolctl import threadpool_info
+print(sorted({pool["num_threads"] for pool in threadpool_info()}))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[1]\n"
