@@ -200,11 +200,13 @@ def _reports(
     policy: Path,
 ) -> list[tuple[Controller, Evaluation]]:
     """Run the episodes of each controller, and enter their real steps into the ledger."""
+    from surrogym_shared.words import counted
+
     reports: list[tuple[Controller, Evaluation]] = []
     for controller, load in controllers.items():
         actions = {"policy": "", "reference": "the reference controller"}.get(controller, f"{controller} actions")
         result = run(load, trained_for if controller == "policy" else None, what=actions or str(policy))
-        note = f"{settings.episodes} episodes from seed {settings.first_seed}"
+        note = f"{counted(settings.episodes, 'episode')} from seed {settings.first_seed}"
         enter(result.steps, settings.episodes, f"{note}, {actions}" if actions else note)
         reports.append((controller, result))
     return reports
@@ -273,7 +275,9 @@ def _run(
 
 
 def _telling(update: Update, episodes: int) -> Progress:
-    return lambda share, terminated: update(share, f"{episodes} real episodes, {terminated} terminated")
+    from surrogym_shared.words import counted
+
+    return lambda share, terminated: update(share, f"{counted(episodes, 'real episode')}, {terminated} terminated")
 
 
 def _ledger(surrogate: str | None, server: str | None, card: PolicyCard, noted_in: Path, *, quiet: bool) -> str | None:
@@ -331,6 +335,7 @@ def _kept(promise: Promise | None, result: Evaluation) -> bool | None:
 def _words(reports: Sequence[tuple[Controller, Evaluation]], promise: Promise | None) -> str:
     from surrogym_client.cli.columns import columns
     from surrogym_shared.wire import FEWEST_TO_JUDGE
+    from surrogym_shared.words import counted
 
     names = ("mean", "iqm", "min", "max", "std", "mean_length", "success_rate", "episodes", "steps")
     several = len(reports) > 1
@@ -342,6 +347,7 @@ def _words(reports: Sequence[tuple[Controller, Evaluation]], promise: Promise | 
         return table
     episodes = len(reports[0][1].returns)
     if not _judges(episodes):
-        return f"{table}\n{episodes} episodes are too few to judge the promise: take {FEWEST_TO_JUDGE} or more"
+        few = f"{counted(episodes, 'episode')} {'is' if episodes == 1 else 'are'} too few"
+        return f"{table}\n{few} to judge the promise: take {FEWEST_TO_JUDGE} or more"
     kept = "kept: the mean return is at least" if _kept(promise, reports[0][1]) else "broken: the mean return is below"
     return f"{table}\nthe promise of {promise.low:.4g} to {promise.high:.4g} was {kept} its lower end"

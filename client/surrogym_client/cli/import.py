@@ -276,7 +276,7 @@ def _covered(log: ReadLog) -> dict[str, float]:
 
 def _words(file: Path, imported: Imported, view: SurrogateView | None) -> list[str]:
     from surrogym_client.report.coverage import coverage_of
-    from surrogym_shared.logs.too_few import counted, has
+    from surrogym_shared.words import counted, has
 
     log = imported.log
     lines = [f"{file}: {counted(len(log.table), 'row')}, {counted(len(log.steps), 'step')}"]
@@ -303,7 +303,7 @@ def _columns(log: ReadLog) -> list[str]:
 
 
 def _rejected(imported: Imported) -> list[str]:
-    from surrogym_shared.logs.too_few import counted
+    from surrogym_shared.words import counted
 
     rejected = imported.log.rejected
     if not rejected:

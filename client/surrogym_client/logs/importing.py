@@ -18,12 +18,13 @@ from surrogym_shared.logs.checking import ReadLog, check_log, draft_log, is_of_r
 from surrogym_shared.logs.columns import Roles, roles_by_file, roles_by_map, roles_by_name
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.table import Floats, Table
-from surrogym_shared.logs.too_few import TooFewSteps, counted
+from surrogym_shared.logs.too_few import TooFewSteps
 from surrogym_shared.logs.transitions import Transitions
 from surrogym_shared.logs.units import require_reward_unit
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.spec.base import NAME_PATTERN
 from surrogym_shared.wire import NewSample
+from surrogym_shared.words import counted
 
 BATCH = 2_000  # steps between two reports of progress
 SAMPLER = "log"

@@ -14,6 +14,7 @@ from surrogym_client.report.known import Known
 from surrogym_client.report.wording import number
 from surrogym_shared.intervals import Interval, of_mean
 from surrogym_shared.wire import EpisodeTrace, EvaluationDetail
+from surrogym_shared.words import counted
 
 SHORT_NAMES = {"zero": "no controller", "random": "random actions", "reference": "reference controller"}
 
@@ -54,7 +55,7 @@ def in_short(real: EvaluationDetail, other: EvaluationDetail) -> str:
     """The comparison in a sentence."""
     found, name = compare(real, other), ACTING[other.controller]
     if found is None:
-        return f"With {name}, {other.episodes} episodes earned {number(other.mean)} on average."
+        return f"With {name}, {counted(other.episodes, 'episode')} earned {number(other.mean)} on average."
     starts = f"From {_starts(found.starts, real)}" if found.starts < real.episodes else "From the same starts"
     return f"{starts}, it earned {number(found.mine)} on average, and {name} earned {number(found.theirs)}."
 
@@ -76,9 +77,9 @@ def _gained(real: EvaluationDetail, other: EvaluationDetail) -> str:
     found, name = compare(real, other), ACTING[other.controller]
     if found is None:
         return (
-            f"{real.episodes} episodes with the controller earned {number(real.mean)} on average, and {other.episodes} "
-            f"with {name} earned {number(other.mean)}. Their starts can't be compared one by one, because the single "
-            "episodes are not known."
+            f"{counted(real.episodes, 'episode')} with the controller earned {number(real.mean)} on average, and "
+            f"{counted(other.episodes, 'episode')} with {name} earned {number(other.mean)}. Their starts can't be "
+            "compared one by one, because the single episodes are not known."
         )
     return (
         f"From {_starts(found.starts, real)}, the average return was {number(found.mine)} with the controller and "

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from surrogym_client.report.html import paragraph, section, table
 from surrogym_client.report.known import Known
-from surrogym_client.report.wording import plural, starts_of, steps
+from surrogym_client.report.wording import starts_of, steps
 from surrogym_shared.wire import Controller, SurrogateView
+from surrogym_shared.words import counted
 
 ACTING: dict[Controller, str] = {
     "policy": "the controller",
@@ -54,10 +55,11 @@ def tests(known: Known) -> list[tuple[str, int]]:
     """The real steps of all episodes."""
     own = [] if known.policy is None else known.policy.evaluations
     lines = [
-        (f"{plural(one.episodes, 'episode')} with {ACTING[one.controller]}, {starts_of(one)}", one.steps) for one in own
+        (f"{counted(one.episodes, 'episode')} with {ACTING[one.controller]}, {starts_of(one)}", one.steps)
+        for one in own
     ]
     others = sum(one.steps for policy in known.others for one in policy.evaluations)
-    lines.append((f"episodes with {plural(len(known.others), 'other version')} of the controller", others))
+    lines.append((f"episodes with {counted(len(known.others), 'other version')} of the controller", others))
     unnamed = known.view.ledger.evaluation - sum(count for _, count in lines)
     return [*lines, ("other real episodes, of which no result is stored", max(unnamed, 0))]
 

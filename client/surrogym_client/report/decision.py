@@ -19,6 +19,7 @@ from surrogym_client.report.prediction import prediction
 from surrogym_client.report.wording import criterion, mean, number, original, share, starts, starts_of, steps, successes
 from surrogym_client.surrogates.advice import verdict
 from surrogym_shared.wire import EvaluationDetail, OutputFidelity
+from surrogym_shared.words import counted
 
 NO_CRITERION = "Nobody declared what a success is, so this report can't tell how many episodes failed."
 RETURN = "The return of an episode is the sum of its rewards. Higher is better."
@@ -52,7 +53,7 @@ def _in_short(known: Known) -> str:
     if real is None:
         said = "A controller was trained in the model. It has not been tested in the original environment."
         return paragraph(said, "short")
-    sentences = [f"In {real.episodes} real episodes the controller earned {mean(real)} on average."]
+    sentences = [f"In {counted(real.episodes, 'real episode')} the controller earned {mean(real)} on average."]
     if real.success_rate is not None:
         sentences.append(f"{successes(real)} succeeded.")
     sentences += [in_short(real, other) for other in (known.without, known.reference) if other is not None]

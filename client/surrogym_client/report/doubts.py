@@ -5,9 +5,10 @@ from __future__ import annotations
 from surrogym_client.original.loading import env_option, is_known, sample_command
 from surrogym_client.report.known import PREFERRED, Known
 from surrogym_client.report.prediction import outcome_of
-from surrogym_client.report.wording import plural, starts_of
+from surrogym_client.report.wording import starts_of
 from surrogym_client.surrogates.advice import advice
 from surrogym_shared.wire import EvaluationView, PolicyView
+from surrogym_shared.words import counted
 
 FEW = 30  # episodes; fewer give an unreliable average
 
@@ -19,7 +20,7 @@ def tested(known: Known) -> str:
     for one in evaluations:
         if one.controller == "policy":
             most[starts_of(one)] = max(most.get(starts_of(one), 0), one.episodes)
-    own = [f"{starts} ({plural(episodes, 'episode')})" for starts, episodes in most.items()]
+    own = [f"{starts} ({counted(episodes, 'episode')})" for starts, episodes in most.items()]
     return f"Tested were: {'; '.join(own)}. Not tested were:" if own else ""
 
 
@@ -32,7 +33,8 @@ def untested(known: Known) -> list[str]:
         return ["The controller itself: no real episode was run with it."]
     found = []
     if real.episodes < FEW:
-        found.append(f"Many starts: {real.episodes} episodes say little of an average; {FEW} or more would.")
+        said = f"{counted(real.episodes, 'episode')} say{'s' if real.episodes == 1 else ''} little of an average"
+        found.append(f"Many starts: {said}; {FEW} or more would.")
     own = [one for one in policy.evaluations if one.controller == "policy"]
     if not _other_starts(policy):
         found.append("Starts outside the declared ones.")

@@ -9,8 +9,9 @@ from surrogym_client.report.episodes import Range, draw_ranges
 from surrogym_client.report.figures import svg
 from surrogym_client.report.html import paragraph, picture, section
 from surrogym_client.report.known import Known
-from surrogym_client.report.wording import number, plural
+from surrogym_client.report.wording import number
 from surrogym_shared.wire import EvaluationView, Interval, PolicyPromise
+from surrogym_shared.words import counted
 
 
 class Outcome(NamedTuple):
@@ -74,7 +75,7 @@ def _words(found: Outcome, promise: PolicyPromise, real: EvaluationView) -> str:
         case "perhaps worse":
             return (
                 f"The real average lies {number(found.beyond)} below the predicted interval of {predicted}. This may "
-                f"be chance: the interval of {plural(real.episodes, 'real episode')} overlaps with the predicted one."
+                f"be chance: the interval of {counted(real.episodes, 'real episode')} overlaps with the predicted one."
             )
         case _ if found.beyond > 0:
             return "Reality came out as predicted: the intervals of the real and of the predicted average overlap."
@@ -88,7 +89,7 @@ def _caption(real: EvaluationView | None) -> str:
 
 
 def _range(label: str, one: EvaluationView) -> Range:
-    return Range(f"{label}, {plural(one.episodes, 'episode')}, 95 %", one.mean, *_ends(one.mean_interval))
+    return Range(f"{label}, {counted(one.episodes, 'episode')}, 95 %", one.mean, *_ends(one.mean_interval))
 
 
 def _ends(interval: Interval | None) -> tuple[float | None, float | None]:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from surrogym_client.original.loading import is_known
 from surrogym_shared.spec import EnvironmentSpec, Fixed, Inequality, Normal, Part, Success, Term, Uniform, limits
 from surrogym_shared.wire import EvaluationView
+from surrogym_shared.words import counted
 
 
 def number(value: float) -> str:
@@ -39,12 +40,7 @@ def share(value: float) -> str:
 
 
 def steps(count: int) -> str:
-    return plural(count, "real step")
-
-
-def plural(count: int, noun: str) -> str:
-    """A count with its noun, such as "1 step" and "2,000 steps"."""
-    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+    return counted(count, "real step")
 
 
 def starts_of(evaluation: EvaluationView) -> str:
@@ -71,7 +67,7 @@ def criterion(success: Success) -> str:
     last = "at its end" if success.hold_steps == 1 else f"in each of its last {success.hold_steps} steps"
     conditions = [
         *([f"{' and '.join(map(_inequality, success.hold))} {last}"] if success.hold else []),
-        *([] if success.min_steps is None else [f"it lasts for at least {plural(success.min_steps, 'step')}"]),
+        *([] if success.min_steps is None else [f"it lasts for at least {counted(success.min_steps, 'step')}"]),
         *([] if success.terminated is None else [_ending(success.terminated)]),
         *([] if success.min_return is None else [f"its return is at least {number(success.min_return)}"]),
     ]
@@ -114,7 +110,7 @@ def _times(factor: float, words: str) -> str:
 def starts(spec: EnvironmentSpec) -> str:
     """The declared starts, such as "theta 3.14 rad, speed -1 to 1 rad/s"."""
     if spec.starts:
-        return f"one of {plural(len(spec.starts), 'state')}"
+        return f"one of {counted(len(spec.starts), 'state')}"
     return ", ".join(f"{one.name} {_spread(spec.start[one.name])} {one.unit}".rstrip() for one in spec.coordinates)
 
 

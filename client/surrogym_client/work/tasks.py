@@ -26,6 +26,7 @@ from surrogym_client.transport.api import Api
 from surrogym_client.work.reporter import Reporter
 from surrogym_shared import wire
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.words import counted
 
 QUICK = 4  # a quick training takes this part of the steps that the algorithm suggests
 
@@ -126,7 +127,9 @@ def run_episodes(
         EvaluationFailed: the environment or the policy raised an error after real steps.
     """
     if task.real_episodes > environment.most_episodes:
-        raise ValueError(f"expected at most {environment.most_episodes} real episodes, got {task.real_episodes}")
+        raise ValueError(
+            f"expected at most {counted(environment.most_episodes, 'real episode')}, got {task.real_episodes}"
+        )
     found = api.policies.get(surrogate, task.policy)
     gathered.version = found.version
     settings = EvaluationSettings(task.episodes, task.first_seed, task.wide)
@@ -203,7 +206,7 @@ def _counted(
     except EvaluationInterrupted as interruption:
         note(interruption.steps, 0, "interrupted")
         raise
-    note(result.steps, settings.episodes, f"{settings.episodes} episodes from seed {settings.first_seed}")
+    note(result.steps, settings.episodes, f"{counted(settings.episodes, 'episode')} from seed {settings.first_seed}")
     return result
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from surrogym_shared import wire
+from surrogym_shared.words import counted
 
 
 def words_of_task(task: wire.Task) -> str:
@@ -17,4 +18,4 @@ def words_of_task(task: wire.Task) -> str:
     ]
     beside = f", compared with {' and '.join(others)}" if others else ""
     video = ", with a video" if task.video else ""
-    return f"evaluate version {task.policy} in {task.episodes} real episodes{beside}{video}"
+    return f"evaluate version {task.policy} in {counted(task.episodes, 'real episode')}{beside}{video}"

@@ -8,6 +8,7 @@ from collections import Counter
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.table import Table
 from surrogym_shared.logs.transitions import Transitions
+from surrogym_shared.words import counted, has
 
 DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+\s*$")
 
@@ -54,13 +55,3 @@ def require_steps(table: Table, steps: Transitions, least: int) -> None:
 def _kind(reason: str) -> str:
     """Return a reason without its value and line, so that equal kinds of faults compare as equal."""
     return re.sub(r"line \d+", "line", reason.partition(", got")[0])
-
-
-def counted(count: int, noun: str) -> str:
-    """Return a number with its noun: 1 row, 2 rows."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
-def has(count: int, noun: str) -> str:
-    """Return a number with its noun and verb: 1 row has, 2 rows have."""
-    return f"{counted(count, noun)} {'has' if count == 1 else 'have'}"

@@ -18,6 +18,7 @@ from surrogym_client.policies.card import read_card
 from surrogym_client.policies.files import load_policy
 from surrogym_shared.terminal import progress
 from surrogym_shared.wire import Controller
+from surrogym_shared.words import counted
 
 COMPARED = 20  # starts that are run without the policy as well
 
@@ -70,7 +71,7 @@ def judge(settings: DemoSettings, policy: Path, *, quiet: bool) -> Judgement:
         opener = episodes_of(settings)
 
         def look(share: float, ended: int) -> None:
-            update(share, f"{plain.episodes} real episodes, {ended} terminated")
+            update(share, f"{counted(plain.episodes, 'real episode')}, {ended} terminated")
 
         real = Part("policy", plain, evaluate(predict, opener, plain, look))
         also = None

@@ -14,6 +14,7 @@ from surrogym_client.evaluation.evaluator import Evaluation
 from surrogym_client.report.figures import WIDTH, draw_samples, with_unit
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import SampleView, SurrogateView
+from surrogym_shared.words import counted
 
 
 def draw_all(
@@ -40,7 +41,7 @@ def draw_learning(curve: Sequence[dict[str, Any]]) -> Figure:
 
 def draw_returns(result: Evaluation) -> Figure:
     """Draw the distribution of the real returns."""
-    figure, axes = _one("real return of an episode", "episodes", f"{len(result.returns)} real episodes")
+    figure, axes = _one("real return of an episode", "episodes", counted(len(result.returns), "real episode"))
     axes.hist(result.returns, bins=20)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
@@ -61,7 +62,7 @@ def draw_rollout(spec: EnvironmentSpec, result: Evaluation) -> Figure:
         axes.set(ylabel=label)
     grid[-1].set(xlabel="step")
     figure.align_ylabels()
-    figure.suptitle(f"the median of {len(result.returns)} real episodes, return {result.returns[at]:.4g}")
+    figure.suptitle(f"the median of {counted(len(result.returns), 'real episode')}, return {result.returns[at]:.4g}")
     return figure
 
 
