@@ -1,8 +1,10 @@
 """Scores of a model's predictions of held-out pieces: log density, and coverage of 90 % intervals.
 
 A start is a held-out state from which the model is stepped under the real actions, along functions drawn from it and
-with its learned noise. Its coordinates after h steps are compared with the real ones as a normal distribution with the
-mean and the deviation of the draws. The reward is compared after one step.
+with its learned noise. Its coordinates after h steps are compared with the real ones by a Student distribution with the
+mean and the deviation of the draws. Its tails are heavy, as those of a deviation that a few functions show. So a single
+surprise does not decide, which would have a normal distribution's density of e^-200 at 20 deviations. The reward is
+compared after one step.
 
 S starts, K draws, H steps, G pieces.
 """
@@ -27,6 +29,8 @@ HORIZONS = (1, 5, 20)  # predicted steps
 DRAWS = 32
 STARTS, SPACING = 8, 5  # most starts in a piece, and least steps between them
 FLOOR = 0.01  # least deviation, in those of the output's change in a step: smaller errors decide nothing
+FREEDOM = 4  # degrees of freedom: those of the five networks of an ensemble
+PEAK = math.lgamma((FREEDOM + 1) / 2) - math.lgamma(FREEDOM / 2) - 0.5 * math.log(FREEDOM * math.pi)  # log density
 LEVEL = 0.9
 WEIGHTS = 4_000_000  # of drawn functions in memory at once
 SEED = 0
@@ -114,7 +118,7 @@ def _scored(error: Tensor, valid: Tensor, noise: float, piece: Tensor, pieces: i
     draws lack a noise of this deviation."""
     deviation = (error.var(-1) + noise**2 + FLOOR**2).sqrt()
     standard = error.mean(-1) / deviation
-    density = -0.5 * standard.square() - deviation.log() - 0.5 * math.log(2 * math.pi)
+    density = PEAK - (FREEDOM + 1) / 2 * (standard.square() / FREEDOM).log1p() - deviation.log()
     inside = (standard.abs() <= NormalDist().inv_cdf((1 + LEVEL) / 2)).double()
     chosen = [h - 1 for h in HORIZONS if h <= error.shape[1]]
     return Scores(*(_by_piece(values[:, chosen], valid[:, chosen], piece, pieces) for values in (density, inside)))

@@ -14,6 +14,7 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.models.port import Warm
 
 COVERAGE_LOSS = 0.05  # a family that serves may not be inside its intervals more seldom by more than this
+LEAST = 0.05  # nats by which a score must be better: those of intervals that are 5 % narrower
 WINS = 2  # comparisons in a row that a family must win
 SERVING, WON = "selected/serving", "selected/wins"  # names in a warm start
 
@@ -30,8 +31,8 @@ class Standing:
     wins: int = 0  # comparisons in a row that it has won
 
     def beats(self, other: Standing, margin: float) -> bool:
-        """Whether it is better than the family that had served by more than the margin, in standard errors."""
-        clearly = self.better > 0 and self.better > margin * self.error
+        """Whether it is clearly better than the family that had served: by more than the margin, in standard errors."""
+        clearly = self.better > max(LEAST, margin * self.error)
         return clearly and self.coverage >= other.coverage - COVERAGE_LOSS
 
 
