@@ -1,7 +1,7 @@
 """The choice of families by evidence: what it decides, and what the families are worth on other episodes.
 
 python tests/benchmarks/bench_families.py
-python tests/benchmarks/bench_families.py --tasks bounce --rows 2000 --logs 0 1 2
+python tests/benchmarks/bench_families.py --tasks bounce --settings '{"candidates": "gaussian_process, ensemble"}'
 
 ``pendulum`` is smooth; its few samples are single steps from anywhere. ``bounce`` is a ball that is pushed on a line
 between two hard walls, and loses some speed when it hits one within a step: the change of its speed jumps. ``contact``
@@ -17,6 +17,7 @@ candidate by more than 5 points there. The time is processor time of the fit.
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 import time
@@ -76,7 +77,7 @@ class Bounce(Machine):
 
 
 TASKS: dict[str, type[Machine]] = {"pendulum": Pendulum, "bounce": Bounce, "contact": Contact}
-ROWS = {"pendulum": [30], "bounce": [2_000], "contact": [2_000]}
+ROWS = {"pendulum": [30], "bounce": [500, 2_000], "contact": [500, 2_000]}
 
 
 def episodes(machine: Machine, count: int, rng: np.random.Generator) -> Samples:
@@ -181,14 +182,14 @@ def main() -> None:
     made = parser(__doc__)
     made.add_argument("--tasks", choices=TASKS, nargs="*", default=list(TASKS))
     made.add_argument("--rows", type=int, nargs="*", help="of the log; by default as the task needs")
-    made.add_argument("--candidates", default=SelectedFamilies.candidates)
+    made.add_argument("--settings", default="{}", help="of the family, as JSON")
     made.add_argument("--logs", type=int, nargs="*", default=[0], help="seeds of the logs")
     options = started(made)
     report = []
     for task in options.tasks:
         for rows in options.rows or ROWS[task]:
             for log in options.logs:
-                report.append(measured(task, rows, log, {"candidates": options.candidates}))
+                report.append(measured(task, rows, log, json.loads(options.settings)))
                 show(report[-1])
     write(options.out, "families", {"rows": report})
 

@@ -20,7 +20,8 @@ LARGEST_MARGIN = 10.0
 @dataclass(frozen=True)
 class SelectedFamilies(Settings, Learner):
     """Every candidate is fitted without some steps and predicts them; each output is served by the family that predicts
-    it best. The settings of the built-in families are valid too, and are passed on to them.
+    it best. The settings of the built-in families are valid too, and are passed on to them. The warm start is those of
+    the candidates, and which families have served and won: another family takes over only if it wins twice in a row.
 
     Attributes:
         candidates: names of families, with commas between them; the first one serves until another is better.
