@@ -77,7 +77,7 @@ class Bounce(Machine):
 
 
 TASKS: dict[str, type[Machine]] = {"pendulum": Pendulum, "bounce": Bounce, "contact": Contact}
-ROWS = {"pendulum": [30], "bounce": [500, 2_000], "contact": [500, 2_000]}
+ROWS = {"pendulum": [30], "bounce": [500, 1_000], "contact": [500, 1_000]}
 
 
 def episodes(machine: Machine, count: int, rng: np.random.Generator) -> Samples:
