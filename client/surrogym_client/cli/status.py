@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -12,7 +12,7 @@ from surrogym_client.cli.groups import Service, add
 from surrogym_client.cli.options import AsJson, names_of_surrogates
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from surrogym_client.transport.api import Api
     from surrogym_shared.wire import ModelView, OutputFidelity, SurrogateSummary, SurrogateView
@@ -76,7 +76,16 @@ def _one(api: Api, name: str, form: Form) -> str:
         return view.model_dump_json()
     if form == "short":
         return _short(view)
-    return _detail(view, api.models(name) if view.phase == "over_budget" else ())
+    return _detail(view, api.models(name) if view.phase == "over_budget" else (), _selection(api, view))
+
+
+def _selection(api: Api, view: SurrogateView) -> Mapping[str, Any] | None:
+    """Return what the newest model says of the families that were compared; None if its family compares none."""
+    from surrogym_client.surrogates.compared import compares, selection_of
+
+    if view.model_version is None or not compares(view.spec):
+        return None
+    return selection_of(view.spec, api.model(view.name).description)
 
 
 def _patiently(look: Callable[[], str], as_json: bool) -> str:
@@ -117,7 +126,7 @@ def _row(seen: SurrogateSummary) -> tuple[str | float | None, ...]:
     )
 
 
-def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
+def _detail(view: SurrogateView, models: Sequence[ModelView], selection: Mapping[str, Any] | None = None) -> str:
     from surrogym_client.cli.columns import columns
     from surrogym_client.surrogates.advice import advice, noise_in_words, verdict
 
@@ -142,6 +151,7 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
             f"target {view.target:g}; as the paper counts it {view.fidelity.confidence_index_paper:.4f}",
             columns([FIDELITY, *(_judged(output) for output in view.fidelity.outputs)]),
             *_predicted(view.fidelity.outputs),
+            *_compared(selection, view.outputs),
             f"verdict: {verdict(view)}",
         ]
     if noise := noise_in_words(view):
@@ -149,6 +159,14 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
     if following := advice(view, models):
         lines.append(f"next: {following}")
     return "\n".join(lines)
+
+
+def _compared(selection: Mapping[str, Any] | None, outputs: Sequence[str]) -> list[str]:
+    """Table of the families that were compared; empty if the surrogate has one family."""
+    from surrogym_client.cli.columns import columns
+    from surrogym_client.surrogates.compared import HEADING, rows_of, said_of
+
+    return [] if selection is None else [said_of(selection), columns([HEADING, *rows_of(selection, outputs)])]
 
 
 def _steps(seen: SurrogateSummary) -> str:

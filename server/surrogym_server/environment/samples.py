@@ -48,6 +48,16 @@ def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
     return change[:, definition.moving]
 
 
+def preceding(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
+    """Row of the step that each sample (n,) continues, -1 if there is none: it ended, as measured, where this one
+    starts."""
+    columns = list(definition.moving)
+    follows = torch.full((len(samples),), -1)
+    same = (samples.q[1:, columns] == samples.q_next[:-1, columns]).all(-1) & ~samples.terminated[:-1]
+    follows[1:] = torch.where(same, torch.arange(len(same)), -1)
+    return follows
+
+
 def saturated(definition: EnvironmentDefinition, q_next: Tensor) -> Tensor:
     """Which samples (n,) ended at a declared bound. Their increments are cut, so they say little about the dynamics."""
     return (limit_sides(definition, q_next) != 0).any(-1)

@@ -1,4 +1,5 @@
-"""Abilities that only some families of models have. Each is a class that a model inherits besides ``DynamicsModel``.
+"""Abilities that only some families of models have. Each is a class that a model inherits besides ``DynamicsModel``. A
+model of several families returns an object of its own instead (``DynamicsModel.ability``).
 
 Code that uses an ability calls ``offers``, and has a fallback for models without it. The ability's docstring states it.
 
@@ -10,7 +11,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +19,12 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.port import DynamicsModel, Transition
-
-A = TypeVar("A")
+from surrogym_server.models.port import A, DynamicsModel, Transition
 
 
 def offers(model: DynamicsModel, ability: type[A]) -> A | None:
-    """Return the model as an object with this ability; None if its family lacks the ability."""
-    return model if isinstance(model, ability) else None
+    """Return the model as an object with this ability; None if the model lacks the ability."""
+    return model.ability(ability)
 
 
 class FunctionDraws(ABC):
@@ -220,6 +218,24 @@ class Lookahead(ABC):
     @abstractmethod
     def as_if_answered(self, steps: PredictedSteps) -> DynamicsModel:
         """Return the model as if real steps (T, ...) had been taken as predicted: deviations shrink, means stay."""
+
+
+class RewardOfStep(ABC):
+    """Ability to predict the reward of a step whose next state is given, as if the transition were known.
+
+    Fallback of a model of several families: the reward of the next state that this family predicts itself.
+    """
+
+    @abstractmethod
+    def reward_of_step(
+        self, q: Tensor, u: Tensor, q_next: Tensor, *, paths: Tensor | None = None, deviation: bool = False
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return the reward (m,) of steps from q (m, C) under u (m, F) to q_next (m, C), and its deviation (m,) if
+        requested.
+
+        Both are those of ``transition`` at the next state that it predicts; with ``paths`` (m, W), those of
+        ``transition_along``.
+        """
 
 
 class RewardEdges(ABC):

@@ -14,7 +14,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
 from surrogym_server.tensors import to_device
 
+A = TypeVar("A")
 Warm = Mapping[str, NDArray[np.float64]]  # named arrays that one fit leaves for a warm start of the next
 
 
@@ -119,6 +120,10 @@ class DynamicsModel(ABC):
     @abstractmethod
     def description(self) -> dict[str, Any]:
         """Describe the model in detail as JSON: ``outputs`` with one entry each, and further fields of the family."""
+
+    def ability(self, kind: type[A]) -> A | None:
+        """Return an object that has one of the ``models.abilities`` of this model; None if the model lacks it."""
+        return self if isinstance(self, kind) else None
 
     def on(self, device: torch.device) -> DynamicsModel:
         """Return the same model with its arrays on a device."""

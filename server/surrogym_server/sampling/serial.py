@@ -23,8 +23,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.environment.samples import Samples
+from surrogym_server.environment.samples import Samples, preceding
 from surrogym_server.models.abilities import AtSamples, LearnedNoise, SampledFunctions, offers
 from surrogym_server.models.port import DynamicsModel
 
@@ -93,16 +92,6 @@ def _learned(model: DynamicsModel) -> Tensor:
     able = offers(model, LearnedNoise)
     found = [0.0] * len(model.definition.outputs) if able is None else able.noise_deviations
     return torch.tensor(found, dtype=torch.float64)
-
-
-def preceding(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """Row of the step that each sample (n,) continues, -1 if there is none: it ended, as measured, where this one
-    starts."""
-    columns = list(definition.moving)
-    follows = torch.full((len(samples),), -1)
-    same = (samples.q[1:, columns] == samples.q_next[:-1, columns]).all(-1) & ~samples.terminated[:-1]
-    follows[1:] = torch.where(same, torch.arange(len(same)), -1)
-    return follows
 
 
 def _told(at: AtSamples, follows: Tensor, slope: Tensor) -> SensorNoise | None:

@@ -2,12 +2,20 @@
 
 import pytest
 
+from support.selected import mixed_cases
 from surrogym_server.testing import LAWS_OF_MODELS, model_cases
 
-FAMILIES: dict[str, dict[str, float]] = {"gaussian_process": {}, "ensemble": {"steps": 300}}
+FAMILIES: dict[str, dict[str, float]] = {"gaussian_process": {}, "ensemble": {"steps": 300}, "selected": {"steps": 50}}
 THROUGH_INDUCING_POINTS = model_cases("sparse_gaussian_process", {"inducing": 40}, 200)  # fewer samples are exact
+PROCESS, SPARSE, ENSEMBLE = "gaussian_process", "sparse_gaussian_process", "ensemble"
+MIXED = {  # families of angle, speed and reward
+    "speed by networks": (PROCESS, ENSEMBLE, PROCESS),
+    "reward by networks": (PROCESS, PROCESS, ENSEMBLE),
+    "processes of two kinds": (PROCESS, SPARSE, SPARSE),
+}
 CASES = {f"{family}, {case}": case for family, own in FAMILIES.items() for case in model_cases(family, own)}
 CASES |= {f"sparse_gaussian_process, {case}": case for case in THROUGH_INDUCING_POINTS}
+CASES |= {f"{name}, {case}": case for name, serving in MIXED.items() for case in mixed_cases(serving, {"steps": 300})}
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -9,10 +9,10 @@ import torch
 
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
-from surrogym_server.environment.samples import Samples
+from surrogym_server.environment.samples import Samples, preceding
 from surrogym_server.models.guard import learn
 from surrogym_server.sampling.design import Request, judge_model
-from surrogym_server.sampling.serial import CRITICAL, MAINLY, best_share, preceding, sensor_noise, sensor_pattern
+from surrogym_server.sampling.serial import CRITICAL, MAINLY, best_share, sensor_noise, sensor_pattern
 from surrogym_server.sampling.tolerances import usual_tolerances
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 

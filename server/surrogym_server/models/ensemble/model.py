@@ -12,7 +12,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.environment.step_rules import moved, paid, placed
-from surrogym_server.models.abilities import Differentiable, FunctionDraws
+from surrogym_server.models.abilities import Differentiable, FunctionDraws, RewardOfStep
 from surrogym_server.models.ensemble.inputs import Inputs
 from surrogym_server.models.ensemble.networks import Networks
 from surrogym_server.models.port import DynamicsModel, Transition
@@ -35,7 +35,7 @@ class Regression:
 
 
 @dataclass(frozen=True)
-class NetworkEnsembleModel(DynamicsModel, FunctionDraws, Differentiable):
+class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, Differentiable):
     """K members. The mean is the members' mean, and the deviation that between members. No noise is learned."""
 
     definition: EnvironmentDefinition
@@ -81,6 +81,18 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, Differentiable):
     ) -> Transition:
         del process
         return self._in_blocks(q, u, None, paths[:, 0].long(), deviations, reward_deviation)
+
+    def reward_of_step(
+        self, q: Tensor, u: Tensor, q_next: Tensor, *, paths: Tensor | None = None, deviation: bool = False
+    ) -> tuple[Tensor, Tensor | None]:
+        member = None if paths is None else paths[:, 0].long()
+
+        def judged(q: Tensor, u: Tensor, q_next: Tensor, member: Tensor | None) -> tuple[Tensor, Tensor]:
+            rewards = self._rewards(q, u, q_next)
+            return _chosen(rewards, member), rewards.std(0)
+
+        reward, spread = in_blocks(ROWS, judged, q, u, q_next, member)
+        return reward, spread if deviation else None
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         change = self.transitions(self._inputs.of_transition(q, u)).mean(0)
