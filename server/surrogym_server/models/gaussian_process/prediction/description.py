@@ -36,6 +36,7 @@ def describe(definition: EnvironmentDefinition, output: OutputModel) -> dict[str
             "quadratic_variance": hyper.quadratic_variance,
             "noise_variance": hyper.noise_variance,
             "jitter": output.posterior.jitter,
+            "shares_samples_with": list(output.shared),
         }
         if (sparse := output.posterior.sparse) is not None:
             prior = hyper.signal_variance + hyper.linear_variance
