@@ -75,6 +75,7 @@ def test_tanks_that_are_filled_by_another_tank_share_samples(model):
         {"second", "third"},
     ]
     assert [len(output.posterior.y) for output in model.transitions] == [SAMPLES, *[3 * SAMPLES] * 3]
+    assert "with samples of" in model.structures[1]
     assert describe(ROW, model.transitions[1])["shares_samples_with"] == list(model.transitions[1].shared)
 
 

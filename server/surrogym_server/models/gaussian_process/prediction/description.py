@@ -61,4 +61,5 @@ def structure(output: OutputModel) -> str:
     if output.posterior is None:
         return "constant"
     learned = "" if output.warp is None else f"{output.warp}: "
-    return f"{learned}{output.posterior.hyper.kernel} on {output.feature_map}"
+    shared = f", with samples of {', '.join(output.shared)}" if output.shared else ""
+    return f"{learned}{output.posterior.hyper.kernel} on {output.feature_map}{shared}"
