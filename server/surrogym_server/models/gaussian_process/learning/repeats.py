@@ -55,7 +55,7 @@ def _is_to_learn(learner: OutputLearner, output: OutputModel) -> bool:
 def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Candidate | None:
     """The output with its process; None if it can't share samples."""
     posterior, selection, chosen = output.posterior, learner.selections.get(output.name), output.feature_map
-    if posterior is None or posterior.sparse is not None or chosen.rates or output.at_limit or chosen.history:
+    if posterior is None or posterior.sparse is not None or chosen.rates or output.at_limit:
         return None
     if selection is None and not chosen.dropped:
         return None
