@@ -10,7 +10,7 @@ import torch
 from surrogym_server.errors import NumericalFailure
 from surrogym_server.gp import Part, Pool, condition, pools, subsets
 from surrogym_server.models.gaussian_process.feature_maps import reflection
-from surrogym_server.models.gaussian_process.learning.dropping import LESS, WIN, map_without
+from surrogym_server.models.gaussian_process.learning.dropping import WIN, map_without
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner, is_unexplained
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
@@ -80,11 +80,9 @@ def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Cand
 
 
 def _sharing(members: Sequence[_Candidate], pool: Pool, member: int) -> OutputModel:
-    """A member with the samples of its pool, if its own are foretold better by them."""
+    """A member with the samples of its pool, if its own are foretold no worse by them."""
     made, output = members[member], members[member].output
     assert output.posterior is not None
-    if not is_unexplained(output.posterior):
-        return output
     x, y, hyper = pool.samples_of(member, MOST)
     try:
         posterior = condition(hyper, x, y)
@@ -92,7 +90,7 @@ def _sharing(members: Sequence[_Candidate], pool: Pool, member: int) -> OutputMo
         return output
     foretold, _ = posterior.leave_one_out()
     off = (foretold - y)[: len(made.part.y)].square().mean().sqrt()
-    if float(off) > LESS * output.posterior.left_out.error:
+    if float(off) > output.posterior.left_out.error:
         return output
     whole = replace(output.feature_map, dropped=(), parity=members[0].output.feature_map.parity)
     kept = torch.zeros(len(made.every) + len(output.feature_map.dropped), dtype=torch.bool)
