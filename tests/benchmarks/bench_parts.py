@@ -247,7 +247,7 @@ class Gate:
         self.prior = torch.tensor(np.concatenate([self.plain.prior, own]))
         self.lower = np.concatenate([self.plain.lower, [-2.0, math.log(0.01)], np.full(d, math.log(0.02)), [-18.0]])
         self.upper = np.concatenate([self.plain.upper, [2.0, math.log(2.0)], np.full(d, math.log(1e3)), [9.0]])
-        self.inner, self.d = len(self.plain.prior), d
+        self.inner, self.d, self.options = len(self.plain.prior), d, case.options
 
     def k(self, theta: Tensor, a: Tensor, b: Tensor) -> Tensor:
         """Latent covariance of a (m, d) and b (n, d)."""
