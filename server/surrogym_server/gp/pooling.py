@@ -97,13 +97,15 @@ class Pool:
     def samples_of(self, member: int, most: int) -> tuple[Tensor, Tensor, Hyperparameters]:
         """Inputs (k, d), ascending, and targets (k,) of all parts, and the hyperparameters, as one part sees them.
 
-        Its own samples come first, and all of them. Of the others there are as many as fit into ``most``.
+        Its own samples come first, and all of them. Of the others there are as many as fit into ``most``. Targets have
+        the part's scale around the first part's centre: that of an odd function is 0.
         """
         first, own, inputs = self.parts[0], self.parts[member], self.inputs[member]
         back = [inputs.index(place) for place in sorted(inputs)]
         others = [i for i in range(len(self.parts)) if i != member]
         x = torch.cat([self.parts[i].read(self.inputs[i]) for i in others])
-        y = torch.cat([own.targets_of(self.parts[i]) for i in others])
+        seen = replace(own, centre=first.centre)
+        y = torch.cat([seen.targets_of(self.parts[i]) for i in others])
         rows = spread(len(y), max(0, most - len(own.y)))
         mirror = self.hyper.reflection
         ratio = (first.scale / own.scale) ** 2
@@ -115,7 +117,7 @@ class Pool:
             ratio * self.hyper.noise_variance,
             None if mirror is None else replace(mirror, signs=mirror.signs[back]),
         )
-        return torch.cat([own.read(inputs), x[rows]])[:, back], torch.cat([own.y, y[rows]]), hyper
+        return torch.cat([own.read(inputs), x[rows]])[:, back], torch.cat([seen.targets_of(own), y[rows]]), hyper
 
 
 def pools(parts: Sequence[Part], most: int) -> list[Pool]:

@@ -58,10 +58,11 @@ def test_each_member_foretells_better_with_the_samples_of_both(pool):
     x = 2 * torch.rand(300, 5, generator=torch.Generator().manual_seed(9), dtype=torch.float64) - 1
     for member, own in enumerate(pool.parts):
         a, b = (0, 3) if pool.numbers[member] == 0 else (4, 1)
-        truth = (f(x[:, a], x[:, b]) + 3 - own.centre) / own.scale
+        truth = (f(x[:, a], x[:, b]) + 3 - pool.parts[0].centre) / own.scale
         inputs = sorted(pool.inputs[member])
         together = condition(*(pool.samples_of(member, 100)[i] for i in (2, 0, 1)))
-        errors = [(made.mean(x[:, inputs]) - truth).square().mean().sqrt() for made in (together, own.posterior)]
+        alone = own.posterior.mean(x[:, inputs]) + (own.centre - pool.parts[0].centre) / own.scale
+        errors = [(mean - truth).square().mean().sqrt() for mean in (together.mean(x[:, inputs]), alone)]
         assert errors[0] < 0.7 * errors[1]
 
 
@@ -70,7 +71,7 @@ def test_own_samples_come_first_and_others_become_fewer(pool):
         x, y, _ = pool.samples_of(member, 40)
         assert x.shape == (40, 2)
         torch.testing.assert_close(x[:25], own.x[:, sorted(pool.inputs[member])])
-        torch.testing.assert_close(y[:25], own.y)
+        torch.testing.assert_close(own.scale * y[:25] + pool.parts[0].centre, own.scale * own.y + own.centre)
 
 
 def test_gain_is_the_evidence_together_less_that_apart(pool):
@@ -117,3 +118,16 @@ def test_inputs_keep_their_signs_in_a_mirror_image():
     unread = {"reads": tuple(range(5)), "fewer": other.hyper}
     assert pools([known, replace(other, signs=stays, **unread)], most=4) == []
     assert pools([known, replace(other, signs=None, **unread)], most=4) == []
+
+
+def test_an_odd_function_has_no_centre():
+    """A part that was standardised around its average sees the pool around 0, where an odd function is 0."""
+    turned = -torch.ones(5, dtype=torch.float64)
+    known, plain = odd((0, 3), 0, turned), odd((4, 1), 1, turned)
+    other = replace(plain, y=(plain.y - 0.2) / 0.5, centre=0.2, scale=0.5)
+    (found,) = pools([known, other], most=4)
+    member = found.numbers.index(1)
+    x, y, hyper = found.samples_of(member, 100)
+    torch.testing.assert_close(0.5 * y[:25], plain.y)
+    foretold, _ = condition(hyper, x, y).leave_one_out()
+    assert float((foretold - y).abs().max()) < 0.05

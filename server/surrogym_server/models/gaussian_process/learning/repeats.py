@@ -97,4 +97,5 @@ def _sharing(members: Sequence[_Candidate], pool: Pool, member: int) -> OutputMo
     kept[[made.every[place] for place in pool.inputs[member]]] = True
     others = tuple(other.output.name for other in members if other is not made)
     scores = (*output.scores, (str(chosen := map_without(whole, kept)), pool.gain))
-    return replace(output, feature_map=chosen, posterior=posterior, scores=scores, shared=others)
+    centre = pool.parts[0].centre
+    return replace(output, feature_map=chosen, posterior=posterior, centre=centre, scores=scores, shared=others)
