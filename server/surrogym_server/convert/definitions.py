@@ -128,6 +128,7 @@ def _model(design: wire.Design) -> Choice:
             "reward_peaks": not paper,
             "rates": not paper,
             "drop_inputs": not paper,
+            "repeated_parts": not paper,
             "symmetry": design.symmetry,
         }
         choice = Choice(choice.name, tuple({**preset, **dict(choice.settings)}.items()))

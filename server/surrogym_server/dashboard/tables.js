@@ -48,7 +48,7 @@ export function ledgerTable() {
   return { element: section("ledger", "Ledger", "Every real step, by purpose.", place), show: render };
 }
 
-const HYPER = ["family", "inputs", "kernel", "features", "features_left_out", "rates", "lengthscale", "signal_variance", "linear_variance", "quadratic_variance", "noise_variance", "jitter", "scale", "points", "left_out"];
+const HYPER = ["family", "inputs", "kernel", "features", "features_left_out", "shares_samples_with", "rates", "lengthscale", "signal_variance", "linear_variance", "quadratic_variance", "noise_variance", "jitter", "scale", "points", "left_out"];
 
 function hyper(value) {
   if (typeof value === "number") return number(value);

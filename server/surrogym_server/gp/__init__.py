@@ -23,6 +23,7 @@ from surrogym_server.gp.joint import Joint
 from surrogym_server.gp.kernel import Hyperparameters, Reflection, covariance
 from surrogym_server.gp.parameters import MOST_NOISE, NOISE_FLOOR, FitOptions
 from surrogym_server.gp.pathwise import Pathwise
+from surrogym_server.gp.pooling import Part, Pool, pools
 from surrogym_server.gp.posterior import LeftOut, Posterior, Sparse, condition
 from surrogym_server.gp.selection import Selection, select_inputs
 from surrogym_server.gp.serving import Output, Serving
@@ -40,7 +41,9 @@ __all__ = [
     "Joint",
     "LeftOut",
     "Output",
+    "Part",
     "Pathwise",
+    "Pool",
     "Posterior",
     "Reflection",
     "Selection",
@@ -56,6 +59,7 @@ __all__ = [
     "fit_growing",
     "hyperparameter_samples",
     "noisy_explanation",
+    "pools",
     "refine",
     "refine_where_hard",
     "select_inputs",

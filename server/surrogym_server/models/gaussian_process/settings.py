@@ -18,6 +18,8 @@ class Settings:
         rates: whether transitions may change the faster the further along an input; see ``gp.growth``.
         reward_peaks: whether the reward may be learned by its logarithm, if it is nearly zero almost everywhere.
         drop_inputs: whether an output may leave out inputs that it does not read; see ``gp.selection``.
+        repeated_parts: whether outputs that do the same with inputs of their own may share samples; see ``gp.pooling``.
+            Needs ``drop_inputs``.
     """
 
     kernel: str = "composite"
@@ -26,11 +28,12 @@ class Settings:
     reward_peaks: bool = True
     rates: bool = True
     drop_inputs: bool = True
+    repeated_parts: bool = True
 
     def __post_init__(self) -> None:
         for name, known in CHOICES.items():
             if (given := getattr(self, name)) not in known:
                 raise ValueError(f"expected {name} to be one of {', '.join(known)}, got {given!r}")
-        for name in ("reward_jumps", "reward_peaks", "rates", "drop_inputs"):
+        for name in ("reward_jumps", "reward_peaks", "rates", "drop_inputs", "repeated_parts"):
             if not isinstance(given := getattr(self, name), bool):
                 raise ValueError(f"expected {name} to be true or false, got {given!r}")

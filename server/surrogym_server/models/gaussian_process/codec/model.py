@@ -28,10 +28,11 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 from surrogym_server.models.gaussian_process.prediction.regions import TERMINATION
 from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel
 
-FORMAT = 6
+FORMAT = 7
 JUMP = "jump"  # prefix of the names of its arrays
-# 1: a reward's timing was the definition's alone; 2: no drift; 3: no warp; 4: no rates; 5: no inputs left out
-READABLE = (1, 2, 3, 4, 5, 6)
+# 1: a reward's timing was the definition's alone; 2: no drift; 3: no warp; 4: no rates; 5: no inputs left out; 6: no
+# shared samples
+READABLE = (1, 2, 3, 4, 5, 6, 7)
 
 
 class GaussianProcessCodec(ModelCodec):

@@ -45,6 +45,7 @@ def require_output(definition: EnvironmentDefinition, output: OutputModel) -> No
     _require_warp(output)
     _require_rates(definition, output)
     _require_at_limit(definition, output)
+    _require_shared(definition, output)
     _require_shapes(definition, output)
     _require_numbers(output)
 
@@ -62,6 +63,7 @@ def output_header(output: OutputModel) -> dict[str, Any]:
         "warp": None if output.warp is None else asdict(output.warp),
         "past_limits": output.past_limits,
         "at_limit": output.at_limit,
+        "shared": output.shared,
     }
     if (posterior := output.posterior) is not None:
         hyper = posterior.hyper
@@ -109,7 +111,10 @@ def read_output(
     name, left_out, warp = str(entry["name"]), int(entry["left_out"]), _warp(entry.get("warp"))
     past_limits = bool(entry.get("past_limits", False))
     at_limit = tuple(int(side) for side in entry.get("at_limit", ()))
-    return OutputModel(name, feature_map, posterior, centre, scale, left_out, scores, warp, past_limits, at_limit)
+    shared = tuple(str(other) for other in entry.get("shared", ()))
+    return OutputModel(
+        name, feature_map, posterior, centre, scale, left_out, scores, warp, past_limits, at_limit, shared
+    )
 
 
 def _warp(entry: dict[str, Any] | None) -> Warp | None:
@@ -190,6 +195,13 @@ def _require_at_limit(definition: EnvironmentDefinition, output: OutputModel) ->
     count = 0 if output.posterior is None else len(output.posterior.y)
     if output.name not in definition.outputs[:-1] or len(sides) != count or not set(sides) <= {-1, 0, 1}:
         raise InvalidInput(f"output {output.name!r}: expected a side, -1, 0 or 1, for each of {count} points")
+
+
+def _require_shared(definition: EnvironmentDefinition, output: OutputModel) -> None:
+    """Check that only a transition shares samples, with other transitions."""
+    transitions = definition.outputs[:-1]
+    if output.shared and not {output.name, *output.shared} <= set(transitions):
+        raise InvalidInput(f"output {output.name!r}: expected to share samples with transitions, got {output.shared}")
 
 
 def _require_numbers(output: OutputModel) -> None:

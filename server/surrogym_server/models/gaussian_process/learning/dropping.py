@@ -34,6 +34,7 @@ def without_inputs(
         rows = spread(len(posterior.y), subsets.FEW)
         some = condition(posterior.hyper, posterior.x[rows], posterior.y[rows])
         found = select_inputs(some, learner.options(output.name), may, ODDS)
+        learner.selections[output.name] = found
         wins = found.gain > WIN * len(rows)
         return _with_fewer(learner, output, posterior, found) if wins else output
     except NumericalFailure:
@@ -51,7 +52,7 @@ def _of_many(
     found = learner.many.fewer_inputs(x, y, learner.options(output.name), posterior, may, ODDS)
     if found is None:
         return output
-    return replace(output, feature_map=_without(output.feature_map, found.kept), posterior=found.posterior)
+    return replace(output, feature_map=map_without(output.feature_map, found.kept), posterior=found.posterior)
 
 
 def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
@@ -73,7 +74,7 @@ def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
 def _with_fewer(learner: OutputLearner, output: OutputModel, posterior: Posterior, found: Selection) -> OutputModel:
     """The output with the inputs that were found, if with these all samples are foretold better by the others."""
     kept, x, y = found.kept, posterior.x[:, found.kept], posterior.y
-    feature_map = _without(output.feature_map, kept)
+    feature_map = map_without(output.feature_map, kept)
     if len(y) <= subsets.FEW:
         fewer = condition(found.hyper, x, y)
     else:
@@ -84,7 +85,7 @@ def _with_fewer(learner: OutputLearner, output: OutputModel, posterior: Posterio
     return replace(output, feature_map=feature_map, posterior=fewer, scores=scores)
 
 
-def _without(feature_map: FeatureMap, kept: Tensor) -> FeatureMap:
+def map_without(feature_map: FeatureMap, kept: Tensor) -> FeatureMap:
     """The map with the features kept (d,)."""
     rates = tuple(rate for rate, left in zip(feature_map.rates, kept.tolist(), strict=False) if left)
     return replace(feature_map, dropped=tuple((~kept).nonzero()[:, 0].tolist()), rates=rates)

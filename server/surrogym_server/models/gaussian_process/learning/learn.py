@@ -17,6 +17,7 @@ from surrogym_server.models.gaussian_process.learning.many import BySubsets, Man
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.rates import output_with_rates
 from surrogym_server.models.gaussian_process.learning.region import learn_termination
+from surrogym_server.models.gaussian_process.learning.repeats import with_samples_of_others
 from surrogym_server.models.gaussian_process.learning.reward import learn_reward
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
@@ -78,4 +79,4 @@ def _transitions(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
         used = more if output.past_limits else keep
         output = held(learner, output, target, inputs, used, side)
         outputs.append(without_inputs(learner, output, target, inputs, used))
-    return tuple(outputs)
+    return with_samples_of_others(learner, outputs)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import Censored, FitOptions, Fitted, Posterior, fit, spread, subsets
+from surrogym_server.gp import Censored, FitOptions, Fitted, Posterior, Selection, fit, spread, subsets
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.learning.many import EXPLAINED, BySubsets, ManySamples
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
@@ -37,6 +37,7 @@ class OutputLearner:
     warm: Warm  # hyperparameters of earlier fits by "output|feature map"
     thetas: dict[str, NDArray[np.float64]]  # hyperparameters of this fit
     many: ManySamples = field(default_factory=BySubsets)  # what is done with more than ``subsets.FEW`` samples
+    selections: dict[str, Selection] = field(default_factory=dict)  # inputs that evidence alone keeps, by output
 
     def allowed(self, maps: tuple[FeatureMap, ...]) -> tuple[FeatureMap, ...]:
         """The maps that the settings allow to compare."""

@@ -36,6 +36,7 @@ def describe(definition: EnvironmentDefinition, output: OutputModel) -> dict[str
             "quadratic_variance": hyper.quadratic_variance,
             "noise_variance": hyper.noise_variance,
             "jitter": output.posterior.jitter,
+            "shares_samples_with": list(output.shared),
         }
         if (sparse := output.posterior.sparse) is not None:
             prior = hyper.signal_variance + hyper.linear_variance
@@ -60,4 +61,5 @@ def structure(output: OutputModel) -> str:
     if output.posterior is None:
         return "constant"
     learned = "" if output.warp is None else f"{output.warp}: "
-    return f"{learned}{output.posterior.hyper.kernel} on {output.feature_map}"
+    shared = f", with samples of {', '.join(output.shared)}" if output.shared else ""
+    return f"{learned}{output.posterior.hyper.kernel} on {output.feature_map}{shared}"

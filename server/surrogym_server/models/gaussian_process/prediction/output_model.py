@@ -34,6 +34,7 @@ class OutputModel:
     warp: Warp | None = None
     past_limits: bool = False  # whether it was learned from samples that ended at a limit of another coordinate
     at_limit: tuple[int, ...] = ()  # for each point: 1 or -1 if it observes the upper or lower limit; () if none does
+    shared: tuple[str, ...] = ()  # outputs whose samples it learned from as well, see ``gp.pooling``
 
     def mean(self, x: Tensor) -> Tensor:
         """Posterior mean at features x (m, d), in the output's unit, (m,)."""

@@ -1,0 +1,101 @@
+"""Choice by evidence which outputs do the same with inputs of their own and share samples, see ``gp.pooling``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from surrogym_server.errors import NumericalFailure
+from surrogym_server.gp import Part, Pool, condition, pools, subsets
+from surrogym_server.models.gaussian_process.feature_maps import reflection
+from surrogym_server.models.gaussian_process.learning.dropping import WIN, map_without
+from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner, is_unexplained
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+
+ROLES = 4  # most inputs of a function that is shared
+MOST = subsets.FEW  # samples of its own and of others, beyond which those of others become fewer
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """An output that may share samples."""
+
+    place: int
+    output: OutputModel
+    part: Part
+    every: tuple[int, ...]  # places, in the map that drops nothing, of the inputs of ``part``
+
+
+def with_samples_of_others(learner: OutputLearner, outputs: Sequence[OutputModel]) -> tuple[OutputModel, ...]:
+    """The outputs, of which those that repeat each other learn from each other's samples too."""
+    shared = list(outputs)
+    if not learner.settings.repeated_parts or not any(_is_to_learn(learner, output) for output in outputs):
+        return tuple(shared)
+    found = [made for place, output in enumerate(outputs) if (made := _candidate(learner, place, output)) is not None]
+    try:
+        together = pools([made.part for made in found], ROLES)
+    except NumericalFailure:
+        return tuple(shared)
+    for pool in together:
+        if pool.gain > WIN * max(len(part.y) for part in pool.parts):
+            members = [found[number] for number in pool.numbers]
+            for member, made in enumerate(members):
+                shared[made.place] = _sharing(members, pool, member)
+    return tuple(shared)
+
+
+def _is_to_learn(learner: OutputLearner, output: OutputModel) -> bool:
+    """Whether something is left to explain, where the inputs of the output were looked at."""
+    unexplained = output.posterior is not None and is_unexplained(output.posterior)
+    return unexplained and output.name in learner.selections
+
+
+def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Candidate | None:
+    """The output with its process; None if it can't share samples."""
+    posterior, selection, chosen = output.posterior, learner.selections.get(output.name), output.feature_map
+    if posterior is None or posterior.sparse is not None or chosen.rates or output.at_limit:
+        return None
+    if selection is None and not chosen.dropped:
+        return None
+    mirror = reflection(learner.definition, replace(chosen, parity="odd"))
+    kept = torch.ones(posterior.x.shape[1], dtype=torch.bool)
+    hyper = posterior.hyper
+    if not chosen.dropped and selection is not None:
+        kept, hyper = selection.kept, selection.hyper
+    count = posterior.x.shape[1] + len(chosen.dropped)
+    part = Part(
+        posterior.x,
+        posterior.y,
+        posterior.hyper,
+        output.centre,
+        output.scale,
+        learner.options(output.name),
+        tuple(kept.nonzero()[:, 0].tolist()),
+        hyper,
+        None if mirror is None else mirror.signs,
+    )
+    return _Candidate(place, output, part, tuple(i for i in range(count) if i not in chosen.dropped))
+
+
+def _sharing(members: Sequence[_Candidate], pool: Pool, member: int) -> OutputModel:
+    """A member with the samples of its pool, if its own are foretold no worse by them."""
+    made, output = members[member], members[member].output
+    assert output.posterior is not None
+    x, y, hyper = pool.samples_of(member, MOST)
+    try:
+        posterior = condition(hyper, x, y)
+    except NumericalFailure:
+        return output
+    foretold, _ = posterior.leave_one_out()
+    off = (foretold - y)[: len(made.part.y)].square().mean().sqrt()
+    if float(off) > output.posterior.left_out.error:
+        return output
+    whole = replace(output.feature_map, dropped=(), parity=members[0].output.feature_map.parity)
+    kept = torch.zeros(len(made.every) + len(output.feature_map.dropped), dtype=torch.bool)
+    kept[[made.every[place] for place in pool.inputs[member]]] = True
+    others = tuple(other.output.name for other in members if other is not made)
+    scores = (*output.scores, (str(chosen := map_without(whole, kept)), pool.gain))
+    centre = pool.parts[0].centre
+    return replace(output, feature_map=chosen, posterior=posterior, centre=centre, scores=scores, shared=others)
