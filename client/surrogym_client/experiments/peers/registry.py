@@ -77,12 +77,19 @@ def _world_model() -> Peer:
     return WorldModel()
 
 
+def _bayesian_network() -> Peer:
+    from surrogym_client.experiments.peers.methods.bayesian_network import BayesianNetwork
+
+    return BayesianNetwork()
+
+
 METHODS = {
     "pilco": Method("PILCO: Gaussian processes, moment matching, gradients", _pilco),
     "black_drops": Method("Black-DROPS: Gaussian processes, sampled rollouts, CMA-ES", _black_drops),
     "pets": Method("PETS: ensemble of networks, planning by the cross-entropy method", _pets, episodes=10),
     "mbpo": Method("MBPO: ensemble of networks, soft actor-critic on short rollouts", _mbpo),
     "world_model": Method("recurrent world model: mixture density network, CMA-ES in its dream", _world_model),
+    "bayesian_network": Method("a Bayesian network in PILCO's loop: dropout, particles, gradients", _bayesian_network),
     "sac": Method("soft actor-critic of Stable-Baselines3, model-free", _sac, budget=20_000),
     "ppo": Method("proximal policy optimisation of Stable-Baselines3, model-free", _ppo, budget=100_000),
 }
