@@ -17,7 +17,7 @@ from surrogym_client.experiments.peers.points import Point
 from surrogym_client.experiments.peers.registry import METHODS, OURS, task_of
 
 PALETTE = (*(f"C{place}" for place in range(10)), "navy")
-COLOURS = dict(zip((*OURS, *METHODS), PALETTE, strict=True))
+COLOURS = dict(zip((*OURS, *METHODS), PALETTE, strict=False))  # any further one is grey
 SIZE = (7.0, 4.0)  # inches
 
 
