@@ -46,7 +46,7 @@ def imagined():
 def test_a_resting_cart_earns_each_step():
     made = imagined()
     theta = np.random.default_rng(1).uniform(-1, 1, (3, made.size))
-    np.testing.assert_allclose(made.returns(theta, np.random.default_rng(2)), 100.0)
+    np.testing.assert_allclose(made.returns(theta, np.random.default_rng(2)), 500.0)
 
 
 def test_all_policies_are_batched_as_one():

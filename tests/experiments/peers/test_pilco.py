@@ -26,7 +26,7 @@ def model():
 
 def parameters(basis=6):
     rng = np.random.default_rng(1)
-    theta = pilco._first_parameters(STATES, pilco.start_beliefs(SPEC, 4)[0], basis, rng)
+    theta = pilco._first_parameters(STATES, pilco.start_beliefs(SPEC, 4), pilco.Settings(basis), rng)
     return theta + 0.3 * rng.standard_normal(len(theta))
 
 

@@ -1,5 +1,7 @@
 """A finished cell is not run again, a failed one is, and every cell says why it ended."""
 
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -119,3 +121,16 @@ def test_a_memory_does_not_reach_the_second_evaluation(monkeypatch, tmp_path):
     monkeypatch.setitem(METHODS, "remembering", Method("", Learned, budget=100))
     (point,) = run_cell(PeerCell("cartpole", "remembering", 0, episodes=2), tmp_path)
     assert point.ended == REACHED
+
+
+def test_a_cell_computes_in_one_thread_in_libraries_that_load_later_too():
+    """SciPy's own BLAS loads with the methods. Its second thread would wait by spinning, and the wait would count."""
+    code = """
+from surrogym_client.experiments.peers import study
+study._single_thread()
+import scipy.linalg
+from threadpoolctl import threadpool_info
+print(sorted({pool["num_threads"] for pool in threadpool_info()}))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[1]\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from copy import deepcopy
@@ -168,6 +169,12 @@ def _outcome(result: Evaluation) -> Outcome:
 
 
 def _single_thread() -> None:
+    """Let every library compute in one thread: those loaded here at once, and those loaded later by the environment.
+
+    SciPy has its own BLAS. Its threads wait for each other by spinning, which costs more than it gains.
+    """
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
     import torch
     from threadpoolctl import threadpool_limits
 

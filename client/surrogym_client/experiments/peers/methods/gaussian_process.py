@@ -19,7 +19,7 @@ from torch import Tensor
 from surrogym_client.original.protocol import Array
 
 MOST = 300  # samples; PILCO's authors take 300 inducing points beyond, we take a random subset
-SIGNAL_TO_NOISE, SPREAD, POWER = 500.0, 100.0, 30  # limits of hyperparameters as in the authors' penalty
+SIGNAL_TO_NOISE, SPREAD, POWER = 1_000.0, 100.0, 30  # limits of hyperparameters as in the authors' penalty
 ITERATIONS = 200
 JITTER = 1e-9  # relative to the signal's variance
 BLOCK = 64  # rows of a factor's inverse that are multiplied at once
@@ -198,7 +198,7 @@ def negative_log_evidence(x: Array, y: Array, theta: Array) -> tuple[float, Arra
 
 
 def _penalty(theta: Array, spread: Array) -> tuple[float, Array]:
-    """A penalty and its gradient. It grows steeply where the signal is 500 times the noise, or a length scale 100
+    """A penalty and its gradient. It grows steeply where the signal is 1,000 times the noise, or a length scale 100
     times the inputs' deviation or a hundredth of it (the authors' ``hypCurb``)."""
     over = np.append((theta[:-2] - np.log(spread)) / np.log(SPREAD), (theta[-2] - theta[-1]) / np.log(SIGNAL_TO_NOISE))
     slope = POWER * over ** (POWER - 1) / np.append(np.full(len(spread), np.log(SPREAD)), np.log(SIGNAL_TO_NOISE))

@@ -33,7 +33,8 @@ class Settings:
 
     basis: int = 50
     iterations: int = 150  # of L-BFGS after each episode; the authors' line searches
-    horizon: int = 60  # the longest
+    horizon: int = 100  # the longest
+    spread: float = 1.0  # of the first centres around the starts; 0, the authors', found a local optimum more often
     modes: int = 4  # normal distributions that cover starts anywhere on a circle; the paper has one start
 
 
@@ -51,7 +52,7 @@ class Pilco:
         torch.manual_seed(seed)
         horizon = min(known.horizon, self._settings.horizon)
         beliefs = start_beliefs(real.spec, self._settings.modes)
-        theta = _first_parameters(states, beliefs[0], self._settings.basis, rng)
+        theta = _first_parameters(states, beliefs, self._settings, rng)
         control, data = random_control(states, rng), list[Transitions]()
         while True:
             data.append(episode(real, states, control, horizon, known.repeat))
@@ -84,10 +85,17 @@ def _modes(start: Uniform | Normal | Fixed, modes: int) -> tuple[Array, float]:
             return np.array([low + width * (place + 0.5) for place in range(count)]), float(width / np.sqrt(12))
 
 
-def _first_parameters(states: States, starts: Tensor, basis: int, rng: np.random.Generator) -> Array:
-    """Centres near the starts, small random targets, and length scales of one, or 0.7 for features of angles."""
-    featured = states.featured(starts.numpy())
-    centres = featured[rng.integers(len(featured), size=basis)] + rng.standard_normal((basis, states.features))
+def _first_parameters(
+    states: States, starts: tuple[Tensor, Tensor], settings: Settings, rng: np.random.Generator
+) -> Array:
+    """Centres around the starts (means (K, C), covariances (K, C, C)), small random targets, and length scales of one,
+    or 0.7 for features of angles."""
+    basis = settings.basis
+    means, covariances = (part.numpy() for part in starts)
+    drawn = rng.integers(len(means), size=basis)
+    spread = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))  # the covariances are diagonal
+    at = states.featured(means[drawn] + spread[drawn] * rng.standard_normal((basis, means.shape[1])))
+    centres = at + settings.spread * rng.standard_normal(at.shape)
     targets = 0.1 * rng.standard_normal((basis, states.controls))
     linear = int((~states.angles).sum())
     scales = np.where(np.arange(states.features) < linear, 1.0, 0.7)

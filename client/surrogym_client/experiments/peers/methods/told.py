@@ -101,6 +101,11 @@ def _rod(q: Array, u: Array, reached: Array) -> Array:
     return figures.reward(reached)
 
 
+def _mujoco_cart(q: Array, u: Array, reached: Array) -> Array:
+    del q
+    return figures.cart_reward(reached, figures.CART_CONTROL * u)
+
+
 def _acrobot(q: Array, u: Array, reached: Array) -> Array:
     del q, u
     height = -np.cos(reached[:, 0]) - np.cos(reached[:, 0] + reached[:, 1])
@@ -138,6 +143,7 @@ TOLD = {
         repeat=2,
     ),
     figures.NAME: Told(_rod, _pendulum_cost(upright=-1.0), horizon=40),
+    figures.CART_NAME: Told(_mujoco_cart, None, horizon=figures.CART_STEPS),
     "CartPole-v1": Told(
         _one,
         TipCost(  # the cart's position, and ten times the pole's angle
@@ -148,7 +154,7 @@ TOLD = {
             goal=np.zeros(2),
             width=1.0,
         ),
-        horizon=100,
+        horizon=500,
     ),
     SWING_UP: Told(_swing_up(WIDTH["smooth"]), _swing_up_cost(WIDTH["smooth"]), horizon=40),
     SWING_UP_NARROW: Told(_swing_up(WIDTH["narrow"]), _swing_up_cost(WIDTH["narrow"]), horizon=40),
@@ -162,6 +168,6 @@ TOLD = {
             goal=np.array([0, 2.0]),
             width=1.0,
         ),
-        horizon=50,
+        horizon=100,
     ),
 }
