@@ -12,7 +12,9 @@ from surrogym_client.experiments.peers.port import BudgetSpent, Clock, Real
 from surrogym_client.original import make
 from surrogym_client.original.episodes import open_episode
 
-SMALL = Settings(hidden=(32, 32), decay=(0.0, 0.0, 0.0), explore=40, every=20, rollouts=20, updates=2, batch=32)
+SMALL = Settings(
+    hidden=(32, 32), decay=(0.0, 0.0, 0.0), epoch=1, explore=40, every=20, rollouts=20, updates=2, batch=32
+)
 
 
 def samples(n=2_000):
@@ -28,7 +30,7 @@ def ensemble(networks=4):
 def test_training_ends_by_itself_and_the_elites_are_the_best_on_held_out_samples():
     x, y = samples()
     model = ensemble()
-    trained = fit(model, torch.optim.Adam(model.parameters(), 3e-3), x, y, 2, np.random.default_rng(0), lambda: None)
+    trained = fit(model, torch.optim.Adam(model.parameters(), 3e-3), x, y, 2, 1, np.random.default_rng(0), lambda: None)
     errors = held_out(model, x, y)
     assert errors.max() < 0.01
     assert len(trained.elites) == 2
@@ -40,7 +42,7 @@ def test_a_training_that_makes_networks_worse_leaves_them_as_they_were():
     x, y = samples(200)  # one step an epoch
     model = ensemble()
     model.scale_by(x)
-    fit(model, torch.optim.Adam(model.parameters(), 3e-3), x, y, 2, np.random.default_rng(0), lambda: None)
+    fit(model, torch.optim.Adam(model.parameters(), 3e-3), x, y, 2, 1, np.random.default_rng(0), lambda: None)
     before = [part.detach().clone() for part in model.weights]
     optimizer, steps = torch.optim.SGD(model.parameters(), 0.0), 0
 
@@ -49,10 +51,22 @@ def test_a_training_that_makes_networks_worse_leaves_them_as_they_were():
         steps += 1
         optimizer.param_groups[0]["lr"] = 0.0 if steps == 1 else 1.0
 
-    fit(model, optimizer, x, y, 2, np.random.default_rng(0), worse)
+    fit(model, optimizer, x, y, 2, 1, np.random.default_rng(0), worse)
     assert steps == 7  # the first epoch, five more, and the one after which it gives up
     for part, kept in zip(model.weights, before, strict=True):
         torch.testing.assert_close(part.detach(), kept)
+
+
+def test_an_epoch_of_few_samples_passes_them_several_times():
+    x, y = samples(500)  # two batches
+    model, steps = ensemble(), 0
+
+    def counted():
+        nonlocal steps
+        steps += 1
+
+    fit(model, torch.optim.SGD(model.parameters(), 0.0), x, y, 2, 5, np.random.default_rng(0), counted)
+    assert steps == 7 * 6  # seven epochs of three passes
 
 
 def test_draws_come_from_every_elite_and_from_no_other_network():

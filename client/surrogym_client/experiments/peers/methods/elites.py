@@ -52,6 +52,7 @@ def fit(
     x: Tensor,
     y: Tensor,
     elites: int,
+    least: int,
     rng: np.random.Generator,
     check: Callable[[], None],
 ) -> Trained:
@@ -64,6 +65,7 @@ def fit(
         optimizer: of its parameters.
         x, y: inputs (n, I) and outputs (n, E).
         elites: number of networks to keep, those with the smallest held-out errors.
+        least: steps of an epoch. With fewer batches than this, an epoch passes the samples several times.
         rng: random generator.
         check: called before each step.
     """
@@ -72,16 +74,18 @@ def fit(
     out, rest = order[:held], order[held:]
     model.scale_by(x[rest])
     chosen = rest[torch.from_numpy(rng.integers(len(rest), size=(networks, len(rest))))]
+    passes = -(-least // -(-len(rest) // BATCH))  # both divisions round up
     own = [*model.weights, *model.biases]
     kept, best = [part.detach().clone() for part in own], torch.full((networks,), torch.inf)
     waited = 0
     while waited <= PATIENCE:
-        for at in torch.split(chosen, BATCH, 1):
-            check()
-            optimizer.zero_grad()
-            model.loss(x[at], y[at]).backward()  # type: ignore[no-untyped-call]
-            optimizer.step()
-        chosen = torch.gather(chosen, 1, torch.from_numpy(rng.random(chosen.shape)).argsort(1))
+        for _ in range(passes):
+            for at in torch.split(chosen, BATCH, 1):
+                check()
+                optimizer.zero_grad()
+                model.loss(x[at], y[at]).backward()  # type: ignore[no-untyped-call]
+                optimizer.step()
+            chosen = torch.gather(chosen, 1, torch.from_numpy(rng.random(chosen.shape)).argsort(1))
         errors = held_out(model, x[out], y[out])
         better = ~(errors >= best * (1 - LEAST))
         best = torch.where(better, errors, best)
