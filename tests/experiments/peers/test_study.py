@@ -13,6 +13,7 @@ from surrogym_client.experiments.peers.points import BUDGET, REACHED, TIME
 from surrogym_client.experiments.peers.port import NotApplicable
 from surrogym_client.experiments.peers.registry import METHODS, Method, task_of
 from surrogym_client.experiments.peers.study import PeerCell, run_cell
+from surrogym_client.policies.predict import PerEpisode
 
 
 class Balancing:
@@ -95,6 +96,31 @@ def test_a_users_environment_is_a_task_without_a_target():
 def test_model_free_rounds_end_at_fixed_steps():
     assert goals(20_000) == [1_000, 2_000, 5_000, 10_000, 20_000]
     assert goals(700) == [700]
+
+
+class Forgetful(PerEpisode):
+    """Balances in its first 500 steps of an episode, and not after them, as a policy does that remembers an evaluation
+    before this one."""
+
+    def __init__(self) -> None:
+        self.steps: dict[int, int] = {}
+
+    def actions(self, episodes, observations):
+        self.steps |= {number: self.steps.get(number, 0) + 1 for number in episodes}
+        sign = np.array([1 if self.steps[number] <= 500 else -1 for number in episodes])
+        return (sign * (observations[:, 2] + 0.3 * observations[:, 3]) > 0).astype(float)[:, None]
+
+
+def test_a_memory_does_not_reach_the_second_evaluation(monkeypatch, tmp_path):
+    class Learned:
+        def learn(self, real, seed):
+            real.reset()
+            real.step(np.zeros(1))
+            yield Forgetful()
+
+    monkeypatch.setitem(METHODS, "remembering", Method("", Learned, budget=100))
+    (point,) = run_cell(PeerCell("cartpole", "remembering", 0, episodes=2), tmp_path)
+    assert point.ended == REACHED
 
 
 def test_a_cell_computes_in_one_thread_in_libraries_that_load_later_too():

@@ -51,8 +51,8 @@ def command(
     """Run other methods on our tasks, and draw learning curves.
 
     The folder --out gets points.csv, peers.md and a picture of each task. A finished run is not repeated, so the same
-    command continues after Ctrl-C. docs/results/peers.md has the rules. The methods default and latin_hypercube are
-    ours; their runs come from files of rows, which surrogym reproduce efficiency writes.
+    command continues after Ctrl-C. docs/results/peers.md has the rules. The methods default, latin_hypercube and
+    barl are ours; their runs come from files of rows, which surrogym reproduce efficiency writes.
 
     Example: surrogym reproduce peers --tasks pendulum --methods sac,ppo --seeds 3
 

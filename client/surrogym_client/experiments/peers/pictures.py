@@ -16,7 +16,8 @@ from surrogym_client.experiments.peers.curves import by_method, curve
 from surrogym_client.experiments.peers.points import Point
 from surrogym_client.experiments.peers.registry import METHODS, OURS, task_of
 
-COLOURS = {name: f"C{place}" for place, name in enumerate((*OURS, *METHODS))}
+PALETTE = (*(f"C{place}" for place in range(10)), "navy")
+COLOURS = dict(zip((*OURS, *METHODS), PALETTE, strict=False))  # any further one is grey
 SIZE = (7.0, 4.0)  # inches
 
 

@@ -9,7 +9,7 @@ from surrogym_client.experiments.peers.port import Peer
 from surrogym_client.experiments.tasks import EVERY_TASK, DemoTask, Target
 from surrogym_client.original.loading import has_specification
 
-OURS = ("default", "latin_hypercube")  # arms of the efficiency study
+OURS = ("default", "latin_hypercube", "barl")  # arms of the efficiency study
 CORE = ("pendulum", "cartpole", "swingup", "acrobot")
 SHARE, LEAST = 10, 1_000  # a peer's real steps: this many times ours, and at least as many
 OWN_BUDGET = 100  # real steps of ours for a task that is none of the demo
@@ -65,10 +65,31 @@ def _pets() -> Peer:
     return Pets()
 
 
+def _mbpo() -> Peer:
+    from surrogym_client.experiments.peers.methods.mbpo import Mbpo
+
+    return Mbpo()
+
+
+def _world_model() -> Peer:
+    from surrogym_client.experiments.peers.methods.world_model import WorldModel
+
+    return WorldModel()
+
+
+def _bayesian_network() -> Peer:
+    from surrogym_client.experiments.peers.methods.bayesian_network import BayesianNetwork
+
+    return BayesianNetwork()
+
+
 METHODS = {
     "pilco": Method("PILCO: Gaussian processes, moment matching, gradients", _pilco),
     "black_drops": Method("Black-DROPS: Gaussian processes, sampled rollouts, CMA-ES", _black_drops),
     "pets": Method("PETS: ensemble of networks, planning by the cross-entropy method", _pets, episodes=10),
+    "mbpo": Method("MBPO: ensemble of networks, soft actor-critic on short rollouts", _mbpo),
+    "world_model": Method("recurrent world model: mixture density network, CMA-ES in its dream", _world_model),
+    "bayesian_network": Method("a Bayesian network in PILCO's loop: dropout, particles, gradients", _bayesian_network),
     "sac": Method("soft actor-critic of Stable-Baselines3, model-free", _sac, budget=20_000),
     "ppo": Method("proximal policy optimisation of Stable-Baselines3, model-free", _ppo, budget=100_000),
 }

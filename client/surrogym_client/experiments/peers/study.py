@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from multiprocessing import active_children, get_context
@@ -143,7 +144,7 @@ def _rounds(cell: PeerCell, begun: Point) -> Iterator[Point]:
 def _judged(point: Point, policy: Acting, opener: Callable[[], Episode], task: DemoTask, episodes: int) -> Point:
     """The point with what the policy earns, and with the end of its cell if it reaches the target."""
     plain = EvaluationSettings(episodes=episodes)
-    real = evaluate(policy, opener, plain)
+    real = evaluate(deepcopy(policy), opener, plain)  # a memory of its episodes must not enter the second evaluation
     reached = has_target(task.target) and replace(task.target, also_success=None).reached(_outcome(real))
     if reached and task.also is not None and task.target.also_success is not None:
         other = replace(plain, wide=task.also.wide, start_scale=task.also.scale)
