@@ -114,7 +114,7 @@ class SurrogateVecEnv(VecEnv):
         for lane in result.final_lanes:
             self.reset_infos[lane] = {"model_version": int(result.model_version[lane])}
         infos = _infos(step)
-        if self._lanes.view.penalty > 0:
+        if self._lanes.penalised:
             self._penalty += result.reward_mean - result.reward
             for lane in np.flatnonzero(done):
                 infos[lane]["penalty"] = float(self._penalty[lane])

@@ -222,6 +222,15 @@ def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum
     differing = evaluated.json["disagreements"]
     assert ledger.evaluation == 1800
     assert ledger.logged == differing["learned"] == min(4, len(differing["steps"]))
+    every = on_server("evaluate", "policy.zip", "--episodes", "2", "--learn-all", "--wait", "100", "--json", "--quiet")
+    with Api(server_process.url) as api:
+        view = api.surrogate(pendulum)
+    new = every.json["disagreements"]["learned"]
+    assert 400 - ledger.logged <= new <= 400, "all steps of two episodes, less those of the same starts above"
+    assert view.ledger.logged == ledger.logged + new
+    assert view.fidelity.samples == view.samples, "the command waits for the model that has learned from them"
+    both = on_server("evaluate", "policy.zip", "--learn", "4", "--learn-all")
+    assert (both.code, "expected --learn or --learn-all, got both" in both.err) == (1, True)
     few = on_server("evaluate", "policy.zip", "--episodes", "3")
     assert few.out.splitlines()[2] == "3 episodes are too few to judge the promise: take 30 or more"
     unaudited = on_server("audit", "policy.zip")  # the sampler has ended

@@ -82,6 +82,7 @@ OTHERWISE = {
     "docs/how-to/history.md": "tests/docs/test_how_to.py runs its programs",
     "docs/how-to/snapshots.md": "tests/docs/test_how_to.py runs its program",
     "docs/how-to/models.md": "test_benchmarks imports its benchmark",
+    "docs/how-to/rounds.md": "tests/cli/test_commands.py, as its rounds take an hour",
     "docs/how-to/ray.md": "tests/cli/test_sampling_on_ray.py reads such a runtime environment",
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
     "docs/how-to/work.md": "tests/work and tests/cli/test_jobs.py run its commands",

@@ -62,7 +62,9 @@ def test_the_interval_holds_the_mean_of_new_starts_nine_times_in_ten(between: fl
 def test_a_promise_leaves_the_penalty_out_and_repeats(pendulum_server):
     with HttpSurrogate(pendulum_server.url, "pendulum") as port:
         still = lambda observation: np.zeros((len(observation), 1))  # noqa: E731
-        plain, penalised, again = (promise_of(port, still, 3, options) for options in ({}, {"penalty": 5.0}, {}))
+        plain, penalised, again = (
+            promise_of(port, still, 3, options) for options in ({}, {"penalty": 5.0, "caution": 2.0}, {})
+        )
         other = promise_of(port, still, 4)
     assert plain == penalised == again
     assert plain != other

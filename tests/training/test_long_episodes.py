@@ -93,8 +93,10 @@ def test_the_noise_of_a_long_training_stays(prolong: bool, tmp_path: Path):
         {"termination": ((FAR,),)},
         {"settings": TrainSettings(start_box=0.5)},
         {"settings": TrainSettings(session={"time_limit": 150})},
+        {"settings": TrainSettings(horizon=20)},
+        {"settings": TrainSettings(start_visited=0.5)},
     ],
-    ids=["short episodes", "no time limit", "termination", "chosen starts", "chosen time limit"],
+    ids=["short episodes", "no time limit", "termination", "chosen starts", "chosen limit", "horizon", "visited"],
 )
 def test_another_training_is_unchanged(other: dict[str, Any]):
     given = task(**other)

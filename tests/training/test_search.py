@@ -39,3 +39,23 @@ def test_a_tracker_is_refused_where_nothing_is_logged():
         ValueError, match="FASTPPO supports no tracker: expected none, or another algorithm, got mlflow"
     ):
         search_for(TrainSettings("fastppo", tracker="mlflow"))
+
+
+@pytest.mark.parametrize("algorithm", ["cmaes", "gradient"])
+@pytest.mark.parametrize("chosen", [{"start_visited": 0.5}, {"horizon": 20}], ids=["visited starts", "horizon"])
+def test_searches_over_whole_episodes_refuse_parts_of_them(algorithm: str, chosen: dict):
+    with pytest.raises(ValueError, match="runs whole episodes: expected no start_visited or horizon"):
+        search_for(TrainSettings(algorithm=algorithm, **chosen))
+    search_for(TrainSettings(algorithm="fastppo", **chosen))
+
+
+def test_visited_starts_replace_those_anywhere_unless_both_are_chosen():
+    assert TrainSettings(start_visited=0.5, horizon=20).learning == {
+        "seed": 0,
+        "start_box": 0.0,
+        "start_visited": 0.5,
+        "time_limit": 20,
+    }
+    both = TrainSettings(start_visited=0.5, start_box=0.25).learning
+    assert (both["start_box"], both["start_visited"]) == (0.25, 0.5)
+    assert "time_limit" not in TrainSettings(start_visited=0.5, horizon=20).judging, "policies run whole episodes"

@@ -184,6 +184,7 @@ def test_imagined_returns_are_whole_episodes_from_the_declared_starts(surrogate)
     assert returns.shape == (8,)
     assert ((returns > -2_000) & (returns < -400)).all(), "a free pendulum earns that in 200 steps"
     np.testing.assert_array_equal(returns, imagined_returns(surrogate, nothing, 8, seed=3, start_box=1.0, trust=1e-9))
+    np.testing.assert_array_equal(returns, imagined_returns(surrogate, nothing, 8, seed=3, start_visited=1.0))
     assert not surrogate._sessions
 
 

@@ -36,18 +36,39 @@ class Differences:
             "they cost no real step and none of the budget.",
         ),
     ] = 0
+    learn_all: Annotated[
+        bool,
+        typer.Option(
+            "--learn-all",
+            help="Add every step of the episodes to the surrogate's samples, also those that the model predicts. They "
+            "cost no further real step and none of the budget.",
+        ),
+    ] = False
+    wait: Annotated[
+        float,
+        typer.Option(
+            min=0, help="Seconds to wait for the model that learns from these steps, with --learn or --learn-all."
+        ),
+    ] = 0.0
+
+    @property
+    def learns(self) -> bool:
+        return self.learn > 0 or self.learn_all
 
     def check(self, settings: EvaluationSettings) -> None:
         """Refuse to learn from an environment that was changed on purpose.
 
         Raises:
-            CommandError: ``--learn`` was given together with ``--perturb``.
+            CommandError: ``--learn`` or ``--learn-all`` was given together with ``--perturb``, or with each other.
         """
         from surrogym_client.cli.errors import CommandError
 
-        if self.learn and settings.perturb:
+        if self.learn and self.learn_all:
+            raise CommandError("expected --learn or --learn-all, got both; give one of the two")
+        if self.learns and settings.perturb:
+            option = "--learn-all" if self.learn_all else "--learn"
             raise CommandError(
-                "expected --learn with the environment as it is, got --perturb, which changes it; give one of the two"
+                f"expected {option} with the environment as it is, got --perturb, which changes it; give one of the two"
             )
 
     def between(
@@ -69,14 +90,19 @@ class Differences:
         from surrogym_client.errors import SurrogymClientError
         from surrogym_shared.terminal import say
 
-        if not (self.where or self.learn or left(promise, result)):
+        if not (self.where or self.learns or left(promise, result)):
             return None
         if surrogate is None:
-            say("not compared with a model: expected --surrogate, got none", quiet=quiet or not self.learn)
+            say("not compared with a model: expected --surrogate, got none", quiet=quiet or not self.learns)
             return None
         try:
             with connect(server, token) as api:
-                return _compare(api, surrogate, result, settings.first_seed, self.learn)
+                found = _compare(api, surrogate, result, settings.first_seed, self.learn)
+                if found is not None and self.learn_all:
+                    found = replace(found, learned=_learn_all(api, surrogate, result), all_steps=True)
+                if found is not None and found.learned and self.wait:
+                    _await_model(api, surrogate, self.wait, quiet=quiet)
+                return found
         except SurrogymClientError as error:
             say(f"not compared with the model of {surrogate!r}: {error}", quiet=quiet)
             return None
@@ -112,6 +138,32 @@ def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, lear
     return differing
 
 
+def _learn_all(api: Api, surrogate: str, result: Evaluation) -> int:
+    """Add all real steps to the surrogate's samples, and return how many were new."""
+    from surrogym_client.evaluation.comparing import as_samples, steady, steps_of
+
+    spec = api.surrogate(surrogate).spec
+    steps = [step for step in steps_of(result.traces, result.steps) if spec.known(step.coordinates)]
+    samples = as_samples(steady(spec, steps))
+    if not samples:
+        return 0
+    added = api.add_samples(surrogate, "evaluate", samples, purpose="logged")
+    return len(added.sample_ids) - added.duplicates
+
+
+def _await_model(api: Api, surrogate: str, seconds: float, *, quiet: bool) -> None:
+    """Wait until the server has fitted a model to all samples. If that takes too long, say so."""
+    from surrogym_client.surrogates.waiting import DesignUnfinished, wait_for_model, words_of_design
+    from surrogym_shared.terminal import on_interrupt, progress, say
+
+    stays = f"interrupted while the server fits the model; surrogym status {surrogate} shows it"
+    try:
+        with on_interrupt(lambda: stays), progress("fit", quiet=quiet) as update:
+            wait_for_model(api, surrogate, seconds, lambda view: update(None, words_of_design(view)))
+    except DesignUnfinished as error:
+        say(str(error), quiet=quiet)
+
+
 @dataclass(frozen=True)
 class Differing:
     """Steps at which reality and the model disagree.
@@ -119,7 +171,8 @@ class Differing:
     Attributes:
         found: the steps.
         first_seed: reset seed of the first episode; each further episode has the next one.
-        learned: number of these steps that were added to the surrogate's samples.
+        learned: number of steps that were added to the surrogate's samples.
+        all_steps: whether these are all steps, and not only those at which the two disagree.
         changed: names of the constants that changed within an episode.
         left_out: number of steps within which one of them changed. They are not compared, because a model keeps
             constants.
@@ -130,6 +183,7 @@ class Differing:
     learned: int = 0
     changed: tuple[str, ...] = ()
     left_out: int = 0
+    all_steps: bool = False
 
     def in_words(self, spec: EnvironmentSpec | None) -> list[str]:
         """Return one line about all steps, one for each of the worst episodes, and one for each of the worst steps."""
@@ -138,7 +192,7 @@ class Differing:
         found = self.found
         if not found.found:
             none = f"none of {found.compared} real steps differs from the model by more than the model's uncertainty"
-            return [none, *self._left_out()]
+            return [none, *self._left_out(), *self._learned()]
         count = len(found.found)
         lines = [
             f"{count} of {found.compared} real steps differ{'s' * (count == 1)} from the model by more than the "
@@ -152,10 +206,7 @@ class Differing:
             )
         names = () if spec is None else spec.coordinate_names
         lines += [f"  {self._at(one, names)}" for one in found.found[:SHOWN]]
-        lines += self._left_out()
-        if self.learned:
-            lines.append(f"the model learns from {self.learned} of these steps; train again in the new model")
-        return lines
+        return [*lines, *self._left_out(), *self._learned()]
 
     def as_json(self) -> dict[str, Any]:
         """Return all disagreements as JSON."""
@@ -189,6 +240,13 @@ class Differing:
         steps = "1 real step, in which" if self.left_out == 1 else f"{self.left_out} real steps, in each of which"
         names = " or ".join(self.changed) or "a constant"
         return [f"not compared: {steps} {names} changed, because the model keeps it constant"]
+
+    def _learned(self) -> list[str]:
+        """Say from how many steps the model learns. Nothing without any."""
+        if not self.learned:
+            return []
+        which = "real steps" if self.all_steps else "of these steps"
+        return [f"the model learns from {self.learned} {which}; train again in the new model"]
 
     def _at(self, one: Disagreement, names: Sequence[str]) -> str:
         count = len(one.step.coordinates)

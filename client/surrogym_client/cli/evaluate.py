@@ -121,7 +121,7 @@ def command(
     The real steps count in the surrogate's ledger. The server stores the policy and the episodes; if it does not
     answer, they wait beside the policy until surrogym policy push. If the mean return lies outside the promise's
     interval, the command compares the steps with the model and shows the states at which the two disagree. With
-    --learn, the model learns from these steps.
+    --learn, the model learns from these steps; with --learn-all, from every step.
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
 

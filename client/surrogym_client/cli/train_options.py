@@ -116,6 +116,14 @@ class SessionOptions:
             "output's standard deviation in the samples. [default: no limit]"
         ),
     ] = None
+    caution: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            help="Subtract CAUTION times the model's doubt from each reward. The doubt is the largest ratio that "
+            "--trust looks at, times the reward's standard deviation in the samples. [default: 0]",
+        ),
+    ] = None
     penalty: Annotated[
         float | None,
         typer.Option(
@@ -153,6 +161,24 @@ class StartOptions:
             max=1,
             help="Share of episodes that start anywhere in the sampling range, between 0 and 1. The others start "
             "where the specification says. [default: 0.5; 0 if all samples come from a log]",
+        ),
+    ] = None
+    start_visited: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            max=1,
+            help="Share of episodes that start at a state at which a real step was taken, between 0 and 1. Then no "
+            "episode starts anywhere in the sampling range unless --start-box is given. Not with cmaes or gradient. "
+            "[default: 0]",
+        ),
+    ] = None
+    horizon: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Longest episode of the training, in virtual steps. The critic values what would follow. Policies "
+            "are still compared over whole episodes. Not with cmaes or gradient. [default: the time limit]",
         ),
     ] = None
     start_from: Annotated[Path | None, typer.Option(help="Policy file to continue the training from.")] = None

@@ -102,6 +102,11 @@ class Lanes:
         return self._request.num_envs
 
     @property
+    def penalised(self) -> bool:
+        """Whether rewards are lowered where the model is unsure."""
+        return self.view.penalty > 0 or self._request.caution > 0
+
+    @property
     def mode(self) -> AutoresetMode:
         return self._request.autoreset_mode
 

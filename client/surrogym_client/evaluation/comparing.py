@@ -85,10 +85,10 @@ class StepOfEpisode:
     terminated: bool
 
 
-def steps_of(traces: Sequence[Trace]) -> list[StepOfEpisode]:
-    """Return at most ``MOST`` steps of episodes, evenly spaced."""
+def steps_of(traces: Sequence[Trace], most: int = MOST) -> list[StepOfEpisode]:
+    """Return at most ``most`` steps of episodes, evenly spaced."""
     places = [(episode, t) for episode, trace in enumerate(traces) for t in range(len(trace.reward))]
-    kept = np.unique(np.linspace(0, len(places) - 1, min(len(places), MOST)).astype(int))
+    kept = np.unique(np.linspace(0, len(places) - 1, min(len(places), most)).astype(int))
     return [_step(traces[episode], episode, t) for episode, t in (places[i] for i in kept)]
 
 
@@ -174,7 +174,11 @@ def samples_of(found: Disagreements, most: int) -> list[NewSample]:
     for one in found.found:
         turn = rank[one.step.episode] = rank.get(one.step.episode, 0) + 1
         turns.append((turn, one.step))
-    chosen = [step for _, step in sorted(turns, key=lambda item: item[0])[:most]]
+    return as_samples([step for _, step in sorted(turns, key=lambda item: item[0])[:most]])
+
+
+def as_samples(steps: Sequence[StepOfEpisode]) -> list[NewSample]:
+    """Return the steps as samples."""
     return [
         NewSample(
             coordinates=list(step.coordinates),
@@ -183,5 +187,5 @@ def samples_of(found: Disagreements, most: int) -> list[NewSample]:
             reward=step.reward,
             terminated=step.terminated,
         )
-        for step in chosen
+        for step in steps
     ]

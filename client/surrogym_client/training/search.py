@@ -154,11 +154,13 @@ def search_for(settings: TrainSettings) -> PolicySearch:
 
     Raises:
         ValueError: the settings name no search, the name or a hyperparameter is unknown, or the search can't be
-            prolonged, tracked or started from a policy as the settings require.
+            prolonged, tracked or started from a policy, or chooses no starts and horizon, as the settings require.
     """
     name, kind = name_of(settings), SEARCHES.get(name_of(settings))
     if settings.prolong and not kind.prolongable:
         raise ValueError(f"{name} trains for a fixed number of steps: expected no prolonging, or another algorithm")
+    if not kind.prolongable and (settings.start_visited is not None or settings.horizon is not None):
+        raise ValueError(f"{name} runs whole episodes: expected no start_visited or horizon, or another algorithm")
     if settings.tracker is not None and not kind.tracked:
         raise ValueError(f"{name} supports no tracker: expected none, or another algorithm, got {settings.tracker}")
     if settings.start_from is not None and not kind.resumable:

@@ -40,6 +40,8 @@ class TrainSettings:
     num_envs: int | None = None
     seed: int = 0
     start_box: float | None = None  # share of episodes that start anywhere in the sampling range; None: START_BOX
+    start_visited: float | None = None  # share of episodes that start at a state of a real step; None: 0
+    horizon: int | None = None  # longest training episode, in steps; None: the time limit
     start_from: Path | None = None  # saved policy to continue from
     trust_policy: bool = False  # unpickle that policy's objects, which may run code
     anew: bool = False  # begin with a new network, and use the saved policy only if the new one stays worse
@@ -59,9 +61,15 @@ class TrainSettings:
 
     @property
     def learning(self) -> dict[str, Any]:
-        """Return the session fields of the lanes that a policy learns in."""
-        start_box = START_BOX if self.start_box is None else self.start_box
-        return {"seed": self.seed, "start_box": start_box, **self.session}
+        """Return the session fields of the lanes that a policy learns in. If a share of the episodes starts at visited
+        states, none starts anywhere unless that was chosen."""
+        usual = START_BOX if self.start_visited is None else 0.0
+        fields: dict[str, Any] = {"seed": self.seed, "start_box": usual if self.start_box is None else self.start_box}
+        if self.start_visited is not None:
+            fields["start_visited"] = self.start_visited
+        if self.horizon is not None:
+            fields["time_limit"] = self.horizon
+        return {**fields, **self.session}
 
     @property
     def judging(self) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import Protocol, assert_never
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from surrogym_server.engine.requests import Advance, Open, Opening, PolicySteps, Reset, Rollout, SampledRewards, Step
 from surrogym_server.engine.rollouts import parts_of, roll, roll_policy
@@ -76,6 +77,7 @@ def opened(
     """
     opening = request.opening
     settings = _limited(resolved(opening, definition), request.rewards, model)
+    settings = replace(settings, visited=_visited(settings, definition, request.visited))
     return open_session(
         secrets.token_urlsafe(SESSION_ID_BYTES) + place,
         request.surrogate,
@@ -112,6 +114,19 @@ def _limited(settings: VirtualSettings, rewards: SampledRewards | None, model: D
     if rewards is None or not limits_rewards(model.definition) or model.samples > rewards.samples:
         return settings
     return replace(settings, reward_limits=reward_limits(rewards.low, rewards.high))
+
+
+def _visited(settings: VirtualSettings, definition: EnvironmentDefinition, states: Array | None) -> Tensor | None:
+    """States (k, C) at which a share of the episodes starts; None if there is no such share.
+
+    Raises:
+        InvalidInput: there are no real steps.
+    """
+    if settings.start_visited == 0:
+        return None
+    if states is None or not len(states):
+        raise InvalidInput("start_visited: expected a surrogate with real steps, got one without, such as a file's")
+    return torch.tensor(states, dtype=torch.float64, device=definition.device)
 
 
 def fingerprint_of(request: Advance) -> Fingerprint:

@@ -53,6 +53,7 @@ class Open:
     definition: EnvironmentDefinition
     opening: Opening
     rewards: SampledRewards | None = None  # None: virtual rewards have no limits
+    visited: Array | None = None  # (k, C) states of real steps, for a session that starts episodes there
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import io
 import json
 import zlib
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from surrogym_server.engine.occupancy import Reservoir
@@ -34,12 +35,14 @@ def session_to_bytes(session: Session) -> bytes:
         "id": session.id,
         "surrogate": session.surrogate,
         "surrogate_id": session.surrogate_id,
-        "settings": asdict(session.settings),
+        "settings": asdict(replace(session.settings, visited=None)),
         "seed": session.seed,
         "model": session.model,
         "opened_by": session.opened_by,
     }
     arrays: Arrays = {"versions": session.versions, **_prefixed("lanes", session.lanes.to_arrays())}
+    if session.settings.visited is not None:
+        arrays["starts"] = session.settings.visited.cpu().numpy()
     if session.answer is not None:
         header["answer"] = {"seq": session.answer.seq, "digest": session.answer.request.digest}
         arrays |= _outcome_arrays(session.answer.outcome)
@@ -86,7 +89,7 @@ def _read(definition: EnvironmentDefinition, data: bytes, surrogate_id: int) -> 
         id=header["id"],
         surrogate=header["surrogate"],
         definition=definition,
-        settings=_settings(header["settings"]),
+        settings=_settings(header["settings"], arrays.get("starts"), definition.device),
         seed=header["seed"],
         model=header["model"],
         lanes=to_device(LaneState.from_arrays(_unprefixed("lanes", arrays)), definition.device),
@@ -98,13 +101,14 @@ def _read(definition: EnvironmentDefinition, data: bytes, surrogate_id: int) -> 
     )
 
 
-def _settings(saved: dict[str, Any]) -> VirtualSettings:
+def _settings(saved: dict[str, Any], starts: NDArray[Any] | None, device: torch.device) -> VirtualSettings:
     limits, noise = saved.get("reward_limits"), saved.get("sensor_noise", ())
     tuples = {
         "reward_limits": None if limits is None else (limits[0], limits[1]),
         "sensor_noise": tuple((name, deviation) for name, deviation in noise),
     }
-    return VirtualSettings(**{**saved, **tuples})
+    visited = None if starts is None else torch.from_numpy(starts).to(device)
+    return VirtualSettings(**{**saved, **tuples, "visited": visited})
 
 
 def _answer(header: dict[str, Any], arrays: Arrays) -> Answer | None:

@@ -50,7 +50,7 @@ class DeclaredReward:
     def __call__(self, q: Tensor, u: Tensor) -> Tensor:
         """Reward (m,) of the state q (m, C), before or after the step, and the action u (m, F)."""
         values, weights, conditions = self._compiled
-        x = values(q) + u @ weights
+        x = values(q) + u @ weights if weights.numel() else values(q)  # no quantity: the number of actions is unknown
         holds = conditions(q)
         total = q.new_zeros(len(q))
         begin = 0

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 
+import numpy as np
+
 from surrogym_server.engine.core import limits_rewards
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Array, Open, Opening, Restore, SampledRewards, Saved, SessionInfo
@@ -14,6 +16,8 @@ from surrogym_server.errors import Damaged, SurrogymError, UnknownSession
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import SavedSession
+
+MOST_STARTS = 10_000  # states of real steps at which the episodes of a session start
 
 logger = logging.getLogger(__name__)
 
@@ -107,7 +111,18 @@ class SessionService:
     def _asked(self, surrogate: str, opening: Opening) -> Open:
         record = self._storage.surrogates.get(surrogate)
         definition = self._definitions.of(record)
-        return Open(surrogate, record.id, definition, opening, self._rewards(surrogate, definition))
+        rewards, visited = self._rewards(surrogate, definition), self._visited(surrogate, opening)
+        return Open(surrogate, record.id, definition, opening, rewards, visited)
+
+    def _visited(self, surrogate: str, opening: Opening) -> Array | None:
+        """States of the surrogate's real steps, evenly spaced if there are more than ``MOST_STARTS``; None if the
+        session starts no episode there."""
+        if opening.settings.start_visited == 0:
+            return None
+        states = self._storage.samples.arrays(surrogate).coordinates
+        kept = np.linspace(0, len(states) - 1, min(len(states), MOST_STARTS)).astype(int)
+        chosen: Array = states[kept]
+        return chosen
 
     def _rewards(self, surrogate: str, definition: EnvironmentDefinition) -> SampledRewards | None:
         seen = self._storage.samples.reward_range(surrogate) if limits_rewards(definition) else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -37,6 +37,7 @@ class VirtualSettings:
     time_limit: int | None = None
     penalty: float = 0.0  # k of eq. 14
     start_box: float = 0.0  # share of episodes that start anywhere in the sampling range
+    start_visited: float = 0.0  # share of episodes that start at one of the states ``visited``
     particles: int = 1_000
     propagation: Literal["mean", "sample"] = "sample"
     weighting: Weighting = "inverse_variance"
@@ -46,7 +47,14 @@ class VirtualSettings:
     sensor_noise: SensorNoise = ()  # errors of observed coordinates, which don't move the state
     reward_limits: tuple[float, float] | None = None  # of mean rewards; None: none
     trust: float | None = None  # truncate an episode if an output deviates by more, in its deviations over the samples
+    caution: float = 0.0  # doubts that are subtracted from each reward, see ``_doubted``
     compiled: bool = False  # compute steps in compiled code if the model offers it; chosen when the session opens
+    visited: Tensor | None = field(default=None, compare=False, repr=False)  # (k, C) states of real steps
+
+    @property
+    def doubts(self) -> bool:
+        """Whether a step needs the deviation of each output."""
+        return self.trust is not None or self.caution > 0
 
 
 @dataclass(frozen=True)
@@ -135,7 +143,7 @@ def step(
         active = with_paths(model, active, settings.functions)
     action = torch.from_numpy(u).to(definition.device)
     action = action if isinstance(moving, slice) else action[moving]
-    moved = _move(model, settings, active, action, deviations, particle_steps)
+    moved = _doubted(model, settings, _move(model, settings, active, action, deviations, particle_steps))
     untrusted = _untrusted(model, settings, moved)
     left = _left(definition, moved, untrusted)
     if left is not None:
@@ -220,11 +228,21 @@ def _move(
         lanes.q,
         u,
         settings.penalty,
-        deviations or settings.trust is not None,
+        deviations or settings.doubts,
         process=None if process is None else process[:, 0],
         paths=lanes.path if settings.variant == "pathwise" else None,
         functions=settings.functions,
     )
+
+
+def _doubted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> Moved:
+    """The move with rewards lowered by ``caution`` times the doubt: the largest deviation of an output, in its
+    deviations over the samples, times the deviation of the reward over the samples."""
+    if settings.caution == 0:
+        return moved
+    assert moved.deviation is not None
+    doubt = (moved.deviation / model.scales).amax(1) * model.scales[-1]
+    return replace(moved, reward=moved.reward - settings.caution * doubt)
 
 
 def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> Tensor | None:
@@ -274,7 +292,7 @@ def _begin(definition: EnvironmentDefinition, settings: VirtualSettings, lanes: 
         return lanes
     fresh = lanes.take(chosen)
     fresh = replace(fresh, episode=fresh.episode + 1, elapsed=torch.zeros_like(fresh.elapsed))
-    q = start_coordinates(definition, fresh, settings.start_box)
+    q = start_coordinates(definition, fresh, settings.start_box, settings.start_visited, settings.visited)
     particles = fresh.particles
     if settings.variant == "probabilistic":
         particles = start_particles(definition, fresh, q, settings.particles, settings.spread)

@@ -13,20 +13,33 @@ from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise, uniform_noise
 
 
-def start_coordinates(definition: EnvironmentDefinition, lanes: LaneState, box_share: float) -> Tensor:
-    """Start of each lane's current episode, (N, C). A share of the episodes starts anywhere in the sampling range."""
+def start_coordinates(
+    definition: EnvironmentDefinition,
+    lanes: LaneState,
+    box_share: float,
+    visited_share: float = 0.0,
+    visited: Tensor | None = None,
+) -> Tensor:
+    """Start of each lane's current episode, (N, C). A share of the episodes starts anywhere in the sampling range, and
+    another share at one of the states ``visited`` (k, C)."""
     coordinates = definition.coordinates
     p = uniform_noise(lanes, Purpose.START, len(coordinates))
     if definition.starts:
-        states = definition.start_states
-        declared = states[(p[:, 0] * len(states)).long().clamp_(max=len(states) - 1)]
+        declared = _one_of(definition.start_states, p[:, 0])
     else:
         declared = torch.stack([c.start.quantile(p[:, i]) for i, c in enumerate(coordinates)], -1)
-    if box_share == 0:
+    if box_share == 0 and visited_share == 0:
         return declared
     anywhere = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(coordinates)], -1)
-    in_box = uniform_noise(lanes, Purpose.BOX_START, 1) < box_share
-    return torch.where(in_box, anywhere, declared)
+    kind = uniform_noise(lanes, Purpose.BOX_START, 1)
+    if visited is not None:
+        declared = torch.where(kind < box_share + visited_share, _one_of(visited, p[:, 0]), declared)
+    return torch.where(kind < box_share, anywhere, declared)
+
+
+def _one_of(states: Tensor, p: Tensor) -> Tensor:
+    """The state (N, C) of ``states`` (k, C) at each of the shares p (N,), in [0, 1)."""
+    return states[(p * len(states)).long().clamp_(max=len(states) - 1)]
 
 
 def start_particles(

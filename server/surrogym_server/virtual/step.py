@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 
 def in_fastest_form(settings: VirtualSettings, model: DynamicsModel) -> VirtualSettings:
     """Settings of a new session, with compiled steps if they work here and are faster."""
-    deviations = settings.variant == "probabilistic" or settings.penalty > 0 or settings.trust is not None
+    deviations = settings.variant == "probabilistic" or settings.penalty > 0 or settings.doubts
     able = offers(model, CompiledSteps)
     if able is None or not able.compiled_pays(deviations=deviations):
         return settings

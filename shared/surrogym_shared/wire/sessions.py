@@ -59,6 +59,9 @@ class OpenSession(Request):
     start_box: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.0, description="share of episodes that start anywhere in the sampling range"
     )
+    start_visited: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.0, description="share of episodes that start at the state of a real step from before the session"
+    )
     process_noise: bool = Field(default=False, description="whether the learned noise of a step is added to the state")
     sensor_noise: dict[str, Annotated[FiniteFloat, Field(ge=0)]] = Field(
         default={},
@@ -69,6 +72,11 @@ class OpenSession(Request):
         default=None,
         description="truncate an episode when an output's predicted standard deviation exceeds this factor times "
         "the output's standard deviation in the samples; null: no limit",
+    )
+    caution: Annotated[float, Field(ge=0, le=1_000)] = Field(
+        default=0.0,
+        description="subtract this factor times the model's doubt from each reward: the largest ratio of an output's "
+        "predicted standard deviation to its standard deviation in the samples, times that of the reward",
     )
     particles: Annotated[int, Field(ge=1, le=MAX_PARTICLES)] = Field(
         default=1_000, description="variant probabilistic: number of particles of a lane"
@@ -96,6 +104,12 @@ class OpenSession(Request):
     idempotency_key: Key | None = Field(
         default=None, description="a repeat with the same key opens no second session; null: each request opens one"
     )
+
+    @model_validator(mode="after")
+    def _shares_of_starts_fit(self) -> Self:
+        if (both := self.start_box + self.start_visited) > 1:
+            raise ValueError(f"start_box and start_visited: expected shares of 1 in all, got {both:g}")
+        return self
 
     @model_validator(mode="after")
     def _particles_are_the_probabilistic_variants(self) -> Self:

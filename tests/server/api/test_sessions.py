@@ -197,6 +197,23 @@ def test_rewards_keep_near_those_of_the_samples(client: httpx.Client, name: str,
     assert imagined.max() <= max(rewards) + room
 
 
+def test_episodes_start_at_states_of_real_steps(client: httpx.Client, name: str):
+    pendulum.teach(client, name, budget=5)
+    samples = client.get(f"/v1/surrogates/{name}/samples").json()["samples"]
+    asked = {"num_envs": 64, "seed": 0, "start_visited": 1.0}
+    session = client.post(f"/v1/surrogates/{name}/sessions", json=asked).json()["id"]
+    send(client, session, "reset")
+    starts = client.get(f"/v1/sessions/{session}/coordinates").json()["coordinates"]
+    assert {tuple(start) for start in starts} == {tuple(sample["coordinates"]) for sample in samples}
+
+
+def test_shares_of_starts_above_one_are_refused(client: httpx.Client, name: str):
+    pendulum.teach(client, name, budget=5)
+    asked = {"start_box": 0.5, "start_visited": 0.6}
+    refused = client.post(f"/v1/surrogates/{name}/sessions", json=asked)
+    assert (refused.status_code, "shares of 1 in all, got 1.1" in refused.text) == (422, True)
+
+
 @pytest.mark.parametrize("functions", [0, 2])
 def test_functions_are_of_variant_pathwise_alone(client: httpx.Client, taught: str, functions: int):
     options = {"num_envs": 2, "functions": functions, "variant": "deterministic" if functions else "pathwise"}

@@ -34,7 +34,8 @@ def with_short_episodes(task: SearchTask, rollout: int) -> SearchTask:
         rollout: steps of each lane in a rollout.
     """
     spec, settings = task.port.spec(), task.settings
-    chosen = settings.start_box is not None or not {"time_limit", "start_box"}.isdisjoint(settings.session)
+    ways = settings.start_box, settings.start_visited, settings.horizon
+    chosen = any(way is not None for way in ways) or not {"time_limit", "start_box"}.isdisjoint(settings.session)
     limit = spec.time_limit or 0
     if chosen or spec.termination != () or limit <= LONG * rollout or spec.design.preset == "paper":
         return task

@@ -42,7 +42,7 @@ class Collector:
 
     def __init__(self, lanes: Lanes, gamma: float, gae_lambda: float, seed: int) -> None:
         self._gamma, self._lambda, self._noise = gamma, gae_lambda, NoiseKey(seed)
-        self._lanes, self._penalised = ActingLanes(lanes), lanes.view.penalty > 0
+        self._lanes, self._penalised = ActingLanes(lanes), lanes.penalised
         self._lanes.reset()
         self._scale = RewardScale(lanes.num_envs, gamma)
         self._earned = np.zeros(lanes.num_envs)  # returns of the running episodes

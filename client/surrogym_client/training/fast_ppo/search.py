@@ -373,7 +373,8 @@ def _reference(**hyperparameters: Any) -> StableBaselinesSearch:
 
 def _from_declared_starts(task: SearchTask) -> SearchTask:
     """Return the task with every episode from a declared start."""
-    return replace(task, settings=replace(task.settings, session={**task.settings.session, "start_box": 0.0}))
+    declared = {**task.settings.session, "start_box": 0.0, "start_visited": 0.0}
+    return replace(task, settings=replace(task.settings, horizon=None, session=declared))
 
 
 @contextmanager

@@ -44,6 +44,15 @@ def _exceeds(deviation: Floats, trust: float, scales: Floats) -> bool:
 
 
 @inlined
+def _doubt(deviation: Floats, scales: Floats) -> float:
+    """The largest deviation, in deviations over the samples, times that of the reward."""
+    most = 0.0
+    for o in range(len(deviation)):
+        most = max(most, deviation[o] / scales[o])
+    return float(most * scales[-1])
+
+
+@inlined
 def _is_outside(q: Floats, inside: Floats) -> bool:
     outside = False
     for c in range(len(q)):
@@ -58,6 +67,7 @@ def _is_outside(q: Floats, inside: Floats) -> bool:
     types.float64[:, ::1],
     types.boolean[::1],
     types.float64[::1],
+    types.float64,
     types.float64,
     types.float64,
     types.float64,
@@ -80,6 +90,7 @@ def conclude(
     terminal_reward: float,
     penalty: float,
     trust: float,
+    caution: float,
     time_limit: int,
     inside: Floats,
     outside_reward: float,
@@ -115,6 +126,8 @@ def conclude(
         left = not (np.isnan(outside_reward) or over[row]) and (doubtful or _is_outside(q_next[row], inside))
         rewards[1, n] = mean
         rewards[0, n] = mean if penalty == 0 else mean - penalty * deviation[row, -1]
+        if caution > 0:
+            rewards[0, n] -= caution * _doubt(deviation[row], scales)
         if left:
             lacking = max(time_limit - elapsed[n], 1) if time_limit >= 0 else 1
             rewards[0, n] = rewards[1, n] = outside_reward * lacking

@@ -120,7 +120,7 @@ def _moved(
     deviations: bool,
 ) -> ArrayTransition:
     """Move the moving lanes, in their order."""
-    wanted, process = deviations or settings.trust is not None, None
+    wanted, process = deviations or settings.doubts, None
     if settings.process_noise:
         drawn = normal_noise(lanes, Purpose.PROCESS, 1, len(model.definition.outputs) - 1)[:, 0]
         process = driving(model, settings.sensor_noise, drawn).numpy()
@@ -144,7 +144,7 @@ def _concluded(
 ) -> int:
     """Complete the step of the moving lanes, and return how many of them ended."""
     trust, limit, outside = settings.trust, settings.time_limit, model.definition.outside_reward
-    scales = np.zeros(0) if trust is None else model.scales.numpy()
+    scales = model.scales.numpy() if settings.doubts else np.zeros(0)
     return conclude(
         moving,
         moved.q_next,
@@ -155,6 +155,7 @@ def _concluded(
         model.terminal_reward,
         settings.penalty,
         np.inf if trust is None else trust,
+        settings.caution,
         -1 if limit is None else limit,
         ANYWHERE if outside is None else torch.stack(model.definition.sampled).numpy(),
         np.nan if outside is None else outside,
@@ -173,7 +174,8 @@ def _begin(
     at = torch.from_numpy(chosen)
     fresh = lanes.take(at)
     fresh = replace(fresh, episode=fresh.episode + 1, elapsed=torch.zeros_like(fresh.elapsed))
-    changed.q[chosen] = start_coordinates(definition, fresh, settings.start_box).numpy()
+    starts = settings.start_box, settings.start_visited, settings.visited
+    changed.q[chosen] = start_coordinates(definition, fresh, *starts).numpy()
     changed.episode[chosen] += 1
     changed.elapsed[chosen] = 0
     changed.phase[chosen] = RUNNING

@@ -80,6 +80,15 @@ def test_shapes():
     assert [value(ball, q, [push]) for push in (1.0, 0.0)] == [2, 0]  # 0.09 + 0.9025 <= 1 < 0.25 + 0.9025
 
 
+@pytest.mark.parametrize("actions", [1, 2])
+def test_a_level_of_the_state_pays_whatever_the_number_of_actions(actions: int):
+    """A reward of two values that was found has conditions, and no quantity whose weights name the actions."""
+    fast = Inequality(term=Term.linear(speed=1), relation=">=", value=1.0)
+    spec = paying(RewardTerm(shape="one", when=(fast,)))
+    for speed, paid in ((0.5, 0.0), (1.5, 1.0)):
+        assert value(spec, [0.0, speed], [0.3] * actions) == paid
+
+
 def test_a_term_counts_only_when_its_conditions_hold():
     near = Inequality(term=Term.linear(theta=1), relation=">=", value=0.5)
     slow = Inequality(term=Term.linear(speed=1), relation="<", value=1)
