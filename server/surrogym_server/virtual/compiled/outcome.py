@@ -53,6 +53,13 @@ def _doubt(deviation: Floats, scales: Floats) -> float:
 
 
 @inlined
+def _penalised(mean: float, deviation: Floats, penalty: float, caution: float, scales: Floats) -> float:
+    """A mean reward less penalties of the deviations (O,), that of the reward last. Those of weight 0 are not read."""
+    paid = mean if penalty == 0 else mean - penalty * deviation[-1]
+    return float(paid - caution * _doubt(deviation, scales) if caution > 0 else paid)
+
+
+@inlined
 def _is_outside(q: Floats, inside: Floats) -> bool:
     outside = False
     for c in range(len(q)):
@@ -125,9 +132,7 @@ def conclude(
         doubtful = trust < np.inf and _exceeds(deviation[row], trust, scales)
         left = not (np.isnan(outside_reward) or over[row]) and (doubtful or _is_outside(q_next[row], inside))
         rewards[1, n] = mean
-        rewards[0, n] = mean if penalty == 0 else mean - penalty * deviation[row, -1]
-        if caution > 0:
-            rewards[0, n] -= caution * _doubt(deviation[row], scales)
+        rewards[0, n] = _penalised(mean, deviation[row], penalty, caution, scales)
         if left:
             lacking = max(time_limit - elapsed[n], 1) if time_limit >= 0 else 1
             rewards[0, n] = rewards[1, n] = outside_reward * lacking
@@ -135,8 +140,7 @@ def conclude(
         late = time_limit >= 0 and elapsed[n] >= time_limit
         terminated = over[row] or left
         ends[0, n], ends[1, n], ends[2, n], ends[4, n] = terminated, late or doubtful, doubtful, left
-        ended = terminated or late or doubtful
-        ends[3, n] = ended
+        ends[3, n] = ended = terminated or late or doubtful
         phase[n] = ENDED if ended else RUNNING
         count += ended
         for c in range(q.shape[1]):
