@@ -98,7 +98,7 @@ def test_a_surrogate_deleted_and_made_anew_elsewhere_is_another_one(clients: lis
     while (reply := reset(second, session)).is_success:
         assert time.monotonic() < deadline, "the session ends with its surrogate"
         time.sleep(0.1)
-    assert reply.status_code == 404
+    assert reply.status_code == 404, reply.text
     assert version(second, opened(second, "renewed")) >= 1
 
 

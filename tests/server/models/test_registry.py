@@ -20,7 +20,7 @@ def test_gaussian_processes_are_the_default_and_the_preset_says_how():
     assert learner() == GaussianProcesses("composite", True, "auto")
     assert learner(symmetry="none") == GaussianProcesses("composite", True, "none")
     assert learner(preset="paper", symmetry="none") == GaussianProcesses(
-        "squared_exponential", False, "none", False, False, False
+        "squared_exponential", False, "none", False, False, False, False
     )
 
 

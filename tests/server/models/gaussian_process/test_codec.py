@@ -114,8 +114,8 @@ def test_a_file_without_its_header_field_is_refused(pendulum_definition, data):
 
 
 def test_another_format_or_environment_is_refused(pendulum_definition, cartpole_definition, data):
-    with pytest.raises(InvalidInput, match="got format 7"):
-        from_bytes(pendulum_definition, rewritten(data, header_of(data) | {"format": 7}))
+    with pytest.raises(InvalidInput, match="got format 8"):
+        from_bytes(pendulum_definition, rewritten(data, header_of(data) | {"format": 8}))
     with pytest.raises(InvalidInput, match="outputs"):
         from_bytes(cartpole_definition, data)
     renamed = replace(pendulum_definition.coordinates[0], name="angle")
