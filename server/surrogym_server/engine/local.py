@@ -169,7 +169,7 @@ class LocalEngine(SessionEngine):
     async def sweep(self) -> None:
         self._expired += len(self._live.sweep())
         for surrogate in await asyncio.to_thread(self._models.look):
-            self._live.close_all_of(surrogate)
+            await self.forget(surrogate)
 
     async def start(self) -> None:
         await asyncio.to_thread(self._compiling.start)

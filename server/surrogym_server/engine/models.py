@@ -80,20 +80,20 @@ class ModelCache:
         raise NoModel("expected a surrogate with a model, but no model has been fitted yet")
 
     def look(self) -> list[int]:
-        """Publish the versions that other servers have stored of surrogates in use here, and forget deleted surrogates.
-        Returns the latter."""
+        """Publish the versions that other servers have stored of surrogates in use here.
+
+        Returns:
+            The surrogates that are deleted. Their models stay until ``forget``, so that their sessions can end before.
+        """
         with self._lock:
             known = list(self._latest.items())
         if not known:
             return []
         newest = self._newest()
-        gone = [surrogate for surrogate, _ in known if surrogate not in newest]
-        for surrogate in gone:
-            self.forget(surrogate)
         for surrogate, version in known:
             if newest.get(surrogate, version) > version:
                 self.publish(surrogate, newest[surrogate])
-        return gone
+        return [surrogate for surrogate, _ in known if surrogate not in newest]
 
     def publish(self, surrogate: int, version: int) -> int:
         """Let lanes use a version from their next reset on, unless a newer one is known. Returns the newest version."""
