@@ -16,7 +16,7 @@ from surrogym_server.testing import ModelCase, model_cases
 
 @dataclass(frozen=True)
 class Mixed(Learner):
-    """Candidates of ``selected`` that serve the outputs as it was said."""
+    """A family ``selected`` whose outputs are served by the candidates that a test names."""
 
     family: SelectedFamilies
     serving: tuple[str, ...]  # of each output (O,)
