@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from surrogym_client.policies.evidence import Promise
     from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.wire import NewSample
 
 
 @dataclass(frozen=True)
@@ -131,11 +132,7 @@ def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, lear
     steps = steady(view.spec, known)
     found = disagreements(steps, compared(api, view.spec, view, steps)) if steps else Disagreements(0, (), {})
     differing = Differing(found, first_seed, changed=result.varied, left_out=len(known) - len(steps))
-    samples = samples_of(differing.found, learn)
-    if samples:
-        added = api.add_samples(surrogate, "evaluate", samples, purpose="logged")
-        differing = replace(differing, learned=len(added.sample_ids) - added.duplicates)
-    return differing
+    return replace(differing, learned=_add(api, surrogate, samples_of(differing.found, learn)))
 
 
 def _learn_all(api: Api, surrogate: str, result: Evaluation) -> int:
@@ -144,7 +141,11 @@ def _learn_all(api: Api, surrogate: str, result: Evaluation) -> int:
 
     spec = api.surrogate(surrogate).spec
     steps = [step for step in steps_of(result.traces, result.steps) if spec.known(step.coordinates)]
-    samples = as_samples(steady(spec, steps))
+    return _add(api, surrogate, as_samples(steady(spec, steps)))
+
+
+def _add(api: Api, surrogate: str, samples: list[NewSample]) -> int:
+    """Add steps that were taken to the surrogate's samples, and return how many were new."""
     if not samples:
         return 0
     added = api.add_samples(surrogate, "evaluate", samples, purpose="logged")

@@ -16,15 +16,9 @@ from surrogym_shared.acting import ActingPolicy
 from surrogym_shared.network import Network, bounds_of, counts_of
 from surrogym_shared.port import PolicyPort, PolicyRollout, StepResult, SurrogatePort
 
-WHOLE = {
-    "start_box": 0.0,
-    "start_visited": 0.0,
-    "trust": None,
-}  # a shortened episode would earn more if rewards are costs
-PAID_OUTSIDE = {
-    "start_box": 0.0,
-    "start_visited": 0.0,
-}  # an episode that leaves the trusted range gets a penalty for its missing steps
+DECLARED = {"start_box": 0.0, "start_visited": 0.0}  # all episodes begin as declared
+WHOLE = {**DECLARED, "trust": None}  # a shortened episode would earn more if rewards are costs
+PAID_OUTSIDE = DECLARED  # an episode that leaves the trusted range gets a penalty for its missing steps
 STATISTICS_LANES = 1_024
 STEPS_AT_ONCE = 1_000  # steps of an imagined episode in one reply; an episode may be longer
 

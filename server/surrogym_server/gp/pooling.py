@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import islice, permutations
+from itertools import permutations
 
 import torch
 from torch import Tensor
@@ -189,19 +189,19 @@ def _played(known: Posterior, x: Tensor, y: Tensor, may: Tensor) -> Inputs | Non
     strongest = effect.argsort(descending=True)[: d + 1].tolist()
     starts = [tried for tried in permutations(strongest, d) if _allowed(may, tried)]
     if not starts:
-        starts = list(islice((tried for tried in permutations(range(size), d) if _allowed(may, tried)), 1))
-    if not starts:
-        return None
+        any_allowed = next((tried for tried in permutations(range(size), d) if _allowed(may, tried)), None)
+        if any_allowed is None:
+            return None
+        starts = [any_allowed]
     errors = _errors(known, x, y, starts)
     found: list[tuple[float, Inputs]] = []
     for place in errors.argsort()[:STARTS].tolist():
         best, error = starts[place], float(errors[place])
         for _ in range(SWEEPS):
             tried = [t for t in _neighbours(best, size) if _allowed(may, t)]
-            least, at = _errors(known, x, y, tried).min(0) if tried else (errors[place], 0)
-            if float(least) >= error:
+            if not tried or float((again := _errors(known, x, y, tried)).min()) >= error:
                 break
-            best, error = tried[int(at)], float(least)
+            best, error = tried[int(again.argmin())], float(again.min())
         found.append((error, best))
     return min(found)[1]
 

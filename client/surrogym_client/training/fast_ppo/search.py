@@ -12,7 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from surrogym_client.environments.lanes import Lanes, session_request
-from surrogym_client.evaluation.imagined import observation_statistics
+from surrogym_client.evaluation.imagined import DECLARED, observation_statistics
 from surrogym_client.original.protocol import LONGEST_EPISODE
 from surrogym_client.policies.defaults import (
     ATTEMPT_SEED,
@@ -373,8 +373,8 @@ def _reference(**hyperparameters: Any) -> StableBaselinesSearch:
 
 def _from_declared_starts(task: SearchTask) -> SearchTask:
     """Return the task with every episode from a declared start."""
-    declared = {**task.settings.session, "start_box": 0.0, "start_visited": 0.0}
-    return replace(task, settings=replace(task.settings, horizon=None, session=declared))
+    session = {**task.settings.session, **DECLARED}
+    return replace(task, settings=replace(task.settings, horizon=None, session=session))
 
 
 @contextmanager

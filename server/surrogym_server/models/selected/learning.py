@@ -31,7 +31,6 @@ from surrogym_server.models.selected.selection import (
 from surrogym_server.models.singles import GAUSSIAN_PROCESS, SPARSE_GAUSSIAN_PROCESS
 from surrogym_server.plugins import in_one_line
 
-EXACT = 150  # samples up to which sparse processes are exact ones
 WarmArrays = dict[str, NDArray[np.float64]]
 
 
@@ -99,7 +98,7 @@ def _rivals(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Candidates to compare, and a note about one that is left out because another one is the same."""
     sparse = learners.get(SPARSE_GAUSSIAN_PROCESS)
-    limit = max(EXACT, getattr(sparse, "inducing", 0))
+    limit = getattr(sparse, "exact", 0)
     same = sparse is not None and GAUSSIAN_PROCESS in names and SPARSE_GAUSSIAN_PROCESS not in serving
     if not same or samples > limit:
         return names, ()

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
+from surrogym_server.gp import subsets
 from surrogym_server.models.gaussian_process.learning.learn import learn
 from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_server.models.port import Learned, Learner, ModelCodec, Warm
@@ -32,6 +33,11 @@ class SparseGaussianProcesses(Settings, Learner):
         given = self.inducing
         if isinstance(given, bool) or not isinstance(given, int) or not FEWEST <= given <= MOST:
             raise ValueError(f"expected inducing to be a whole number from {FEWEST} to {MOST}, got {given!r}")
+
+    @property
+    def exact(self) -> int:
+        """Samples up to which the family is that of exact processes."""
+        return max(subsets.FEW, self.inducing)
 
     @property
     def codec(self) -> ModelCodec:

@@ -12,6 +12,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from surrogym_client.experiments.peers.methods.ensemble import moments
+
 Masks = tuple[Tensor, Tensor]
 """Factors (n, H) of the units of both layers: 0, or 1 / (1 - rate)."""
 
@@ -37,7 +39,7 @@ class DropoutNetwork(nn.Module):
 
     def scale_by(self, x: Tensor, y: Tensor) -> None:
         """Take means and deviations of inputs (n, I) and outputs (n, E)."""
-        self.scales = _moments(x), _moments(y)
+        self.scales = torch.stack(moments(x)), torch.stack(moments(y))
 
     def masks(self, count: int) -> Masks:
         """Draw masks, one for each of n samples."""
@@ -79,9 +81,3 @@ def train(
         (error**2).mean().backward()
         optimizer.step()
     model.requires_grad_(False)
-
-
-def _moments(values: Tensor) -> Tensor:
-    """Mean and deviation (2, E) of values (n, E); a constant has a deviation of one."""
-    deviation = values.std(0)
-    return torch.stack([values.mean(0), torch.where(deviation < 1e-6, torch.ones_like(deviation), deviation)])

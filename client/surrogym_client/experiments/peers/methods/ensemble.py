@@ -43,9 +43,9 @@ class Ensemble(nn.Module):
 
     def scale_by(self, x: Tensor) -> None:
         """Take mean and deviation of inputs (n, I)."""
-        self.middle: Tensor = x.mean(0)
-        deviation = x.std(0)
-        self.spread: Tensor = torch.where(deviation < 1e-6, torch.ones_like(deviation), deviation)
+        self.middle: Tensor
+        self.spread: Tensor
+        self.middle, self.spread = moments(x)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Means and log variances (B, n, E) of each network at its own inputs (B, n, I)."""
@@ -94,3 +94,9 @@ def train(
             optimizer.zero_grad()
             model.loss(x[at], y[at]).backward()  # type: ignore[no-untyped-call]
             optimizer.step()
+
+
+def moments(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and deviation (E,) of values (n, E); a constant has a deviation of one."""
+    deviation = values.std(0)
+    return values.mean(0), torch.where(deviation < 1e-6, torch.ones_like(deviation), deviation)

@@ -44,9 +44,7 @@ class Settings:
     hidden: tuple[int, ...] = (200, 200, 200, 200)
     decay: tuple[float, ...] = (2.5e-5, 5e-5, 7.5e-5, 7.5e-5, 1e-4)
     rate: float = 1e-3
-    epoch: int = (
-        16  # steps of an epoch, at least: that of 5,000 real steps, with which most of the authors' tasks begin
-    )
+    epoch: int = 16  # steps of an epoch, at least: as with 5,000 real steps, the authors' usual first ones
     explore: int = 500  # real steps of random actions; at most half of the budget
     every: int = 250  # real steps between trainings of the ensemble
     rollouts: int = 400  # for each real step between trainings
@@ -121,7 +119,8 @@ class Pools:
     """Real and imagined transitions. SAC draws its batches from it, as from a replay buffer of its library.
 
     Args:
-        room: for so many real transitions, with as many entries as ``seen`` (D,) and ``action`` (F,).
+        room: largest number of real transitions.
+        seen, action: numbers of entries D and F.
         rng: random generator.
         share: of a batch that is real.
     """

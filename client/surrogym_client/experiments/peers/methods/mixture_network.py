@@ -14,6 +14,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from surrogym_client.experiments.peers.methods.ensemble import moments
+
 LOWEST = -5.0  # log deviation of a component, in deviations of the output
 RESTART = 10.0  # weight of an end in the loss; that of the authors' dream
 CLIP = 1.0  # largest entry of a gradient
@@ -51,8 +53,8 @@ class MixtureNetwork(nn.Module):
 
     def scale_by(self, episodes: Sequence[Episode]) -> None:
         """Take means and deviations of observations and outputs."""
-        self.middle, self.spread = _moments(torch.cat([part.seen for part in episodes]))
-        self.out_middle, self.out_spread = _moments(torch.cat([_targets(part) for part in episodes]))
+        self.middle, self.spread = moments(torch.cat([part.seen for part in episodes]))
+        self.out_middle, self.out_spread = moments(torch.cat([_targets(part) for part in episodes]))
 
     def scaled(self, seen: Tensor) -> Tensor:
         """Observations (..., D) in deviations from their mean."""
@@ -114,7 +116,7 @@ def train(
     steps: int,
     check: Callable[[], None],
 ) -> None:
-    """Continue the training with so many gradient steps, each on all episodes. ``check`` is called before each."""
+    """Continue the training. Each of the ``steps`` is a gradient step on all episodes, and calls ``check`` first."""
     model.scale_by(episodes)
     for _ in range(steps):
         check()
@@ -135,9 +137,3 @@ def _padded(episodes: Sequence[Episode]) -> tuple[list[Tensor], ...]:
     for end, part in zip(ends, episodes, strict=True):
         end[-1] = float(part.ended)
     return [p.seen[:-1] for p in episodes], [p.action for p in episodes], [_targets(p) for p in episodes], ends
-
-
-def _moments(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and deviation (E,) of values (n, E); a constant has a deviation of one."""
-    deviation = values.std(0)
-    return values.mean(0), torch.where(deviation < 1e-6, torch.ones_like(deviation), deviation)

@@ -60,11 +60,10 @@ def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Cand
     if selection is None and not chosen.dropped:
         return None
     mirror = reflection(learner.definition, replace(chosen, parity="odd"))
-    kept = torch.ones(posterior.x.shape[1], dtype=torch.bool)
-    hyper = posterior.hyper
+    size = posterior.x.shape[1]
+    reads, fewer = tuple(range(size)), posterior.hyper
     if not chosen.dropped and selection is not None:
-        kept, hyper = selection.kept, selection.hyper
-    count = posterior.x.shape[1] + len(chosen.dropped)
+        reads, fewer = tuple(selection.kept.nonzero()[:, 0].tolist()), selection.hyper
     part = Part(
         posterior.x,
         posterior.y,
@@ -72,11 +71,12 @@ def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Cand
         output.centre,
         output.scale,
         learner.options(output.name),
-        tuple(kept.nonzero()[:, 0].tolist()),
-        hyper,
+        reads,
+        fewer,
         None if mirror is None else mirror.signs,
     )
-    return _Candidate(place, output, part, tuple(i for i in range(count) if i not in chosen.dropped))
+    every = tuple(i for i in range(size + len(chosen.dropped)) if i not in chosen.dropped)
+    return _Candidate(place, output, part, every)
 
 
 def _sharing(members: Sequence[_Candidate], pool: Pool, member: int) -> OutputModel:
