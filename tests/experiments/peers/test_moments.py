@@ -118,7 +118,7 @@ def test_a_fitted_process_predicts_and_knows_how_well():
     rng = np.random.default_rng(0)
     x = rng.uniform(-2, 2, (60, 2))
     y = np.stack([np.sin(2 * x[:, 0]), 5 * x[:, 1] ** 2], 1) + 0.05 * rng.standard_normal((60, 2))
-    model, at = fit(x, y, rng), rng.uniform(-1.5, 1.5, (100, 2))
+    model, at = fit(x, y, 1_000.0, rng), rng.uniform(-1.5, 1.5, (100, 2))
     mean, deviation = model.predict(torch.from_numpy(at))
     error = mean.numpy() - np.stack([np.sin(2 * at[:, 0]), 5 * at[:, 1] ** 2], 1)
     assert np.sqrt((error**2).mean(0)).max() < 0.1

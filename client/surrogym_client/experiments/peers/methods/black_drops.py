@@ -29,13 +29,14 @@ PAST = 1.5  # ranges of data that rollouts may leave them by, before they stay w
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of Black-DROPS: those of the authors' pendulum, but for ``rollouts``."""
+    """Settings of Black-DROPS: those of the authors' pendulum, but for ``rollouts`` and ``signal_to_noise``."""
 
     hidden: int = 10
     evaluations: int = 10_000  # of policies, for each search; the authors' cart-pole has 40,000
     restarts: int = 5
     sigma: float = 1.0  # a fifth of the bounds
     rollouts: int = 5  # of each policy; the authors take one, and a CMA-ES that handles uncertainty
+    signal_to_noise: float = 500.0  # limit of the processes' hyperparameters; the authors have none
 
 
 class BlackDrops:
@@ -54,7 +55,8 @@ class BlackDrops:
             data.append(episode(real, states, control, known.horizon, known.repeat))
             seen = Transitions.joined(data)
             inputs = np.concatenate([states.featured(seen.q), seen.u], 1)
-            model = fit(inputs, states.change(seen.q, seen.reached), rng, real.clock.check)
+            ratio = self._settings.signal_to_noise
+            model = fit(inputs, states.change(seen.q, seen.reached), ratio, rng, real.clock.check)
             limits = np.abs(states.featured(np.concatenate([seen.q, seen.reached]))).max(0) + 1e-6
             imagined = Imagined(states, known, model, seen, limits, self._settings)
             best = search(

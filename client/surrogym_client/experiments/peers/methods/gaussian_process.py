@@ -19,7 +19,7 @@ from torch import Tensor
 from surrogym_client.original.protocol import Array
 
 MOST = 300  # samples; PILCO's authors take 300 inducing points beyond, we take a random subset
-SIGNAL_TO_NOISE, SPREAD, POWER = 1_000.0, 100.0, 30  # limits of hyperparameters as in the authors' penalty
+SPREAD, POWER = 100.0, 30  # of PILCO's penalty: limit of a length scale, and steepness
 ITERATIONS = 200
 JITTER = 1e-9  # relative to the signal's variance
 BLOCK = 64  # rows of a factor's inverse that are multiplied at once
@@ -107,24 +107,27 @@ def conditioned(x: Tensor, y: Tensor, lengthscale: Tensor, signal: Tensor, noise
     return Processes(x, lengthscale, signal, noise, factor, weights)
 
 
-def fit(x: Array, y: Array, rng: np.random.Generator, check: Callable[[], None] = lambda: None) -> Processes:
-    """Fit hyperparameters by evidence with the authors' penalty, from their starting point.
+def fit(
+    x: Array, y: Array, signal_to_noise: float, rng: np.random.Generator, check: Callable[[], None] = lambda: None
+) -> Processes:
+    """Fit hyperparameters by evidence with the penalty of PILCO's authors, from their starting point.
 
     Args:
         x: inputs (n, I).
         y: outputs (n, E).
+        signal_to_noise: limit of the ratio of the deviations of signal and noise.
         rng: draws a subset of many samples.
         check: called at each evaluation.
     """
     if len(x) > MOST:
         kept = rng.choice(len(x), MOST, replace=False)
         x, y = x[kept], y[kept]
-    found = [_fit_one(x, column, check) for column in y.T]
+    found = [_fit_one(x, column, signal_to_noise, check) for column in y.T]
     lengthscale, signal, noise = (torch.from_numpy(np.stack(part)) for part in zip(*found, strict=True))
     return conditioned(torch.from_numpy(x), torch.from_numpy(y), lengthscale, signal, noise)
 
 
-def _fit_one(x: Array, y: Array, check: Callable[[], None]) -> tuple[Array, float, float]:
+def _fit_one(x: Array, y: Array, signal_to_noise: float, check: Callable[[], None]) -> tuple[Array, float, float]:
     """Length scales (I,), signal and noise of one output (n,)."""
     spread = np.maximum(x.std(0, ddof=1), 1e-3)
     level = max(y.std(ddof=1), 1e-6)
@@ -136,7 +139,7 @@ def _fit_one(x: Array, y: Array, check: Callable[[], None]) -> tuple[Array, floa
             loss, slope = negative_log_evidence(x, y, theta)
         except LinAlgError:  # no Cholesky factor
             return np.nan, np.zeros_like(theta)
-        penalty, further = _penalty(theta, spread)
+        penalty, further = _penalty(theta, spread, signal_to_noise)
         return loss + penalty, slope + further
 
     found = lowest(objective, start, [(v - 7, v + 7) for v in start], maxiter=ITERATIONS)
@@ -197,9 +200,10 @@ def negative_log_evidence(x: Array, y: Array, theta: Array) -> tuple[float, Arra
     return float(y @ weights / 2 + np.log(np.diag(factor)).sum()), np.array(slope)
 
 
-def _penalty(theta: Array, spread: Array) -> tuple[float, Array]:
-    """A penalty and its gradient. It grows steeply where the signal is 1,000 times the noise, or a length scale 100
-    times the inputs' deviation or a hundredth of it (the authors' ``hypCurb``)."""
-    over = np.append((theta[:-2] - np.log(spread)) / np.log(SPREAD), (theta[-2] - theta[-1]) / np.log(SIGNAL_TO_NOISE))
-    slope = POWER * over ** (POWER - 1) / np.append(np.full(len(spread), np.log(SPREAD)), np.log(SIGNAL_TO_NOISE))
+def _penalty(theta: Array, spread: Array, signal_to_noise: float) -> tuple[float, Array]:
+    """A penalty and its gradient. It grows steeply where the ratio of signal and noise is at its limit, or a length
+    scale is 100 times the inputs' deviation or a hundredth of it (PILCO's ``hypCurb``)."""
+    limits = np.log([*np.full(len(spread), SPREAD), signal_to_noise])
+    over = np.append(theta[:-2] - np.log(spread), theta[-2] - theta[-1]) / limits
+    slope = POWER * over ** (POWER - 1) / limits
     return float((over**POWER).sum()), np.append(slope, -slope[-1])

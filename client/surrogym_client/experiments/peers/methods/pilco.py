@@ -25,6 +25,7 @@ from surrogym_client.policies.predict import Acting
 from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform
 
 HALF_TURN = np.pi
+SIGNAL_TO_NOISE = 1_000.0  # limit of the processes' hyperparameters, as in the authors' penalty
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ def _policy(states: States, theta: Tensor | Array) -> Processes:
 def _model(states: States, data: Transitions, rng: np.random.Generator, check: Callable[[], None]) -> Processes:
     """Processes from features and controls to changes of coordinates."""
     inputs = np.concatenate([states.featured(data.q), data.u], 1)
-    return fit(inputs, states.change(data.q, data.reached), rng, check)
+    return fit(inputs, states.change(data.q, data.reached), SIGNAL_TO_NOISE, rng, check)
 
 
 def _improved(
