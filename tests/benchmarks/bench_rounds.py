@@ -22,6 +22,7 @@ from typing import Any
 
 from bench_start import COMMAND, serving
 from common import started
+
 from surrogym_shared.words import counted
 
 NAME = "task"
