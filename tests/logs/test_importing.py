@@ -85,6 +85,12 @@ def test_a_grown_log_adds_only_its_new_steps(server_process: ServerProcess, tmp_
     assert import_log(late, to=name, url=server_process.url).taken == 20
 
 
+@pytest.mark.parametrize(("budget", "expected"), [(None, 5), (0, 0), (30, 30)])
+def test_a_budget_replaces_that_of_a_given_specification(log: Path, budget: int | None, expected: int):
+    drafted = import_log(log, budget=5).log.spec
+    assert import_log(log, spec=drafted, budget=budget).log.spec.design.budget == expected
+
+
 def test_a_surrogate_of_a_log_moves_as_a_file(server_process: ServerProcess, log: Path, name: str):
     import_log(log, register=name, url=server_process.url)
     with Api(server_process.url) as api:

@@ -47,13 +47,13 @@ class OfLogs:
         ),
     ] = None
     budget: Annotated[
-        int,
+        int | None,
         typer.Option(
             min=0,
             help="For a log: real steps that the design may take beyond the log; 0 if there is no machine to take "
-            "them.",
+            "them. [default: that of --spec, or 0]",
         ),
-    ] = 0
+    ] = None
     picture: Annotated[
         Path | None,
         typer.Option(
@@ -108,7 +108,7 @@ def command(
     from surrogym_client.logs.reading import format_of
 
     if format_of(file) == "surrogate":
-        if given := [f"--{name}" for name, value in vars(log).items() if value]:
+        if given := [f"--{name}" for name, value in vars(log).items() if value is not None]:
             raise CommandError(f"{file} is a surrogate's file: {given[0].replace('mapping', 'map')} is for logs")
         _import_surrogate(context, file, name, service, output)
         return

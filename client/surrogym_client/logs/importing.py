@@ -56,7 +56,7 @@ class Options:
 
     mapping: Path | Mapping_ | None = None  # file, or what stands in one; None goes by the names of the columns
     spec: EnvironmentSpec | None = None  # that the log is checked against; None drafts one
-    budget: int = 0  # of a drafted one
+    budget: int | None = None  # of the design; None is that of ``spec``, or 0
     name: str = ""  # of its environment; the file's by default
     progress: Progress = field(default=lambda _share, _words: None)
 
@@ -74,9 +74,15 @@ def read_log(path: str | Path, options: Options | None = None) -> ReadLog:
     table = read(path)
     roles = _roles(table, options.mapping)
     options.progress(0.1, f"checking {len(table)} rows")
-    if options.spec is not None:
-        return check_log(table, roles, options.spec)
-    return draft_log(table, roles, options.name or path.stem, options.budget)
+    if options.spec is None:
+        return draft_log(table, roles, options.name or path.stem, options.budget or 0)
+    return check_log(table, roles, _with_budget(options.spec, options.budget))
+
+
+def _with_budget(spec: EnvironmentSpec, budget: int | None) -> EnvironmentSpec:
+    if budget is None:
+        return spec
+    return spec.model_copy(update={"design": spec.design.model_copy(update={"budget": budget})})
 
 
 def send(api: Api, name: str, log: ReadLog, progress: Progress = lambda _share, _words: None) -> tuple[int, int]:
@@ -102,7 +108,7 @@ def import_log(
     to: str | None = None,
     mapping: str | Path | Mapping_ | None = None,
     spec: EnvironmentSpec | None = None,
-    budget: int = 0,
+    budget: int | None = None,
     rejected: str | Path | None = None,
     draft: str | Path | None = None,
     url: str | None = None,
@@ -117,7 +123,8 @@ def import_log(
         to: name of a surrogate that is there, by whose specification the rows are checked.
         mapping: what the columns are: a JSON or TOML file, or the same as a dictionary; None goes by their names.
         spec: the specification that the rows are checked against; None drafts one.
-        budget: real steps that the design of a drafted one may ask for; 0 where there is no machine.
+        budget: real steps that the design may ask for, 0 where there is no machine. None is that of ``spec``, or 0 of
+            a drafted one.
         rejected: where the rows go that can't be used; by default beside the log.
         draft: file to which the specification is written, before anything is sent.
         url, token: of the server, as ``Api`` takes them.
