@@ -80,6 +80,9 @@ FORMULAS: dict[str, Formula] = {
     "a disc": lambda q: np.hypot(q[:, 0], q[:, 1]) < 0.6,
     "outside of a ball": lambda q: 3.0 * (q[:, 0] ** 2 + (q[:, 1] - 0.5) ** 2 + np.cos(q[:, 2]) ** 2 > 0.5),
     "a distance between entries": lambda q: np.abs(q[:, 0] - q[:, 1]) < 0.2,
+    "a box": lambda q: (np.abs(q[:, 0] + 0.5) < 0.6) & (np.abs(q[:, 1] - 0.5) < 0.5),
+    "a box that moves": lambda q: (np.abs(q[:, 0] - q[:, 1]) < 0.7) & (np.cos(q[:, 2]) > 0.1),
+    "outside of a corner": lambda q: -2.0 * ~((q[:, 0] > -0.5) & (q[:, 1] > 0.3)),
 }
 
 
@@ -109,7 +112,22 @@ OTHERS: dict[str, Formula] = {
 def test_another_reward_is_left_to_be_learned(reward: Formula):
     machine = Machine(reward, "after")
     assert machine.found() is None
-    assert machine.steps <= 100 + SEEK + 2 * POINTS * (HALVINGS + 1)
+    assert machine.steps <= 100 + SEEK + 6 * POINTS * (HALVINGS + 1)
+
+
+def test_a_state_that_jumps_hides_no_box():
+    """At a contact the next state jumps, so some points of the boundary lie on no face."""
+    machine = Machine(FORMULAS["a box"], "after")
+
+    def step(q: np.ndarray, u: np.ndarray) -> Paid:
+        steps = machine.step(q, u)
+        jump = np.where(q[:, 2] > 2.5, 1.0, 0.0)[:, None] * np.array([1.3, 0.0, 0.0])
+        after = steps.q_next + jump
+        return Paid(q, u, after, FORMULAS["a box"](after).astype(float))
+
+    found = threshold_reward(spec(), step(*machine.draw(100)), step, machine.draw)
+    assert found is not None
+    assert sorted(round(one.value, 4) for one in found.terms[0].when) == [-1.1, 0.0, 0.1, 1.0]
 
 
 def test_the_paid_steps_of_one_pass_are_enough():
@@ -162,7 +180,12 @@ def test_a_description_declares_a_bonus_near_a_goal(registered: Register):
 @installed("dm_control")
 @pytest.mark.parametrize(
     ("task", "seed", "shape"),
-    [("reacher-easy", 0, "ball"), ("reacher-easy", 51, "ball"), ("pendulum-swingup", 0, "one")],
+    [
+        ("reacher-easy", 0, "ball"),
+        ("reacher-easy", 51, "ball"),
+        ("pendulum-swingup", 0, "one"),
+        ("ball_in_cup-catch", 1, "one"),
+    ],
 )
 def test_rewards_of_the_control_suite_are_found(task: str, seed: int, shape: str):
     found = describe(f"dm_control:{task}", seed=seed)

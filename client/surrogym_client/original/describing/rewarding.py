@@ -47,6 +47,9 @@ class Paid:
     def at(self, chosen: slice | NDArray[np.bool_]) -> Paid:
         return Paid(self.q[chosen], self.u[chosen], self.q_next[chosen], self.reward[chosen])
 
+    def one(self, number: int) -> Paid:
+        return self.at(slice(number, number + 1))
+
     def before(self) -> Array:
         """The states (n, C) before the steps."""
         return self.q

@@ -1,4 +1,4 @@
-"""Find a reward of two values that changes at a level of an observation entry, or at an ellipsoid of some entries.
+"""Find a reward of two values that changes at a level of an observation entry, at an ellipsoid or at a box of some.
 
 Bonuses for being near a goal or above a height are of this kind. Bisections between a step with one value and a step
 with the other give points x of the boundary. One end of most bisections is in a random state, so that the points
@@ -6,7 +6,8 @@ lie on all sides. A form is found if all points satisfy
 
     x_i = level,   or   sum_i ((x_i - c_i) / r_i)^2 = 1
 
-where x holds one to three entries, and if it gives the reward of every other step.
+where x holds one to three entries, or if most points have one of a few levels, as on the faces of a box, and if the
+form gives the reward of every other step.
 
 Shapes: n steps, C coordinates, F action entries, K points of the boundary, k entries.
 """
@@ -19,8 +20,9 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_client.original.describing.boxes import LEVEL, MOST_FACES, alone, box, contains, has_face
 from surrogym_client.original.describing.probing import EXACT
-from surrogym_client.original.describing.rewarding import Paid, error_of
+from surrogym_client.original.describing.rewarding import Paid, Timing, error_of
 from surrogym_client.original.protocol import Array
 from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Inequality, Quantity, RewardTerm, Term
 from surrogym_shared.terms import evaluate
@@ -30,9 +32,11 @@ BATCH = 12
 ENOUGH = 4  # steps with the rarer value, at which bisections begin
 POINTS = 12  # of the boundary: twice the numbers of an ellipsoid of three entries
 HALVINGS = 24
-LEVEL = 1e-5  # largest distance of a point from the boundary, as a share of the boundary's size
+COARSE = 10  # halvings after which a step is still far enough from the boundary to check a form
+NEAR = 0.02  # of the range of states: how far the end of a bisection moves for a point beside another
 FLAT = 1e-3  # a share of the largest singular value: with one below it, points lie on more than one ellipsoid
 MOST = 5_000  # groups of entries
+READS: dict[Timing, Callable[[Paid], Array]] = {"after": Paid.after, "before": Paid.before}
 
 Steps = Callable[[Array, Array], Paid]  # from states (n, C) with actions (n, F), without those that end an episode
 Drawn = Callable[[int], tuple[Array, Array]]  # n random states (n, C) and actions (n, F)
@@ -52,18 +56,48 @@ def threshold_reward(spec: EnvironmentSpec, seen: Paid, step: Steps, draw: Drawn
     if len(values) != 2:
         return None
     rare, usual = (float(value) for value in values[np.argsort(counts)])
-    bounds = _boundary(steps, len(seen), steps.reward == rare, step)
+    boundary = _Boundary(steps, len(seen), steps.reward == rare, step)
+    bounds = boundary.more()
     if len(bounds) < POINTS:
         return None
-    for timing in ("after", "before"):
-        reads = Paid.after if timing == "after" else Paid.before
+    for found in itertools.chain(_smooth(spec, bounds, steps, rare, usual), _boxes(spec, boundary, steps)):
+        if error_of(spec, found, steps.joined(boundary.passed)) <= EXACT * abs(rare - usual):
+            return found
+    return None
+
+
+def _smooth(spec: EnvironmentSpec, bounds: Paid, steps: Paid, rare: float, usual: float) -> Iterator[DeclaredReward]:
+    """Rewards whose boundary is a level or an ellipsoid."""
+    for timing, reads in READS.items():
         for group in itertools.islice(_groups(spec), MOST):
             for inside in regions(spec, group, reads(bounds), reads(steps)):
-                for terms in (_paying(inside, rare, usual), _paying(inside, usual, rare)):
-                    found = DeclaredReward(kind="declared", timing=timing, terms=terms)
-                    if error_of(spec, found, steps) <= EXACT * abs(rare - usual):
-                        return found
-    return None
+                yield _paying(timing, inside, rare, usual)
+                yield _paying(timing, inside, usual, rare)
+
+
+def _boxes(spec: EnvironmentSpec, boundary: _Boundary, steps: Paid) -> Iterator[DeclaredReward]:
+    """Rewards whose boundary has faces. If the points so far share a level, as many are added, and then a neighbour of
+    each that shares none, to find the quantity that has a level there.
+
+    A face that no point meets leaves steps inside whose reward is that of outside. The way to one of them crosses it.
+    """
+    terms, values = _single(spec), np.unique(steps.reward)
+    timings = [time for time, reads in READS.items() if has_face(spec, terms, reads(boundary.points), reads(steps))]
+    if timings:
+        boundary.more()
+    for timing, (within, elsewhere) in itertools.product(timings, (values, values[::-1])):
+        reads = READS[timing]
+        for _ in range(MOST_FACES):
+            boundary.beside(alone(spec, terms, reads(boundary.points), reads(steps)))
+            known = steps.joined(boundary.passed)
+            when = box(spec, terms, reads(boundary.points), reads(known), known.reward == within)
+            if not when:
+                break
+            wrong = np.flatnonzero(contains(spec, when, reads(known)) & (known.reward != within))
+            if not len(wrong):
+                yield _paying(timing, RewardTerm(shape="one", when=when), float(within), float(elsewhere))
+                break
+            boundary.between(known.one(np.flatnonzero(known.reward == within)[0]), known.one(wrong[0]))
 
 
 def _with_both_values(steps: Paid, step: Steps, draw: Drawn) -> Paid:
@@ -76,20 +110,69 @@ def _with_both_values(steps: Paid, step: Steps, draw: Drawn) -> Paid:
     return steps
 
 
-def _boundary(steps: Paid, explored: int, rare: NDArray[np.bool_], step: Steps) -> Paid:
-    """Steps next to the boundary (K,), by bisection between steps with the rare value and others, in pairs.
+class _Boundary:
+    """Steps next to the boundary, by bisection between steps with the rare value and others.
 
     The first ``explored`` steps are those of few episodes. All of them that have the rare value may be neighbours, and
     a small part of a boundary does not tell its form. So one end of most bisections is in a random state.
     """
-    few, others = _spread(np.flatnonzero(rare), explored), _spread(np.flatnonzero(~rare), explored)
-    found = steps.at(slice(0))
-    for number in range(2 * POINTS):
-        if len(found) >= POINTS:
-            break
-        one, other = few[number % len(few)], others[(number + number // len(few)) % len(others)]
-        found = found.joined(_bisected(steps, one, other, step))
-    return found
+
+    def __init__(self, steps: Paid, explored: int, rare: NDArray[np.bool_], step: Steps) -> None:
+        self.points = self.passed = steps.at(slice(0))  # near the boundary, and on the way to it
+        self._steps, self._step = steps, step
+        self._ends: list[tuple[Paid, Paid]] = []  # of the bisection of each point
+        few, others = ([steps.one(i) for i in _spread(np.flatnonzero(of), explored)] for of in (rare, ~rare))
+        self._paired = 0  # points that have a neighbour, or were tried
+        self._pairs = ((few[n % len(few)], others[(n + n // len(few)) % len(others)]) for n in itertools.count())
+
+    def more(self) -> Paid:
+        """Add at most ``POINTS`` points, of at most twice as many bisections, and return all."""
+        enough = len(self.points) + POINTS
+        for one, other in itertools.islice(self._pairs, 2 * POINTS):
+            self._add(one, other)
+            if len(self.points) == enough:
+                break
+        return self.points
+
+    def beside(self, chosen: NDArray[np.bool_]) -> None:
+        """Add a point near each of some points (K,), once."""
+        width = np.ptp(self._steps.q, axis=0)
+        new = self._paired + np.flatnonzero(chosen[self._paired :])
+        self._paired = len(chosen)
+        for number in new:
+            self._add(*self._ends[number], shift=NEAR * width * np.where(np.arange(len(width)) % 2, 1, -1))
+
+    def between(self, one: Paid, other: Paid) -> None:
+        """Add a point between two steps with different values."""
+        self._add(one, other)
+
+    def _add(self, one: Paid, other: Paid, shift: Array | float = 0.0) -> None:
+        found = self._bisected(one, other, shift)
+        self.points = self.points.joined(found)
+        self._ends += [(one, other)] * len(found)
+
+    def _bisected(self, one: Paid, other: Paid, shift: Array | float) -> Paid:
+        """The step next to the boundary between two steps, with state and action between theirs. The state of the
+        other step is shifted (C,).
+
+        None if a step ends an episode, or all have the same reward: then one of the two steps can't be repeated
+        exactly, or the shifted end is on the same side.
+        """
+        q, u, q_other, u_other = one.q[0], one.u[0], other.q[0] + shift, other.u[0]
+        last, met = self._steps.at(slice(0)), set[bool]()
+        for number in range(HALVINGS):
+            middle, action = (q + q_other) / 2, (u + u_other) / 2
+            last = self._step(middle[None], action[None])
+            if not len(last):
+                return last
+            if number < COARSE:
+                self.passed = self.passed.joined(last)
+            met.add(same := bool(last.reward[0] == one.reward[0]))
+            if same:
+                q, u = middle, action
+            else:
+                q_other, u_other = middle, action
+        return last if len(met) == 2 else last.at(slice(0))
 
 
 def _spread(chosen: NDArray[np.int64], explored: int) -> NDArray[np.int64]:
@@ -98,39 +181,31 @@ def _spread(chosen: NDArray[np.int64], explored: int) -> NDArray[np.int64]:
     return np.append(anywhere, near[np.linspace(0, len(near) - 1, min(POINTS, len(near))).astype(int)])
 
 
-def _bisected(steps: Paid, one: int, other: int, step: Steps) -> Paid:
-    """The step next to the boundary between two steps, with state and action between theirs.
-
-    None if a step ends an episode, or all have the same reward: then one of the two steps can't be repeated exactly.
-    """
-    (q, u), (q_other, u_other) = (steps.q[one], steps.u[one]), (steps.q[other], steps.u[other])
-    last, met = steps.at(slice(0)), set[bool]()
-    for _ in range(HALVINGS):
-        middle, action = (q + q_other) / 2, (u + u_other) / 2
-        last = step(middle[None], action[None])
-        if not len(last):
-            return last
-        met.add(same := bool(last.reward[0] == steps.reward[one]))
-        if same:
-            q, u = middle, action
-        else:
-            q_other, u_other = middle, action
-    return last if len(met) == 2 else last.at(slice(0))
-
-
 def _groups(spec: EnvironmentSpec) -> Iterator[tuple[Term, ...]]:
     """Groups of one to three terms whose level may be the boundary, the simplest ones first."""
-    shown = [entry.term for entry in spec.observation if entry.term.low is None and entry.term.high is None]
+    shown = _shown(spec)
+    yield from ((term,) for term in _single(spec))
+    yield from itertools.combinations(shown, 2)
+    yield from itertools.combinations(shown, 3)
+    yield from itertools.combinations([*shown, *_differences(shown)], 2)
+
+
+def _single(spec: EnvironmentSpec) -> list[Term]:
+    """Terms that may be at a level each: what is observed, coordinates, cosines and sines, and differences."""
     own: list[Term] = []
     for coordinate in spec.coordinates:
         own.append(Term.linear(**{coordinate.name: 1.0}))
         if coordinate.kind == "angle":
             own += [Term.cos(**{coordinate.name: 1.0}), Term.sin(**{coordinate.name: 1.0})]
-    differences = [one + (-1.0) * other for one, other in itertools.combinations(shown, 2)]
-    yield from ((term,) for term in [*shown, *own, *differences])
-    yield from itertools.combinations(shown, 2)
-    yield from itertools.combinations(shown, 3)
-    yield from itertools.combinations([*shown, *differences], 2)
+    return [*(shown := _shown(spec)), *own, *_differences(shown)]
+
+
+def _shown(spec: EnvironmentSpec) -> list[Term]:
+    return [entry.term for entry in spec.observation if entry.term.low is None and entry.term.high is None]
+
+
+def _differences(shown: Sequence[Term]) -> list[Term]:
+    return [one + (-1.0) * other for one, other in itertools.combinations(shown, 2)]
 
 
 def regions(spec: EnvironmentSpec, group: Sequence[Term], bounds: Array, states: Array) -> Iterator[RewardTerm]:
@@ -171,7 +246,8 @@ def _ellipsoid(group: Sequence[Term], x: Array, elsewhere: Array) -> tuple[Quant
     )
 
 
-def _paying(inside: RewardTerm, within: float, elsewhere: float) -> tuple[RewardTerm, ...]:
-    """Terms of a reward of two values."""
+def _paying(timing: Timing, inside: RewardTerm, within: float, elsewhere: float) -> DeclaredReward:
+    """A reward of two values."""
     bonus = inside.model_copy(update={"weight": within - elsewhere})
-    return (bonus, RewardTerm(weight=elsewhere, shape="one")) if elsewhere else (bonus,)
+    terms = (bonus, RewardTerm(weight=elsewhere, shape="one")) if elsewhere else (bonus,)
+    return DeclaredReward(kind="declared", timing=timing, terms=terms)

@@ -14,7 +14,8 @@ def words_of_reward(reward: DeclaredReward) -> str:
     """What a declared reward is."""
     bonus = reward.terms[0]
     if bonus.when:
-        return "a threshold of a quantity of the state"
+        several = f"{len(bonus.when)} thresholds of quantities of the state, all met at once,"
+        return "a threshold of a quantity of the state" if len(bonus.when) == 1 else several
     return (
         "an ellipsoid of quantities of the state"
         if bonus.shape == "ball"
