@@ -238,6 +238,7 @@ def _build_services(settings: Settings, design: DesignPort, process: _Process) -
     designer = Designer(
         storage,
         definitions,
+        design.plan,
         process.fits,
         process.models,
         notices,

@@ -78,7 +78,7 @@ def fit_all_due(storage: Storage) -> None:
     async def fit() -> None:
         cache, notices, metrics = ModelCache(load, storage.models.newest), Notices(), ProcessMetrics()
         options = {"owner": "here", "threads": 1, "look_seconds": 1.0, "fit_seconds": 60.0}
-        await Designer(storage, definitions, Here(), cache, notices, metrics, **options).fit_all_due()
+        await Designer(storage, definitions, initial_queries, Here(), cache, notices, metrics, **options).fit_all_due()
 
     asyncio.run(fit())
 

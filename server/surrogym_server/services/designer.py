@@ -29,6 +29,7 @@ from surrogym_server.plugins import in_one_line
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
+from surrogym_server.services.surrogates import Plan
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import (
     FREE,
@@ -75,6 +76,7 @@ class Designer:
         self,
         storage: Storage,
         definitions: Definitions,
+        plan: Plan,
         fits: Compute,
         models: ModelCache,
         notices: Notices,
@@ -89,6 +91,7 @@ class Designer:
         """Args:
         storage: holds the right to fit.
         definitions: of the surrogates in it.
+        plan: the first queries under a budget.
         fits: runs the jobs.
         models: is informed of each new version.
         notices: wake this designer, and are posted after each fit.
@@ -100,6 +103,7 @@ class Designer:
         fit_workers: number of fits at a time, not counting long ones."""
         self._storage = storage
         self._definitions = definitions
+        self._plan = plan
         self._fits = fits
         self._models = models
         self._notices = notices
@@ -137,12 +141,14 @@ class Designer:
 
     async def _begin_all_due(self) -> None:
         designs = self._storage.designs
-        due, hopeless = await asyncio.to_thread(lambda: (designs.due(), designs.hopeless()))
+        due, hopeless, unbegun = await asyncio.to_thread(lambda: (designs.due(), designs.hopeless(), designs.unbegun()))
         for name in due:
             if name not in self._tasks:
                 self._tasks[name] = asyncio.create_task(self._fit_in_turn(name))
         if hopeless:
             await asyncio.to_thread(self._give_up, hopeless)
+        if unbegun:
+            await asyncio.to_thread(self._ask_first, unbegun)
 
     async def _fit_in_turn(self, name: str) -> None:
         """Run one fit. Its errors end this fit only."""
@@ -341,6 +347,15 @@ class Designer:
                     f"all {len(set_aside)} initial queries were set aside; the last error was: {set_aside[-1].error}"
                 )
                 self._storage.surrogates.set_phase(name, "failed", error)
+                self._notices.post(name)
+
+    def _ask_first(self, unbegun: Sequence[str]) -> None:
+        """Queue initial queries of designs that got a budget after they had been created without one."""
+        for name in unbegun:
+            with suppress(SurrogymError):  # deleted meanwhile, or the storage is away
+                budget = self._storage.surrogates.get(name).budget
+                _, coordinates, action, rollouts = self._plan(self._definitions.get(name), budget)
+                self._storage.designs.ask_first(name, coordinates, action, rollouts)
                 self._notices.post(name)
 
 

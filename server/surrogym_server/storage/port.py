@@ -168,6 +168,17 @@ class Designs(ABC):
         """
 
     @abstractmethod
+    def unbegun(self) -> list[str]:
+        """Return the names of surrogates whose design has a budget but never had a query, oldest first.
+
+        Such a surrogate is collecting and not paused, and has no samples: it was created with a budget of 0.
+        """
+
+    @abstractmethod
+    def ask_first(self, name: str, coordinates: Array, action: Array, rollouts: Sequence[Array]) -> None:
+        """Queue the initial queries of an ``unbegun`` surrogate. If it is no longer unbegun, nothing changes."""
+
+    @abstractmethod
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
         """Take the right to fit. The phase becomes ``fitting``. Returns None if the surrogate is not due."""
 

@@ -78,6 +78,7 @@ def designer(storage: Storage, definitions: Definitions, cache: ModelCache, runn
         return Designer(
             storage,
             definitions,
+            initial_queries,
             runner,
             cache,
             Notices(),
@@ -361,6 +362,17 @@ def teach_another(storage: Storage, budget: int) -> None:
     for query in storage.queries.claim("another", "tester", 100, 60):
         step = pendulum.real_step(list(query.coordinates), list(query.action))
         storage.samples.add("another", "tester", [NewSample(**step, query_id=query.id, lease_token=query.token)])
+
+
+def test_a_budget_that_comes_later_gets_initial_queries(answered: Storage, designer):
+    spec = pendulum.spec()
+    definition = definition_from_spec(EnvironmentSpec.model_validate(spec))
+    answered.surrogates.create(NewSurrogate("late", spec, 0, 0.999, initial_queries(definition, 0)[0]))
+    fit_all(designer)
+    assert answered.queries.counts("late").pending == 0
+    answered.designs.improve("late", 3, raise_budget=True)
+    fit_all(designer)
+    assert answered.queries.counts("late").pending == 3
 
 
 @pytest.mark.parametrize("error", [CancelledError(), RuntimeError("line 1\n  line 2")])

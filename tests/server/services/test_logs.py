@@ -47,7 +47,7 @@ def fit(storage: Storage, definitions: Definitions):
     def run() -> None:
         async def once() -> None:
             designer = Designer(
-                storage, definitions, Here(), cache, Notices(), ProcessMetrics(),
+                storage, definitions, initial_queries, Here(), cache, Notices(), ProcessMetrics(),
                 owner="here", threads=1, look_seconds=0.05, fit_seconds=3600,
             )  # fmt: skip
             await designer.fit_all_due()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 import sqlalchemy as sa
 
@@ -133,6 +134,21 @@ def test_a_design_without_samples_is_hopeless_once_all_its_queries_are_set_aside
     storage.surrogates.change(hopeless, paused=True)
     assert storage.designs.hopeless() == []
     assert storage.queries.counts(waiting).pending == 1
+
+
+def test_a_design_is_unbegun_while_it_has_a_budget_and_never_had_a_query(
+    storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
+) -> None:
+    late, sampled = (make(queries=0, name=name, budget=0) for name in ("late", "sampled"))
+    assert storage.designs.unbegun() == []
+    for name in (late, sampled):
+        storage.surrogates.change(name, budget=5)
+    storage.samples.add(sampled, "a", [by_hand()])
+    assert storage.designs.unbegun() == [late]
+    for name in (late, late, sampled):  # the second time changes nothing
+        storage.designs.ask_first(name, np.zeros((2, 2)), np.zeros((2, 1)), ())
+    assert storage.designs.unbegun() == []
+    assert [storage.queries.counts(name).pending for name in (late, sampled)] == [2, 0]
 
 
 def test_a_second_list_shows_what_came_since_the_first(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +14,7 @@ from surrogym_server.errors import BeyondBudget, LeaseExpired, UnknownSurrogate
 from surrogym_server.storage import port
 from surrogym_server.storage.records import (
     OPEN_STATUSES,
+    Array,
     FitLease,
     Granted,
     NewDesign,
@@ -51,6 +53,14 @@ IS_HOPELESS = sa.and_(
     ~OPEN_QUERY,
     ~sa.exists(OWN_SAMPLES),
 )
+IS_UNBEGUN = sa.and_(
+    surrogates.c.phase == constant("collecting"),
+    surrogates.c.paused.is_(False),
+    surrogates.c.budget > 0,
+    ~sa.exists(OWN_QUERIES),
+    ~sa.exists(OWN_SAMPLES),
+)
+UNBEGUN = sa.select(surrogates.c.name).where(IS_UNBEGUN).order_by(surrogates.c.id)
 HOPELESS = sa.select(surrogates.c.name).where(IS_HOPELESS).order_by(surrogates.c.id)
 
 
@@ -90,6 +100,16 @@ class SqlDesigns(port.Designs):
     def hopeless(self) -> list[str]:
         with self._database.read() as connection:
             return list(connection.execute(HOPELESS).scalars())
+
+    def unbegun(self) -> list[str]:
+        with self._database.read() as connection:
+            return list(connection.execute(UNBEGUN).scalars())
+
+    def ask_first(self, name: str, coordinates: Array, action: Array, rollouts: Sequence[Array]) -> None:
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            if connection.execute(sa.select(surrogates.c.id).where(surrogates.c.id == held.id, IS_UNBEGUN)).first():
+                insert_queries(connection, held, "initial", 0, coordinates, action, rollouts)
 
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
         with self._database.write() as connection:
