@@ -5,7 +5,12 @@ import pytest
 from support.selected import mixed_cases
 from surrogym_server.testing import LAWS_OF_MODELS, model_cases
 
-FAMILIES: dict[str, dict[str, float]] = {"gaussian_process": {}, "ensemble": {"steps": 300}, "selected": {"steps": 50}}
+FAMILIES: dict[str, dict[str, float]] = {
+    "gaussian_process": {},
+    "ensemble": {"steps": 300},
+    "bayesian_last_layer": {"members": 3, "steps": 150},
+    "selected": {"steps": 50},
+}
 THROUGH_INDUCING_POINTS = model_cases("sparse_gaussian_process", {"inducing": 40}, 200)  # fewer samples are exact
 PROCESS, SPARSE, ENSEMBLE = "gaussian_process", "sparse_gaussian_process", "ensemble"
 MIXED = {  # families of angle, speed and reward
