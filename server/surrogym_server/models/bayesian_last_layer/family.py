@@ -16,8 +16,8 @@ from surrogym_server.models.bayesian_last_layer.learning import learn
 from surrogym_server.models.bayesian_last_layer.training import Training
 from surrogym_server.models.port import Learned, Learner, ModelCodec, Warm
 
-LARGEST = {"members": MAX_MEMBERS, "units": MAX_UNITS, "waves": MAX_WAVES, "steps": 5_000, "seed": 2**31}
-LEAST = {"members": 1, "units": 1, "waves": 0, "steps": 1, "seed": 0}
+LARGEST = {"networks": MAX_MEMBERS, "units": MAX_UNITS, "waves": MAX_WAVES, "iterations": 5_000, "seed": 2**31}
+LEAST = {"networks": 1, "units": 1, "waves": 0, "iterations": 1, "seed": 0}
 
 
 @dataclass(frozen=True)
@@ -25,18 +25,21 @@ class BayesianLastLayers(Learner):
     """A few networks for each output, whose last layers are exact Bayesian linear regressions on hidden units and
     random waves. The warm start is what the last fit has trained: hidden weights and variances.
 
+    The settings are not called ``members`` and ``steps``, because ``selected`` passes its own on to all candidates that
+    have settings of these names, and an ensemble needs more of both.
+
     Attributes:
-        members: number of networks of each output.
+        networks: number of networks of each output.
         units: of each hidden layer.
         waves: random Fourier features beside the hidden units.
-        steps: of gradient ascent.
+        iterations: of gradient ascent.
         seed: of initial weights, waves and batches.
     """
 
-    members: int = 5
+    networks: int = 4
     units: int = 32
     waves: int = 64
-    steps: int = 600
+    iterations: int = 300
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -50,5 +53,5 @@ class BayesianLastLayers(Learner):
         return BayesianLastLayerCodec()
 
     def learn(self, definition: EnvironmentDefinition, samples: Samples, warm: Warm | None = None) -> Learned:
-        training = Training(self.members, self.units, self.waves, self.steps, self.seed)
+        training = Training(self.networks, self.units, self.waves, self.iterations, self.seed)
         return learn(training, definition, samples, warm or {})

@@ -34,7 +34,7 @@ from surrogym_server.models.bayesian_last_layer.regression import Regression
 from surrogym_server.tensors import in_rows
 
 RATE, VARIANCE_RATE = 0.01, 0.03  # initial learning rates of weights and of variances; they decay to 0 by a cosine
-LARGEST_BATCH = 512
+LARGEST_BATCH = 256  # more samples are drawn from at random in each step
 LEAST_NOISE = 1e-8  # variance, in those of an output
 TYPICAL_NOISE = 1e-3  # median of the noise's prior, in the same unit
 WIDE, WIDER = (
