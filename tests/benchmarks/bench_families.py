@@ -1,6 +1,7 @@
 """The choice of families by evidence: what it decides, and what the families are worth on other episodes.
 
 python tests/benchmarks/bench_families.py
+python tests/benchmarks/bench_families.py --alone --tasks bounce --rows 500
 python tests/benchmarks/bench_families.py --tasks bounce --settings '{"candidates": "gaussian_process, ensemble"}'
 
 ``pendulum`` is smooth; its few samples are single steps from anywhere. ``bounce`` is a ball that is pushed on a line
@@ -12,7 +13,8 @@ log and scored on 40 fresh episodes (for ``pendulum``, too) by the same scores: 
 nats, of values in deviations of the output's change, and coverage of 90 % intervals. A choice counts as wrong if a
 rival is clearly better there by the rule of the choice: by more than twice the standard error, with a coverage that is
 no worse by more than 5 points. It also counts as wrong if it lost coverage: it is inside more seldom than the first
-candidate by more than 5 points there. The time is processor time of the fit.
+candidate by more than 5 points there. The time is processor time of the fit. With ``--alone`` nothing is chosen: each
+candidate is only fitted to the whole log and scored on the fresh episodes.
 """
 
 from __future__ import annotations
@@ -134,6 +136,24 @@ def measured(task: str, rows: int, log: int, settings: Mapping[str, Any]) -> dic
     }
 
 
+def alone(task: str, rows: int, log: int, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """How each candidate does on fresh episodes, without a choice among them."""
+    machine, rng = TASKS[task](), np.random.default_rng([log, rows])
+    samples = anywhere(machine, rows, rng) if task == "pendulum" else episodes(machine, rows // EPISODE, rng)
+    fresh, definition, found = episodes(machine, FRESH, rng), definition_from_spec(machine.spec()), {}
+    print(f"{task}, {len(samples)} rows, log {log}")
+    for name, learner in SelectedFamilies(**settings).learners.items():
+        begun = time.process_time()
+        model = learner.learn(definition, samples).model
+        seconds = time.process_time() - begun
+        judged = on_fresh(definition, model, samples, fresh)
+        outputs = {output: asdict_of(one) for output, one in zip(definition.outputs, judged, strict=True)}
+        found[name] = {"seconds of a fit": seconds, "fresh": outputs}
+        said = ", ".join(f"{output} {one['score']:.2f}, {one['coverage']:.0%}" for output, one in outputs.items())
+        print(f"  {name:24}{seconds:6.1f} s a fit; {said} inside")
+    return {"task": task, "rows": len(samples), "log": log, "alone": found}
+
+
 def on_fresh(
     definition: EnvironmentDefinition, model: DynamicsModel, samples: Samples, fresh: Samples
 ) -> tuple[Scores, ...]:
@@ -182,6 +202,7 @@ def main() -> None:
     made = parser(__doc__)
     made.add_argument("--tasks", choices=TASKS, nargs="*", default=list(TASKS))
     made.add_argument("--rows", type=int, nargs="*", help="of the log; by default as the task needs")
+    made.add_argument("--alone", action="store_true", help="score every candidate, and choose none")
     made.add_argument("--settings", default="{}", help="of the family, as JSON")
     made.add_argument("--logs", type=int, nargs="*", default=[0], help="seeds of the logs")
     options = started(made)
@@ -189,6 +210,9 @@ def main() -> None:
     for task in options.tasks:
         for rows in options.rows or ROWS[task]:
             for log in options.logs:
+                if options.alone:
+                    report.append(alone(task, rows, log, json.loads(options.settings)))
+                    continue
                 report.append(measured(task, rows, log, json.loads(options.settings)))
                 show(report[-1])
     write(options.out, "families", {"rows": report})

@@ -34,6 +34,9 @@ class SelectedFamilies(Settings, Learner):
     members: int = 5
     units: int = 32
     steps: int = 600
+    networks: int = 4
+    waves: int = 64
+    iterations: int = 300
     seed: int = 0
 
     def __post_init__(self) -> None:
