@@ -12,11 +12,12 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.ensemble.inputs import Inputs
-from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Regression
+from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Noise, Regression
 from surrogym_server.models.ensemble.networks import Networks
 from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel
 
-FORMAT = 1
+FORMAT = 2
+READABLE = (1, 2)  # 1: no noise
 TRANSITIONS, REWARD, ENDING = "transitions", "reward", "ending"
 MAX_MEMBERS, MAX_UNITS = 16, 128
 Arrays = Mapping[str, Tensor]
@@ -45,7 +46,7 @@ class NetworkEnsembleCodec(ModelCodec):
     def decode(self, definition: EnvironmentDefinition, stored: StoredModel) -> NetworkEnsembleModel:
         header, arrays = stored.header, stored.tensors
         outputs = tuple(header["outputs"])
-        if header["format"] != FORMAT or outputs != definition.outputs:
+        if header["format"] not in READABLE or outputs != definition.outputs:
             raise InvalidInput(
                 f"expected a model of format {FORMAT} with outputs {definition.outputs}, "
                 f"got format {header['format']!r} with {outputs}"
@@ -80,6 +81,8 @@ def _checked(
 
 def _regression_arrays(name: str, regression: Regression) -> dict[str, Tensor]:
     own = {f"{name}.centre": regression.centre, f"{name}.scale": regression.scale}
+    if (noise := regression.noise) is not None:
+        own |= {f"{name}.noise.size": noise.size} | _arrays(f"{name}.noise", noise.networks)
     return own | _arrays(name, regression.networks)
 
 
@@ -92,7 +95,18 @@ def _regression(name: str, arrays: Arrays, inputs: int, outputs: int, *, quadrat
     _require(name, {"centre": centre, "scale": scale}, {"centre": (outputs,), "scale": (outputs,)})
     if bool((scale < 0).any()):
         raise InvalidInput(f"{name}: expected scales of at least 0, got {float(scale.min()):g}")
-    return Regression(_networks(name, arrays, inputs, outputs, quadratic=quadratic), centre, scale)
+    networks = _networks(name, arrays, inputs, outputs, quadratic=quadratic)
+    return Regression(networks, centre, scale, _noise(f"{name}.noise", arrays, inputs, outputs))
+
+
+def _noise(name: str, arrays: Arrays, inputs: int, outputs: int) -> Noise | None:
+    """The noise; None if the arrays have none of this name."""
+    if (size := arrays.get(f"{name}.size")) is None:
+        return None
+    _require(name, {"size": size}, {"size": (outputs,)})
+    if bool((size < 0).any()):
+        raise InvalidInput(f"{name}: expected sizes of at least 0, got {float(size.min()):g}")
+    return Noise(_networks(name, arrays, inputs, outputs, quadratic=False), size)
 
 
 def _networks(name: str, arrays: Arrays, d: int, p: int, *, quadratic: bool) -> Networks:
