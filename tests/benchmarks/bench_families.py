@@ -12,9 +12,9 @@ Every log is fitted by ``selected`` once, so the comparison decides at once. The
 log and scored on 40 fresh episodes (for ``pendulum``, too) by the same scores: log density after 1, 5 and 20 steps in
 nats, of values in deviations of the output's change, and coverage of 90 % intervals. A choice counts as wrong if a
 rival is clearly better there by the rule of the choice: by more than twice the standard error, with a coverage that is
-no worse by more than 5 points. It also counts as wrong if it lost coverage: it is inside more seldom than the first
-candidate by more than 5 points there. The time is processor time of the fit. With ``--alone`` nothing is chosen: each
-candidate is only fitted to the whole log and scored on the fresh episodes.
+clearly no worse by more than 5 points. It also counts as wrong if it lost coverage: it is inside more seldom than the
+first candidate by more than 5 points there. The time is processor time of the fit. With ``--alone`` nothing is chosen:
+each candidate is only fitted to the whole log and scored on the fresh episodes.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples, increments
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.models.selected import SelectedFamilies
+from surrogym_server.models.selected.learning import compared
 from surrogym_server.models.selected.scores import Scores, scores
-from surrogym_server.models.selected.selection import COVERAGE_LOSS, Standing
+from surrogym_server.models.selected.selection import COVERAGE_LOSS
 from surrogym_shared.spec import ModelChoice
 
 Array = np.ndarray[Any, Any]
@@ -165,11 +166,8 @@ def better(judged: Mapping[str, tuple[Scores, ...]], serving: str, column: int) 
     """Families that would have been better on the fresh episodes, by the rule of the choice."""
     base, found = judged[serving][column], []
     for name, outputs in judged.items():
-        one = outputs[column]
-        difference = one.density - base.density
-        error = float(difference.std()) / math.sqrt(len(difference))
-        rival = Standing(name, 0.0, float(difference.mean()), error, float(one.inside.mean()))
-        if name != "selected" and rival.beats(Standing(serving, 0.0, 0.0, 0.0, float(base.inside.mean())), MARGIN):
+        rival, had = compared(name, outputs[column], base), compared(serving, base, base)
+        if name != "selected" and rival.beats(had, MARGIN):
             found.append(name)
     first = next(iter(judged.values()))[column]
     if float(base.inside.mean()) < float(first.inside.mean()) - COVERAGE_LOSS:
@@ -194,8 +192,8 @@ def show(row: Mapping[str, Any]) -> None:
         for family, fresh in output["fresh"].items():
             one = held_out.get(family)
             said = "" if one is None else f"{one['score']:.2f} ({one['better']:+.2f} +- {one['error']:.2f})"
-            said += "" if one is None else f", {one['coverage']:.0%} inside"
-            print(f"    {family:24}{said:40} fresh: {fresh['score']:.2f}, {fresh['coverage']:.0%} inside")
+            said += "" if one is None else f", {one['coverage']:.0%} +- {one['coverage_error']:.0%} inside"
+            print(f"    {family:24}{said:48} fresh: {fresh['score']:.2f}, {fresh['coverage']:.0%} inside")
 
 
 def main() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import torch
 from torch import Tensor
@@ -12,11 +12,11 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.ensemble.inputs import Inputs
-from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Regression
+from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Noise, Regression
 from surrogym_server.models.ensemble.networks import Networks
 from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel
 
-FORMAT = 1
+NOISELESS, FORMAT = 1, 2  # models of the versions before noise was learned are written as they were read
 TRANSITIONS, REWARD, ENDING = "transitions", "reward", "ending"
 MAX_MEMBERS, MAX_UNITS = 16, 128
 Arrays = Mapping[str, Tensor]
@@ -33,7 +33,7 @@ class NetworkEnsembleCodec(ModelCodec):
         if isinstance(model.ending, Networks):
             tensors |= _arrays(ENDING, model.ending)
         header = {
-            "format": FORMAT,
+            "format": NOISELESS if model.transitions.noise is None else FORMAT,
             "outputs": list(model.definition.outputs),
             "terminal_reward": model.terminal_reward,
             "samples": model.samples,
@@ -45,7 +45,7 @@ class NetworkEnsembleCodec(ModelCodec):
     def decode(self, definition: EnvironmentDefinition, stored: StoredModel) -> NetworkEnsembleModel:
         header, arrays = stored.header, stored.tensors
         outputs = tuple(header["outputs"])
-        if header["format"] != FORMAT or outputs != definition.outputs:
+        if header["format"] not in (NOISELESS, FORMAT) or outputs != definition.outputs:
             raise InvalidInput(
                 f"expected a model of format {FORMAT} with outputs {definition.outputs}, "
                 f"got format {header['format']!r} with {outputs}"
@@ -56,11 +56,18 @@ class NetworkEnsembleCodec(ModelCodec):
         for name, array in arrays.items():
             if array.dtype != torch.float64 or not bool(torch.isfinite(array).all()):
                 raise InvalidInput(f"expected finite numbers of torch.float64 as {name}, got {array.dtype}")
-        return _checked(definition, arrays, terminal_reward, samples, str(header["digest"]), header["ending"])
+        noisy = header["format"] == FORMAT
+        return _checked(definition, arrays, terminal_reward, samples, str(header["digest"]), header["ending"], noisy)
 
 
 def _checked(
-    definition: EnvironmentDefinition, arrays: Arrays, terminal_reward: float, samples: int, digest: str, label: object
+    definition: EnvironmentDefinition,
+    arrays: Arrays,
+    terminal_reward: float,
+    samples: int,
+    digest: str,
+    label: object,
+    noisy: bool,
 ) -> NetworkEnsembleModel:
     """Build the model of these arrays, after a check of every shape against the environment."""
     inputs = Inputs(definition)
@@ -68,6 +75,8 @@ def _checked(
     u = torch.zeros(1, definition.action.size, dtype=torch.float64)
     x, count = inputs.of_transition(q, u), len(definition.outputs) - 1
     transitions = _regression(TRANSITIONS, arrays, x.shape[1], count, quadratic=False)
+    if noisy:
+        transitions = replace(transitions, noise=_noise(f"{TRANSITIONS}.noise", arrays, x.shape[1], count))
     reward = None
     if definition.declared_reward is None:
         reward = _regression(REWARD, arrays, inputs.of_reward(q, u, q).shape[1], 1, quadratic=True)
@@ -80,6 +89,8 @@ def _checked(
 
 def _regression_arrays(name: str, regression: Regression) -> dict[str, Tensor]:
     own = {f"{name}.centre": regression.centre, f"{name}.scale": regression.scale}
+    if (noise := regression.noise) is not None:
+        own |= {f"{name}.noise.size": noise.size} | _arrays(f"{name}.noise", noise.networks)
     return own | _arrays(name, regression.networks)
 
 
@@ -93,6 +104,14 @@ def _regression(name: str, arrays: Arrays, inputs: int, outputs: int, *, quadrat
     if bool((scale < 0).any()):
         raise InvalidInput(f"{name}: expected scales of at least 0, got {float(scale.min()):g}")
     return Regression(_networks(name, arrays, inputs, outputs, quadratic=quadratic), centre, scale)
+
+
+def _noise(name: str, arrays: Arrays, inputs: int, outputs: int) -> Noise:
+    size = arrays[f"{name}.size"]
+    _require(name, {"size": size}, {"size": (outputs,)})
+    if bool((size < 0).any()):
+        raise InvalidInput(f"{name}: expected sizes of at least 0, got {float(size.min()):g}")
+    return Noise(_networks(name, arrays, inputs, outputs, quadratic=False), size)
 
 
 def _networks(name: str, arrays: Arrays, d: int, p: int, *, quadratic: bool) -> Networks:

@@ -17,7 +17,7 @@ LEAST = {"members": 2, "units": 1, "steps": 1, "seed": 0}
 
 @dataclass(frozen=True)
 class NetworkEnsembles(Learner):
-    """Networks of two hidden layers, each anchored to its own initial weights.
+    """Networks of two hidden layers, each anchored to its own initial weights, with noise that depends on the state.
 
     There is no warm start, because continued networks would remember the first samples better than later ones.
 

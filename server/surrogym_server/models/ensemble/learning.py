@@ -11,9 +11,9 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples, increments, saturated
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.ensemble.inputs import Inputs
-from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Regression
+from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Noise, Regression
 from surrogym_server.models.ensemble.networks import Networks
-from surrogym_server.models.ensemble.training import Training, cross_entropy, squared_error, train
+from surrogym_server.models.ensemble.training import Training, cross_entropy, squared_error, train, train_with_noise
 
 MIN_POINTS = 2
 CONSTANT = 1e-9  # an output whose deviation is below this share of its own size never varied
@@ -27,7 +27,7 @@ def learn(training: Training, definition: EnvironmentDefinition, samples: Sample
     inputs = Inputs(definition)
     usable = _enough(~saturated(definition, samples.q_next))
     x, change = inputs.of_transition(samples.q, samples.u), increments(definition, samples)
-    transitions = _regression(training, x[usable], change[usable])
+    transitions = _with_noise(training, x[usable], change[usable])
     reward, terminal_reward = _reward(_seeded(training, REWARD_SEED), inputs, samples)
     ending = None
     if definition.learns_termination:
@@ -41,7 +41,7 @@ def _reward(training: Training, inputs: Inputs, samples: Samples) -> tuple[Regre
         return None, known.terminal
     goes_on = _enough(~samples.terminated)
     x = inputs.of_reward(samples.q, samples.u, samples.q_next)
-    reward = _regression(training, x[goes_on], samples.reward[goes_on, None], quadratic=True)
+    reward = _noiseless(training, x[goes_on], samples.reward[goes_on, None])
     if bool(goes_on.all()):
         return reward, 0.0
     beyond = samples.reward - reward(x).mean(0)[:, 0]
@@ -55,12 +55,26 @@ def _ending(training: Training, x: Tensor, ended: Tensor) -> Networks | float:
     return train(training, x, ended.double()[:, None], cross_entropy)
 
 
-def _regression(training: Training, x: Tensor, y: Tensor, *, quadratic: bool = False) -> Regression:
-    """Networks of inputs x (n, d) and targets y (n, p), standardised."""
+def _with_noise(training: Training, x: Tensor, y: Tensor) -> Regression:
+    """Networks of inputs x (n, d) and targets y (n, p), and of their noise."""
+    target, centre, scale = _standardised(y)
+    networks, noisy = train_with_noise(training, x, target)
+    noise = Noise(noisy, torch.zeros_like(scale))
+    noise = replace(noise, size=noise.deviation(x).square().mean(0).sqrt())
+    return Regression(networks, centre, scale, noise)
+
+
+def _noiseless(training: Training, x: Tensor, y: Tensor) -> Regression:
+    """Networks of inputs x (n, d), squares included, and targets y (n, p)."""
+    target, centre, scale = _standardised(y)
+    return Regression(train(training, x, target, squared_error, quadratic=True), centre, scale)
+
+
+def _standardised(y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Targets (n, p) in deviations, their mean (p,) and their deviation (p,), 0 for one that never varied."""
     centre, scale = y.mean(0), y.std(0, correction=0)
     scale = torch.where(scale > CONSTANT * centre.abs(), scale, 0.0)
-    target = (y - centre) / torch.where(scale > 0, scale, 1.0)
-    return Regression(train(training, x, target, squared_error, quadratic=quadratic), centre, scale)
+    return (y - centre) / torch.where(scale > 0, scale, 1.0), centre, scale
 
 
 def _enough(chosen: Tensor) -> Tensor:

@@ -12,13 +12,25 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.environment.step_rules import moved, paid, placed
-from surrogym_server.models.abilities import Differentiable, FunctionDraws, RewardOfStep
+from surrogym_server.models.abilities import Differentiable, FunctionDraws, LearnedNoise, RewardOfStep
 from surrogym_server.models.ensemble.inputs import Inputs
-from surrogym_server.models.ensemble.networks import Networks
-from surrogym_server.models.port import DynamicsModel, Transition
+from surrogym_server.models.ensemble.networks import Networks, bounded
+from surrogym_server.models.port import A, DynamicsModel, Transition
 from surrogym_server.tensors import cached, in_blocks
 
 ROWS = 8_192  # predicted at once
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of single steps that depends on the inputs, in deviations of the outputs."""
+
+    networks: Networks  # of its log variance
+    size: Tensor  # (p,) deviation over the samples: root mean square
+
+    def deviation(self, x: Tensor) -> Tensor:
+        """Deviation at x (m, d), that of the members' mean variance, (m, p)."""
+        return bounded(self.networks(x)).exp().mean(0).sqrt()
 
 
 @dataclass(frozen=True)
@@ -28,15 +40,21 @@ class Regression:
     networks: Networks
     centre: Tensor  # (p,)
     scale: Tensor  # (p,)
+    noise: Noise | None = None  # None if none is learned
 
     def __call__(self, x: Tensor) -> Tensor:
         """Values of every member at x (m, d), (K, m, p)."""
         return self.centre + self.scale * self.networks(x)
 
+    def shaken(self, x: Tensor, process: Tensor) -> Tensor:
+        """Noise at x (m, d), of standard normal numbers (m, p), (m, p)."""
+        return torch.zeros_like(process) if self.noise is None else self.scale * self.noise.deviation(x) * process
+
 
 @dataclass(frozen=True)
-class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, Differentiable):
-    """K members. The mean is the members' mean, and the deviation that between members. No noise is learned."""
+class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, LearnedNoise, Differentiable):
+    """K members. The mean is the members' mean, and the deviation that between members. The noise of a transition
+    depends on the state; the reward has none, and models of older files have none at all."""
 
     definition: EnvironmentDefinition
     transitions: Regression  # M outputs
@@ -56,8 +74,18 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, Different
         deviations: bool = False,
         reward_deviation: bool = False,
     ) -> Transition:
-        del process  # no noise is learned
-        return self._in_blocks(q, u, noise, None, deviations, reward_deviation)
+        return self._in_blocks(q, u, noise, process, None, deviations, reward_deviation)
+
+    def ability(self, kind: type[A]) -> A | None:
+        """No learned noise if none was learned."""
+        return None if kind is LearnedNoise and self.transitions.noise is None else super().ability(kind)
+
+    @property
+    def noise_deviations(self) -> tuple[float, ...]:
+        """Root mean squares over the samples; 0 for the reward."""
+        noise = self.transitions.noise
+        found = torch.zeros_like(self.transitions.scale) if noise is None else self.transitions.scale * noise.size
+        return (*found.tolist(), 0.0)
 
     @property
     def path_size(self) -> int:
@@ -79,8 +107,7 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, Different
         deviations: bool = False,
         reward_deviation: bool = False,
     ) -> Transition:
-        del process
-        return self._in_blocks(q, u, None, paths[:, 0].long(), deviations, reward_deviation)
+        return self._in_blocks(q, u, None, process, paths[:, 0].long(), deviations, reward_deviation)
 
     def reward_of_step(
         self, q: Tensor, u: Tensor, q_next: Tensor, *, paths: Tensor | None = None, deviation: bool = False
@@ -125,8 +152,8 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, Different
     def description(self) -> dict[str, Any]:
         names, scales = self.definition.outputs, self.scales.tolist()
         outputs = [
-            {"name": name, "kernel": structure, "scale": scale}
-            for name, structure, scale in zip(names, self.structures, scales, strict=True)
+            {"name": name, "kernel": structure, "scale": scale, "noise": noise}
+            for name, structure, scale, noise in zip(names, self.structures, scales, self.noise_deviations, strict=True)
         ]
         return {"outputs": outputs, "terminal_reward": self.terminal_reward, "samples": self.samples}
 
@@ -135,12 +162,13 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, Different
         q: Tensor,
         u: Tensor,
         noise: Tensor | None,
+        process: Tensor | None,
         member: Tensor | None,
         deviations: bool,
         reward_deviation: bool,
     ) -> Transition:
         step = partial(self._step, deviations, reward_deviation)
-        q_next, reward, spread, doubt = in_blocks(ROWS, step, q, u, noise, member)
+        q_next, reward, spread, doubt = in_blocks(ROWS, step, q, u, noise, process, member)
         return Transition(q_next, reward, spread if deviations else None, doubt if reward_deviation else None)
 
     def _step(
@@ -150,16 +178,20 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, Different
         q: Tensor,
         u: Tensor,
         noise: Tensor | None,
+        process: Tensor | None,
         member: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Next states (m, C), rewards (m,), and the requested deviations, (m, M) and (m,), else (m, 0).
 
-        Rows follow the mean, moved by ``noise`` (m, M) deviations, or each its own member (m,).
+        Rows follow the mean, moved by ``noise`` (m, M) deviations, or each its own member (m,). ``process`` (m, M)
+        adds the learned noise.
         """
-        changes = self.transitions(self._inputs.of_transition(q, u))
+        x = self._inputs.of_transition(q, u)
+        changes = self.transitions(x)
         spread = changes.std(0) if deviations or noise is not None else q.new_zeros(len(q), 0)
         change = _chosen(changes, member)
         change = change if noise is None else change + spread * noise
+        change = change if process is None else change + self.transitions.shaken(x, process)
         q_next = self._arrived(q, u, change)
         rewards = self._rewards(q, u, q_next)
         doubt = rewards.std(0) if reward_deviation else q.new_zeros(len(q), 0)

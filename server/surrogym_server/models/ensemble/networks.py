@@ -6,10 +6,14 @@ a linear part takes no hidden units, and extrapolates.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import softplus
+
+LEAST_NOISE, MOST_NOISE = 0.003, 10.0  # bounds of a deviation of noise, in deviations of an output
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,12 @@ class Networks:
         """Values of every member at x (m, d), (K, m, p)."""
         quadratic = self.skip.shape[1] > x.shape[-1] + 1
         return basis(x, quadratic) @ self.skip + nonlinear(x, self.hidden)
+
+
+def bounded(log_variance: Tensor) -> Tensor:
+    """Log variances of noise, softly kept within ``LEAST_NOISE`` and ``MOST_NOISE``."""
+    low, high = 2 * math.log(LEAST_NOISE), 2 * math.log(MOST_NOISE)
+    return low + softplus(high - softplus(high - log_variance) - low)
 
 
 def basis(x: Tensor, quadratic: bool) -> Tensor:

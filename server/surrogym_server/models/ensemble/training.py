@@ -8,8 +8,13 @@ with w_k drawn from a normal prior of variances v, and sigma the deviation of th
 draws from the posterior; for networks they are so approximately. Far from samples the members differ as their priors
 do.
 
-Reference: T. Pearce, F. Leibfried, A. Brintrup, "Uncertainty in neural networks: approximately Bayesian ensembling",
-AISTATS 2020, eq. 9.
+With noise, each member has a second network g_k for the log variance of a step, and 1/2 (log v + |y - f|^2 / v) with
+v = exp(g_k(x)) takes the place of the squared error. So the mean need not follow steps that it can't predict, such as
+those near a contact. The pull keeps its weight. What no mean of these networks predicts counts as noise.
+
+References: T. Pearce, F. Leibfried, A. Brintrup, "Uncertainty in neural networks: approximately Bayesian ensembling",
+AISTATS 2020, eq. 9; B. Lakshminarayanan, A. Pritzel, C. Blundell, "Simple and scalable predictive uncertainty
+estimation using deep ensembles", NeurIPS 2017, eq. 1.
 """
 
 from __future__ import annotations
@@ -22,13 +27,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from surrogym_server.models.ensemble.networks import Networks, basis, nonlinear
+from surrogym_server.models.ensemble.networks import Networks, basis, bounded, nonlinear
 from surrogym_server.tensors import in_rows
 
 NOISE = 0.01  # sigma, in deviations of an output
 RIDGE = 1e-3  # of the skip, in samples
 RATE = 0.01  # initial learning rate; it decays to 0 by a cosine
 LARGEST_BATCH = 512
+NOISE_BEGINS = math.exp(
+    -1.5
+)  # deviation of the noise before training, in deviations of an output; 0.05 fails at contacts
 Loss = Callable[[Tensor, Tensor], Tensor]  # of predictions (K, m, p) and targets (m, p)
 
 
@@ -68,6 +76,36 @@ def train(training: Training, x: Tensor, y: Tensor, loss: Loss, *, quadratic: bo
 
     _descend((skip, *hidden), objective, training.steps)
     return Networks(*map(in_rows, (skip, *hidden)))
+
+
+def train_with_noise(training: Training, x: Tensor, y: Tensor) -> tuple[Networks, Networks]:
+    """Fit networks to inputs x (n, d) and targets y (n, p), and others to the log variance of their noise."""
+    generator = torch.Generator().manual_seed(training.seed)
+    anchors, variances = _priors(training, x.shape[1], y.shape[1], generator)
+    drawn, _ = _priors(training, x.shape[1], y.shape[1], generator)
+    linear = basis(x, quadratic=False)
+    skip = _ridge(linear, y - nonlinear(x, anchors)).requires_grad_()
+    hidden = tuple(anchor.clone().requires_grad_() for anchor in anchors)
+    begun = x.new_full((training.members, 1, y.shape[1]), 2 * math.log(NOISE_BEGINS)).requires_grad_()
+    noisy = tuple(weights.requires_grad_() for weights in (*drawn[:-1], torch.zeros_like(drawn[-1])))
+
+    def objective() -> Tensor:
+        rows = _batch(len(x), generator)
+        mean = linear[rows] @ skip + nonlinear(x[rows], hidden)
+        log_variance = bounded(begun + nonlinear(x[rows], noisy))
+        pull = [((w - a).square() / v).sum() for w, a, v in zip(hidden, anchors, variances, strict=True)]
+        return _unlikely(mean, log_variance, y[rows]) + NOISE**2 / len(x) * torch.stack(pull).sum()
+
+    _descend((skip, *hidden, begun, *noisy), objective, training.steps)
+    constant = torch.cat([begun, begun.new_zeros(len(begun), x.shape[1], y.shape[1])], 1)  # it reads x by units alone
+    return Networks(*map(in_rows, (skip, *hidden))), Networks(*map(in_rows, (constant, *noisy)))
+
+
+def _unlikely(mean: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:
+    """Negative log likelihood of targets (m, p), less a constant: summed over members and outputs, averaged over
+    samples. Mean and log variance are those of every member, (K, m, p)."""
+    each = 0.5 * (log_variance + (target - mean).square() * (-log_variance).exp())
+    return each.mean(1).sum()
 
 
 def _descend(weights: Sequence[Tensor], objective: Callable[[], Tensor], steps: int) -> None:

@@ -180,11 +180,17 @@ def _standings(by_family: Mapping[str, Sequence[Scores]], had: str, column: int)
         known = one.density.isfinite() & base.density.isfinite()
         if int(known.sum()) < FEWEST:
             continue
-        difference = (one.density - base.density)[known]
-        error = float(difference.std()) / math.sqrt(len(difference))
-        score, coverage = float(one.density[known].mean()), float(one.inside[known].mean())
-        found.append(Standing(name, score, float(difference.mean()), error, coverage))
+        found.append(compared(name, *(Scores(side.density[known], side.inside[known]) for side in (one, base))))
     return tuple(found) if any(one.family == had for one in found) else ()
+
+
+def compared(name: str, one: Scores, base: Scores) -> Standing:
+    """Compare scores of a family with those of another one on the same pieces. Errors are those over pieces, because
+    steps of one piece are not independent."""
+    better, lost = one.density - base.density, base.inside - one.inside
+    error, coverage_error = (float(side.std()) / math.sqrt(len(side)) for side in (better, lost))
+    score, difference, coverage = (float(side.mean()) for side in (one.density, better, one.inside))
+    return Standing(name, score, difference, error, coverage, coverage_error=coverage_error)
 
 
 def _scale(definition: EnvironmentDefinition, samples: Samples) -> Tensor:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.port import Warm
 
-COVERAGE_LOSS = 0.05  # a family that serves may not be inside its intervals more seldom by more than this
+COVERAGE_LOSS = 0.05  # it must be shown that a family is inside its intervals more seldom by at most this
+ROUNDING = 1e-9
 LEAST = 0.05  # nats by which a score must be better: those of intervals that are 5 % narrower
 WINS = 2  # comparisons in a row that a family must win
 SERVING, WON = "selected/serving", "selected/wins"  # names in a warm start
@@ -29,11 +30,15 @@ class Standing:
     error: float  # standard error of this difference over pieces
     coverage: float  # share of held-out values inside the 90 % interval
     wins: int = 0  # comparisons in a row that it has won
+    coverage_error: float = 0.0  # standard error over pieces of its difference from the coverage of the same family
 
     def beats(self, other: Standing, margin: float) -> bool:
-        """Whether it is clearly better than the family that had served: by more than the margin, in standard errors."""
+        """Whether it is clearly better than ``other``, the family that had served: by more than the margin, in standard
+        errors. Its coverage must be clearly not much worse: a loss of the margin more than was seen is still allowed.
+        """
         clearly = self.better > max(LEAST, margin * self.error)
-        return clearly and self.coverage >= other.coverage - COVERAGE_LOSS
+        lost = other.coverage - self.coverage
+        return clearly and lost + margin * self.coverage_error <= COVERAGE_LOSS + ROUNDING
 
 
 @dataclass(frozen=True)
@@ -138,6 +143,7 @@ def from_warm(candidates: Sequence[str], outputs: int, warm: Warm) -> Before | N
 
 def _standing(stored: Mapping[str, Any]) -> Standing:
     score, better, error, coverage = (float(stored[name]) for name in ("score", "better", "error", "coverage"))
-    if not all(map(math.isfinite, (score, better, error, coverage))):
-        raise InvalidInput(f"expected finite scores, got {score}, {better}, {error} and {coverage}")
-    return Standing(str(stored["family"]), score, better, error, coverage, int(stored["wins"]))
+    coverage_error = float(stored.get("coverage_error", 0.0))  # which older files lack
+    if not all(map(math.isfinite, (score, better, error, coverage, coverage_error))):
+        raise InvalidInput(f"expected finite scores, got {score}, {better}, {error}, {coverage} and {coverage_error}")
+    return Standing(str(stored["family"]), score, better, error, coverage, int(stored["wins"]), coverage_error)

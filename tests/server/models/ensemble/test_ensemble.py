@@ -15,7 +15,9 @@ from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, InvalidSpec
-from surrogym_server.models.ensemble.model import NetworkEnsembleModel
+from surrogym_server.models.abilities import LearnedNoise, offers
+from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Noise
+from surrogym_server.models.ensemble.training import Training, train_with_noise
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.registry import learner_of
 from surrogym_server.plugins import Choice
@@ -130,7 +132,7 @@ def changed(model: NetworkEnsembleModel, **header: object) -> bytes:
 @pytest.mark.parametrize(
     ("header", "said"),
     [
-        ({"format": 2}, "expected a model of format 1"),
+        ({"format": 3}, "expected a model of format 2"),
         ({"outputs": ["theta", "reward"]}, "with outputs"),
         ({"samples": 0}, "finite terminal reward and samples"),
         ({"terminal_reward": float("inf")}, "finite terminal reward"),
@@ -140,6 +142,52 @@ def changed(model: NetworkEnsembleModel, **header: object) -> bytes:
 def test_a_header_that_contradicts_the_environment_is_refused(model, definition, header, said):
     with pytest.raises(InvalidInput, match=said):
         from_bytes(definition, changed(model, **header))
+
+
+def test_noise_is_learned_where_it_is():
+    """Half of the inputs have noise of 0.5, the other half none. A single noise would be right for neither."""
+    x = torch.linspace(-1.5, 1.5, 300, dtype=torch.float64)[:, None]
+    noise = torch.randn(300, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    y = torch.sin(x) + 0.5 * noise * (x > 0)
+    networks, noisy = train_with_noise(Training(4, 16, 300, 0), x, y)
+    found = Noise(noisy, torch.ones(1)).deviation(x)[:, 0]
+    assert float(found[x[:, 0] < -0.2].median()) < 0.1
+    assert 0.3 < float(found[x[:, 0] > 0.2].median()) < 0.7
+    quiet = x[:, 0] < -0.2
+    assert float((networks(x).mean(0) - torch.sin(x))[quiet].abs().max()) < 0.1, (
+        "noise elsewhere does not bend the mean"
+    )
+
+
+def test_process_noise_moves_steps_by_the_learned_noise(model):
+    steps, able = random_steps(pendulum(), 10, seed=3), offers(model, LearnedNoise)
+    assert able is not None
+    assert 0 < able.noise_deviations[1] < 0.5 * float(model.scales[1])
+    assert able.noise_deviations[-1] == 0, "that of the reward is not learned"
+    still, moved = (model.transition(steps.q, steps.u, process=torch.full((10, 2), w).double()) for w in (0.0, 1.0))
+    assert torch.equal(still.q_next, model.transition(steps.q, steps.u).q_next)
+    shift = moved.q_next[:, 1] - still.q_next[:, 1]
+    assert float(shift.square().mean().sqrt()) == pytest.approx(able.noise_deviations[1], rel=0.5)
+    paths = torch.ones(10, 1, dtype=torch.float64)
+    along = [model.transition_along(paths, steps.q, steps.u, process=p).q_next[:, 1] for p in (None, torch.ones(10, 2))]
+    torch.testing.assert_close(along[1] - along[0], shift)
+
+
+def test_a_file_of_format_1_has_no_noise_and_the_same_predictions(model, definition):
+    """Files of the versions before the ensemble learned noise stay readable."""
+    old = replace(model, transitions=replace(model.transitions, noise=None))
+    loaded = from_bytes(definition, changed(old, format=1))
+    steps = random_steps(pendulum(), 10, seed=3)
+    assert offers(loaded, LearnedNoise) is None
+    shaken = loaded.transition(steps.q, steps.u, process=torch.ones(10, 2).double()).q_next
+    assert torch.equal(shaken, model.transition(steps.q, steps.u).q_next)
+
+
+def test_a_negative_size_of_noise_is_refused(model, definition):
+    noise = replace(model.transitions.noise, size=-model.transitions.noise.size)
+    data = to_bytes(replace(model, transitions=replace(model.transitions, noise=noise)))
+    with pytest.raises(InvalidInput, match=r"transitions\.noise: expected sizes of at least 0"):
+        from_bytes(definition, data)
 
 
 def test_the_only_label_of_an_ending_is_0_or_1():

@@ -6,8 +6,11 @@ import json
 from dataclasses import replace
 
 import pytest
+import torch
 
 from surrogym_server.errors import InvalidInput
+from surrogym_server.models.selected.learning import compared
+from surrogym_server.models.selected.scores import Scores
 from surrogym_server.models.selected.selection import (
     Before,
     Evidence,
@@ -40,12 +43,45 @@ def test_a_family_takes_over_when_it_has_won_twice() -> None:
     [
         replace(RIVAL, error=0.3),  # not by more than the margin
         replace(RIVAL, coverage=0.84),  # its intervals are too narrow
+        replace(RIVAL, coverage_error=0.02),  # too few pieces show that they are not: 2 + 2 * 2 points may be lost
         replace(RIVAL, better=0.04, error=0.0),  # too little to matter
         replace(RIVAL, better=-0.5),
     ],
 )
 def test_a_comparison_that_is_not_won_ends_the_row(rival: Standing) -> None:
     assert serving(rival, Before(("process",), ({"networks": 1},))) == ("process", 0)
+
+
+def test_coverage_that_is_known_well_enough_is_lost_by_at_most_five_points() -> None:
+    """The rival is inside by 2 points less, and 2 standard errors of 1.5 points more are still allowed, not of 1.6."""
+    before = Before(("process",), ({"networks": 1},))
+    assert serving(replace(RIVAL, coverage_error=0.015), before)[0] == "networks"
+    assert serving(replace(RIVAL, coverage_error=0.016), before)[0] == "process"
+    wider = replace(RIVAL, coverage=0.97, coverage_error=0.05)
+    assert serving(wider, before)[0] == "networks", "a rival with wider intervals needs fewer pieces"
+
+
+def test_a_margin_of_zero_asks_for_no_certainty() -> None:
+    before = Before(("process",), ({"networks": 1},))
+    assert decided(before, [[HAD, replace(RIVAL, error=9.0, coverage_error=9.0)]], 0.0)[0] == ("networks",)
+
+
+def test_errors_are_those_over_pieces() -> None:
+    """Of 16 pieces four lose all intervals: a quarter of the coverage, with the standard error of 16 values."""
+    inside, density = torch.ones(16), torch.zeros(16)
+    narrow = torch.where(torch.arange(16) < 4, 0.0, inside)
+    found = compared("networks", Scores(density, narrow), Scores(density, inside))
+    assert found.coverage == 0.75
+    assert found.coverage_error == pytest.approx(float(narrow.std()) / 4)
+    assert compared("process", Scores(density, inside), Scores(density, inside)).coverage_error == 0
+
+
+def test_a_stored_selection_without_errors_of_coverage_is_read() -> None:
+    """Files of versions before this error was known stay readable."""
+    stored = selection(("networks",), ((HAD, RIVAL),)).to_json()
+    for one in stored["standings"][0]:
+        del one["coverage_error"]
+    assert Selection.from_json(stored, 1).standings[0][1] == RIVAL
 
 
 def test_the_first_comparison_decides_at_once() -> None:
