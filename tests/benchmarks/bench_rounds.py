@@ -80,6 +80,7 @@ def _options() -> argparse.Namespace:
     made.add_argument("environment", help="name of the environment")
     made.add_argument("--spec", type=Path, help="description as surrogym describe writes it. Default: describe first")
     made.add_argument("--model", default="sparse_gaussian_process", help="family of models")
+    made.add_argument("--settings", type=json.loads, default={}, help="of the family, as JSON")
     made.add_argument("--access", choices=["reset", "any"], default="reset", help="of the first real steps")
     made.add_argument("--seed", type=int, default=0)
     made.add_argument("--initial", type=int, default=1_000, help="real steps before the first round")
@@ -105,7 +106,7 @@ def _described(options: argparse.Namespace) -> tuple[Path, int]:
         found = options.spec.read_bytes()
     described: dict[str, Any] = json.loads(found)
     (options.out / "whole.json").write_text(json.dumps(described))
-    described["specification"]["design"]["model"] = options.model
+    described["specification"]["design"]["model"] = {"name": options.model, "settings": options.settings}
     if options.longest is not None:
         described["specification"]["time_limit"] = options.longest
     file: Path = options.out / "env.json"
