@@ -57,7 +57,7 @@ def main() -> None:
         spec, real = _described(options)
         register = [NAME, "--env", options.environment, "--spec", str(spec), "--access", options.access]
         budget = ["--budget", str(options.initial), "--initial", str(options.initial), "--seed", str(options.seed)]
-        rollout = [] if options.access == "any" else ["--max-rollout", "100"]
+        rollout = [] if options.access == "any" else ["--max-rollout", str(options.rollout)]
         _run("register", *register, *budget, *rollout)
         _run("sample", NAME, "--env", options.environment, "--until-done", as_json=False)
         real += options.initial
@@ -84,6 +84,7 @@ def _options() -> argparse.Namespace:
     made.add_argument("--access", choices=["reset", "any"], default="reset", help="of the first real steps")
     made.add_argument("--seed", type=int, default=0)
     made.add_argument("--initial", type=int, default=1_000, help="real steps before the first round")
+    made.add_argument("--rollout", type=int, default=100, help="actions of each random episode of these, at most")
     made.add_argument("--each", type=int, default=1_000, help="real steps of a round, about")
     made.add_argument("--budget", type=int, default=10_000, help="real steps at which rounds end")
     made.add_argument("--longest", type=int, help="steps of a real episode of a round. Default: as declared")
