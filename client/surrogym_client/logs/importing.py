@@ -123,8 +123,7 @@ def import_log(
         to: name of a surrogate that is there, by whose specification the rows are checked.
         mapping: what the columns are: a JSON or TOML file, or the same as a dictionary; None goes by their names.
         spec: the specification that the rows are checked against; None drafts one.
-        budget: real steps that the design may ask for, 0 where there is no machine. None is that of ``spec``, or 0 of
-            a drafted one.
+        budget: real steps that the design may ask for; 0 without a machine. None is that of ``spec``, or 0.
         rejected: where the rows go that can't be used; by default beside the log.
         draft: file to which the specification is written, before anything is sent.
         url, token: of the server, as ``Api`` takes them.
