@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import json
+from typing import Any
+
+from safetensors.torch import load, save
+
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
+from surrogym_server.models.files import to_bytes
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
-from surrogym_server.models.port import Learned, Warm
+from surrogym_server.models.port import DynamicsModel, Learned, Warm
 from surrogym_server.models.registry import learner_of
 
 
@@ -19,3 +25,18 @@ def gaussian_processes(definition: EnvironmentDefinition, samples: Samples) -> G
     model = learn(definition, samples).model
     assert isinstance(model, GaussianProcessModel)
     return model
+
+
+def header_of(data: bytes) -> dict[str, Any]:
+    """The header of a model's file, without the checksum, as programs before it wrote it."""
+    header: dict[str, Any] = json.loads(
+        json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["surrogym"]
+    )
+    header.pop("checksum", None)
+    return header
+
+
+def with_header(model: DynamicsModel, **header: object) -> bytes:
+    """The file of a model, with other entries in its header."""
+    data = to_bytes(model)
+    return save(load(data), {"surrogym": json.dumps(header_of(data) | header)})

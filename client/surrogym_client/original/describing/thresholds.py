@@ -129,7 +129,7 @@ class _Boundary:
         """Add at most ``POINTS`` points, of at most twice as many bisections, and return all."""
         enough = len(self.points) + POINTS
         for one, other in itertools.islice(self._pairs, 2 * POINTS):
-            self._add(one, other)
+            self.between(one, other)
             if len(self.points) == enough:
                 break
         return self.points
@@ -140,13 +140,10 @@ class _Boundary:
         new = self._paired + np.flatnonzero(chosen[self._paired :])
         self._paired = len(chosen)
         for number in new:
-            self._add(*self._ends[number], shift=NEAR * width * np.where(np.arange(len(width)) % 2, 1, -1))
+            self.between(*self._ends[number], shift=NEAR * width * np.where(np.arange(len(width)) % 2, 1, -1))
 
-    def between(self, one: Paid, other: Paid) -> None:
-        """Add a point between two steps with different values."""
-        self._add(one, other)
-
-    def _add(self, one: Paid, other: Paid, shift: Array | float = 0.0) -> None:
+    def between(self, one: Paid, other: Paid, shift: Array | float = 0.0) -> None:
+        """Add a point between two steps with different values. The state of the other one is shifted (C,)."""
         found = self._bisected(one, other, shift)
         self.points = self.points.joined(found)
         self._ends += [(one, other)] * len(found)

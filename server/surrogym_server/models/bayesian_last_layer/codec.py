@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import fields
 
@@ -16,6 +15,7 @@ from surrogym_server.models.bayesian_last_layer.model import BayesianLastLayerMo
 from surrogym_server.models.bayesian_last_layer.regression import Regression
 from surrogym_server.models.ensemble.inputs import Inputs
 from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel
+from surrogym_server.models.stored_networks import Header, checked_header, only_label, require_shapes
 
 FORMAT = 1
 TRANSITIONS, REWARD, ENDING = "transitions", "reward", "ending"
@@ -34,36 +34,15 @@ class BayesianLastLayerCodec(ModelCodec):
         learned = isinstance(model.ending, Regression)
         if isinstance(model.ending, Regression):
             tensors |= _arrays(ENDING, model.ending)
-        header = {
-            "format": FORMAT,
-            "outputs": list(model.definition.outputs),
-            "terminal_reward": model.terminal_reward,
-            "samples": model.samples,
-            "digest": model.digest,
-            "ending": None if learned else model.ending,
-        }
-        return StoredModel(header, tensors)
+        label = None if learned else model.ending
+        header = Header(FORMAT, model.terminal_reward, model.samples, model.digest, label)
+        return StoredModel(header.as_stored(model.definition), tensors)
 
     def decode(self, definition: EnvironmentDefinition, stored: StoredModel) -> BayesianLastLayerModel:
-        header, arrays = stored.header, stored.tensors
-        outputs = tuple(header["outputs"])
-        if header["format"] != FORMAT or outputs != definition.outputs:
-            raise InvalidInput(
-                f"expected a model of format {FORMAT} with outputs {definition.outputs}, "
-                f"got format {header['format']!r} with {outputs}"
-            )
-        terminal_reward, samples = float(header["terminal_reward"]), int(header["samples"])
-        if not math.isfinite(terminal_reward) or samples < 1:
-            raise InvalidInput(f"expected a finite terminal reward and samples, got {terminal_reward} and {samples}")
-        for name, array in arrays.items():
-            if array.dtype != torch.float64 or not bool(torch.isfinite(array).all()):
-                raise InvalidInput(f"expected finite numbers of torch.float64 as {name}, got {array.dtype}")
-        return _checked(definition, arrays, terminal_reward, samples, str(header["digest"]), header["ending"])
+        return _checked(definition, stored.tensors, checked_header(definition, stored, (FORMAT,)))
 
 
-def _checked(
-    definition: EnvironmentDefinition, arrays: Arrays, terminal_reward: float, samples: int, digest: str, label: object
-) -> BayesianLastLayerModel:
+def _checked(definition: EnvironmentDefinition, arrays: Arrays, header: Header) -> BayesianLastLayerModel:
     """Build the model of these arrays, after a check of every shape against the environment."""
     inputs = Inputs(definition)
     q = torch.zeros(1, len(definition.coordinates), dtype=torch.float64)
@@ -79,9 +58,13 @@ def _checked(
     if definition.learns_termination:
         learned = f"{ENDING}.mean" in arrays
         ending = (
-            _regression(ENDING, arrays, inputs.of_end(q).shape[1], 1, quadratic=False) if learned else _label(label)
+            _regression(ENDING, arrays, inputs.of_end(q).shape[1], 1, quadratic=False)
+            if learned
+            else only_label(header.label)
         )
-    return BayesianLastLayerModel(definition, transitions, reward, ending, terminal_reward, samples, digest)
+    return BayesianLastLayerModel(
+        definition, transitions, reward, ending, header.terminal_reward, header.samples, header.digest
+    )
 
 
 def _arrays(name: str, regression: Regression) -> dict[str, Tensor]:
@@ -116,15 +99,9 @@ def _regression(name: str, arrays: Arrays, d: int, p: int, *, quadratic: bool) -
         "scale": (p,),
         "left_out": (p, 3),
     }
-    _require_shapes(name, own | vars(features), shapes)
+    require_shapes(name, own | vars(features), shapes)
     _require_numbers(name, own)
     return Regression(features=features, **own)
-
-
-def _require_shapes(name: str, arrays: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    for part, shape in shapes.items():
-        if (got := tuple(arrays[part].shape)) != shape:
-            raise InvalidInput(f"{name}: expected {part} of shape {shape}, got {got}")
 
 
 def _require_numbers(name: str, own: Arrays) -> None:
@@ -136,9 +113,3 @@ def _require_numbers(name: str, own: Arrays) -> None:
             raise InvalidInput(f"{name}: expected {part} of at least 0, got {float(own[part].min()):g}")
     if bool((own["left_out"][:, 1:] > 1).any()):
         raise InvalidInput(f"{name}: expected shares of left_out of at most 1, got {float(own['left_out'].max()):g}")
-
-
-def _label(label: object) -> float:
-    if label not in (0.0, 1.0):
-        raise InvalidInput(f"expected the only label of an ending to be 0 or 1, got {str(label)[:80]}")
-    return float(bool(label))

@@ -15,6 +15,7 @@ from surrogym_server.models.bayesian_last_layer.codec import (
 from surrogym_server.models.bayesian_last_layer.learning import learn
 from surrogym_server.models.bayesian_last_layer.training import Training
 from surrogym_server.models.port import Learned, Learner, ModelCodec, Warm
+from surrogym_server.models.whole_numbers import require_whole
 
 LARGEST = {"networks": MAX_MEMBERS, "units": MAX_UNITS, "waves": MAX_WAVES, "iterations": 5_000, "seed": 2**31}
 LEAST = {"networks": 1, "units": 1, "waves": 0, "iterations": 1, "seed": 0}
@@ -44,9 +45,7 @@ class BayesianLastLayers(Learner):
 
     def __post_init__(self) -> None:
         for name, largest in LARGEST.items():
-            given, least = getattr(self, name), LEAST[name]
-            if isinstance(given, bool) or not isinstance(given, int) or not least <= given <= largest:
-                raise ValueError(f"expected {name} to be a whole number from {least} to {largest}, got {given!r}")
+            require_whole(name, getattr(self, name), LEAST[name], largest)
 
     @property
     def codec(self) -> ModelCodec:

@@ -17,7 +17,7 @@ from surrogym_server.models.bayesian_last_layer.model import BayesianLastLayerMo
 from surrogym_server.models.bayesian_last_layer.regression import Regression
 from surrogym_server.models.bayesian_last_layer.training import Training, train
 from surrogym_server.models.ensemble.inputs import Inputs
-from surrogym_server.models.ensemble.learning import CONSTANT, MIN_POINTS
+from surrogym_server.models.ensemble.learning import MIN_POINTS, enough, standardised
 from surrogym_server.models.port import Learned, Warm
 
 TRANSITIONS, REWARD, ENDING = "transitions", "reward", "ending"
@@ -44,7 +44,7 @@ class _Learning:
         self.left: dict[str, NDArray[np.float64]] = {}
 
     def learned(self, samples: Samples) -> Learned:
-        usable = _enough(~saturated(self.definition, samples.q_next))
+        usable = enough(~saturated(self.definition, samples.q_next))
         x, change = self.inputs.of_transition(samples.q, samples.u), increments(self.definition, samples)
         transitions = self._regression(TRANSITIONS, x[usable], change[usable])
         reward, terminal_reward = self._reward(samples)
@@ -60,7 +60,7 @@ class _Learning:
         """The reward of non-terminating steps, and the mean of what terminating steps pay in addition."""
         if (known := self.definition.declared_reward) is not None:
             return None, known.terminal
-        goes_on = _enough(~samples.terminated)
+        goes_on = enough(~samples.terminated)
         x = self.inputs.of_reward(samples.q, samples.u, samples.q_next)
         reward = self._regression(REWARD, x[goes_on], samples.reward[goes_on, None], quadratic=True)
         if bool(goes_on.all()):
@@ -76,9 +76,7 @@ class _Learning:
 
     def _regression(self, name: str, x: Tensor, y: Tensor, *, quadratic: bool = False) -> Regression:
         """The regression of inputs x (n, d) and targets y (n, p), in the units of the targets."""
-        centre, scale = y.mean(0), y.std(0, correction=0)
-        scale = torch.where(scale > CONSTANT * centre.abs(), scale, 0.0)
-        target = (y - centre) / torch.where(scale > 0, scale, 1.0)
+        target, centre, scale = standardised(y)
         training = replace(self.training, seed=self.training.seed + SEEDS[name])
         fitted = train(training, x, target, quadratic=quadratic, warm=_own(self.warm, name))
         self.left |= {f"{name}.{key}": tensor.numpy() for key, tensor in fitted.warm.items()}
@@ -89,8 +87,3 @@ def _own(warm: Warm, name: str) -> Mapping[str, Tensor]:
     """A regression's own part of a warm start."""
     own = {key.removeprefix(f"{name}."): array for key, array in warm.items() if key.startswith(f"{name}.")}
     return {key: torch.as_tensor(np.asarray(array), dtype=torch.float64) for key, array in own.items()}
-
-
-def _enough(chosen: Tensor) -> Tensor:
-    """The chosen samples (n,), or all of them if the chosen ones are too few to learn from."""
-    return chosen if int(chosen.sum()) >= MIN_POINTS else torch.ones_like(chosen)

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import saturated
-from surrogym_server.environment.step_rules import moved, paid, placed
+from surrogym_server.environment.step_rules import paid
 from surrogym_server.models.abilities import (
     Differentiable,
-    FunctionDraws,
     LearnedNoise,
     LeaveOneOut,
     LeaveOneOutErrors,
@@ -28,18 +26,15 @@ from surrogym_server.models.abilities import (
 )
 from surrogym_server.models.bayesian_last_layer.lookahead import LayerAlongPaths, LayerOutlook
 from surrogym_server.models.bayesian_last_layer.regression import Regression
-from surrogym_server.models.ensemble.inputs import Inputs
-from surrogym_server.models.port import DynamicsModel, Transition
+from surrogym_server.models.ensemble.stepping import SteppedInBlocks, drawn_member
 from surrogym_server.tensors import cached, in_blocks
-
-ROWS = 2_048  # predicted at once
 
 
 @dataclass(frozen=True)
-class BayesianLastLayerModel(
-    DynamicsModel, FunctionDraws, LeaveOneOut, LearnedNoise, Lookahead, RewardOfStep, Differentiable
-):
+class BayesianLastLayerModel(SteppedInBlocks, LeaveOneOut, LearnedNoise, Lookahead, RewardOfStep, Differentiable):
     """K members, each with a posterior of its last layers' weights. A drawn function is a member and its weights."""
+
+    rows = 2_048
 
     definition: EnvironmentDefinition
     transitions: Regression  # M outputs
@@ -49,48 +44,23 @@ class BayesianLastLayerModel(
     samples: int
     digest: str
 
-    def transition(
-        self,
-        q: Tensor,
-        u: Tensor,
-        *,
-        noise: Tensor | None = None,
-        process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
-    ) -> Transition:
-        return self._in_blocks(q, u, noise, process, None, deviations, reward_deviation)
-
     @property
     def path_size(self) -> int:
         return 1 + self.transitions.size + (0 if self.reward is None else self.reward.size)
 
     def draw(self, noise: Tensor) -> Tensor:
         """Draw functions. A function is the number of its member, all as likely, and the weights of its outputs."""
-        members = self.transitions.members
-        number: Tensor = (members * torch.special.ndtr(noise[:, 0])).floor().clamp_max(members - 1)
+        number = drawn_member(noise[:, 0], self.transitions.members)
         first, last = self._split(noise)
         weights = [self.transitions.drawn(first, number.long())]
         if self.reward is not None:
             weights.append(self.reward.drawn(last, number.long()))
         return torch.cat([number[:, None], *weights], 1)
 
-    def transition_along(
-        self,
-        paths: Tensor,
-        q: Tensor,
-        u: Tensor,
-        *,
-        process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
-    ) -> Transition:
-        return self._in_blocks(q, u, None, process, paths, deviations, reward_deviation)
-
     def reward_of_step(
         self, q: Tensor, u: Tensor, q_next: Tensor, *, paths: Tensor | None = None, deviation: bool = False
     ) -> tuple[Tensor, Tensor | None]:
-        reward, spread = in_blocks(ROWS, partial(self._rewards, deviation), q, u, q_next, paths)
+        reward, spread = in_blocks(self.rows, partial(self._rewards, deviation), q, u, q_next, paths)
         return reward, spread if deviation else None
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
@@ -179,20 +149,6 @@ class BayesianLastLayerModel(
             reward = reward.as_if_answered(0, reward.phi(self._inputs_of(column, steps)[learns]))
         return replace(self, transitions=transitions, reward=reward)
 
-    def _in_blocks(
-        self,
-        q: Tensor,
-        u: Tensor,
-        noise: Tensor | None,
-        process: Tensor | None,
-        paths: Tensor | None,
-        deviations: bool,
-        reward_deviation: bool,
-    ) -> Transition:
-        step = partial(self._step, deviations, reward_deviation)
-        q_next, reward, spread, doubt = in_blocks(ROWS, step, q, u, noise, process, paths)
-        return Transition(q_next, reward, spread if deviations else None, doubt if reward_deviation else None)
-
     def _step(
         self,
         deviations: bool,
@@ -203,10 +159,6 @@ class BayesianLastLayerModel(
         process: Tensor | None,
         paths: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Next states (m, C), rewards (m,), and the requested deviations, (m, M) and (m,), else (m, 0) and (m,).
-
-        Rows follow the mean, moved by ``noise`` (m, M) deviations, or each its own function of ``paths`` (m, W).
-        """
         phi = self.transitions.phi(self._inputs.of_transition(q, u))
         wanted = deviations or noise is not None
         spread = self.transitions.deviation(phi) if wanted else q.new_zeros(len(q), 0)
@@ -263,17 +215,6 @@ class BayesianLastLayerModel(
         learned = [self.transitions, *([] if self.reward is None else [self.reward])]
         rows = [row for regression in learned for row in regression.parts.mean(0).sqrt().tolist()]
         return [dict(zip(("polynomial", "units", "waves"), row, strict=True)) for row in rows]
-
-    def _arrived(self, q: Tensor, u: Tensor, change: Tensor) -> Tensor:
-        return moved(self.definition, self._inverse, q, u, placed(self.definition, change))
-
-    @cached_property
-    def _inverse(self) -> ObservationInverse | None:
-        return ObservationInverse.of(self.definition) if self.definition.moves_observation else None
-
-    @cached_property
-    def _inputs(self) -> Inputs:
-        return Inputs(self.definition)
 
 
 def _structure(regression: Regression, column: int, more: str = "") -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import fields, replace
 
@@ -15,6 +14,7 @@ from surrogym_server.models.ensemble.inputs import Inputs
 from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Noise, Regression
 from surrogym_server.models.ensemble.networks import Networks
 from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel
+from surrogym_server.models.stored_networks import Header, checked_header, only_label, require_shapes
 
 NOISELESS, FORMAT = 1, 2  # models of the versions before noise was learned are written as they were read
 TRANSITIONS, REWARD, ENDING = "transitions", "reward", "ending"
@@ -32,50 +32,23 @@ class NetworkEnsembleCodec(ModelCodec):
         networks = isinstance(model.ending, Networks)
         if isinstance(model.ending, Networks):
             tensors |= _arrays(ENDING, model.ending)
-        header = {
-            "format": NOISELESS if model.transitions.noise is None else FORMAT,
-            "outputs": list(model.definition.outputs),
-            "terminal_reward": model.terminal_reward,
-            "samples": model.samples,
-            "digest": model.digest,
-            "ending": None if networks else model.ending,
-        }
-        return StoredModel(header, tensors)
+        form = NOISELESS if model.transitions.noise is None else FORMAT
+        label = None if networks else model.ending
+        header = Header(form, model.terminal_reward, model.samples, model.digest, label)
+        return StoredModel(header.as_stored(model.definition), tensors)
 
     def decode(self, definition: EnvironmentDefinition, stored: StoredModel) -> NetworkEnsembleModel:
-        header, arrays = stored.header, stored.tensors
-        outputs = tuple(header["outputs"])
-        if header["format"] not in (NOISELESS, FORMAT) or outputs != definition.outputs:
-            raise InvalidInput(
-                f"expected a model of format {FORMAT} with outputs {definition.outputs}, "
-                f"got format {header['format']!r} with {outputs}"
-            )
-        terminal_reward, samples = float(header["terminal_reward"]), int(header["samples"])
-        if not math.isfinite(terminal_reward) or samples < 1:
-            raise InvalidInput(f"expected a finite terminal reward and samples, got {terminal_reward} and {samples}")
-        for name, array in arrays.items():
-            if array.dtype != torch.float64 or not bool(torch.isfinite(array).all()):
-                raise InvalidInput(f"expected finite numbers of torch.float64 as {name}, got {array.dtype}")
-        noisy = header["format"] == FORMAT
-        return _checked(definition, arrays, terminal_reward, samples, str(header["digest"]), header["ending"], noisy)
+        return _checked(definition, stored.tensors, checked_header(definition, stored, (NOISELESS, FORMAT)))
 
 
-def _checked(
-    definition: EnvironmentDefinition,
-    arrays: Arrays,
-    terminal_reward: float,
-    samples: int,
-    digest: str,
-    label: object,
-    noisy: bool,
-) -> NetworkEnsembleModel:
+def _checked(definition: EnvironmentDefinition, arrays: Arrays, header: Header) -> NetworkEnsembleModel:
     """Build the model of these arrays, after a check of every shape against the environment."""
     inputs = Inputs(definition)
     q = torch.zeros(1, len(definition.coordinates), dtype=torch.float64)
     u = torch.zeros(1, definition.action.size, dtype=torch.float64)
     x, count = inputs.of_transition(q, u), len(definition.outputs) - 1
     transitions = _regression(TRANSITIONS, arrays, x.shape[1], count, quadratic=False)
-    if noisy:
+    if header.format == FORMAT:
         transitions = replace(transitions, noise=_noise(f"{TRANSITIONS}.noise", arrays, x.shape[1], count))
     reward = None
     if definition.declared_reward is None:
@@ -83,8 +56,14 @@ def _checked(
     ending: Networks | float | None = None
     if definition.learns_termination:
         networks = f"{ENDING}.skip" in arrays
-        ending = _networks(ENDING, arrays, inputs.of_end(q).shape[1], 1, quadratic=False) if networks else _label(label)
-    return NetworkEnsembleModel(definition, transitions, reward, ending, terminal_reward, samples, digest)
+        ending = (
+            _networks(ENDING, arrays, inputs.of_end(q).shape[1], 1, quadratic=False)
+            if networks
+            else only_label(header.label)
+        )
+    return NetworkEnsembleModel(
+        definition, transitions, reward, ending, header.terminal_reward, header.samples, header.digest
+    )
 
 
 def _regression_arrays(name: str, regression: Regression) -> dict[str, Tensor]:
@@ -100,7 +79,7 @@ def _arrays(name: str, networks: Networks) -> dict[str, Tensor]:
 
 def _regression(name: str, arrays: Arrays, inputs: int, outputs: int, *, quadratic: bool) -> Regression:
     centre, scale = arrays[f"{name}.centre"], arrays[f"{name}.scale"]
-    _require(name, {"centre": centre, "scale": scale}, {"centre": (outputs,), "scale": (outputs,)})
+    require_shapes(name, {"centre": centre, "scale": scale}, {"centre": (outputs,), "scale": (outputs,)})
     if bool((scale < 0).any()):
         raise InvalidInput(f"{name}: expected scales of at least 0, got {float(scale.min()):g}")
     return Regression(_networks(name, arrays, inputs, outputs, quadratic=quadratic), centre, scale)
@@ -108,7 +87,7 @@ def _regression(name: str, arrays: Arrays, inputs: int, outputs: int, *, quadrat
 
 def _noise(name: str, arrays: Arrays, inputs: int, outputs: int) -> Noise:
     size = arrays[f"{name}.size"]
-    _require(name, {"size": size}, {"size": (outputs,)})
+    require_shapes(name, {"size": size}, {"size": (outputs,)})
     if bool((size < 0).any()):
         raise InvalidInput(f"{name}: expected sizes of at least 0, got {float(size.min()):g}")
     return Noise(_networks(name, arrays, inputs, outputs, quadratic=False), size)
@@ -127,17 +106,5 @@ def _networks(name: str, arrays: Arrays, d: int, p: int, *, quadratic: bool) -> 
         "second_bias": (k, 1, h),
         "last": (k, h, p),
     }
-    _require(name, vars(networks), shapes)
+    require_shapes(name, vars(networks), shapes)
     return networks
-
-
-def _require(name: str, arrays: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    for part, shape in shapes.items():
-        if (got := tuple(arrays[part].shape)) != shape:
-            raise InvalidInput(f"{name}: expected {part} of shape {shape}, got {got}")
-
-
-def _label(label: object) -> float:
-    if label not in (0.0, 1.0):
-        raise InvalidInput(f"expected the only label of an ending to be 0 or 1, got {str(label)[:80]}")
-    return float(bool(label))

@@ -10,6 +10,7 @@ from surrogym_server.models.ensemble.codec import MAX_MEMBERS, MAX_UNITS, Networ
 from surrogym_server.models.ensemble.learning import learn
 from surrogym_server.models.ensemble.training import Training
 from surrogym_server.models.port import Learned, Learner, ModelCodec, Warm
+from surrogym_server.models.whole_numbers import require_whole
 
 LARGEST = {"members": MAX_MEMBERS, "units": MAX_UNITS, "steps": 5_000, "seed": 2**31}
 LEAST = {"members": 2, "units": 1, "steps": 1, "seed": 0}
@@ -35,9 +36,7 @@ class NetworkEnsembles(Learner):
 
     def __post_init__(self) -> None:
         for name, largest in LARGEST.items():
-            given, least = getattr(self, name), LEAST[name]
-            if isinstance(given, bool) or not isinstance(given, int) or not least <= given <= largest:
-                raise ValueError(f"expected {name} to be a whole number from {least} to {largest}, got {given!r}")
+            require_whole(name, getattr(self, name), LEAST[name], largest)
 
     @property
     def codec(self) -> ModelCodec:

@@ -25,7 +25,7 @@ def learn(training: Training, definition: EnvironmentDefinition, samples: Sample
     if len(samples) < MIN_POINTS:
         raise InvalidInput(f"a model needs at least {MIN_POINTS} samples, got {len(samples)}")
     inputs = Inputs(definition)
-    usable = _enough(~saturated(definition, samples.q_next))
+    usable = enough(~saturated(definition, samples.q_next))
     x, change = inputs.of_transition(samples.q, samples.u), increments(definition, samples)
     transitions = _with_noise(training, x[usable], change[usable])
     reward, terminal_reward = _reward(_seeded(training, REWARD_SEED), inputs, samples)
@@ -39,7 +39,7 @@ def _reward(training: Training, inputs: Inputs, samples: Samples) -> tuple[Regre
     """The reward of non-terminating steps, and the mean of what terminating steps pay in addition."""
     if (known := inputs.definition.declared_reward) is not None:
         return None, known.terminal
-    goes_on = _enough(~samples.terminated)
+    goes_on = enough(~samples.terminated)
     x = inputs.of_reward(samples.q, samples.u, samples.q_next)
     reward = _noiseless(training, x[goes_on], samples.reward[goes_on, None])
     if bool(goes_on.all()):
@@ -57,7 +57,7 @@ def _ending(training: Training, x: Tensor, ended: Tensor) -> Networks | float:
 
 def _with_noise(training: Training, x: Tensor, y: Tensor) -> Regression:
     """Networks of inputs x (n, d) and targets y (n, p), and of their noise."""
-    target, centre, scale = _standardised(y)
+    target, centre, scale = standardised(y)
     networks, noisy = train_with_noise(training, x, target)
     noise = Noise(noisy, torch.zeros_like(scale))
     noise = replace(noise, size=noise.deviation(x).square().mean(0).sqrt())
@@ -66,18 +66,18 @@ def _with_noise(training: Training, x: Tensor, y: Tensor) -> Regression:
 
 def _noiseless(training: Training, x: Tensor, y: Tensor) -> Regression:
     """Networks of inputs x (n, d), squares included, and targets y (n, p)."""
-    target, centre, scale = _standardised(y)
+    target, centre, scale = standardised(y)
     return Regression(train(training, x, target, squared_error, quadratic=True), centre, scale)
 
 
-def _standardised(y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def standardised(y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Targets (n, p) in deviations, their mean (p,) and their deviation (p,), 0 for one that never varied."""
     centre, scale = y.mean(0), y.std(0, correction=0)
     scale = torch.where(scale > CONSTANT * centre.abs(), scale, 0.0)
     return (y - centre) / torch.where(scale > 0, scale, 1.0), centre, scale
 
 
-def _enough(chosen: Tensor) -> Tensor:
+def enough(chosen: Tensor) -> Tensor:
     """The chosen samples (n,), or all of them if the chosen ones are too few to learn from."""
     return chosen if int(chosen.sum()) >= MIN_POINTS else torch.ones_like(chosen)
 

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.environment.observation_inverse import ObservationInverse
-from surrogym_server.environment.step_rules import moved, paid, placed
-from surrogym_server.models.abilities import Differentiable, FunctionDraws, LearnedNoise, RewardOfStep
-from surrogym_server.models.ensemble.inputs import Inputs
+from surrogym_server.environment.step_rules import paid
+from surrogym_server.models.abilities import Differentiable, LearnedNoise, RewardOfStep
 from surrogym_server.models.ensemble.networks import Networks, bounded
-from surrogym_server.models.port import A, DynamicsModel, Transition
+from surrogym_server.models.ensemble.stepping import SteppedInBlocks, drawn_member
+from surrogym_server.models.port import A
 from surrogym_server.tensors import cached, in_blocks
-
-ROWS = 8_192  # predicted at once
 
 
 @dataclass(frozen=True)
@@ -52,9 +48,11 @@ class Regression:
 
 
 @dataclass(frozen=True)
-class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, LearnedNoise, Differentiable):
+class NetworkEnsembleModel(SteppedInBlocks, RewardOfStep, LearnedNoise, Differentiable):
     """K members. The mean is the members' mean, and the deviation that between members. The noise of a transition
     depends on the state; the reward has none, and models of older files have none at all."""
+
+    rows = 8_192
 
     definition: EnvironmentDefinition
     transitions: Regression  # M outputs
@@ -63,18 +61,6 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, LearnedNo
     terminal_reward: float
     samples: int
     digest: str
-
-    def transition(
-        self,
-        q: Tensor,
-        u: Tensor,
-        *,
-        noise: Tensor | None = None,
-        process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
-    ) -> Transition:
-        return self._in_blocks(q, u, noise, process, None, deviations, reward_deviation)
 
     def ability(self, kind: type[A]) -> A | None:
         """No learned noise if none was learned."""
@@ -93,21 +79,7 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, LearnedNo
 
     def draw(self, noise: Tensor) -> Tensor:
         """Draw functions. A function is a member, chosen with equal probability, and is given by its number."""
-        members = self.transitions.networks.members
-        number: Tensor = (members * torch.special.ndtr(noise)).floor().clamp_max(members - 1)
-        return number
-
-    def transition_along(
-        self,
-        paths: Tensor,
-        q: Tensor,
-        u: Tensor,
-        *,
-        process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
-    ) -> Transition:
-        return self._in_blocks(q, u, None, process, paths[:, 0].long(), deviations, reward_deviation)
+        return drawn_member(noise, self.transitions.networks.members)
 
     def reward_of_step(
         self, q: Tensor, u: Tensor, q_next: Tensor, *, paths: Tensor | None = None, deviation: bool = False
@@ -118,7 +90,7 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, LearnedNo
             rewards = self._rewards(q, u, q_next)
             return _chosen(rewards, member), rewards.std(0)
 
-        reward, spread = in_blocks(ROWS, judged, q, u, q_next, member)
+        reward, spread = in_blocks(self.rows, judged, q, u, q_next, member)
         return reward, spread if deviation else None
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
@@ -157,20 +129,6 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, LearnedNo
         ]
         return {"outputs": outputs, "terminal_reward": self.terminal_reward, "samples": self.samples}
 
-    def _in_blocks(
-        self,
-        q: Tensor,
-        u: Tensor,
-        noise: Tensor | None,
-        process: Tensor | None,
-        member: Tensor | None,
-        deviations: bool,
-        reward_deviation: bool,
-    ) -> Transition:
-        step = partial(self._step, deviations, reward_deviation)
-        q_next, reward, spread, doubt = in_blocks(ROWS, step, q, u, noise, process, member)
-        return Transition(q_next, reward, spread if deviations else None, doubt if reward_deviation else None)
-
     def _step(
         self,
         deviations: bool,
@@ -179,13 +137,9 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, LearnedNo
         u: Tensor,
         noise: Tensor | None,
         process: Tensor | None,
-        member: Tensor | None,
+        paths: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Next states (m, C), rewards (m,), and the requested deviations, (m, M) and (m,), else (m, 0).
-
-        Rows follow the mean, moved by ``noise`` (m, M) deviations, or each its own member (m,). ``process`` (m, M)
-        adds the learned noise.
-        """
+        member = None if paths is None else paths[:, 0].long()
         x = self._inputs.of_transition(q, u)
         changes = self.transitions(x)
         spread = changes.std(0) if deviations or noise is not None else q.new_zeros(len(q), 0)
@@ -203,17 +157,6 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, RewardOfStep, LearnedNo
             return known(q_next if known.after else q, u).expand(self.transitions.networks.members, -1)
         assert self.reward is not None
         return self.reward(self._inputs.of_reward(q, u, q_next))[..., 0]
-
-    def _arrived(self, q: Tensor, u: Tensor, change: Tensor) -> Tensor:
-        return moved(self.definition, self._inverse, q, u, placed(self.definition, change))
-
-    @cached_property
-    def _inverse(self) -> ObservationInverse | None:
-        return ObservationInverse.of(self.definition) if self.definition.moves_observation else None
-
-    @cached_property
-    def _inputs(self) -> Inputs:
-        return Inputs(self.definition)
 
 
 def _chosen(values: Tensor, member: Tensor | None) -> Tensor:

@@ -13,6 +13,7 @@ from surrogym_server.models.port import Learned, Learner, ModelCodec, Warm
 from surrogym_server.models.sparse_gaussian_process.codec import SparseGaussianProcessCodec
 from surrogym_server.models.sparse_gaussian_process.learning import ByBound
 from surrogym_server.models.sparse_gaussian_process.model import SparseGaussianProcessModel
+from surrogym_server.models.whole_numbers import require_whole
 
 FEWEST, MOST = 10, 2_000  # inducing points
 
@@ -30,9 +31,7 @@ class SparseGaussianProcesses(Settings, Learner):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        given = self.inducing
-        if isinstance(given, bool) or not isinstance(given, int) or not FEWEST <= given <= MOST:
-            raise ValueError(f"expected inducing to be a whole number from {FEWEST} to {MOST}, got {given!r}")
+        require_whole("inducing", self.inducing, FEWEST, MOST)
 
     @property
     def exact(self) -> int:

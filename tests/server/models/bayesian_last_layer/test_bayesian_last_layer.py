@@ -3,14 +3,12 @@ samples, odd files and settings are refused."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import pytest
 import torch
-from safetensors.torch import load, save
 
-from support.models import learn
+from support.models import learn, with_header
 from support.real_steps import random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
@@ -180,13 +178,6 @@ def test_settings_that_make_no_sense_are_refused(settings, said):
         learner_of(Choice("bayesian_last_layer", tuple(settings.items())))
 
 
-def changed(model: BayesianLastLayerModel, **header: object) -> bytes:
-    data = to_bytes(model)
-    stored = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["surrogym"])
-    del stored["checksum"]
-    return save(load(data), {"surrogym": json.dumps(stored | header)})
-
-
 @pytest.mark.parametrize(
     ("header", "said"),
     [
@@ -198,7 +189,7 @@ def changed(model: BayesianLastLayerModel, **header: object) -> bytes:
 )
 def test_a_header_that_contradicts_the_environment_is_refused(model, definition, header, said):
     with pytest.raises(InvalidInput, match=said):
-        from_bytes(definition, changed(model, **header))
+        from_bytes(definition, with_header(model, **header))
 
 
 @pytest.mark.parametrize(

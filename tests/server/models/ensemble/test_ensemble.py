@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import pytest
 import torch
-from safetensors.torch import load, save
 
-from support.models import learn
+from support.models import learn, with_header
 from support.real_steps import random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
@@ -122,13 +120,6 @@ def test_settings_that_make_no_sense_are_refused(settings, said):
         learner_of(Choice("ensemble", tuple(settings.items())))
 
 
-def changed(model: NetworkEnsembleModel, **header: object) -> bytes:
-    data = to_bytes(model)
-    stored = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["surrogym"])
-    del stored["checksum"]
-    return save(load(data), {"surrogym": json.dumps(stored | header)})
-
-
 @pytest.mark.parametrize(
     ("header", "said"),
     [
@@ -141,7 +132,7 @@ def changed(model: NetworkEnsembleModel, **header: object) -> bytes:
 )
 def test_a_header_that_contradicts_the_environment_is_refused(model, definition, header, said):
     with pytest.raises(InvalidInput, match=said):
-        from_bytes(definition, changed(model, **header))
+        from_bytes(definition, with_header(model, **header))
 
 
 def test_noise_is_learned_where_it_is():
@@ -176,7 +167,7 @@ def test_process_noise_moves_steps_by_the_learned_noise(model):
 def test_a_file_of_format_1_has_no_noise_and_the_same_predictions(model, definition):
     """Files of the versions before the ensemble learned noise stay readable."""
     old = replace(model, transitions=replace(model.transitions, noise=None))
-    loaded = from_bytes(definition, changed(old, format=1))
+    loaded = from_bytes(definition, with_header(old, format=1))
     steps = random_steps(pendulum(), 10, seed=3)
     assert offers(loaded, LearnedNoise) is None
     shaken = loaded.transition(steps.q, steps.u, process=torch.ones(10, 2).double()).q_next
@@ -196,7 +187,7 @@ def test_the_only_label_of_an_ending_is_0_or_1():
     assert model.ending == 0.0
     assert from_bytes(model.definition, to_bytes(model)).ending == 0.0
     with pytest.raises(InvalidInput, match=r"to be 0 or 1, got 0\.5"):
-        from_bytes(model.definition, changed(model, ending=0.5))
+        from_bytes(model.definition, with_header(model, ending=0.5))
 
 
 def test_more_members_than_any_learner_makes_are_refused(model, definition):

@@ -9,17 +9,11 @@ import pytest
 import torch
 from safetensors.torch import load, save
 
+from support.models import header_of
 from surrogym_server.environment.features import FeatureMap
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
-
-
-def header_of(data: bytes) -> dict:
-    """Without the checksum, as programs before it wrote it."""
-    header = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["surrogym"])
-    header.pop("checksum", None)
-    return header
 
 
 def rewritten(data: bytes, header: dict | None = None, **tensors: torch.Tensor | None) -> bytes:

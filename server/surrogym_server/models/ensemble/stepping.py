@@ -1,0 +1,95 @@
+"""Steps of models whose drawn functions are members of networks: in blocks, from changes to next states."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from functools import cached_property, partial
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.observation_inverse import ObservationInverse
+from surrogym_server.environment.step_rules import moved, placed
+from surrogym_server.models.abilities import FunctionDraws
+from surrogym_server.models.ensemble.inputs import Inputs
+from surrogym_server.models.port import DynamicsModel, Transition
+from surrogym_server.tensors import in_blocks
+
+
+class SteppedInBlocks(DynamicsModel, FunctionDraws):
+    """A model that predicts at most ``rows`` steps at once."""
+
+    rows: ClassVar[int]
+
+    def transition(
+        self,
+        q: Tensor,
+        u: Tensor,
+        *,
+        noise: Tensor | None = None,
+        process: Tensor | None = None,
+        deviations: bool = False,
+        reward_deviation: bool = False,
+    ) -> Transition:
+        return self._in_blocks(q, u, noise, process, None, deviations, reward_deviation)
+
+    def transition_along(
+        self,
+        paths: Tensor,
+        q: Tensor,
+        u: Tensor,
+        *,
+        process: Tensor | None = None,
+        deviations: bool = False,
+        reward_deviation: bool = False,
+    ) -> Transition:
+        return self._in_blocks(q, u, None, process, paths, deviations, reward_deviation)
+
+    @abstractmethod
+    def _step(
+        self,
+        deviations: bool,
+        reward_deviation: bool,
+        q: Tensor,
+        u: Tensor,
+        noise: Tensor | None,
+        process: Tensor | None,
+        paths: Tensor | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Next states (m, C), rewards (m,), and the requested deviations, (m, M) and (m,), else (m, 0) and (m,).
+
+        Rows follow the mean, moved by ``noise`` (m, M) deviations, or each its own function of ``paths`` (m, W).
+        ``process`` (m, M) adds the learned noise.
+        """
+
+    def _in_blocks(
+        self,
+        q: Tensor,
+        u: Tensor,
+        noise: Tensor | None,
+        process: Tensor | None,
+        paths: Tensor | None,
+        deviations: bool,
+        reward_deviation: bool,
+    ) -> Transition:
+        step = partial(self._step, deviations, reward_deviation)
+        q_next, reward, spread, doubt = in_blocks(self.rows, step, q, u, noise, process, paths)
+        return Transition(q_next, reward, spread if deviations else None, doubt if reward_deviation else None)
+
+    def _arrived(self, q: Tensor, u: Tensor, change: Tensor) -> Tensor:
+        return moved(self.definition, self._inverse, q, u, placed(self.definition, change))
+
+    @cached_property
+    def _inverse(self) -> ObservationInverse | None:
+        return ObservationInverse.of(self.definition) if self.definition.moves_observation else None
+
+    @cached_property
+    def _inputs(self) -> Inputs:
+        return Inputs(self.definition)
+
+
+def drawn_member(noise: Tensor, members: int) -> Tensor:
+    """Numbers of members, all as likely, of standard normal numbers. They are stored as floats."""
+    numbers: Tensor = (members * torch.special.ndtr(noise)).floor().clamp_max(members - 1)
+    return numbers
