@@ -2,7 +2,7 @@
 
 A real server, and the commands that a user would type. Each round prints one line. The means of a round are those of
 its own episodes, which nothing was learned from before. The real steps are all that were taken, those of the
-description among them.
+description among them. In the end, the policy of the round with the largest mean is measured from other starts.
 
     python tests/benchmarks/bench_rounds.py Hopper-v5 --seed 1 --initial 1000 --each 1000 --budget 10000
 """
@@ -62,17 +62,20 @@ def main() -> None:
         _run("sample", NAME, "--env", options.environment, "--until-done", as_json=False)
         real += options.initial
         rounds: list[Round] = []
-        while real < options.budget:
+        while real + options.each <= options.budget:
             rounds.append(_round(options, len(rounds) + 1, real, rounds[-1].length if rounds else None))
             real += round(rounds[-1].episodes * rounds[-1].length)
             _write(options.out / "rounds.csv", rounds)
-        _train(options, len(rounds) + 1)
-        arguments = [str(options.out / "policy.zip"), "--env", options.environment, "--first-seed", "50000"]
+        kept = max(rounds, key=lambda found: found.mean).round
+        arguments = [str(_policy(options, kept)), "--env", options.environment, "--first-seed", "50000"]
         whole = ["--spec", str(options.out / "whole.json"), "--episodes", str(options.judge)]
         judged = _run("evaluate", *arguments, *whole, "--compare", "zero")
         (options.out / "judged.json").write_text(json.dumps(judged, indent=1))
         mean, least, best = (judged[name] for name in ("mean", "min", "max"))
-        print(f"after {real:,} real steps: mean {mean:.1f} of {options.judge} starts ({least:.1f} to {best:.1f})")
+        print(
+            f"after {real:,} real steps: policy of round {kept}, mean {mean:.1f} of {options.judge} starts "
+            f"({least:.1f} to {best:.1f})"
+        )
 
 
 def _options() -> argparse.Namespace:
@@ -86,12 +89,15 @@ def _options() -> argparse.Namespace:
     made.add_argument("--initial", type=int, default=1_000, help="real steps before the first round")
     made.add_argument("--rollout", type=int, default=100, help="actions of each random episode of these, at most")
     made.add_argument("--each", type=int, default=1_000, help="real steps of a round, about")
-    made.add_argument("--budget", type=int, default=10_000, help="real steps at which rounds end")
+    made.add_argument(
+        "--budget", type=int, default=10_000, help="real steps, about. A round begins while it has room for --each"
+    )
     made.add_argument("--longest", type=int, help="steps of a real episode of a round. Default: as declared")
+    made.add_argument("--explore", type=float, default=0.0, help="random share of the actions of these episodes")
     made.add_argument("--steps", type=int, default=300_000, help="virtual steps of each training")
     made.add_argument("--train", default="", help="further options of surrogym train, in one word")
     made.add_argument(
-        "--judge", type=int, default=20, help="real episodes of the last policy. Nothing is learned from them"
+        "--judge", type=int, default=20, help="real episodes of the policy that is kept. Nothing is learned from them"
     )
     made.add_argument("--out", type=Path, default=Path("build/rounds"), help="folder, of one run")
     return started(made)
@@ -119,9 +125,9 @@ def _round(options: argparse.Namespace, number: int, real: int, length: float | 
     began = time.monotonic()
     trained = _train(options, number)
     episodes = 1 if length is None else max(1, min(MOST_EPISODES, round(options.each / length)))
-    arguments = [str(options.out / "policy.zip"), "--env", options.environment, "--spec", str(options.out / "env.json")]
+    arguments = [str(_policy(options, number)), "--env", options.environment, "--spec", str(options.out / "env.json")]
     seeds = ["--episodes", str(episodes), "--first-seed", str(1_000 * options.seed + MOST_EPISODES * number)]
-    done = _run("evaluate", *arguments, *seeds, "--learn-all", "--wait", str(WAIT))
+    done = _run("evaluate", *arguments, *seeds, "--explore", str(options.explore), "--learn-all", "--wait", str(WAIT))
     promise = trained["promise"]
     found = Round(
         *(number, real, trained["imagined_return"], promise["low"], promise["high"], trained["trusted"], episodes),
@@ -136,10 +142,14 @@ def _round(options: argparse.Namespace, number: int, real: int, length: float | 
 
 
 def _train(options: argparse.Namespace, number: int) -> dict[str, Any]:
-    policy = options.out / "policy.zip"
-    seed, before = 1_000 * options.seed + number, ["--start-from", str(policy)] if number > 1 else []
-    arguments = [NAME, "--seed", str(seed), "--steps", str(options.steps), "--no-audit", "--out", str(policy)]
+    before = ["--start-from", str(_policy(options, number - 1))] if number > 1 else []
+    arguments = [NAME, "--seed", str(1_000 * options.seed + number), "--steps", str(options.steps), "--no-audit"]
+    arguments += ["--out", str(_policy(options, number))]
     return _run("train", *arguments, *before, *options.train.split(), "--wait", str(WAIT))
+
+
+def _policy(options: argparse.Namespace, number: int) -> Path:
+    return Path(options.out, f"policy-{number}.zip")
 
 
 def _run(command: str, *arguments: str, as_json: bool = True) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from surrogym_client.evaluation.evaluator import (
     evaluate,
     interquartile_mean,
 )
-from surrogym_client.original.actions import decode_actions
+from surrogym_client.original.actions import decode_actions, explored
 from surrogym_client.original.episodes import open_episode
 from surrogym_client.original.errors import NotPerturbable
 from surrogym_shared.spec import Success
@@ -157,6 +157,37 @@ def test_bins_are_decoded_and_bounds_kept():
     np.testing.assert_allclose(decode_actions(plain, np.array([[5.0], [-5.0]]), 2)[:, 0], [2, -2])
     with pytest.raises(ValueError, match=r"expected actions of shape \(2, 1\), got \(3, 1\)"):
         decode_actions(plain, np.zeros((3, 1)), 2)
+
+
+def test_exploration_changes_actions_within_bounds_and_repeats():
+    settings = EvaluationSettings(episodes=2, explore=0.5)
+    again, alone = (evaluate(pendulum_policy, opener("Pendulum-v1"), replace(settings, parallel=n)) for n in (1, 2))
+    plain = evaluate(pendulum_policy, opener("Pendulum-v1"), replace(settings, explore=0.0))
+    for one, other in zip(again.traces, alone.traces, strict=True):
+        np.testing.assert_allclose(one.action, other.action, atol=1e-5)  # with instances beside it, too
+    first = again.trace.action
+    assert np.abs(first).max() <= 2
+    assert not np.allclose(first[0], plain.trace.action[0])
+    assert not np.allclose(first[0], again.traces[1].action[0])
+    assert not settings.declared  # the promise is for the policy itself
+
+
+def test_exploration_of_discrete_actions_replaces_a_share_of_them():
+    rng, spec = np.random.default_rng(0), original.make("CartPole-v1").spec()
+    changed = np.array([explored(spec, np.array([1.0]), 0.5, rng)[0] for _ in range(2_000)])
+    assert set(changed) == {0.0, 1.0}
+    assert changed.mean() == pytest.approx(0.75, abs=0.05)
+    binned = original.make("Pendulum-v1", bins=5).spec()
+    drawn = {float(explored(binned, np.array([1.0]), 1.0, rng)[0]) for _ in range(200)}
+    assert drawn == {-2.0, -1.0, 0.0, 1.0, 2.0}
+
+
+def test_exploration_spreads_by_its_share_of_half_the_range():
+    rng, spec = np.random.default_rng(0), original.make("Pendulum-v1").spec()
+    changed = np.array([explored(spec, np.array([0.5]), 0.1, rng)[0] for _ in range(4_000)])
+    assert changed.std() == pytest.approx(0.2, rel=0.05)
+    with pytest.raises(ValueError, match="explore to be from 0 to 1, got 2"):
+        EvaluationSettings(explore=2)
 
 
 def test_interquartile_mean_leaves_out_the_quarters():

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from surrogym_client.cli.groups import PolicyReading
+    from surrogym_client.evaluation.evaluator import EvaluationSettings
     from surrogym_client.original.episodes import Episode
     from surrogym_client.policies.card import PolicyCard
     from surrogym_client.policies.predict import Acting, Predict
@@ -41,6 +42,14 @@ class Beside:
             "an instance of the class. These real steps count too. The module's code is run."
         ),
     ] = None
+
+    def check(self, settings: EvaluationSettings) -> None:
+        """Raise ``CommandError`` for a comparison in which the policy's actions are changed at random."""
+        from surrogym_client.cli.errors import CommandError
+
+        if settings.explore and (self.compare or self.reference):
+            option = "--compare" if self.compare else "--reference"
+            raise CommandError(f"expected {option} without --explore, which changes actions; give one of the two")
 
     def controllers(
         self, policy: Path, card: PolicyCard, reading: PolicyReading, opener: Callable[[], Episode]

@@ -68,6 +68,15 @@ class Episodes:
             "as they are.",
         ),
     ] = 0.0
+    explore: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            max=1,
+            help="Change the actions at random, for --learn-all: a continuous one by normal noise of EXPLORE times "
+            "half its range, a discrete one with probability EXPLORE. The promise is then not judged.",
+        ),
+    ] = 0.0
     parallel: Annotated[
         int | None,
         typer.Option(
@@ -133,6 +142,7 @@ def command(
 
     card, settings, token = card_of_policy(policy), episodes.settings(), service.token_for(context)
     differences.check(settings)
+    beside.check(settings)
     opener = opener_for_policy(env, read_spec(spec), card, quiet=output.quiet)
     ledger = _ledger(surrogate, service.server, card, card_path(policy), quiet=output.quiet)
     enter = partial(_enter, ledger, service.server, token, quiet=output.quiet)
@@ -323,7 +333,7 @@ def _enter(
 
 
 def _settings(settings: EvaluationSettings) -> dict[str, Any]:
-    names = ("first_seed", "wide", "start_scale", "perturb")
+    names = ("first_seed", "wide", "start_scale", "perturb", "explore")
     return {name: getattr(settings, name) for name in names}
 
 

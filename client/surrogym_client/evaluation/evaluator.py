@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.original.actions import decode_actions
+from surrogym_client.original.actions import decode_actions, explored
 from surrogym_client.original.episodes import Episode, Moment, draw
 from surrogym_client.original.errors import RAISED, EvaluationFailed, PolicyMisfit
 from surrogym_client.original.fitting import check_policy
@@ -26,6 +26,7 @@ Progress = Callable[[float, int], None]  # arguments: share done in [0, 1], numb
 
 FIRST_SEED = 10_000
 FEW_EQUAL = 3  # episodes that are compared; if they are equal, the evaluation says so
+EXPLORING = 1  # part of the seed of random changes of actions
 ROUNDING = 1e-6  # share of its range by which a constant may change within an episode
 
 
@@ -34,9 +35,10 @@ class EvaluationSettings:
     """Settings of an evaluation: how many episodes, from which starts, in which environment.
 
     ``wide`` starts anywhere in the sampling range. ``start_scale`` widens the declared starts about their middle by
-    this factor. ``perturb`` is the standard deviation of random factors on physical attributes. ``parallel`` is the
-    number of instances of the environment that are open at once; None takes one for each episode if the environment
-    declares that it runs in parallel, and a single one otherwise.
+    this factor. ``perturb`` is the standard deviation of random factors on physical attributes. ``explore`` changes the
+    actions at random, see ``explored``. ``parallel`` is the number of instances of the environment that are open at
+    once; None takes one for each episode if the environment declares that it runs in parallel, and a single one
+    otherwise.
     """
 
     episodes: int = 100
@@ -44,6 +46,7 @@ class EvaluationSettings:
     wide: bool = False
     start_scale: float = 1.0
     perturb: float = 0.0
+    explore: float = 0.0
     parallel: int | None = None
 
     def __post_init__(self) -> None:
@@ -51,11 +54,13 @@ class EvaluationSettings:
             raise ValueError(f"expected at least 1 episode and 1 instance, got {self.episodes} and {self.parallel}")
         if self.wide and self.start_scale != 1:
             raise ValueError("expected either starts over the whole range or scaled starts, got both")
+        if not 0 <= self.explore <= 1:
+            raise ValueError(f"expected explore to be from 0 to 1, got {self.explore}")
 
     @property
     def declared(self) -> bool:
-        """Whether episodes start as the specification says, in the environment without perturbations."""
-        return not self.wide and self.start_scale == 1 and not self.perturb
+        """Whether episodes are those of the policy from the specification's starts, in the environment as it is."""
+        return not self.wide and self.start_scale == 1 and not self.perturb and not self.explore
 
 
 @dataclass(frozen=True)
@@ -219,6 +224,7 @@ class _Tally:
     number: int  # from 0, in the order of the seeds
     episode: Episode
     moment: Moment
+    rng: np.random.Generator  # of the exploration
     total: float = 0.0
     length: int = 0
     held: int = 0  # number of last steps in a row that met the success criterion
@@ -287,16 +293,20 @@ class _Run:
         """Begin the next episodes, one in each free instance, until all have begun."""
         first = len(self._tallies)
         begun = [
-            _Tally(first + i, episode, _start(episode, self.settings, first + i))
+            _Tally(first + i, episode, _start(episode, self.settings, first + i), self._noise(first + i))
             for i, episode in enumerate(free[: self.settings.episodes - first])
         ]
         self._tallies += begun
         return begun
 
+    def _noise(self, number: int) -> np.random.Generator:
+        return np.random.default_rng([self.settings.first_seed + number, EXPLORING])
+
     def _step(self, running: Sequence[_Tally]) -> None:
+        share = self.settings.explore
         for tally, action in zip(running, self._actions(running), strict=True):
             self.begun += 1
-            tally.step(action)
+            tally.step(explored(tally.episode.spec, action, share, tally.rng) if share else action)
 
     def _actions(self, running: Sequence[_Tally]) -> Array:
         """Return the policy's actions (N, F)."""

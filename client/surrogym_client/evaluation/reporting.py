@@ -28,7 +28,7 @@ def as_reported(
 
     Args:
         result: the episodes.
-        settings: starts and perturbation of the episodes.
+        settings: starts, perturbation and exploration of the episodes.
         key: idempotency key, so that the same evaluation is stored once.
         controller: what chose the actions.
         paired: number of the episode to compare, see ``paired_start``.
@@ -62,7 +62,8 @@ def words_of(settings: EvaluationSettings, varied: Sequence[str] = ()) -> str:
         starts = f"starts {settings.start_scale:g} times as far apart as declared"
     machine = f", masses, lengths and limits changed by {settings.perturb:.0%}" if settings.perturb else ""
     changing = f", {', '.join(varied)} changed within episodes" if varied else ""
-    return f"{starts}, from seed {settings.first_seed}{machine}{changing}"
+    random = f", actions changed at random by {settings.explore:.0%}" if settings.explore else ""
+    return f"{starts}, from seed {settings.first_seed}{machine}{random}{changing}"
 
 
 def _trace(rank: wire.TraceRank, seed: int, trace: Trace) -> wire.EpisodeTrace:

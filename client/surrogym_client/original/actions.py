@@ -34,6 +34,22 @@ def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], num_envs: int) -> A
     return np.asarray(low + rows * (high - low) / (counts - 1))
 
 
+def explored(spec: EnvironmentSpec, action: Array, share: float, rng: np.random.Generator) -> Array:
+    """Change an action (F,) of the environment at random.
+
+    A continuous entry gets normal noise with a standard deviation of ``share`` times half its range, and stays within
+    its bounds. An entry with a finite number of values becomes a random one of them with probability ``share``.
+    """
+    size = spec.action.size
+    if isinstance(spec.action, BoxAction):
+        low, high = np.array(spec.action.low), np.array(spec.action.high)
+        if spec.action.bins is None:
+            return np.clip(action + rng.normal(0, share * (high - low) / 2, size), low, high)
+    counts = np.array(_counts(spec.action))
+    drawn = decode_actions(spec, rng.integers(counts, size=size), 1)[0]
+    return np.where(rng.random(size) < share, drawn, action)
+
+
 def _counts(action: BoxAction | DiscreteAction | MultiDiscreteAction) -> tuple[int, ...]:
     """Number of values in each dimension of a policy's action."""
     match action:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import fields
 from typing import Any, Literal
@@ -72,6 +73,16 @@ def points_do_not_see_those_beside_them(case: ModelCase) -> None:
         alone = case.model.transition(case.points.q[index : index + 1], case.points.u[index : index + 1])
         assert close(alone.q_next[0], together.q_next[index])
         assert close(alone.reward[0], together.reward[index])
+
+
+def without_points_there_are_no_steps(case: ModelCase) -> None:
+    """And no warning, because the deviation of no values is not a number."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        made = case.model.transition(case.points.q[:0], case.points.u[:0], deviations=True, reward_deviation=True)
+    assert (made.deviation is not None, made.reward_deviation is not None) == (True, True)
+    assert made.q_next.shape == (0, len(case.definition.coordinates))
+    assert made.reward.shape == (0,)
 
 
 def next_states_are_where_the_environment_can_be(case: ModelCase) -> None:
@@ -225,6 +236,7 @@ LAWS_OF_MODELS: tuple[Callable[[ModelCase], None], ...] = (
     the_same_call_gives_the_same_numbers,
     learning_twice_gives_the_same_model,
     points_do_not_see_those_beside_them,
+    without_points_there_are_no_steps,
     next_states_are_where_the_environment_can_be,
     a_draw_is_the_mean_and_noise_times_the_deviation,
     lags_repeat_the_step,

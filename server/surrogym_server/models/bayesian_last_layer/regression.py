@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.models.bayesian_last_layer.features import Features
+from surrogym_server.models.ensemble.stepping import between
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,8 @@ class Regression:
     def deviation(self, phi: Tensor) -> Tensor:
         """Deviation of the mixture (m, p): of the members' variances and of their means."""
         within = (phi @ self.root).square().sum(-1).mean(0)
-        between = (phi @ self.mean[..., None])[..., 0].var(0, correction=0)
-        return self.scale * (within + between).mT.sqrt()
+        apart = between((phi @ self.mean[..., None])[..., 0], correction=0)
+        return self.scale * (within + apart).mT.sqrt()
 
     def means(self, x: Tensor) -> Tensor:
         """Mean (m, p) at x (m, d)."""

@@ -27,16 +27,20 @@ class NetworkEnsembles(Learner):
         units: of each hidden layer.
         steps: of gradient descent.
         seed: of initial weights and of batches.
+        beta: from 0, where noise explains what is hard to learn, to 1, where the mean learns all samples alike.
     """
 
     members: int = 5
     units: int = 32
     steps: int = 600
     seed: int = 0
+    beta: float = 0.0
 
     def __post_init__(self) -> None:
         for name, largest in LARGEST.items():
             require_whole(name, getattr(self, name), LEAST[name], largest)
+        if isinstance(self.beta, bool) or not isinstance(self.beta, int | float) or not 0 <= self.beta <= 1:
+            raise ValueError(f"expected beta to be a number from 0 to 1, got {self.beta!r}")
 
     @property
     def codec(self) -> ModelCodec:
@@ -44,5 +48,5 @@ class NetworkEnsembles(Learner):
 
     def learn(self, definition: EnvironmentDefinition, samples: Samples, warm: Warm | None = None) -> Learned:
         del warm
-        training = Training(self.members, self.units, self.steps, self.seed)
+        training = Training(self.members, self.units, self.steps, self.seed, self.beta)
         return Learned(learn(training, definition, samples), {})

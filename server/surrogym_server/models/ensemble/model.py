@@ -12,7 +12,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.step_rules import paid
 from surrogym_server.models.abilities import Differentiable, LearnedNoise, RewardOfStep
 from surrogym_server.models.ensemble.networks import Networks, bounded
-from surrogym_server.models.ensemble.stepping import SteppedInBlocks, drawn_member
+from surrogym_server.models.ensemble.stepping import SteppedInBlocks, between, drawn_member
 from surrogym_server.models.port import A
 from surrogym_server.tensors import cached, in_blocks
 
@@ -88,7 +88,7 @@ class NetworkEnsembleModel(SteppedInBlocks, RewardOfStep, LearnedNoise, Differen
 
         def judged(q: Tensor, u: Tensor, q_next: Tensor, member: Tensor | None) -> tuple[Tensor, Tensor]:
             rewards = self._rewards(q, u, q_next)
-            return _chosen(rewards, member), rewards.std(0)
+            return _chosen(rewards, member), between(rewards).sqrt()
 
         reward, spread = in_blocks(self.rows, judged, q, u, q_next, member)
         return reward, spread if deviation else None
@@ -142,13 +142,13 @@ class NetworkEnsembleModel(SteppedInBlocks, RewardOfStep, LearnedNoise, Differen
         member = None if paths is None else paths[:, 0].long()
         x = self._inputs.of_transition(q, u)
         changes = self.transitions(x)
-        spread = changes.std(0) if deviations or noise is not None else q.new_zeros(len(q), 0)
+        spread = between(changes).sqrt() if deviations or noise is not None else q.new_zeros(len(q), 0)
         change = _chosen(changes, member)
         change = change if noise is None else change + spread * noise
         change = change if process is None else change + self.transitions.shaken(x, process)
         q_next = self._arrived(q, u, change)
         rewards = self._rewards(q, u, q_next)
-        doubt = rewards.std(0) if reward_deviation else q.new_zeros(len(q), 0)
+        doubt = between(rewards).sqrt() if reward_deviation else q.new_zeros(len(q), 0)
         return q_next, _chosen(rewards, member), spread, doubt
 
     def _rewards(self, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:

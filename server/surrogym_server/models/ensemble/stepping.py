@@ -93,3 +93,8 @@ def drawn_member(noise: Tensor, members: int) -> Tensor:
     """Numbers of members, all as likely, of standard normal numbers. They are stored as floats."""
     numbers: Tensor = (members * torch.special.ndtr(noise)).floor().clamp_max(members - 1)
     return numbers
+
+
+def between(values: Tensor, correction: int = 1) -> Tensor:
+    """Variance between members (K, ...): none of no points, of which torch's would warn."""
+    return values.var(0, correction=correction) if values.numel() else values[0]

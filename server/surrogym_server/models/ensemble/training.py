@@ -12,9 +12,13 @@ With noise, each member has a second network g_k for the log variance of a step,
 v = exp(g_k(x)) takes the place of the squared error. So the mean need not follow steps that it can't predict, such as
 those near a contact. The pull keeps its weight. What no mean of these networks predicts counts as noise.
 
+With 0 < beta <= 1, each step's term is weighted by v^beta, through which no gradient passes. With 1 the mean has the
+gradient of the squared error, and learns also those steps that the noise could explain.
+
 References: T. Pearce, F. Leibfried, A. Brintrup, "Uncertainty in neural networks: approximately Bayesian ensembling",
 AISTATS 2020, eq. 9; B. Lakshminarayanan, A. Pritzel, C. Blundell, "Simple and scalable predictive uncertainty
-estimation using deep ensembles", NeurIPS 2017, eq. 1.
+estimation using deep ensembles", NeurIPS 2017, eq. 1; M. Seitzer, A. Tavakoli, D. Antic, G. Martius, "On the pitfalls
+of heteroscedastic uncertainty estimation with probabilistic neural networks", ICLR 2022, eq. 5.
 """
 
 from __future__ import annotations
@@ -46,6 +50,7 @@ class Training:
     units: int
     steps: int
     seed: int
+    beta: float
 
 
 def squared_error(predicted: Tensor, target: Tensor) -> Tensor:
@@ -94,18 +99,19 @@ def train_with_noise(training: Training, x: Tensor, y: Tensor) -> tuple[Networks
         mean = linear[rows] @ skip + nonlinear(x[rows], hidden)
         log_variance = bounded(begun + nonlinear(x[rows], noisy))
         pull = [((w - a).square() / v).sum() for w, a, v in zip(hidden, anchors, variances, strict=True)]
-        return _unlikely(mean, log_variance, y[rows]) + NOISE**2 / len(x) * torch.stack(pull).sum()
+        return _unlikely(mean, log_variance, y[rows], training.beta) + NOISE**2 / len(x) * torch.stack(pull).sum()
 
     _descend((skip, *hidden, begun, *noisy), objective, training.steps)
     constant = torch.cat([begun, begun.new_zeros(len(begun), x.shape[1], y.shape[1])], 1)  # it reads x by units alone
     return Networks(*map(in_rows, (skip, *hidden))), Networks(*map(in_rows, (constant, *noisy)))
 
 
-def _unlikely(mean: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:
+def _unlikely(mean: Tensor, log_variance: Tensor, target: Tensor, beta: float) -> Tensor:
     """Negative log likelihood of targets (m, p), less a constant: summed over members and outputs, averaged over
-    samples. Mean and log variance are those of every member, (K, m, p)."""
+    samples, each weighted by its predicted variance to the power of ``beta``. Mean and log variance are those of every
+    member, (K, m, p)."""
     each = 0.5 * (log_variance + (target - mean).square() * (-log_variance).exp())
-    return each.mean(1).sum()
+    return (each * (beta * log_variance.detach()).exp()).mean(1).sum()
 
 
 def _descend(weights: Sequence[Tensor], objective: Callable[[], Tensor], steps: int) -> None:
