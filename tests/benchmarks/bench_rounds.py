@@ -16,6 +16,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,9 @@ from surrogym_shared.words import counted
 NAME = "task"
 MOST_EPISODES = 50  # of a round
 WAIT = 1_800  # seconds for a model
+
+
+_READ: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "bool": "True".__eq__}
 
 
 @dataclass(frozen=True)
@@ -49,22 +53,19 @@ class Round:
     round_seconds: float
 
 
+KINDS = {field.name: str(field.type) for field in fields(Round)}
+
+
 def main() -> None:
     options = _options()
     options.out.mkdir(parents=True, exist_ok=True)
     with serving(options.out) as url:
         os.environ["SURROGYM_URL"] = url
-        spec, real = _described(options)
-        register = [NAME, "--env", options.environment, "--spec", str(spec), "--access", options.access]
-        budget = ["--budget", str(options.initial), "--initial", str(options.initial), "--seed", str(options.seed)]
-        rollout = [] if options.access == "any" else ["--max-rollout", str(options.rollout)]
-        _run("register", *register, *budget, *rollout)
-        _run("sample", NAME, "--env", options.environment, "--until-done", as_json=False)
-        real += options.initial
-        rounds: list[Round] = []
+        rounds = _earlier(options.out / "rounds.csv") if options.resume else []
+        real = _after(rounds[-1]) if rounds else _begun(options)
         while real + options.each <= options.budget:
             rounds.append(_round(options, len(rounds) + 1, real, rounds[-1].length if rounds else None))
-            real += round(rounds[-1].episodes * rounds[-1].length)
+            real = _after(rounds[-1])
             _write(options.out / "rounds.csv", rounds)
         kept = max(rounds, key=lambda found: found.mean).round
         arguments = [str(_policy(options, kept)), "--env", options.environment, "--first-seed", "50000"]
@@ -99,8 +100,24 @@ def _options() -> argparse.Namespace:
     made.add_argument(
         "--judge", type=int, default=20, help="real episodes of the policy that is kept. Nothing is learned from them"
     )
+    made.add_argument("--resume", action="store_true", help="continue the interrupted run in --out")
     made.add_argument("--out", type=Path, default=Path("build/rounds"), help="folder, of one run")
     return started(made)
+
+
+def _begun(options: argparse.Namespace) -> int:
+    """Register the environment, and take the real steps before the first round. Returns how many there are by then."""
+    spec, described = _described(options)
+    register = [NAME, "--env", options.environment, "--spec", str(spec), "--access", options.access]
+    budget = ["--budget", str(options.initial), "--initial", str(options.initial), "--seed", str(options.seed)]
+    rollout = [] if options.access == "any" else ["--max-rollout", str(options.rollout)]
+    _run("register", *register, *budget, *rollout)
+    _run("sample", NAME, "--env", options.environment, "--until-done", as_json=False)
+    return described + int(options.initial)
+
+
+def _after(found: Round) -> int:
+    return found.real_steps + round(found.episodes * found.length)
 
 
 def _described(options: argparse.Namespace) -> tuple[Path, int]:
@@ -159,6 +176,14 @@ def _run(command: str, *arguments: str, as_json: bool = True) -> dict[str, Any]:
     if done.returncode:
         raise SystemExit(f"{' '.join(given)} ended with {done.returncode}")
     return dict(json.loads(done.stdout)) if as_json else {}
+
+
+def _earlier(file: Path) -> list[Round]:
+    """The rounds of an interrupted run, whose next round begins anew."""
+    with file.open(newline="") as given:
+        return [
+            Round(**{name: _READ[kind](row[name]) for name, kind in KINDS.items()}) for row in csv.DictReader(given)
+        ]
 
 
 def _write(file: Path, rounds: list[Round]) -> None:
