@@ -81,7 +81,7 @@ def test_nothing_of_a_step_is_made_on_the_cpu(model, variant, differences, monke
     monkeypatch.setattr(environment, "_array", lambda values: arrived.append(values) or np.zeros(0))
     settings = VirtualSettings(LANES, autoreset_mode="disabled", time_limit=3, **VARIANTS[variant])
     with FakeTensorMode(allow_non_fake_inputs=True):
-        with pytest.raises(RuntimeError, match="same device|two different devices"):
+        with pytest.raises(RuntimeError, match=r"same device|two different devices"):
             torch.zeros(2) + torch.zeros(2, device="meta")
         there = to_device(model, torch.device("meta"))
         lanes, _ = reset(there.definition, settings, create(there.definition, settings, 0), seed=1)
