@@ -72,6 +72,7 @@ def test_a_name_of_no_environment_is_one_sentence(surrogym) -> None:
         ),
         (" \n", "env.json is not a specification: it is empty"),
         (json.dumps({"specification": {}}), "is not a specification: "),
+        (json.dumps({"specification": {}, "design": {}}), "expected 'design' within 'specification', got it beside it"),
         (json.dumps({"colour": 1}), "env.json is not a specification: colour: unknown entry; expected some of "),
     ],
 )

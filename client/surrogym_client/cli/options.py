@@ -230,6 +230,10 @@ def read_spec_file(path: Path) -> SpecContent:
     try:
         read = json.loads(content)
         described = isinstance(read, dict) and "specification" in read
+        if described and (beside := sorted(EnvironmentSpec.model_fields.keys() & read)):
+            raise CommandError(
+                f"{path} is not a specification: expected {beside[0]!r} within 'specification', got it beside it"
+            )
         spec = EnvironmentSpec.model_validate_json(json.dumps(read["specification"]) if described else content)
     except ValidationError as error:
         raise CommandError(f"{path} is not a specification: {first_fault(error, of=EnvironmentSpec)}") from error
