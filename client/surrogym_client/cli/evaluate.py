@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -90,11 +91,14 @@ class Episodes:
         """Return the settings of the evaluation.
 
         Raises:
-            CommandError: two options contradict each other.
+            CommandError: two options contradict each other, or one is not a finite number.
         """
         from surrogym_client.cli.errors import CommandError
         from surrogym_client.evaluation.evaluator import EvaluationSettings
 
+        for name in ("start_scale", "perturb", "explore"):
+            if not math.isfinite(given := getattr(self, name)):  # "nan" passes a range
+                raise CommandError(f"expected --{name.replace('_', '-')} to be a finite number, got {given}")
         if self.wide and self.start_scale != 1:
             raise CommandError("expected --wide or --start-scale, got both")
         return EvaluationSettings(**vars(self))
@@ -136,18 +140,17 @@ def command(
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 10 --learn 16
     """
-    from surrogym_client.policies.card import card_path
     from surrogym_client.policies.files import card_of_policy
     from surrogym_shared.terminal import give
 
     card, settings, token = card_of_policy(policy), episodes.settings(), service.token_for(context)
     differences.check(settings)
-    beside.check(settings)
     opener = opener_for_policy(env, read_spec(spec), card, quiet=output.quiet)
-    ledger = _ledger(surrogate, service.server, card, card_path(policy), quiet=output.quiet)
+    ledger = _ledger(surrogate, service.server, card, policy, quiet=output.quiet)
     enter = partial(_enter, ledger, service.server, token, quiet=output.quiet)
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
-    reports = _reports(beside.controllers(policy, card, reading, opener), card.spec, run, enter, settings, policy)
+    controllers = beside.controllers(policy, card, reading, opener, settings)
+    reports = _reports(controllers, card.spec, run, enter, settings, policy)
     result = reports[0][1]
     if stored := push and ledger is not None:
         _keep(policy, reports, settings, quiet=output.quiet)
@@ -290,19 +293,20 @@ def _telling(update: Update, episodes: int) -> Progress:
     return lambda share, terminated: update(share, f"{counted(episodes, 'real episode')}, {terminated} terminated")
 
 
-def _ledger(surrogate: str | None, server: str | None, card: PolicyCard, noted_in: Path, *, quiet: bool) -> str | None:
+def _ledger(surrogate: str | None, server: str | None, card: PolicyCard, policy: Path, *, quiet: bool) -> str | None:
     """Return the name of the surrogate whose ledger counts the real steps; None if no server may be contacted.
 
     An address that only the policy's card names is never contacted, unless it is the default one of this machine.
     """
+    from surrogym_client.policies.card import card_path
     from surrogym_client.transport.connection import DEFAULT_URL
     from surrogym_shared.terminal import say
 
     if surrogate or server or card.server is None or str(card.server).rstrip("/") == DEFAULT_URL:
         return surrogate or card.surrogate
     say(
-        f"the real steps are not reported to {str(card.server)!r}, which {noted_in} names: give --server to enter them "
-        f"into the ledger of {card.surrogate!r}",
+        f"the real steps are not reported to {str(card.server)!r}, which {card_path(policy)} names: give --server to "
+        f"enter them into the ledger of {card.surrogate!r}",
         quiet=quiet,
     )
     return None
