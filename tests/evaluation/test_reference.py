@@ -71,8 +71,10 @@ def test_an_invalid_controller_is_refused_before_a_real_step(controllers: str, t
         evaluate(load_reference(f"{controllers}:wrong"), opened, EvaluationSettings(episodes=1))
     with pytest.raises(UnknownEnvironment, match="absent"):
         load_reference(f"{controllers}:absent")
-    card = PolicyCard()
+    policy = tmp_path / "policy.zip", PolicyCard(), PolicyReading(), opened
     with pytest.raises(CommandError, match=r"expected a policy file that exists, or package\.module:name"):
-        Beside(reference="pid.zip").controllers(tmp_path / "policy.zip", card, PolicyReading(), opened)
-    found = Beside("zero", f"{controllers}:brake").controllers(tmp_path / "policy.zip", card, PolicyReading(), opened)
+        Beside(reference="pid.zip").controllers(*policy, EvaluationSettings())
+    with pytest.raises(CommandError, match="expected --reference without --explore"):
+        Beside(reference=f"{controllers}:brake").controllers(*policy, EvaluationSettings(explore=0.1))
+    found = Beside("zero", f"{controllers}:brake").controllers(*policy, EvaluationSettings())
     assert list(found) == ["policy", "zero", "reference"]
