@@ -15,6 +15,7 @@ from surrogym_client.evaluation.evaluator import (
     evaluate,
     interquartile_mean,
 )
+from surrogym_client.evaluation.reporting import words_of
 from surrogym_client.original.actions import decode_actions, explored
 from surrogym_client.original.episodes import open_episode
 from surrogym_client.original.errors import NotPerturbable
@@ -170,6 +171,7 @@ def test_exploration_changes_actions_within_bounds_and_repeats():
     assert not np.allclose(first[0], plain.trace.action[0])
     assert not np.allclose(first[0], again.traces[1].action[0])
     assert not settings.declared  # the promise is for the policy itself
+    assert words_of(replace(settings, explore=0.004)).endswith("actions changed at random by 0.004")
 
 
 def test_exploration_of_discrete_actions_replaces_a_share_of_them():

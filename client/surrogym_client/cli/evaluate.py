@@ -167,7 +167,10 @@ def command(
 
 
 def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Evaluation) -> list[str]:
-    """Say which constants changed within an episode. Nothing if none did, or without a promise for these starts."""
+    """Say that actions were changed, or which constants changed within an episode. Nothing if neither was, or without a
+    promise for these starts."""
+    if settings.explore:
+        return [f"actions were changed at random by {settings.explore:.2g}, so the promise is not judged"]
     if card.promise is None or not (settings.declared and result.varied):
         return []
     changed = ", ".join(result.varied)

@@ -62,7 +62,7 @@ def words_of(settings: EvaluationSettings, varied: Sequence[str] = ()) -> str:
         starts = f"starts {settings.start_scale:g} times as far apart as declared"
     machine = f", masses, lengths and limits changed by {settings.perturb:.0%}" if settings.perturb else ""
     changing = f", {', '.join(varied)} changed within episodes" if varied else ""
-    random = f", actions changed at random by {settings.explore:.0%}" if settings.explore else ""
+    random = f", actions changed at random by {settings.explore:.2g}" if settings.explore else ""
     return f"{starts}, from seed {settings.first_seed}{machine}{random}{changing}"
 
 
