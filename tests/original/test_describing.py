@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -13,6 +14,7 @@ from support.simulators import CASES, Register, Spiral, installed
 from surrogym_client import original
 from surrogym_client.original.describing import Description, describe
 from surrogym_client.original.simulator import Simulated
+from surrogym_client.original.state_parts import Attribute
 from surrogym_shared import terms
 from surrogym_shared.spec import EnvironmentSpec, limits
 
@@ -37,6 +39,15 @@ def test_a_described_environment_steps_from_its_coordinates_as_in_an_episode(nam
     np.testing.assert_allclose(again.next_coordinates, step.next_coordinates, atol=1e-6)
     assert again.reward == pytest.approx(step.reward, abs=1e-6)
     environment.close()
+
+
+def test_a_state_is_written_in_the_type_that_it_has_now() -> None:
+    """MountainCar's state is an array after a reset and a tuple after a step."""
+    owner = SimpleNamespace(state=np.zeros(2))
+    part = Attribute(owner, "state")
+    owner.state = (1.0, 2.0)
+    part.write(np.array([3.0, 4.0]))
+    assert owner.state == (3.0, 4.0)
 
 
 @installed("mujoco")

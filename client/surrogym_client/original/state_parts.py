@@ -154,7 +154,6 @@ class Attribute(StatePart):
 
     def __init__(self, owner: Any, attribute: str, motion: Motion = "other") -> None:
         self._owner, self._attribute = owner, attribute
-        self._kind = type(getattr(owner, attribute))
         self.variables = tuple(Variable(f"{attribute}{i}", motion) for i in range(self.read().size))
 
     def read(self) -> Array:
@@ -165,7 +164,7 @@ class Attribute(StatePart):
         if isinstance(before, np.ndarray):
             setattr(self._owner, self._attribute, values.astype(before.dtype).reshape(before.shape))
         else:
-            setattr(self._owner, self._attribute, self._kind(values.tolist()))
+            setattr(self._owner, self._attribute, type(before)(values.tolist()))  # an array may be a tuple by now
 
 
 def holds_numbers(owner: Any, attribute: str) -> bool:
