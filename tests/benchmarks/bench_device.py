@@ -12,16 +12,15 @@ device and of results back, as in a server. Without a GPU only the CPU is measur
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import bench_sparse
 import numpy as np
 import torch
-from bench_sparse import chain, designed
+from bench_sparse import chain, designed, seconds_of_a_step
 from common import parser, started, write
 
 from support.models import learn
@@ -29,20 +28,13 @@ from support.real_steps import random_steps
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
-from surrogym_server.local import LocalSurrogate
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.models.registry import learner_of
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire import OpenSession
 
-FORMS: dict[str, dict[str, Any]] = {
-    "mean": {},
-    "penalty": {"penalty": 1.0},
-    "function": {"variant": "pathwise"},
-    "particles": {"variant": "probabilistic", "particles": 1_000},
-}
+FORMS = {**bench_sparse.FORMS, "particles": {"variant": "probabilistic", "particles": 1_000}}
 FAMILIES = {"sparse": "sparse_gaussian_process", "ensemble": "ensemble"}
-SAMPLES, ROUNDS, WARM_UP = 50, 5, 3
+SAMPLES, ROUNDS = 50, 5
 
 
 def learned(name: str, rows: int) -> tuple[EnvironmentSpec, DynamicsModel]:
@@ -54,21 +46,6 @@ def learned(name: str, rows: int) -> tuple[EnvironmentSpec, DynamicsModel]:
     spec = designed(spec, FAMILIES[name], {})
     definition = definition_from_spec(spec)
     return spec, learner_of(definition.learning.model).learn(definition, samples).model
-
-
-def rate(spec: EnvironmentSpec, model: DynamicsModel, lanes: int, form: Mapping[str, Any], seconds: float) -> float:
-    """Env-steps a second: lanes over the median time of a step."""
-    port = LocalSurrogate(spec, model)
-    session = port.open(OpenSession(num_envs=lanes, seed=0, **form)).id
-    port.reset(session)
-    action = np.random.default_rng(0).uniform(-1, 1, (lanes, model.definition.action.size)).astype(np.float32)
-    taken: list[float] = []
-    end = time.perf_counter() + seconds
-    while len(taken) < 2 * WARM_UP or time.perf_counter() < end:
-        clock = time.perf_counter()
-        port.step(session, action)
-        taken.append(time.perf_counter() - clock)
-    return lanes / float(np.median(taken[WARM_UP:]))
 
 
 def compared(options: Any, name: str) -> list[dict[str, Any]]:
@@ -85,7 +62,8 @@ def compared(options: Any, name: str) -> list[dict[str, Any]]:
                 for _ in range(options.rounds):
                     for place, (placed, count) in places.items():
                         torch.set_num_threads(count)
-                        rates[place].append(rate(spec, placed, lanes, FORMS[form], options.seconds))
+                        clock, _ = seconds_of_a_step(spec, placed, lanes, FORMS[form], options.seconds)
+                        rates[place].append(lanes / clock)
             except InvalidInput as refused:
                 print(f"{name}, {form}, {lanes:,} lanes: {refused}")
                 continue

@@ -10,28 +10,24 @@ description among them. In the end, the policy of the round with the largest mea
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from bench_start import COMMAND, serving
 from common import started
 
+from surrogym_client.experiments.reproduce.rows import read_records, write_records
 from surrogym_shared.words import counted
 
 NAME = "task"
 MOST_EPISODES = 50  # of a round
 WAIT = 1_800  # seconds for a model
-
-
-_READ: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "bool": "True".__eq__}
 
 
 @dataclass(frozen=True)
@@ -53,20 +49,17 @@ class Round:
     round_seconds: float
 
 
-KINDS = {field.name: str(field.type) for field in fields(Round)}
-
-
 def main() -> None:
     options = _options()
     options.out.mkdir(parents=True, exist_ok=True)
     with serving(options.out) as url:
         os.environ["SURROGYM_URL"] = url
-        rounds = _earlier(options.out / "rounds.csv") if options.resume else []
+        rounds = read_records(options.out / "rounds.csv", Round) if options.resume else []
         real = _after(rounds[-1]) if rounds else _begun(options)
         while real + options.each <= options.budget:
             rounds.append(_round(options, len(rounds) + 1, real, rounds[-1].length if rounds else None))
             real = _after(rounds[-1])
-            _write(options.out / "rounds.csv", rounds)
+            write_records(options.out / "rounds.csv", Round, rounds)
         kept = max(rounds, key=lambda found: found.mean).round
         arguments = [str(_policy(options, kept)), "--env", options.environment, "--first-seed", "50000"]
         whole = ["--spec", str(options.out / "whole.json"), "--episodes", str(options.judge)]
@@ -176,21 +169,6 @@ def _run(command: str, *arguments: str, as_json: bool = True) -> dict[str, Any]:
     if done.returncode:
         raise SystemExit(f"{' '.join(given)} ended with {done.returncode}")
     return dict(json.loads(done.stdout)) if as_json else {}
-
-
-def _earlier(file: Path) -> list[Round]:
-    """The rounds of an interrupted run, whose next round begins anew."""
-    with file.open(newline="") as given:
-        return [
-            Round(**{name: _READ[kind](row[name]) for name, kind in KINDS.items()}) for row in csv.DictReader(given)
-        ]
-
-
-def _write(file: Path, rounds: list[Round]) -> None:
-    with file.open("w", newline="") as out:
-        rows = csv.DictWriter(out, [field.name for field in fields(Round)])
-        rows.writeheader()
-        rows.writerows(asdict(found) for found in rounds)
 
 
 if __name__ == "__main__":

@@ -176,21 +176,31 @@ def held_out(definition: EnvironmentDefinition, model: DynamicsModel, unseen: Sa
     }
 
 
+def seconds_of_a_step(
+    spec: EnvironmentSpec, model: DynamicsModel, lanes: int, form: Mapping[str, Any], seconds: float
+) -> tuple[float, float]:
+    """Medians of the calls that step a new session of this form for some seconds: by the clock, and of processor
+    time."""
+    port = LocalSurrogate(spec, model)
+    action = np.random.default_rng(0).uniform(-1, 1, (lanes, model.definition.action.size)).astype(np.float32)
+    session = port.open(OpenSession(num_envs=lanes, seed=0, **form)).id
+    port.reset(session)
+    taken: list[tuple[float, float]] = []
+    end = time.perf_counter() + seconds
+    while len(taken) < 2 * WARM_UP or time.perf_counter() < end:
+        clock, busy = time.perf_counter(), time.process_time()
+        port.step(session, action)
+        taken.append((time.perf_counter() - clock, time.process_time() - busy))
+    clock, busy = np.median(taken[WARM_UP:], axis=0)
+    return float(clock), float(busy)
+
+
 def rates(spec: EnvironmentSpec, model: DynamicsModel, lanes: int) -> dict[str, dict[str, float]]:
     """Environment steps a second of a session, by its form."""
-    port, found = LocalSurrogate(spec, model), {}
-    action = np.random.default_rng(0).uniform(-1, 1, (lanes, model.definition.action.size)).astype(np.float32)
-    for name, chosen in FORMS.items():
-        session = port.open(OpenSession(num_envs=lanes, seed=0, **chosen)).id
-        port.reset(session)
-        taken: list[tuple[float, float]] = []
-        end = time.perf_counter() + SECONDS
-        while len(taken) < 2 * WARM_UP or time.perf_counter() < end:
-            clock, busy = time.perf_counter(), time.process_time()
-            port.step(session, action)
-            taken.append((time.perf_counter() - clock, time.process_time() - busy))
-        clock, busy = np.median(taken[WARM_UP:], axis=0)
-        found[name] = {"clock": lanes / float(clock), "processor": lanes / float(busy)}
+    found = {}
+    for name, form in FORMS.items():
+        clock, busy = seconds_of_a_step(spec, model, lanes, form, SECONDS)
+        found[name] = {"clock": lanes / clock, "processor": lanes / busy}
     return found
 
 

@@ -73,8 +73,8 @@ def test_an_invalid_controller_is_refused_before_a_real_step(controllers: str, t
         load_reference(f"{controllers}:absent")
     policy = tmp_path / "policy.zip", PolicyCard(), PolicyReading(), opened
     with pytest.raises(CommandError, match=r"expected a policy file that exists, or package\.module:name"):
-        Beside(reference="pid.zip").controllers(*policy, EvaluationSettings())
+        Beside(reference="pid.zip").controllers(*policy)
     with pytest.raises(CommandError, match="expected --reference without --explore"):
-        Beside(reference=f"{controllers}:brake").controllers(*policy, EvaluationSettings(explore=0.1))
-    found = Beside("zero", f"{controllers}:brake").controllers(*policy, EvaluationSettings())
+        Beside(reference=f"{controllers}:brake").check(EvaluationSettings(explore=0.1))
+    found = Beside("zero", f"{controllers}:brake").controllers(*policy)
     assert list(found) == ["policy", "zero", "reference"]

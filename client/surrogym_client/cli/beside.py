@@ -43,27 +43,25 @@ class Beside:
         ),
     ] = None
 
-    def controllers(
-        self,
-        policy: Path,
-        card: PolicyCard,
-        reading: PolicyReading,
-        opener: Callable[[], Episode],
-        settings: EvaluationSettings,
-    ) -> dict[Controller, Callable[[], Acting]]:
-        """Return loaders of whatever chooses the actions, the policy first.
-
-        Raises:
-            CommandError: the policy's actions are to be changed at random.
-            PolicyMisfit: the reference controller is a policy of another environment, which was opened and not reset.
-            OriginalError: there is no such reference controller; nothing was run.
-        """
+    def check(self, settings: EvaluationSettings) -> None:
+        """Raise ``CommandError`` if something is to be compared with a policy whose actions are changed at random."""
         from surrogym_client.cli.errors import CommandError
-        from surrogym_client.original.fitting import check_policy
 
         if settings.explore and (self.compare or self.reference):
             option = "--compare" if self.compare else "--reference"
             raise CommandError(f"expected {option} without --explore, which changes actions; give one of the two")
+
+    def controllers(
+        self, policy: Path, card: PolicyCard, reading: PolicyReading, opener: Callable[[], Episode]
+    ) -> dict[Controller, Callable[[], Acting]]:
+        """Return loaders of whatever chooses the actions, the policy first.
+
+        Raises:
+            PolicyMisfit: the reference controller is a policy of another environment, which was opened and not reset.
+            OriginalError: there is no such reference controller; nothing was run.
+        """
+        from surrogym_client.original.fitting import check_policy
+
         found: dict[Controller, Callable[[], Acting]] = {"policy": lambda: reading.load(policy, card)}
         compare = self.compare
         if compare is not None:

@@ -145,12 +145,12 @@ def command(
 
     card, settings, token = card_of_policy(policy), episodes.settings(), service.token_for(context)
     differences.check(settings)
+    beside.check(settings)
     opener = opener_for_policy(env, read_spec(spec), card, quiet=output.quiet)
     ledger = _ledger(surrogate, service.server, card, policy, quiet=output.quiet)
     enter = partial(_enter, ledger, service.server, token, quiet=output.quiet)
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
-    controllers = beside.controllers(policy, card, reading, opener, settings)
-    reports = _reports(controllers, card.spec, run, enter, settings, policy)
+    reports = _reports(beside.controllers(policy, card, reading, opener), card.spec, run, enter, settings, policy)
     result = reports[0][1]
     if stored := push and ledger is not None:
         _keep(policy, reports, settings, quiet=output.quiet)

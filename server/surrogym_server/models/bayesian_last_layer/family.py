@@ -15,7 +15,7 @@ from surrogym_server.models.bayesian_last_layer.codec import (
 from surrogym_server.models.bayesian_last_layer.learning import learn
 from surrogym_server.models.bayesian_last_layer.training import Training
 from surrogym_server.models.port import Learned, Learner, ModelCodec, Warm
-from surrogym_server.models.whole_numbers import require_whole
+from surrogym_server.models.setting_checks import require_whole
 
 LARGEST = {"networks": MAX_MEMBERS, "units": MAX_UNITS, "waves": MAX_WAVES, "iterations": 5_000, "seed": 2**31}
 LEAST = {"networks": 1, "units": 1, "waves": 0, "iterations": 1, "seed": 0}

@@ -10,7 +10,7 @@ from surrogym_server.models.ensemble.codec import MAX_MEMBERS, MAX_UNITS, Networ
 from surrogym_server.models.ensemble.learning import learn
 from surrogym_server.models.ensemble.training import Training
 from surrogym_server.models.port import Learned, Learner, ModelCodec, Warm
-from surrogym_server.models.whole_numbers import require_whole
+from surrogym_server.models.setting_checks import require_number, require_whole
 
 LARGEST = {"members": MAX_MEMBERS, "units": MAX_UNITS, "steps": 5_000, "seed": 2**31}
 LEAST = {"members": 2, "units": 1, "steps": 1, "seed": 0}
@@ -39,8 +39,7 @@ class NetworkEnsembles(Learner):
     def __post_init__(self) -> None:
         for name, largest in LARGEST.items():
             require_whole(name, getattr(self, name), LEAST[name], largest)
-        if isinstance(self.beta, bool) or not isinstance(self.beta, int | float) or not 0 <= self.beta <= 1:
-            raise ValueError(f"expected beta to be a number from 0 to 1, got {self.beta!r}")
+        require_number("beta", self.beta, 1)
 
     @property
     def codec(self) -> ModelCodec:

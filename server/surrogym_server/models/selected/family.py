@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 
 from surrogym_server.environment.definition import EnvironmentDefinition
@@ -11,6 +10,7 @@ from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_server.models.port import Learned, Learner, ModelCodec, Warm
 from surrogym_server.models.selected.codec import SelectedCodec
 from surrogym_server.models.selected.learning import learn
+from surrogym_server.models.setting_checks import require_number
 from surrogym_server.models.singles import BUILT_IN, ENSEMBLE, GAUSSIAN_PROCESS, SINGLES, SPARSE_GAUSSIAN_PROCESS
 from surrogym_server.plugins import Choice
 
@@ -44,8 +44,7 @@ class SelectedFamilies(Settings, Learner):
         names = self.names
         if not 2 <= len(set(names)) == len(names):
             raise ValueError(f"expected candidates to be at least two different families, got {self.candidates!r}")
-        if isinstance(self.margin, bool) or not 0 <= self.margin <= LARGEST_MARGIN or not math.isfinite(self.margin):
-            raise ValueError(f"expected margin to be a number from 0 to {LARGEST_MARGIN:g}, got {self.margin!r}")
+        require_number("margin", self.margin, LARGEST_MARGIN)
         for name in names:
             self._learner(name)
 

@@ -10,10 +10,10 @@ from surrogym_server.gp import subsets
 from surrogym_server.models.gaussian_process.learning.learn import learn
 from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_server.models.port import Learned, Learner, ModelCodec, Warm
+from surrogym_server.models.setting_checks import require_whole
 from surrogym_server.models.sparse_gaussian_process.codec import SparseGaussianProcessCodec
 from surrogym_server.models.sparse_gaussian_process.learning import ByBound
 from surrogym_server.models.sparse_gaussian_process.model import SparseGaussianProcessModel
-from surrogym_server.models.whole_numbers import require_whole
 
 FEWEST, MOST = 10, 2_000  # inducing points
 
