@@ -106,6 +106,42 @@ def test_terminating_steps_make_termination_learned_and_a_question() -> None:
     assert any(line.startswith("termination:") for line in found.asked)
 
 
+def test_an_angle_in_an_attribute_is_found_and_shown_by_its_cosine_and_sine() -> None:
+    """Both tasks show single precision, whose rounding errors are no part of a term."""
+    found = describe("Acrobot-v1", STEPS)
+    assert kinds(found) == {"state0": "angle", "state1": "angle", "state2": "linear", "state3": "linear"}
+    shown = ("cos_state0", "sin_state0", "cos_state1", "sin_state1", "state2", "state3")
+    assert found.spec.observation_names == shown
+    assert kinds(describe("Pendulum-v1", STEPS)) == {"state0": "angle", "state1": "linear"}
+
+
+class Wheel(gymnasium.Env):
+    """A wheel that turns freely, on a wagon at a place on which nothing depends."""
+
+    action_space = gymnasium.spaces.Box(-1, 1, (1,))
+    observation_space = gymnasium.spaces.Box(-10, 10, (4,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = self.np_random.uniform(-1, 1, 3)
+        return self._get_obs(), {}
+
+    def step(self, action):
+        place, angle, speed = self.state
+        self.state = np.array([place + 0.1, angle + 0.1 * speed, speed + 0.1 * action[0]])
+        return self._get_obs(), -float(speed**2), False, False, {}
+
+    def _get_obs(self):
+        place, angle, speed = self.state
+        return np.array([place, np.cos(angle), np.sin(angle), speed])
+
+
+def test_a_place_on_which_nothing_depends_is_no_angle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(gymnasium.registry, "Wheel-v0", gymnasium.envs.registration.EnvSpec("Wheel-v0", Wheel))
+    assert kinds(describe("Wheel-v0", STEPS)) == {"state0": "linear", "state1": "angle", "state2": "linear"}
+    assert set(kinds(describe("CartPole-v1", STEPS)).values()) == {"linear"}
+
+
 @installed("pcgym")
 def test_a_setpoint_is_constant_over_its_whole_range() -> None:
     spec = describe("pcgym:cstr", STEPS).spec

@@ -3,9 +3,12 @@
 import sys
 import textwrap
 
+import numpy as np
 import pytest
 
 from surrogym_client import original
+from surrogym_client.original.describing import describe
+from surrogym_client.original.episodes import open_episode
 from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.loading import is_known
 
@@ -64,6 +67,49 @@ def test_a_specification_of_another_environment_is_refused():
         original.make("CartPole-v1", spec=pendulum)
     nameless = pendulum.model_copy(update={"environment": ""})
     assert original.make("Pendulum-v1", spec=nameless).spec() == pendulum
+
+
+@pytest.mark.parametrize("name", ["Pendulum-v1", "Acrobot-v1", "MountainCar-v0"])
+def test_a_description_of_a_known_task_is_opened_as_it_was_described(name):
+    """Its coordinates are those of a simulator. The task's own class answered with an observation of its own, and the
+    server refused every step."""
+    machine = original.make(name, spec=describe(name, 40).spec)
+    spec = machine.spec()
+    assert spec.coordinate_names[0] == "state0"
+    start = machine.begin(3)
+    taken = machine.act(np.array([0.0]))
+    again = machine.step_from(np.asarray(taken.coordinates), np.array([0.0]))
+    np.testing.assert_allclose(taken.coordinates, start)
+    np.testing.assert_allclose(again.next_coordinates, taken.next_coordinates, atol=1e-6)
+    assert taken.next_observation is None, "the server calculates the declared one"
+    episode = open_episode(name, spec, lambda: machine)
+    assert episode.reset(3).observation.shape == (len(spec.observation),)
+    assert episode.place(start).coordinates == pytest.approx(start)
+    episode.close()
+
+
+def test_a_fall_pays_the_same_after_a_fall():
+    """CartPole pays nothing for steps after the end of an episode, and a query may follow a fall."""
+    machine = original.make("CartPole-v1", spec=describe("CartPole-v1", 40).spec)
+    falls = [machine.step_from(np.array([0, 0, 0.2, 2.0]), np.array([1])) for _ in range(2)]
+    assert [(step.terminated, step.reward) for step in falls] == [(True, 1.0)] * 2
+    machine.close()
+
+
+def test_a_known_task_shows_the_observation_that_is_declared():
+    spec = original.make("Pendulum-v1").spec()
+    fewer = spec.model_copy(update={"observation": spec.observation[:2]})
+    at, force = np.array([0.1, 0.2]), np.array([0.5])
+    assert original.make("Pendulum-v1", spec=fewer).step_from(at, force).next_observation is None
+    assert len(original.make("Pendulum-v1", spec=spec).step_from(at, force).next_observation) == 3
+
+
+def test_coordinates_of_a_known_task_in_another_order_are_refused():
+    """They were taken by their place: an angle was set as a speed."""
+    spec = original.make("Pendulum-v1").spec()
+    turned = spec.model_copy(update={"coordinates": spec.coordinates[::-1]})
+    with pytest.raises(UnknownEnvironment, match=r"expected some of .'state0', 'state1'., or theta, speed in this"):
+        original.make("Pendulum-v1", spec=turned)
 
 
 def test_choices_that_contradict_are_refused():

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_client.original.classic import TASKS
 from surrogym_client.original.errors import NotPerturbable, NotSettable, StepFailed
-from surrogym_client.original.gymnasium import native_action, task_for, wrapped
+from surrogym_client.original.gymnasium import native_action, opens_task, shows_the_same, task_for, wrapped
 from surrogym_client.original.protocol import (
     Array,
     Environment,
@@ -86,7 +85,7 @@ class GymnasiumEpisode(Episode):
         super().__init__(spec)
         self._env = self._open()
         self._physics = self._read_physics()
-        self._own_observation = _shows_the_same(spec)
+        self._own_observation = shows_the_same(spec)
 
     def _open(self) -> Any:
         import gymnasium
@@ -241,7 +240,7 @@ class SteppedEpisode(OwnEpisode):
 def open_episode(name: str, spec: EnvironmentSpec | None, factory: Factory) -> Episode:
     """Open an episode of the environment called ``name``. ``factory`` makes the environment if no adapter knows the
     name."""
-    if name in TASKS:
+    if opens_task(name, spec):
         return GymnasiumEpisode(spec or factory().spec())
     made = factory()
     if isinstance(made, Simulated):
@@ -282,8 +281,3 @@ def _draw_one(distribution: Uniform | Normal | Fixed, rng: np.random.Generator) 
             while not low <= (value := float(rng.normal(distribution.mean, distribution.std))) <= high:
                 pass
             return value
-
-
-def _shows_the_same(spec: EnvironmentSpec) -> bool:
-    """Whether the specification's observation equals the environment's own, entry by entry."""
-    return spec.environment in TASKS and TASKS[spec.environment].spec().observation == spec.observation

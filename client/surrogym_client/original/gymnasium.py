@@ -26,6 +26,17 @@ def task_for(environment: str, preset: str) -> Task:
     return TASKS[environment]
 
 
+def opens_task(name: str, spec: EnvironmentSpec | None) -> bool:
+    """Whether a classic control task of this module opens a name: the specification, if any, has the task's own
+    coordinates in their order. A description has others, and a simulator opens those."""
+    return name in TASKS and (spec is None or spec.coordinate_names == TASKS[name].spec().coordinate_names)
+
+
+def shows_the_same(spec: EnvironmentSpec) -> bool:
+    """Whether the specification's observation equals the environment's own, entry by entry."""
+    return spec.environment in TASKS and TASKS[spec.environment].spec().observation == spec.observation
+
+
 class GymnasiumEnvironment:
     """A classic control task that can be set to coordinates or reset. It is unwrapped, so it has no time limit."""
 
@@ -38,6 +49,7 @@ class GymnasiumEnvironment:
         self._task = task_for(spec.environment, spec.design.preset)
         self._env: Any = gymnasium.make(spec.environment).unwrapped
         self._env.reset(seed=0)
+        self._shows_own = shows_the_same(spec)
 
     def spec(self) -> EnvironmentSpec:
         return self._spec
@@ -64,7 +76,7 @@ class GymnasiumEnvironment:
             reward=float(reward),
             terminated=bool(terminated and self._spec.termination),
             truncated=bool(truncated),
-            next_observation=np.asarray(observation, dtype=np.float64),
+            next_observation=np.asarray(observation, dtype=np.float64) if self._shows_own else None,
         )
 
     def save(self) -> bytes:

@@ -14,7 +14,7 @@ from surrogym_client.original.adapters import adapter_of, is_same, is_trusted, o
 from surrogym_client.original.classic import TASKS
 from surrogym_client.original.errors import UnknownEnvironment, sentence
 from surrogym_client.original.executables import Executable, is_executable, open_executable
-from surrogym_client.original.gymnasium import GymnasiumEnvironment, task_for
+from surrogym_client.original.gymnasium import GymnasiumEnvironment, opens_task, task_for
 from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_client.original.protocol import LONGEST_EPISODE, Environment
@@ -224,7 +224,7 @@ def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str,
             f"expected a specification of {name}, got one of {spec.environment}: if it describes {name} as well, write "
             f'"environment": "{name}" in it'
         )
-    if name in TASKS:
+    if opens_task(name, spec):
         spec = spec and spec.model_copy(update={"environment": name})
         base = spec or task_for(name, preset).spec()
         return GymnasiumEnvironment(choose(base))
@@ -233,6 +233,13 @@ def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str,
     simulator = open_simulator(name)
     try:
         return simulator.with_specification(base, shows_own=own, step_limit=step_limit)
+    except UnknownEnvironment as error:
+        simulator.close()
+        if name not in TASKS:
+            raise
+        raise UnknownEnvironment(
+            f"{error}, or {', '.join(TASKS[name].spec().coordinate_names)} in this order"
+        ) from error
     except BaseException:
         simulator.close()
         raise

@@ -15,6 +15,7 @@ from surrogym_client.original.adapters.gymnasium_ids import settable
 from surrogym_client.original.classic import TASKS
 from surrogym_client.original.errors import NotRenderable
 from surrogym_client.original.executables import is_executable
+from surrogym_client.original.gymnasium import opens_task
 from surrogym_client.original.loading import is_known, is_own, load_factory
 from surrogym_client.original.protocol import Array, Native
 from surrogym_shared.spec import EnvironmentSpec
@@ -126,7 +127,7 @@ class _Native:
             self._env.reset(seed=0)
         except (ImportError, gymnasium.error.Error) as error:
             raise self._unavailable(error) from error
-        self._simulator = None if name in TASKS else settable(name, self._env)
+        self._simulator = None if opens_task(name, spec) else settable(name, self._env)
         self.frames_per_second = int(self._env.metadata.get("render_fps", FRAMES_PER_SECOND))
 
     def draw(self, coordinates: Array) -> Picture:

@@ -128,7 +128,9 @@ class Simulator(ABC):
             NotPerturbable: the simulator's masses are unknown.
         """
         del rng, sigma
-        raise NotPerturbable("only MuJoCo models and classic control can be perturbed")
+        raise NotPerturbable(
+            "only MuJoCo models, and classic control with its built-in specification, can be perturbed"
+        )
 
     @abstractmethod
     def close(self) -> None:

@@ -91,19 +91,19 @@ class _Gymnasium(Simulator):
     """Resets and steps of a Gymnasium environment. It keeps the latest observation."""
 
     def __init__(self, name: str, env: Any, limit: int | None) -> None:
-        self._name, self._env = name, env
+        self._name, self._env, self._over = name, env, False
         self.action = action_of(name, env.action_space)
         self.time_limit = limit
 
     def reset(self, seed: int | None) -> Array:
         observation, _ = _entries(self._env.reset(seed=seed), "its reset", ("observation", "info"))
-        self._last = flat(self._name, observation)
+        self._last, self._over = flat(self._name, observation), False
         return self._last
 
     def step(self, action: Array) -> Taken:
         given = self._env.step(native_action(self.action, action))
         observation, reward, terminated, truncated, _ = _entries(given, "its step", STEP)
-        self._last = flat(self._name, observation)
+        self._last, self._over = flat(self._name, observation), bool(terminated or truncated)
         return Taken(self._last, _reward(reward), bool(terminated), bool(truncated))
 
     def close(self) -> None:
@@ -130,6 +130,16 @@ class GymnasiumSimulator(_Gymnasium, OfParts):
             start = [np.ravel(env.init_qpos), np.ravel(env.init_qvel)]
             self.rest[: sum(map(len, start))] = np.concatenate(start)
         self.reset(0)
+
+    def write(self, state: Array) -> None:
+        if self._over:  # Gymnasium allows no step after the end of an episode. CartPole then pays nothing for a fall
+            self.reset(None)
+        super().write(state)
+
+    def restore(self, saved: Array) -> None:
+        if self._over:
+            self.reset(None)
+        super().restore(saved)
 
     def observe(self) -> Array:
         return flat(self._name, self._env._get_obs()) if self.shows else self._last

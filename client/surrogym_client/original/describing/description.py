@@ -346,7 +346,7 @@ class _Draft:
         self, frame: EnvironmentSpec, variables: Sequence[Variable], rng: np.random.Generator
     ) -> list[ObservationEntry]:
         places, observed = self._observed(frame, rng)
-        turning = [v.name for v in variables if v.motion == "turn"]
+        turning = [v.name for v in variables if v.motion == "turn" or v.name in self._probed.turns]
         entries = express(frame, turning, places, observed)
         angles = {c.name for c in frame.coordinates if c.kind == "angle"}
         self._left_out = [i for i, e in enumerate(entries) if e is None and np.ptp(observed[:, i]) > 1e-6]

@@ -15,6 +15,7 @@ from surrogym_shared.spec import EnvironmentSpec, ObservationEntry, Term
 from surrogym_shared.terms import evaluate
 
 TOLERANCE = 1e-7  # of an entry's own size
+DIGITS = 6  # of a weight, if these explain the entry
 FEW_TURNS = 4  # with at most this many turning coordinates, sums of three of them are tried as well
 CLIPPED = 0.02  # share of places at a limit that indicates a clipped entry
 
@@ -39,9 +40,8 @@ def express(
         if np.ptp(entry) <= tolerance:
             found.append(None)
             continue
-        weights = np.linalg.lstsq(design, entry, rcond=None)[0]
-        exact = float(np.abs(design @ weights - entry).max()) <= tolerance
-        term = _sum(basis, weights) if exact else _clip_of(frame, coordinates, entry)
+        weights = _weights(design, entry, tolerance)
+        term = _clip_of(frame, coordinates, entry) if weights is None else _sum(basis, weights)
         found.append(None if term is None else ObservationEntry(name=_name_of(term) or f"o{index}", term=term))
     return found
 
@@ -65,6 +65,20 @@ def _basis(frame: EnvironmentSpec, turning: Sequence[str]) -> list[Term]:
     sums = [dict.fromkeys(chosen, 1.0) for n in range(1, most + 1) for chosen in itertools.combinations(turning, n)]
     circular = [term for weights in sums for term in (Term.sin(**weights), Term.cos(**weights))]
     return [Term.constant(1.0), *linear, *circular]
+
+
+def _weights(design: Array, entry: Array, tolerance: float) -> Array | None:
+    """Weights (b,) of the terms of a basis (n, b) that explain an entry (n,): of a single term if one does.
+
+    Single precision makes each entry a little wrong. Then many terms together explain its rounding errors too, so a
+    single term and short weights come first.
+    """
+    single = np.round(design.T @ entry / np.maximum((design**2).sum(0), TOLERANCE), DIGITS)
+    best = int(np.abs(design * single - entry[:, None]).max(0).argmin())
+    all_of_them = np.asarray(np.linalg.lstsq(design, entry, rcond=None)[0], dtype=np.float64)
+    alone: Array = np.where(np.arange(len(single)) == best, single, 0.0)
+    tried: tuple[Array, ...] = (alone, np.round(all_of_them, DIGITS), all_of_them)
+    return next((weights for weights in tried if np.abs(design @ weights - entry).max() <= tolerance), None)
 
 
 def _sum(basis: Sequence[Term], weights: Array) -> Term | None:

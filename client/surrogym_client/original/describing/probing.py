@@ -5,6 +5,7 @@ Shapes: V variables of the state.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,12 +14,15 @@ from surrogym_client.original.describing.counting import Counted
 from surrogym_client.original.describing.exploring import RESETS, Seen, moved_by
 from surrogym_client.original.errors import StepFailed
 from surrogym_client.original.protocol import Array
+from surrogym_client.original.simulator import Taken
 
 PLACES = 4  # number of states for each question
 EXACT = 1e-6  # of a variable's observed range
 SETTABLE = 1e-3  # of the same range: the largest error of a state that can be set
 FEW = 3.0  # factor for noise that was estimated from few steps
 FARTHEST = 3.0  # largest shift of a position
+TURN = 2 * np.pi
+PART = 1.0  # rad, of a turn
 ANYWHERE = 32  # states within the limits from which a step is taken
 
 
@@ -79,29 +83,72 @@ def probe(counted: Counted, seen: Seen, rng: np.random.Generator) -> Probed:
     probed = Probed(set_error, repeat_error, replay_error)
     if not probed.settable:
         return probed
-    same = max(EXACT, FEW * repeat_error)
-
-    def changes_nothing(index: int, shift: float, *, seen_in_observation: bool) -> bool:
-        for (state, action, _, _), (reached, got) in zip(taken, first, strict=True):
-            moved = state.copy()
-            moved[index] += shift
-            there, step = counted.step_from(moved, action)
-            there[index] -= shift
-            differs = _error(there, reached, scale, step.reward, got.reward) > same
-            if differs or (seen_in_observation and not np.allclose(step.observation, got.observation, atol=1e-6)):
-                return False
-        return True
-
+    ended = [bool(seen.terminated[i]) for i in at]
+    places = [(state, action, end, *got) for (state, action, _, _), end, got in zip(taken, ended, first, strict=True)]
+    shifted = _Shifted(counted, places, scale, max(EXACT, FEW * repeat_error))
     shifts, turns = set(), set()
     for i, variable in enumerate(simulator.variables):
         if variable.limited or not moved_by(seen.next_states[:, i]):
             continue
-        if variable.motion == "slide" and changes_nothing(i, float(rng.uniform(1, FARTHEST)), seen_in_observation=True):
+        if variable.motion == "slide" and shifted.changes_nothing(i, float(rng.uniform(1, FARTHEST))):
             shifts.add(variable.name)
-        if variable.motion == "turn" and changes_nothing(i, 2 * np.pi, seen_in_observation=False):
+        if (variable.motion == "turn" and shifted.turns(i)) or (variable.motion == "other" and shifted.is_angle(i)):
             turns.add(variable.name)
     leaving = _leaving(counted, seen, rng)
     return Probed(set_error, repeat_error, replay_error, frozenset(shifts), frozenset(turns), leaving)
+
+
+class _Shifted:
+    """Steps from some places with one variable shifted, compared with the same steps without the shift.
+
+    ``places``: state (V,), action (F,), whether the step ended the episode, next state (V,), and the step's results.
+    """
+
+    def __init__(
+        self, counted: Counted, places: Sequence[tuple[Array, Array, bool, Array, Taken]], scale: Array, same: float
+    ) -> None:
+        self._counted, self._places, self._scale, self._same = counted, places, scale, same
+
+    def changes_nothing(self, index: int, shift: float) -> bool:
+        """Whether neither the motion nor the observation changes."""
+        return all(motion and shown for motion, shown in self._alike(index, shift))
+
+    def turns(self, index: int) -> bool:
+        """Whether a whole turn changes nothing about the motion."""
+        return all(motion for motion, _ in self._alike(index, TURN))
+
+    def is_angle(self, index: int) -> bool:
+        """Whether whole turns change nothing about a variable of an unknown kind, and a part of a turn does.
+
+        Without the part, a position on which nothing depends would pass for an angle.
+        """
+        whole = []
+        for shift in (TURN, -2 * TURN):
+            for motion, shown in self._alike(index, shift):
+                if not motion:
+                    return False  # the other places would cost real steps
+                whole.append(shown)
+        part = list(self._alike(index, PART))
+        return not all(motion for motion, _ in part) or (all(whole) and not all(shown for _, shown in part))
+
+    def _alike(self, index: int, shift: float) -> Iterator[tuple[bool, bool]]:
+        """For each place, whether the motion and the observation are the same after the shift.
+
+        Reward and end belong to the motion. The shifted variable may be read without whole turns.
+        """
+        for state, action, ended, reached, got in self._places:
+            moved = state.copy()
+            moved[index] += shift
+            try:
+                there, step = self._counted.step_from(moved, action)
+            except StepFailed:
+                yield False, False
+                continue
+            wrong = there[index] - shift - reached[index]
+            there[index] = reached[index] + (wrong - TURN * np.round(wrong / TURN) if shift % TURN == 0 else wrong)
+            error = _error(there, reached, self._scale, step.reward, got.reward)
+            shown = np.allclose(step.observation, got.observation, atol=1e-6)
+            yield error <= self._same and step.terminated == ended, bool(shown)
 
 
 def _leaving(counted: Counted, seen: Seen, rng: np.random.Generator) -> float:
