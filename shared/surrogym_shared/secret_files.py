@@ -15,9 +15,12 @@ OTHERS = stat.S_IRGRP | stat.S_IROTH
 def open_to_others(path: Path) -> str | None:
     """Return a warning, with its remedy, if other users of this machine can read a file; else None."""
     try:
-        mode = stat.S_IMODE(path.stat().st_mode)
+        found = path.stat().st_mode
     except OSError:
         return None
+    mode = stat.S_IMODE(found)
+    if stat.S_ISDIR(found):
+        return None  # reading it raises the error
     if os.name != "posix" or not mode & OTHERS:
         return None
     return f"{path} may be read by other users of this machine (mode {mode:o}): chmod 600 {path} prevents this"

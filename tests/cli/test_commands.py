@@ -211,7 +211,7 @@ def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum
     changed = on_server("evaluate", "policy.zip", "--learn", "4", "--perturb", "0.1")
     assert (changed.code, "got --perturb" in changed.err) == (1, True)
     nothing = on_server("evaluate", "policy.zip", "--explore", "nan")
-    assert (nothing.code, "expected --explore to be a finite number, got nan" in nothing.err) == (1, True)
+    assert (nothing.code, "'--explore': expected a finite number, got nan" in nothing.err) == (2, True)
     compared = on_server("evaluate", "policy.zip", "--compare", "zero", "--explore", "0.1")
     assert (compared.code, "--compare without --explore" in compared.err) == (1, True)
     evaluated = on_server("evaluate", "policy.zip", "--episodes", "3", *besides, "--learn", "4", "--json", "--quiet")

@@ -72,7 +72,8 @@ def test_a_name_of_no_environment_is_one_sentence(surrogym) -> None:
         ),
         (" \n", "env.json is not a specification: it is empty"),
         (json.dumps({"specification": {}}), "is not a specification: "),
-        (json.dumps({"specification": {}, "design": {}}), "expected 'design' within 'specification', got it beside it"),
+        (json.dumps({"specification": {}, "design": {}}), "got 'design' beside 'specification', where only real_steps"),
+        (json.dumps({"specification": {}, "Desing": {}}), "got 'Desing' beside 'specification', where only real_steps"),
         (json.dumps({"colour": 1}), "env.json is not a specification: colour: unknown entry; expected some of "),
     ],
 )
@@ -107,4 +108,4 @@ def test_two_names_and_two_files_are_refused(surrogym, described: Path) -> None:
     said = surrogym("register", "a", str(described), "--name", "b", "--print-spec")
     assert "expected one name, got 'a' and --name 'b'" in said.err
     said = surrogym("register", "a", str(described), "--spec", str(described), "--print-spec")
-    assert "got both" in said.err
+    assert "expected one specification, got the argument" in said.err

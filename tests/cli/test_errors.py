@@ -128,3 +128,20 @@ def test_an_unknown_surrogate(on_server, command):
 def test_the_way_out_stands_beside_what_is_wrong(surrogym, answer, way_out):
     with scripted_server(answer) as server:
         assert refused(surrogym("status", "--server", server.url)).endswith(f"{way_out}\n")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("train", "pendulum", "--penalty", "nan"),
+        ("sample", "pendulum", "--wait", "inf"),
+        ("change", "pendulum", "--target", "nan"),
+        ("evaluate", "policy.zip", "--perturb", "nan"),
+        ("reproduce", "peers", "--minutes", "nan"),
+    ],
+)
+def test_options_that_are_no_finite_numbers(surrogym, arguments):
+    """NaN passes every range, because each comparison with it is false."""
+    said = surrogym(*arguments)
+    assert said.code == 2
+    assert f"Invalid value for '{arguments[2]}': expected a finite number, got {arguments[3]}" in said.err

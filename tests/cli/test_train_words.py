@@ -30,6 +30,15 @@ def test_an_evaluation_of_ones_own_class_names_the_file_and_the_environment():
     assert said.endswith("; next: surrogym evaluate 'my tank.zip' --env tank:Tank")
 
 
+def test_fewer_steps_than_asked_for_are_explained():
+    result = replace(RESULT, virtual_steps=24576, settings={"n_steps": 128, "num_envs": 64})
+    assert "24576 virtual steps (30000 asked for; they are taken in rollouts of 8192) in" in words_of_result(
+        result, asked=30_000
+    )
+    for asked in (None, 24_576, 90_000):  # the last one was stopped early, for another reason
+        assert "asked for" not in words_of_result(result, asked=asked)
+
+
 @pytest.mark.parametrize(
     ("name", "option"),
     [

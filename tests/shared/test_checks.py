@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from support.moody import SPEC
 from surrogym_shared.checks import first_fault
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.spec.environment import ModelChoice
 
 
 @pytest.mark.parametrize(
@@ -72,3 +73,23 @@ def test_the_entry_that_is_meant_is_named_before_those_that_miss():
     said = first_fault(found.value, of=EnvironmentSpec)
     assert said.startswith("coordinate: unknown entry; expected some of environment, coordinates, ")
     assert said.endswith("; did you mean 'coordinates'?")
+
+
+@pytest.mark.parametrize("given", [float("nan"), float("-inf"), None, [1], {"a": 1}])
+def test_a_setting_of_another_type_is_refused_by_all_that_is_allowed(given: object):
+    """The error named one of four types, by a word of the library."""
+    with pytest.raises(ValidationError) as refused:
+        ModelChoice(name="ensemble", settings={"beta": given})
+    said = first_fault(refused.value)
+    assert said == f"settings.beta: expected a finite number, true, false or a text, got {given}"
+
+
+def test_settings_keep_their_types():
+    settings = {"a": True, "b": 1, "c": 0.5, "d": "text"}
+    assert ModelChoice(name="own", settings=settings).settings == settings
+    assert [type(value) for value in ModelChoice(name="own", settings=settings).settings.values()] == [
+        bool,
+        int,
+        float,
+        str,
+    ]

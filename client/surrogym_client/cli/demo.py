@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from surrogym_client.cli.groups import add
 from surrogym_client.cli.options import ExitWithParent, Quiet, require_known
 from surrogym_client.experiments.arms import ARMS
 from surrogym_client.experiments.tasks import EVERY_TASK
@@ -36,7 +37,7 @@ Algorithm = Annotated[
 
 def register(app: typer.Typer) -> None:
     """Add ``surrogym demo`` to the app."""
-    app.command("demo")(command)
+    add(app, "demo", command)
 
 
 def command(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from functools import wraps
@@ -84,6 +85,7 @@ def ungrouped(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def run(**given: Any) -> None:
+        _require_finite(given)
         for name, group in groups.items():
             given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
         command(**given)
@@ -91,6 +93,19 @@ def ungrouped(command: Callable[..., None]) -> Callable[..., None]:
     run.__signature__ = Signature(flat)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in flat}
     return run
+
+
+def _require_finite(given: dict[str, Any]) -> None:
+    """Refuse options that are no finite numbers: "nan" passes every range.
+
+    Raises:
+        BadParameter: naming the option.
+    """
+    for name, value in given.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise typer.BadParameter(
+                f"expected a finite number, got {value}", param_hint=f"'--{name.replace('_', '-')}'"
+            )
 
 
 def _flattened(parameter: Parameter) -> list[Parameter]:

@@ -89,6 +89,7 @@ Tolerances = Annotated[
 ]
 StepLimit = Annotated[float, typer.Option(min=0.001, help="Seconds that one real step, or one reset, may take.")]
 Preset = Literal["default", "paper"]
+DESCRIBED = ("real_steps", "resets", "found", "asked", "specification")  # entries of what surrogym describe writes
 
 
 def connect(server: str | None, token: str | None, wait: float = 0.0, *, quiet: bool = False) -> Api:
@@ -230,9 +231,10 @@ def read_spec_file(path: Path) -> SpecContent:
     try:
         read = json.loads(content)
         described = isinstance(read, dict) and "specification" in read
-        if described and (beside := sorted(EnvironmentSpec.model_fields.keys() & read)):
+        if described and (beside := sorted(map(str, read.keys() - DESCRIBED))):
             raise CommandError(
-                f"{path} is not a specification: expected {beside[0]!r} within 'specification', got it beside it"
+                f"{path} is not a specification: got {beside[0]!r} beside 'specification', where only "
+                f"{', '.join(DESCRIBED[:-1])} may stand; entries of a specification stand within it"
             )
         spec = EnvironmentSpec.model_validate_json(json.dumps(read["specification"]) if described else content)
     except ValidationError as error:

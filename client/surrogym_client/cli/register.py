@@ -173,7 +173,10 @@ def _sorted_out(
 
     if file is not None:
         if spec is not None:
-            raise CommandError(f"expected {file} or --spec {spec}, got both")
+            raise CommandError(
+                f"expected one specification, got the argument {file} and --spec {spec}: the environment of a "
+                "named surrogate is given by --env"
+            )
         spec = file
     if file is None and env is None:
         return environment, name, spec

@@ -97,7 +97,11 @@ def command(
         summary["version"] = push_or_say(url, token, result.path, surrogate, quiet=output.quiet)
     named = service.server if given_here(context, "server") else None
     shown = partial(
-        words_of_result, closed_loop=loop.improve > 0, server=named, env_option=env_option(spec.environment)
+        words_of_result,
+        asked=search.steps,
+        closed_loop=loop.improve > 0,
+        server=named,
+        env_option=env_option(spec.environment),
     )
     output.give(summary, lambda: shown(result, handover))
 

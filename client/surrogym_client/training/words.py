@@ -16,6 +16,7 @@ def words_of_result(
     result: TrainResult,
     handover: Handover | None = None,
     *,
+    asked: int | None = None,
     closed_loop: bool = False,
     server: str | None = None,
     env_option: str = "",
@@ -25,6 +26,7 @@ def words_of_result(
     Args:
         result: what was trained.
         handover: its promise and whether to trust it.
+        asked: virtual steps that were asked for, if any.
         closed_loop: whether ``--improve`` was given.
         server: address that the next command needs; None if it needs none.
         env_option: option of the next command that names the environment, with a space before it.
@@ -33,11 +35,19 @@ def words_of_result(
     path, lost = shlex.quote(str(result.path)), result.lost_episodes
     cut = f"; {lost} episode{'s' * (lost > 1)} cut short, because the server lost its sessions" if lost else ""
     return (
-        f"{result.path}: {result.virtual_steps} virtual steps in {result.seconds:.1f} s"
+        f"{result.path}: {result.virtual_steps} virtual steps{_of_asked(result, asked)} in {result.seconds:.1f} s"
         f"{_imagined(result.imagined_return)}{cut}{_loop(result.visited_confidence) if closed_loop else ''}"
         f"{_given_up(result.networks - 1)}{_gaining(result)}; next: surrogym evaluate {path}{options}"
         f"{'' if handover is None else chr(10) + words_of_handover(handover)}"
     )
+
+
+def _of_asked(result: TrainResult, asked: int | None) -> str:
+    """Why there are fewer virtual steps than asked for, if the last rollout had no room."""
+    rollout = result.settings.get("n_steps", 0) * result.settings.get("num_envs", 0)
+    if asked is None or not 0 < asked - result.virtual_steps < rollout:
+        return ""
+    return f" ({asked} asked for; they are taken in rollouts of {rollout})"
 
 
 def words_of_handover(handover: Handover) -> str:

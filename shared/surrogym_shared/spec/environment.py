@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, StrictBool, StrictFloat, StrictInt, StrictStr, model_validator
+from pydantic import BeforeValidator, Field, StrictBool, StrictFloat, StrictInt, StrictStr, model_validator
 
-from surrogym_shared.checks import Number, Positive, require, require_known, require_unique
+from surrogym_shared.checks import SHOWN, Number, Positive, require, require_known, require_unique
 from surrogym_shared.spec.actions import Action
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, MAX_STARTS, REWARD, Frozen, Name
 from surrogym_shared.spec.coordinates import Coordinate, StartDistribution, limits
@@ -18,11 +18,21 @@ from surrogym_shared.spec.terms import AllOf, ObservationEntry, Term, Terminatio
 Access = Literal["any", "snapshot", "reset"]
 
 
+def _require_setting(value: object) -> object:
+    """Raise ``ValueError`` if a setting has none of the allowed types. Else a union's error would name one of them."""
+    allowed = isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value))
+    require(allowed, f"expected a finite number, true, false or a text, got {str(value)[:SHOWN]}")
+    return value
+
+
+Setting = Annotated[StrictBool | StrictInt | StrictFloat | StrictStr, BeforeValidator(_require_setting)]
+
+
 class Choice(Frozen):
     """Choice of one of several named parts, with settings of its own."""
 
     name: Name
-    settings: dict[Name, StrictBool | StrictInt | StrictFloat | StrictStr] = Field(default_factory=dict, max_length=64)
+    settings: dict[Name, Setting] = Field(default_factory=dict, max_length=64)
 
 
 class AcquisitionChoice(Choice):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from surrogym_client.cli.groups import add
 from surrogym_client.cli.options import AsJson, Quiet, require_known
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ OnRay = Annotated[
 
 def register(app: typer.Typer) -> None:
     """Add ``surrogym reproduce efficiency`` to the app."""
-    app.command("efficiency")(command)
+    add(app, "efficiency", command)
 
 
 def command(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from surrogym_client.cli.groups import add
 from surrogym_client.cli.options import AsJson, Quiet
 from surrogym_client.cli.reproduce.efficiency import OnRay
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add ``surrogym reproduce paper`` to the app."""
-    app.command("paper")(command)
+    add(app, "paper", command)
 
 
 def command(

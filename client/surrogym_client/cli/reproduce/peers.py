@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym_client.cli.groups import add
 from surrogym_client.cli.options import AsJson, Quiet
 from surrogym_client.cli.reproduce.efficiency import OnRay
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add ``surrogym reproduce peers`` to the app."""
-    app.command("peers")(command)
+    add(app, "peers", command)
 
 
 def command(

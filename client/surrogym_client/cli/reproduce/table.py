@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym_client.cli.groups import add
 from surrogym_client.cli.options import AsJson, Quiet
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add ``surrogym reproduce table`` to the app."""
-    app.command("table")(command)
+    add(app, "table", command)
 
 
 def command(

@@ -7,13 +7,14 @@ from typing import Annotated
 
 import typer
 
+from surrogym_client.cli.groups import add
 from surrogym_client.cli.options import AsJson, Quiet
 from surrogym_client.cli.reproduce.efficiency import OnRay
 
 
 def register(app: typer.Typer) -> None:
     """Add ``surrogym reproduce trust`` to the app."""
-    app.command("trust")(command)
+    add(app, "trust", command)
 
 
 def command(
