@@ -315,10 +315,15 @@ def _plan(
 
     So plans become longer as the model sees more, and fits are few. With snapshots, which need no way from a reset, a
     round has half as many steps, and at least one for each of these outputs, as with single steps.
+
+    If the initial rollouts ended so early that more steps of the initial design are missing than a round has, the
+    round is further random rollouts. Otherwise many small rounds would follow, each with a fit of few steps.
     """
     steps, below = request.extra, _below(confidences, request.target)
     if verdict == "continue":
         usual = max(SHORTEST_ROUND, len(samples) // 4)
+        if not model.definition.snapshots and (missing := _missing(model.definition, samples, request)) > usual:
+            return tuple(map(Rollout, first_rollouts(model.definition, missing, rng)))
         steps = min(
             _room(samples, request), max(len(below), len(samples) // 8) if model.definition.snapshots else usual
         )
@@ -358,6 +363,13 @@ def _excursion(
 def _room(samples: Samples, request: Request) -> int:
     """Real steps that the budget has left for rollouts, without those of pending ones."""
     return request.budget + request.free - len(samples) - sum(map(len, request.pending_rollouts))
+
+
+def _missing(definition: EnvironmentDefinition, samples: Samples, request: Request) -> int:
+    """Real steps that the initial design has yet to take within the budget. Logged ones can replace them."""
+    begun = len(samples) - request.free + min(request.logged, definition.design.initial)
+    initial = definition.design.initial - begun - sum(map(len, request.pending_rollouts))
+    return min(initial, _room(samples, request))
 
 
 def _below(confidences: tuple[OutputConfidence, ...], target: float) -> list[int]:

@@ -231,9 +231,11 @@ def test_a_rewards_edge_in_doubt_is_driven_to(side: int):
 
 
 def test_a_design_without_teleport_spends_its_budget_in_real_steps(swinging: EnvironmentDefinition, begun: Samples):
+    complete = replace(swinging, design=replace(swinging.design, initial=len(begun)))
+
     def ask(**options: object) -> list[int]:
         values = {"budget": len(begun) + 9, "target": 1 - 1e-12, "pending": NOTHING} | options
-        decision = advance(swinging, begun, DesignState(), Request(**values))
+        decision = advance(complete, begun, DesignState(), Request(**values))
         assert len(decision.q) == 0
         return [len(actions) for actions in decision.rollouts]
 
@@ -243,6 +245,23 @@ def test_a_design_without_teleport_spends_its_budget_in_real_steps(swinging: Env
     assert sum(ask(pending_rollouts=pending)) == 2, "its seven steps are spoken for"
     assert sum(ask(budget=len(begun), extra=5)) == 5
     assert ask(budget=len(begun)) == []
+
+
+def test_steps_of_the_initial_design_that_early_ends_left_over_are_taken_in_one_round(
+    swinging: EnvironmentDefinition, begun: Samples
+):
+    """Each round had a quarter of the samples, so that many small rounds followed, each with a fit."""
+    assert (swinging.design.initial, len(begun)) == (12, 3)
+
+    def ask(**options) -> list[int]:
+        request = Request(**{"budget": 60, "target": 1 - 1e-12, "pending": NOTHING} | options)
+        return [len(actions) for actions in advance(swinging, begun, DesignState(), request).rollouts]
+
+    assert ask() == [1, 2, 3, 3]
+    assert sum(ask(budget=8)) == 5, "the budget has no more"
+    assert sum(ask(logged=3)) == 9, "a log is free, and replaces as many initial steps"
+    pending = (Rollout(torch.ones(7, 1, dtype=torch.float64)),)
+    assert sum(ask(pending_rollouts=pending)) == 4, "two are missing, which is less than a usual round"
 
 
 def test_the_latin_hypercube_arm_is_random_rollouts_alone():
