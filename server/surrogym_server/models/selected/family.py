@@ -34,6 +34,7 @@ class SelectedFamilies(Settings, Learner):
     members: int = 5
     units: int = 32
     steps: int = 600
+    beta: float = 0.0
     networks: int = 4
     waves: int = 64
     iterations: int = 300

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import torch
@@ -20,7 +22,9 @@ from surrogym_server.models.abilities import (
 )
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.registry import learner_of
+from surrogym_server.models.selected import SelectedFamilies
 from surrogym_server.models.selected.selection import SERVING, WON
+from surrogym_server.models.singles import BUILT_IN
 from surrogym_server.plugins import Choice
 from surrogym_server.sampling.design import DesignState
 from surrogym_server.testing import ModelCase, model_cases
@@ -134,6 +138,13 @@ def test_settings_reach_the_candidates() -> None:
     family = learner_of(Choice("selected", (("symmetry", "none"), ("members", 3), ("inducing", 50))))
     learners = family.learners  # type: ignore[attr-defined]
     assert (learners[PROCESS].symmetry, learners[SPARSE].inducing, learners[ENSEMBLE].members) == ("none", 50, 3)
+
+
+def test_every_setting_of_a_built_in_family_can_be_given() -> None:
+    """A setting that ``selected`` lacks keeps its default there, as the ensemble's ``beta`` did."""
+    own = {field.name for field in fields(SelectedFamilies)}
+    lacking = {name: sorted({field.name for field in fields(kind)} - own) for name, kind in BUILT_IN.items()}  # type: ignore[arg-type]
+    assert not any(lacking.values()), lacking
 
 
 def test_the_preset_of_the_paper_has_one_family() -> None:
