@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import gymnasium
 import numpy as np
@@ -14,7 +15,7 @@ from support.simulators import CASES, Register, Spiral, installed
 from surrogym_client import original
 from surrogym_client.original.describing import Description, describe
 from surrogym_client.original.simulator import Simulated
-from surrogym_client.original.state_parts import Attribute
+from surrogym_client.original.state_parts import Attribute, holds_numbers
 from surrogym_shared import terms
 from surrogym_shared.spec import EnvironmentSpec, limits
 
@@ -140,6 +141,94 @@ def test_a_place_on_which_nothing_depends_is_no_angle(monkeypatch: pytest.Monkey
     monkeypatch.setitem(gymnasium.registry, "Wheel-v0", gymnasium.envs.registration.EnvSpec("Wheel-v0", Wheel))
     assert kinds(describe("Wheel-v0", STEPS)) == {"state0": "linear", "state1": "angle", "state2": "linear"}
     assert set(kinds(describe("CartPole-v1", STEPS)).values()) == {"linear"}
+
+
+@pytest.fixture
+def listed(monkeypatch: pytest.MonkeyPatch):
+    """Registers a class as Own-v0."""
+
+    def register(kind: type[gymnasium.Env]) -> str:
+        monkeypatch.setitem(gymnasium.registry, "Own-v0", gymnasium.envs.registration.EnvSpec("Own-v0", kind))
+        return "Own-v0"
+
+    return register
+
+
+class Remembering(Wheel):
+    """The last force is part of the state, and nothing depends on it."""
+
+    def step(self, action):
+        place, speed, _ = self.state
+        self.state = np.array([0.9 * place + 0.1 * speed, 0.9 * speed + action[0], 10.0 * action[0]])
+        return self._get_obs(), -float(place**2), False, False, {}
+
+    def _get_obs(self):
+        return np.array([*self.state, 0.0])
+
+
+def test_a_number_that_forgets_a_shift_is_no_angle(listed) -> None:
+    """Without whole turns, its next value is the same after any shift."""
+    assert set(kinds(describe(listed(Remembering), STEPS)).values()) == {"linear"}
+
+
+class Hanging(Wheel):
+    """It begins near half a turn, where its angle is read with a jump."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = np.array([0.0, np.pi + self.np_random.uniform(-0.1, 0.1), 0.0])
+        self.state[1] = (self.state[1] + np.pi) % (2 * np.pi) - np.pi
+        return self._get_obs(), {}
+
+
+def test_starts_on_both_sides_of_the_jump_of_an_angle_are_one_arc(listed) -> None:
+    """They were the whole circle."""
+    low, high = limits(describe(listed(Hanging), STEPS).spec.start["state1"])
+    assert np.pi - 0.12 < low < np.pi - 0.05
+    assert np.pi + 0.05 < high < np.pi + 0.12
+
+
+def test_a_sampling_range_ends_at_the_limits_of_what_is_shown() -> None:
+    """Pendulum's speed is clipped at 8 rad/s; a quarter of the range was added on each side."""
+    spec = describe("Pendulum-v1").spec
+    assert limits(spec.coordinates[1].sampling) == (-8, 8)
+
+
+def test_a_reward_has_no_terms_of_rounding_and_none_that_cancel() -> None:
+    """Squares of cosine and sine came with a constant that cancels them."""
+    terms = describe("Pendulum-v1").spec.reward.terms
+    assert sorted(round(term.weight, 6) for term in terms) == [-1, -0.1, -0.001]
+    assert {term.shape for term in terms} == {"square"}
+
+
+class Pair(NamedTuple):
+    x: float
+    number: int
+
+
+@pytest.mark.parametrize(
+    ("state", "written"),
+    [((0.5, 2), (1.5, 3)), ([0.5, 2], [1.5, 3]), (Pair(0.5, 2), Pair(1.5, 3)), (np.array([0.5, 2]), None)],
+)
+def test_a_state_keeps_its_container_and_its_whole_numbers(state, written) -> None:
+    """A named tuple ended in an error, and a whole number that the environment used as an index became a fraction."""
+    owner = SimpleNamespace(state=state)
+    assert holds_numbers(owner, "state")
+    Attribute(owner, "state").write(np.array([1.5, 3.0]))
+    assert type(owner.state) is type(state)
+    if written is not None:
+        assert owner.state == written
+        assert type(owner.state[1]) is int
+
+
+def test_a_state_that_can_not_be_written_is_none() -> None:
+    class Fixed:
+        @property
+        def state(self) -> np.ndarray:
+            return np.zeros(2)
+
+    assert not holds_numbers(Fixed(), "state")
+    assert not holds_numbers(SimpleNamespace(state=[[0.0, 1.0], [2.0, 3.0]]), "state")
 
 
 @installed("pcgym")

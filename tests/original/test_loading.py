@@ -11,6 +11,7 @@ from surrogym_client.original.describing import describe
 from surrogym_client.original.episodes import open_episode
 from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.loading import is_known
+from surrogym_shared.spec import BoxAction, DiscreteAction, Reward
 
 OWN = textwrap.dedent(
     """
@@ -110,6 +111,28 @@ def test_coordinates_of_a_known_task_in_another_order_are_refused():
     turned = spec.model_copy(update={"coordinates": spec.coordinates[::-1]})
     with pytest.raises(UnknownEnvironment, match=r"expected some of .'state0', 'state1'., or theta, speed in this"):
         original.make("Pendulum-v1", spec=turned)
+
+
+@pytest.mark.parametrize(
+    ("name", "action", "said"),
+    [
+        ("Pendulum-v1", DiscreteAction(n=3), "has a discrete action of 3 values, but Pendulum-v1 takes a continuous"),
+        ("Pendulum-v1", BoxAction(low=(-1.0, -1.0), high=(1.0, 1.0)), "has a continuous action of 2 entries, but"),
+        ("CartPole-v1", DiscreteAction(n=3), "action of 3 values, but CartPole-v1 takes a discrete action of 2 values"),
+    ],
+)
+@pytest.mark.parametrize("described", [True, False])
+def test_an_action_that_the_environment_can_not_take_is_refused(name, action, said, described):
+    """Numbers of discrete actions were applied as torques, and a second entry was ignored."""
+    spec = describe(name, 40).spec if described else original.make(name).spec()
+    with pytest.raises(UnknownEnvironment, match=said):
+        original.make(name, spec=spec.model_copy(update={"action": action, "reward": Reward()}))
+
+
+def test_an_action_may_be_narrower_than_the_environments():
+    spec = original.make("Pendulum-v1").spec()
+    weak = spec.model_copy(update={"action": BoxAction(low=(-0.5,), high=(0.5,), bins=(3,))})
+    assert original.make("Pendulum-v1", spec=weak).spec() == weak
 
 
 def test_choices_that_contradict_are_refused():

@@ -77,7 +77,7 @@ def placed(url: str, spec: EnvironmentSpec, environment: Any, design: Design | N
         thread = threading.Thread(target=_until_deleted, args=(Sampler(own, name, environment, settings),))
         thread.start()
         try:
-            wait_for_design(api, name, 60)
+            wait_for_design(api, name, 240)  # seconds, on a busy machine
             yield Place(api, port, environment)
         finally:
             api.delete_surrogate(name)
@@ -100,6 +100,15 @@ def test_a_right_model_passes_and_its_steps_stand_apart(line: Place) -> None:
     assert after.ledger.total == before.ledger.total, "an audit costs none of the budget"
     assert after.budget_left == before.budget_left
     assert after.samples == before.samples + 8, "the model learns from the audit"
+
+
+def test_a_policy_that_promises_no_more_than_an_untrained_one_is_not_trusted(line: Place) -> None:
+    """A promise without width passed for a sure one, where no policy could change the return."""
+    best = hand_over(line.subject(), None).promise
+    assert best is not None
+    handover = hand_over(replace(line.subject(), floor=best.high), None)
+    assert not handover.trusted
+    assert handover.reason.startswith("the promise is no more than the return of an untrained policy")
 
 
 def test_a_machine_that_has_changed_fails_the_audit(line: Place) -> None:

@@ -73,7 +73,8 @@ def _all(api: Api, form: Form) -> str:
 def _one(api: Api, name: str, form: Form) -> str:
     view = api.surrogate(name)
     if form == "json":
-        return view.model_dump_json()
+        selection = _selection(api, view)
+        return json.dumps(view.model_dump(mode="json") | ({} if selection is None else {"selection": dict(selection)}))
     if form == "short":
         return _short(view)
     return _detail(view, api.models(name) if view.phase == "over_budget" else (), _selection(api, view))

@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.protocol import Array
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
+from surrogym_shared.spec.actions import Action
 
 
 def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], num_envs: int) -> Array:
@@ -48,6 +50,29 @@ def explored(spec: EnvironmentSpec, action: Array, share: float, rng: np.random.
     counts = np.array(_counts(spec.action))
     drawn = decode_actions(spec, rng.integers(counts, size=size), 1)[0]
     return np.where(rng.random(size) < share, drawn, action)
+
+
+def require_same_action(name: str, declared: Action, own: Action) -> None:
+    """Refuse a declared action that the environment can't take. It may have fewer values, and other bounds.
+
+    Raises:
+        UnknownEnvironment: it has another kind, another number of entries, or more values.
+    """
+    fits = declared.kind == own.kind and declared.size == own.size
+    if fits and not isinstance(own, BoxAction):
+        fits = all(asked <= there for asked, there in zip(_counts(declared), _counts(own), strict=True))
+    if not fits:
+        raise UnknownEnvironment(
+            f"the specification has {_words_of(declared)}, but {name} takes {_words_of(own)}: write the latter in its "
+            "action"
+        )
+
+
+def _words_of(action: Action) -> str:
+    if isinstance(action, BoxAction):
+        return f"a continuous action of {action.size} entr{'y' if action.size == 1 else 'ies'}"
+    values = " and ".join(map(str, _counts(action)))
+    return f"a discrete action of {values} values"
 
 
 def _counts(action: BoxAction | DiscreteAction | MultiDiscreteAction) -> tuple[int, ...]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Literal
 
+from surrogym_client.original.actions import require_same_action
 from surrogym_client.original.adapters import adapter_of, is_same, is_trusted, open_simulator
 from surrogym_client.original.classic import TASKS
 from surrogym_client.original.errors import UnknownEnvironment, sentence
@@ -227,11 +228,14 @@ def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str,
     if opens_task(name, spec):
         spec = spec and spec.model_copy(update={"environment": name})
         base = spec or task_for(name, preset).spec()
-        return GymnasiumEnvironment(choose(base))
+        made = choose(base)
+        require_same_action(name, made.action, TASKS[name].spec().action)
+        return GymnasiumEnvironment(made)
     base = choose(spec or specification(name))
     own = name in SPECIFICATIONS and SPECIFICATIONS[name]().observation == base.observation
     simulator = open_simulator(name)
     try:
+        require_same_action(name, base.action, simulator.action)
         return simulator.with_specification(base, shows_own=own, step_limit=step_limit)
     except UnknownEnvironment as error:
         simulator.close()

@@ -68,11 +68,13 @@ class Simulator(ABC):
         time_limit: steps of an episode; None without a limit.
         scheduled: variables that a schedule sets, such as setpoints, with their lowest and highest value in it. They
             are coordinates, also where a few steps show one value alone.
+        shown_limits: declared limits (D, 2) of the entries of its observation, infinite where it has none.
         notes: findings that a description repeats, one sentence each.
         questions: to a person who reads a description, one sentence each.
     """
 
     settable = True
+    shown_limits: Array | None = None
     fixed = "its state can't be read: the observation is used as its state, and it can only be reset"
     shows = True
     pays = True

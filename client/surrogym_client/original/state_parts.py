@@ -164,19 +164,39 @@ class Attribute(StatePart):
         if isinstance(before, np.ndarray):
             setattr(self._owner, self._attribute, values.astype(before.dtype).reshape(before.shape))
         else:
-            setattr(self._owner, self._attribute, type(before)(values.tolist()))  # an array may be a tuple by now
+            numbers = [_like(old, new) for old, new in zip(before, values.tolist(), strict=True)]
+            made = type(before)(*numbers) if hasattr(before, "_fields") else type(before)(numbers)
+            setattr(self._owner, self._attribute, made)  # an array may be a tuple by now
+
+
+def _like(old: Any, new: float) -> Any:
+    """A number of the type that it had: a whole one may be an index."""
+    if isinstance(old, bool | np.bool_):
+        return new >= 0.5
+    return int(new) if isinstance(old, int | np.integer) and new == int(new) else new
 
 
 def holds_numbers(owner: Any, attribute: str) -> bool:
-    """Whether an attribute holds a state: an array, a list or a tuple of finite numbers."""
+    """Whether an attribute holds a state that can be written: an array, or a list or a tuple, of finite numbers."""
     value = getattr(owner, attribute, None)
-    if not isinstance(value, (np.ndarray, list, tuple)):
+    flat = isinstance(value, list | tuple) and all(np.ndim(entry) == 0 for entry in value)
+    if not (flat or isinstance(value, np.ndarray)):
         return False
     try:
         numbers = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         return False
-    return numbers.size > 0 and bool(np.isfinite(numbers).all())
+    return numbers.size > 0 and bool(np.isfinite(numbers).all()) and _can_be_written(owner, attribute)
+
+
+def _can_be_written(owner: Any, attribute: str) -> bool:
+    """Whether an attribute takes back what it holds. A property may not."""
+    part = Attribute(owner, attribute)
+    try:
+        part.write(part.read())
+    except Exception:  # whatever an environment raises: then it can only be reset
+        return False
+    return True
 
 
 class DrawnIntoModel(StatePart):

@@ -236,8 +236,8 @@ def _not_possible(subject: Subject) -> str | None:
 def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
     if not audit.passed:
         return False, f"the audit failed: {audit.faults[0]}"
-    if (wide := _too_wide(audit.after, floor)) is not None:
-        return False, wide
+    if (doubt := _doubtful(audit.after, floor)) is not None:
+        return False, doubt
     if audit.untestable is not None:
         name, share = audit.untestable
         return False, (
@@ -260,16 +260,21 @@ def _unaudited(subject: Subject, promise: Promise, why: str) -> Handover:
 
 def _without(view: SurrogateView, promise: Promise, floor: float | None, why: str) -> Handover:
     """Return a handover without an audit. It is trusted only if the design is ready."""
-    if (wide := _too_wide(promise, floor)) is not None:
-        return Handover(promise, None, False, f"{wide}; not audited: {why}")
+    if (doubt := _doubtful(promise, floor)) is not None:
+        return Handover(promise, None, False, f"{doubt}; not audited: {why}")
     if view.phase == "ready":
         return Handover(promise, None, True, f"the design is ready; not audited: {why}")
     state = "is not certain of its model" if view.phase in COMPLETED else "has not ended"
     return Handover(promise, None, False, f"the design {state}, and there was no audit: {why}")
 
 
-def _too_wide(promise: Promise, floor: float | None) -> str | None:
-    """Return why a promise is too wide to be trusted; None if it is not."""
+def _doubtful(promise: Promise, floor: float | None) -> str | None:
+    """Return why a promise can't be trusted by its numbers alone; None if it can."""
+    if floor is not None and promise.high <= floor:
+        return (
+            f"the promise is no more than the return of an untrained policy, {floor:.4g}: perhaps no policy can change "
+            "the return within the sampling ranges"
+        )
     if floor is None or not wider(promise, WIDE, floor):
         return None
     return (

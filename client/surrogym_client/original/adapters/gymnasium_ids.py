@@ -93,6 +93,7 @@ class _Gymnasium(Simulator):
     def __init__(self, name: str, env: Any, limit: int | None) -> None:
         self._name, self._env, self._over = name, env, False
         self.action = action_of(name, env.action_space)
+        self.shown_limits = _limits_of(env.observation_space)
         self.time_limit = limit
 
     def reset(self, seed: int | None) -> Array:
@@ -178,6 +179,14 @@ def _entries(given: Any, whose: str, expected: tuple[str, ...]) -> tuple[Any, ..
         return given
     came = f"{len(given)} values" if isinstance(given, tuple) else f"a {type(given).__name__}"
     raise StepFailed(f"expected {whose} to return {len(expected)} values ({', '.join(expected)}), got {came}")
+
+
+def _limits_of(space: Any) -> Array | None:
+    """Limits (D, 2) of an observation; None if its space is no box."""
+    if type(space).__name__ != "Box":
+        return None
+    limits: Array = np.stack([np.ravel(space.low), np.ravel(space.high)], axis=1).astype(np.float64)
+    return limits
 
 
 def _reward(given: Any) -> float:

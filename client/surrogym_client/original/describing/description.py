@@ -40,6 +40,7 @@ FASTER = 1.5  # times the largest observed speed: what a policy may reach
 MARGIN = 0.25  # of the observed range, on each side
 MOSTLY = 0.5  # of all steps with the same reward; then other rewards are met only by luck
 PLACES = 300  # at which an observation is read, without a step
+SINGLE = 1e-6  # relative error of an observation in single precision
 SHORT_WAY = 0.05  # of the way between two stops; a step that is longer may meet a stop from anywhere
 UNKNOWN_SPEED = 1.0  # of a variable that never moved, in the simulator's unit
 UNKNOWN_LIMIT = 200  # steps of an episode if the simulator has no limit
@@ -174,7 +175,8 @@ class _Draft:
             lines.append(f"a shift of {listed(sorted(probed.shifts))} changes nothing, so it is left out")
         if kinds["angle"]:
             lines.append(
-                f"a whole turn of {listed(kinds['angle'])} changes nothing, so it is observed as cosine and sine"
+                f"a whole turn of {listed(kinds['angle'])} changes nothing, so it is an angle, shown by its cosine or "
+                "sine"
             )
         if drawn := [name for name in kinds["constant"] if name not in self._simulator.scheduled]:
             lines.append(f"{listed(drawn)}: constant within an episode, and drawn again at each reset")
@@ -210,10 +212,11 @@ class _Draft:
         ]
         ended, lines = int(self._seen.terminated.sum()), list[str]()
         if guessed:
+            motions = {v.name: v.motion for v in self._simulator.variables}
+            more = f"{FASTER:g} times that for speeds" if "speed" in map(motions.get, guessed) else "some more"
             lines.append(
                 f"sampling range of {listed(guessed)}: does it cover the states that a good policy visits? It covers "
-                "what random actions "
-                f"reached, and {FASTER:g} times that for speeds; the design never queries outside it"
+                f"what random actions reached, and {more}; the design never queries outside it"
             )
         if self._unmoved:
             lines.append(
@@ -227,7 +230,8 @@ class _Draft:
                 "inequality that you declare saves real steps"
             )
         else:
-            lines.append("termination: no step ended an episode. If some states should end it, declare them")
+            paid = ", and what an end pays" if isinstance(spec.reward, DeclaredReward) else ""
+            lines.append(f"termination: no step ended an episode. If some states should end it, declare them{paid}")
         if scheduled := listed([name for name in spec.coordinate_names if name in self._simulator.scheduled]):
             lines.append(
                 f"start of {scheduled}: a schedule sets it in an original episode. A virtual episode keeps one value, "
@@ -294,7 +298,22 @@ class _Draft:
         return Coordinate(name=variable.name, kind=kind, sampling=Uniform(low=low, high=high))
 
     def _range(self, index: int, *, constant: bool) -> tuple[float, float]:
-        """The sampling range of a variable."""
+        """The sampling range of a variable. It ends at the limits with which the environment shows the variable."""
+        low, high = self._reached(index, constant=constant)
+        for shown, ends in zip(self._seen.observations.T, self._shown_limits(), strict=True):
+            within = ends[0] <= self._all[:, index].min() and self._all[:, index].max() <= ends[1]
+            if within and np.allclose(shown, self._seen.next_states[:, index], rtol=SINGLE, atol=SINGLE):
+                low, high = max(low, float(ends[0])), min(high, float(ends[1]))
+        return low, high
+
+    def _shown_limits(self) -> Array:
+        """Limits (D, 2) of the observation's entries."""
+        given, entries = self._simulator.shown_limits, self._seen.observations.shape[1]
+        fits = given is not None and given.shape == (entries, 2)
+        return given if given is not None and fits else np.tile([-np.inf, np.inf], (entries, 1))
+
+    def _reached(self, index: int, *, constant: bool) -> tuple[float, float]:
+        """The sampling range of a variable by its own limits, or by what random actions reached."""
         variable, seen = self._simulator.variables[index], self._all[:, index]
         low, high = float(seen.min()), float(seen.max())
         if variable.motion == "speed":
@@ -334,6 +353,8 @@ class _Draft:
         if coordinate.kind == "constant" and self._simulator.variables[index].limited:
             return Uniform(low=limits(coordinate.sampling)[0], high=limits(coordinate.sampling)[1])
         starts = self._seen.starts[:, index]
+        if coordinate.kind == "angle":
+            starts = _on_an_arc(starts)
         low, high = float(starts.min()), float(starts.max())
         if high - low <= 1e-12 * max(1.0, abs(low)):
             return Fixed(value=low)
@@ -379,6 +400,20 @@ class _Draft:
             place[:] = counted.read()[self._kept]
             observed.append(counted.observe())
         return places, np.stack(observed)
+
+
+def _on_an_arc(angles: Array) -> Array:
+    """The same angles (n,), with whole turns added, so that they lie on the shortest arc that has them all.
+
+    Its middle is within half a turn of 0. Angles near half a turn are read on both sides of the jump there.
+    """
+    turn = 2 * math.pi
+    placed = np.sort(np.mod(angles, turn))
+    gaps = np.diff(np.append(placed, placed[0] + turn))
+    first = placed[(int(gaps.argmax()) + 1) % len(placed)]
+    arc: Array = np.mod(angles - first, turn) + first
+    middle = (arc.min() + arc.max()) / 2
+    return arc - turn * round(float(middle) / turn)
 
 
 def _raw(term: Term) -> set[str]:

@@ -120,7 +120,8 @@ class _Shifted:
     def is_angle(self, index: int) -> bool:
         """Whether whole turns change nothing about a variable of an unknown kind, and a part of a turn does.
 
-        Without the part, a position on which nothing depends would pass for an angle.
+        Without the part, a position on which nothing depends would pass for an angle. The variable's own next value is
+        no such change: it may forget the shift, such as that of an action that the state remembers.
         """
         whole = []
         for shift in (TURN, -2 * TURN):
@@ -128,13 +129,14 @@ class _Shifted:
                 if not motion:
                     return False  # the other places would cost real steps
                 whole.append(shown)
-        part = list(self._alike(index, PART))
+        part = list(self._alike(index, PART, but_itself=True))
         return not all(motion for motion, _ in part) or (all(whole) and not all(shown for _, shown in part))
 
-    def _alike(self, index: int, shift: float) -> Iterator[tuple[bool, bool]]:
+    def _alike(self, index: int, shift: float, *, but_itself: bool = False) -> Iterator[tuple[bool, bool]]:
         """For each place, whether the motion and the observation are the same after the shift.
 
-        Reward and end belong to the motion. The shifted variable may be read without whole turns.
+        Reward and end belong to the motion. The shifted variable may be read without whole turns. With ``but_itself``,
+        it is not compared.
         """
         for state, action, ended, reached, got in self._places:
             moved = state.copy()
@@ -144,7 +146,7 @@ class _Shifted:
             except StepFailed:
                 yield False, False
                 continue
-            wrong = there[index] - shift - reached[index]
+            wrong = 0.0 if but_itself else there[index] - shift - reached[index]
             there[index] = reached[index] + (wrong - TURN * np.round(wrong / TURN) if shift % TURN == 0 else wrong)
             error = _error(there, reached, self._scale, step.reward, got.reward)
             shown = np.allclose(step.observation, got.observation, atol=1e-6)

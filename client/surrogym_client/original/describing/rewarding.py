@@ -125,12 +125,38 @@ def _fitted(spec: EnvironmentSpec, steps: Paid, timing: Timing, size: float) -> 
     weights = np.linalg.lstsq(columns, steps.reward, rcond=None)[0]
     if np.abs(columns @ weights - steps.reward).max() > EXACT * size:
         return None
+    if (fewer := _fewest(_columns(x / reach), steps.reward, EXACT * size)) is not None:
+        weights, centre = fewer, np.zeros_like(centre)
     c, b, a = _parts(np.where(np.abs(weights) > NOTHING * size, weights, 0.0), z.shape[1])
     form, b = a / np.outer(reach, reach), b / reach
     c, b = float(c - b @ centre + centre @ form @ centre), b - 2 * form @ centre
     b = np.where(np.abs(b) * np.abs(x).max(0) > NOTHING * size, b, 0.0)
     terms = (*_squares(quantities, a, reach), *_rest(quantities, c if abs(c) > NOTHING * size else 0.0, b))
     return DeclaredReward(kind="declared", timing=timing, terms=terms) if 0 < len(terms) <= MAX_TERM_PARTS else None
+
+
+def _fewest(columns: Array, reward: Array, tolerance: float) -> Array | None:
+    """Weights of the columns (n, k) that still explain the reward (n,) without many of the others, which are 0.
+
+    Columns are left out one by one, that with the smallest share first. So no rounding remains, and nothing that
+    cancels, such as squares of a cosine and a sine. None if all columns together don't explain the reward.
+    """
+    kept = np.ones(columns.shape[1], dtype=bool)
+
+    def refit() -> Array | None:
+        weights = np.zeros(len(kept))
+        weights[kept] = np.linalg.lstsq(columns[:, kept], reward, rcond=None)[0]
+        return weights if np.abs(columns @ weights - reward).max() <= tolerance else None
+
+    best = refit()
+    if best is None:
+        return None
+    for index in np.argsort(np.abs(best) * np.abs(columns).max(0)):
+        kept[index] = False
+        fewer = refit() if kept.any() else None
+        kept[index] = fewer is None
+        best = best if fewer is None else fewer
+    return best
 
 
 def _read(spec: EnvironmentSpec, q: Array, u: Array) -> Array:
