@@ -20,6 +20,22 @@ def test_the_command_shows_what_there_is(surrogym, tmp_path):
     assert "not reached by 20,000" in (tmp_path / "out" / "peers.md").read_text()
 
 
+def test_a_run_with_other_settings_is_never_overwritten(surrogym, tmp_path):
+    """Hours of computing would be lost."""
+    cell = PeerCell("pendulum", "sac", 0, budget=300)
+    point = Point("pendulum", "sac", 0, 1, 300, ended=BUDGET, specification=cell.specification)
+    write_records(cell.file(tmp_path / "out"), Point, [point])
+    before = cell.file(tmp_path / "out").read_bytes()
+    asked = ("reproduce", "peers", "--tasks=pendulum", "--methods=sac", "--seeds=1", "--out=out")
+    said = surrogym(*asked, "--budget=200")
+    assert said.code == 1
+    assert "out/cells/pendulum-sac-seed0.csv holds a run with other settings" in said.err
+    assert "give another --out" in said.err
+    assert cell.file(tmp_path / "out").read_bytes() == before
+    assert surrogym(*asked, "--budget=200", "--only-table").code == 0
+    assert surrogym(*asked, "--budget=300").code == 0
+
+
 def test_the_command_refuses_what_it_does_not_know(surrogym):
     assert "unknown task 'nothing'" in surrogym("reproduce", "peers", "--tasks=nothing").err
     assert "unknown method 'x'" in surrogym("reproduce", "peers", "--methods=x").err

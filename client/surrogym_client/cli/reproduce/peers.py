@@ -52,8 +52,9 @@ def command(
     """Run other methods on our tasks, and draw learning curves.
 
     The folder --out gets points.csv, peers.md and a picture of each task. A finished run is not repeated, so the same
-    command continues after Ctrl-C. docs/results/peers.md has the rules. The methods default, latin_hypercube and
-    barl are ours; their runs come from files of rows, which surrogym reproduce efficiency writes.
+    command continues after Ctrl-C. Runs with other settings need another --out. docs/results/peers.md has the rules.
+    The methods default, latin_hypercube and barl are ours; their runs come from files of rows, which surrogym
+    reproduce efficiency writes.
 
     Example: surrogym reproduce peers --tasks pendulum --methods sac,ppo --seeds 3
 
@@ -69,6 +70,7 @@ def command(
     numbers = range(first_seed, first_seed + seeds)
     wanted = [PeerCell(t, m, s, budget, episodes, minutes) for s in numbers for t in named for m in chosen]
     if not only_table:
+        _keep_others(wanted, out)
         _run([cell for cell in wanted if not cell.done(out)], out, jobs, on_ray, quiet=quiet)
     _present(wanted, _ours(rows or [], named), out, as_json=as_json, quiet=quiet)
 
@@ -87,6 +89,18 @@ def _tasks(given: str) -> list[str]:
                 "or package.module:Class"
             ) from error
     return names
+
+
+def _keep_others(cells: Sequence[PeerCell], out: Path) -> None:
+    """Refuse to overwrite runs with other settings."""
+    from surrogym_client.cli.errors import CommandError
+
+    if occupied := [cell.file(out) for cell in cells if cell.occupied(out)]:
+        more = f", as do {len(occupied) - 1} more files" if len(occupied) > 1 else ""
+        raise CommandError(
+            f"{occupied[0]} holds a run with other settings, such as --budget, --episodes or --minutes{more}; nothing "
+            "was run: give another --out, or move the file away"
+        )
 
 
 def _run(todo: Sequence[PeerCell], out: Path, jobs: int, on_ray: str | None, *, quiet: bool) -> None:

@@ -69,6 +69,11 @@ class PeerCell:
         specification = self.specification
         return [p for p in read_records(self.file(folder), Point) if p.specification == specification]
 
+    def occupied(self, folder: Path) -> bool:
+        """Whether its file holds a run with other settings, which this cell would overwrite."""
+        specification = self.specification
+        return any(p.specification != specification for p in read_records(self.file(folder), Point))
+
     def done(self, folder: Path) -> bool:
         """Whether it has been run to its end, without an error."""
         points = self.points(folder)
