@@ -41,6 +41,14 @@ def test_the_command_refuses_what_it_does_not_know(surrogym):
     assert "unknown method 'x'" in surrogym("reproduce", "peers", "--methods=x").err
 
 
+def test_a_method_of_ours_leads_to_the_files_of_rows(surrogym):
+    """The help names it, so "unknown" would be wrong."""
+    said = surrogym("reproduce", "peers", "--methods=sac,default")
+    assert said.code == 1
+    assert "default is ours" in said.err
+    assert "--rows FILE" in said.err
+
+
 @pytest.mark.slow
 def test_a_run_leaves_its_points_and_is_not_repeated(surrogym, tmp_path):
     asked = ("reproduce", "peers", "--tasks=pendulum", "--methods=ppo", "--seeds=1", "--out=out", "--budget=64")

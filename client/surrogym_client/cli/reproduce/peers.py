@@ -62,11 +62,9 @@ def command(
 
     Example: surrogym reproduce peers --rows docs/results/efficiency.csv --out runs/peers --only-table
     """
-    from surrogym_client.cli.reproduce.efficiency import names_of
-    from surrogym_client.experiments.peers.registry import METHODS
     from surrogym_client.experiments.peers.study import PeerCell
 
-    named, chosen = _tasks(tasks), names_of("method", methods, METHODS)
+    named, chosen = _tasks(tasks), _methods(methods)
     numbers = range(first_seed, first_seed + seeds)
     wanted = [PeerCell(t, m, s, budget, episodes, minutes) for s in numbers for t in named for m in chosen]
     if not only_table:
@@ -89,6 +87,19 @@ def _tasks(given: str) -> list[str]:
                 "or package.module:Class"
             ) from error
     return names
+
+
+def _methods(given: str) -> list[str]:
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.cli.reproduce.efficiency import names_of
+    from surrogym_client.experiments.peers.registry import METHODS, OURS
+
+    if ours := [name for name in given.split(",") if name in OURS]:
+        raise CommandError(
+            f"{ours[0]} is ours, and --methods takes peers: give --rows FILE, which has its runs; surrogym reproduce "
+            f"efficiency --arms {ours[0]} writes one"
+        )
+    return names_of("method", given, METHODS)
 
 
 def _keep_others(cells: Sequence[PeerCell], out: Path) -> None:
