@@ -41,6 +41,14 @@ def test_the_command_refuses_what_it_does_not_know(surrogym):
     assert "unknown method 'x'" in surrogym("reproduce", "peers", "--methods=x").err
 
 
+def test_a_missing_file_of_rows_is_refused(surrogym, tmp_path):
+    """Else the table would lack our runs without a word. Nothing runs before."""
+    said = surrogym("reproduce", "peers", "--tasks=pendulum", "--methods=sac", "--seeds=1", "--rows=none.csv")
+    assert said.code == 1
+    assert "expected a file of rows, got none.csv, which does not exist" in said.err
+    assert not (tmp_path / "runs").exists()
+
+
 def test_a_method_of_ours_leads_to_the_files_of_rows(surrogym):
     """The help names it, so "unknown" would be wrong."""
     said = surrogym("reproduce", "peers", "--methods=sac,default")

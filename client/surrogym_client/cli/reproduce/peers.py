@@ -67,10 +67,11 @@ def command(
     named, chosen = _tasks(tasks), _methods(methods)
     numbers = range(first_seed, first_seed + seeds)
     wanted = [PeerCell(t, m, s, budget, episodes, minutes) for s in numbers for t in named for m in chosen]
+    ours = _ours(rows or [], named)
     if not only_table:
         _keep_others(wanted, out)
         _run([cell for cell in wanted if not cell.done(out)], out, jobs, on_ray, quiet=quiet)
-    _present(wanted, _ours(rows or [], named), out, as_json=as_json, quiet=quiet)
+    _present(wanted, ours, out, as_json=as_json, quiet=quiet)
 
 
 def _tasks(given: str) -> list[str]:
@@ -152,10 +153,13 @@ def _runner(address: str | None) -> Callable[[Sequence[PeerCell], Path, int, Tel
 
 def _ours(files: Sequence[Path], tasks: Sequence[str]) -> list[Point]:
     """Points of our arms at each task's budget."""
+    from surrogym_client.cli.errors import CommandError
     from surrogym_client.experiments.peers.points import points_of
     from surrogym_client.experiments.peers.registry import OURS, task_of
     from surrogym_client.experiments.reproduce.rows import merge, read_rows
 
+    if missing := [path for path in files if not path.exists()]:
+        raise CommandError(f"expected a file of rows, got {missing[0]}, which does not exist")
     rows = merge(*map(read_rows, files))
     return points_of(
         row for row in rows if row.task in tasks and row.arm in OURS and row.budget <= task_of(row.task).budget
