@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
+from uuid import uuid4
 
 from surrogym_client.errors import SurrogymClientError
 
@@ -158,12 +159,18 @@ def read_records(path: Path, kind: type[R], later: Sequence[str] = ()) -> list[R
 def write_records(path: Path, kind: type[R], records: Iterable[R]) -> None:
     """Write records of a dataclass as CSV, in place of what was there at once: a reader never sees half of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    with partial.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_columns(kind))
-        writer.writerows([_write(value) for value in asdict(record).values()] for record in records)
-    os.replace(partial, path)
+    partial = path.with_name(f"{path.stem}-{uuid4().hex}.partial")  # another writer has another one
+    try:
+        with partial.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(_columns(kind))
+            writer.writerows([_write(value) for value in asdict(record).values()] for record in records)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
 
 
 def _columns(kind: type[DataclassInstance]) -> tuple[str, ...]:
