@@ -83,6 +83,15 @@ def test_a_foreign_file_is_refused(tmp_path, change, words):
         read_rows(path)
 
 
+@pytest.mark.parametrize(
+    ("content", "words"), [(b"task,arm\xff\n", "expected a CSV file in UTF-8"), (b"", "got an empty one")]
+)
+def test_a_file_that_is_no_text_or_empty_is_refused(tmp_path, content, words):
+    (tmp_path / "rows.csv").write_bytes(content)
+    with pytest.raises(UnusableRows, match=words):
+        read_rows(tmp_path / "rows.csv")
+
+
 def test_later_rows_win_but_no_error_hides_a_result():
     better, bad, other = replace(ROW, mean=-140.0), replace(ROW, mean=None, error="died"), replace(ROW, seed=1)
     assert merge([ROW], [better, other]) == [better, other]

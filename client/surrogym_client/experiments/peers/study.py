@@ -67,17 +67,22 @@ class PeerCell:
     def points(self, folder: Path) -> list[Point]:
         """Its points so far, of a run with the same settings."""
         specification = self.specification
-        return [p for p in read_records(self.file(folder), Point) if p.specification == specification]
+        return [p for p in self._kept(folder) if p.specification == specification]
 
     def occupied(self, folder: Path) -> bool:
         """Whether its file holds a run with other settings, which this cell would overwrite."""
         specification = self.specification
-        return any(p.specification != specification for p in read_records(self.file(folder), Point))
+        return any(p.specification != specification for p in self._kept(folder))
 
     def done(self, folder: Path) -> bool:
         """Whether it has been run to its end, without an error."""
         points = self.points(folder)
         return bool(points) and points[-1].ended in (REACHED, BUDGET, TIME)
+
+    def _kept(self, folder: Path) -> list[Point]:
+        """What its file holds, of whatever settings. An empty file, as a full disk leaves it, is no run."""
+        file = self.file(folder)
+        return read_records(file, Point) if file.exists() and file.stat().st_size else []
 
 
 def run_cells(todo: Sequence[PeerCell], folder: Path, jobs: int, tell: Callable[[PeerCell, list[Point]], None]) -> None:
