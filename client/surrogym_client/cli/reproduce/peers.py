@@ -141,7 +141,7 @@ def _run(todo: Sequence[PeerCell], out: Path, jobs: int, on_ray: str | None, *, 
 def _runner(address: str | None) -> Callable[[Sequence[PeerCell], Path, int, Tell], None]:
     """What runs cells: here, or in the Ray cluster at an address."""
     if address is None:
-        from surrogym_client.experiments.peers.study import run_cells
+        from surrogym_client.experiments.peers.processes import run_cells
 
         return run_cells
     from surrogym_client.experiments.peers import on_ray
