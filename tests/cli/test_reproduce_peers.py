@@ -62,6 +62,8 @@ def test_a_run_leaves_its_points_and_is_not_repeated(surrogym, tmp_path):
     asked = ("reproduce", "peers", "--tasks=pendulum", "--methods=ppo", "--seeds=1", "--out=out", "--budget=64")
     said = surrogym(*asked, "--episodes=1")
     assert said.code == 0
+    assert "1 runs, 0 of them done already" in said.err
+    assert "0 of 1 runs, 1 at once" in said.err
     assert "pendulum ppo seed 0: 64 real steps, mean return " in said.err
     assert "| ppo | 1 | 0 of 1 | not reached by 64 |" in said.out
     assert (tmp_path / "out" / "peers-pendulum.png").exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +15,7 @@ from surrogym_client.cli.reproduce.efficiency import OnRay
 
 if TYPE_CHECKING:
     from surrogym_client.experiments.peers.points import Point
+    from surrogym_client.experiments.peers.processes import AfterRound
     from surrogym_client.experiments.peers.study import PeerCell
 
     Tell = Callable[[PeerCell, list[Point]], None]
@@ -63,6 +65,7 @@ def command(
     Example: surrogym reproduce peers --rows docs/results/efficiency.csv --out runs/peers --only-table
     """
     from surrogym_client.experiments.peers.study import PeerCell
+    from surrogym_shared.terminal import say
 
     named, chosen = _tasks(tasks), _methods(methods)
     numbers = range(first_seed, first_seed + seeds)
@@ -70,7 +73,9 @@ def command(
     ours = _ours(rows or [], named)
     if not only_table:
         _keep_others(wanted, out)
-        _run([cell for cell in wanted if not cell.done(out)], out, jobs, on_ray, quiet=quiet)
+        todo = [cell for cell in wanted if not cell.done(out)]
+        say(f"{len(wanted)} runs, {len(wanted) - len(todo)} of them done already", quiet=quiet)
+        _run(todo, out, jobs, on_ray, quiet=quiet)
     _present(wanted, ours, out, as_json=as_json, quiet=quiet)
 
 
@@ -119,6 +124,7 @@ def _run(todo: Sequence[PeerCell], out: Path, jobs: int, on_ray: str | None, *, 
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_shared.terminal import on_interrupt, progress, say
 
+    jobs = min(jobs, len(todo))
     stays = f"interrupted; finished runs are kept in {out / 'cells'}; the same command continues from there"
     with terminations_as_interrupts(), on_interrupt(lambda: stays), progress("peers", quiet=quiet) as update:
         done = 0
@@ -128,22 +134,27 @@ def _run(todo: Sequence[PeerCell], out: Path, jobs: int, on_ray: str | None, *, 
             done += 1
             last = points[-1]
             update(done / len(todo), f"{done} of {len(todo)} runs")
-            earned = "no return" if last.mean is None else f"mean return {last.mean:.1f}"
-            say(
-                f"{cell.task} {cell.method} seed {cell.seed}: {last.real_steps} real steps, {earned}, {last.ended}",
-                quiet=quiet,
-            )
+            say(f"{_told(cell, last)}, {last.ended}", quiet=quiet)
+
+        def after_round(cell: PeerCell, point: Point) -> None:
+            update(done / len(todo), f"{done} of {len(todo)} runs; {_told(cell, point)}, round {point.round}")
 
         if todo:
-            _runner(on_ray)(todo, out, jobs, tell)
+            update(0.0, f"0 of {len(todo)} runs, {jobs} at once; the first round of a run may take minutes")
+            _runner(on_ray, after_round)(todo, out, jobs, tell)
 
 
-def _runner(address: str | None) -> Callable[[Sequence[PeerCell], Path, int, Tell], None]:
-    """What runs cells: here, or in the Ray cluster at an address."""
+def _told(cell: PeerCell, point: Point) -> str:
+    earned = "no return" if point.mean is None else f"mean return {point.mean:.1f}"
+    return f"{cell.task} {cell.method} seed {cell.seed}: {point.real_steps} real steps, {earned}"
+
+
+def _runner(address: str | None, after_round: AfterRound) -> Callable[[Sequence[PeerCell], Path, int, Tell], None]:
+    """What runs cells: here, or in the Ray cluster at an address, from which rounds come at the end of a cell."""
     if address is None:
         from surrogym_client.experiments.peers.processes import run_cells
 
-        return run_cells
+        return partial(run_cells, after_round=after_round)
     from surrogym_client.experiments.peers import on_ray
     from surrogym_client.runtime.ray_cluster import connect
 
