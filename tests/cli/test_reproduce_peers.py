@@ -41,6 +41,18 @@ def test_the_command_refuses_what_it_does_not_know(surrogym):
     assert "unknown method 'x'" in surrogym("reproduce", "peers", "--methods=x").err
 
 
+@pytest.mark.parametrize(("task", "words"), [("nomod:Nope", "No module named 'nomod'"), ("mine:Nope", "'Nope'")])
+def test_a_class_that_does_not_exist_is_refused_before_anything_runs(surrogym, tmp_path, task, words):
+    """It was refused by the process of the first cell, after those of other tasks had begun."""
+    (tmp_path / "mine.py").touch()
+    said = surrogym("reproduce", "peers", f"--tasks=pendulum,{task}", "--methods=ppo", "--seeds=1")
+    assert said.code == 1
+    assert f"expected package.module:factory, got '{task}'" in said.err
+    assert words in said.err
+    assert "Traceback" not in said.err
+    assert not (tmp_path / "runs").exists()
+
+
 def test_a_missing_file_of_rows_is_refused(surrogym, tmp_path):
     """Else the table would lack our runs without a word. Nothing runs before."""
     said = surrogym("reproduce", "peers", "--tasks=pendulum", "--methods=sac", "--seeds=1", "--rows=none.csv")

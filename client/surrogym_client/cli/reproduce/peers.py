@@ -72,6 +72,8 @@ def command(
     wanted = [PeerCell(t, m, s, budget, episodes, minutes) for s in numbers for t in named for m in chosen]
     ours = _ours(rows or [], named)
     if not only_table:
+        if on_ray is None:
+            _require_classes(named)
         _keep_others(wanted, out)
         todo = [cell for cell in wanted if not cell.done(out)]
         say(f"{len(wanted)} runs, {len(wanted) - len(todo)} of them done already", quiet=quiet)
@@ -93,6 +95,17 @@ def _tasks(given: str) -> list[str]:
                 "or package.module:Class"
             ) from error
     return names
+
+
+def _require_classes(tasks: Sequence[str]) -> None:
+    """Refuse a class that this machine does not have. Machines of a cluster may have others."""
+    from surrogym_client.experiments.peers.registry import task_of
+    from surrogym_client.original.executables import is_executable
+    from surrogym_client.original.loading import is_own, load_factory
+
+    for environment in (task_of(name).environment for name in tasks):
+        if is_own(environment) and not is_executable(environment):
+            load_factory(environment)
 
 
 def _methods(given: str) -> list[str]:
