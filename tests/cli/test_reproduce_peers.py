@@ -53,6 +53,24 @@ def test_a_class_that_does_not_exist_is_refused_before_anything_runs(surrogym, t
     assert not (tmp_path / "runs").exists()
 
 
+def test_a_method_that_has_to_know_the_reward_is_refused_before_anything_runs(surrogym, tmp_path):
+    """Its process said so after half a minute, with exit status 0."""
+    said = surrogym("reproduce", "peers", "--tasks=invertedpendulum", "--methods=pets,pilco", "--seeds=1")
+    assert said.code == 1
+    assert "pets can't learn invertedpendulum: a model-based peer has to know the reward" in said.err
+    assert "pilco can't learn invertedpendulum" in said.err
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.slow
+def test_the_command_fails_if_no_run_came_to_its_end(surrogym, tmp_path):
+    (tmp_path / "ending.py").write_text("import os\n\n\ndef ends():\n    os._exit(3)\n")
+    said = surrogym("reproduce", "peers", "--tasks=ending:ends", "--methods=ppo", "--seeds=1", "--out=out")
+    assert said.code == 1
+    assert "its process ended with exit code 3" in said.out
+    assert "none of 1 runs came to its end" in said.err
+
+
 def test_a_missing_file_of_rows_is_refused(surrogym, tmp_path):
     """Else the table would lack our runs without a word. Nothing runs before."""
     said = surrogym("reproduce", "peers", "--tasks=pendulum", "--methods=sac", "--seeds=1", "--rows=none.csv")

@@ -64,6 +64,7 @@ def command(
 
     Example: surrogym reproduce peers --rows docs/results/efficiency.csv --out runs/peers --only-table
     """
+    from surrogym_client.cli.errors import CommandError
     from surrogym_client.experiments.peers.study import PeerCell
     from surrogym_shared.terminal import say
 
@@ -77,8 +78,10 @@ def command(
         _keep_others(wanted, out)
         todo = [cell for cell in wanted if not cell.done(out)]
         say(f"{len(wanted)} runs, {len(wanted) - len(todo)} of them done already", quiet=quiet)
-        _run(todo, out, jobs, on_ray, quiet=quiet)
+        _run(todo if on_ray else _learnable(todo, quiet=quiet), out, jobs, on_ray, quiet=quiet)
     _present(wanted, ours, out, as_json=as_json, quiet=quiet)
+    if not (only_table or any(cell.done(out) for cell in wanted)):
+        raise CommandError(f"none of {len(wanted)} runs came to its end; the reasons are above and in {out / 'cells'}")
 
 
 def _tasks(given: str) -> list[str]:
@@ -131,6 +134,26 @@ def _keep_others(cells: Sequence[PeerCell], out: Path) -> None:
             f"{occupied[0]} holds a run with other settings, such as --budget, --episodes or --minutes{more}; nothing "
             "was run: give another --out, or move the file away"
         )
+
+
+def _learnable(cells: Sequence[PeerCell], *, quiet: bool) -> list[PeerCell]:
+    """The cells whose method may learn their task. Says which others are left out, and why.
+
+    Raises:
+        CommandError: none is left.
+    """
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.experiments.peers.study import refusals
+    from surrogym_shared.terminal import say
+
+    refused = refusals(cells)
+    words = [f"{method} can't learn {task}: {reason}" for (task, method), reason in refused.items()]
+    left = [cell for cell in cells if (cell.task, cell.method) not in refused]
+    if words and not left:
+        raise CommandError("; ".join(words))
+    for line in words:
+        say(f"{line}; left out", quiet=quiet)
+    return left
 
 
 def _run(todo: Sequence[PeerCell], out: Path, jobs: int, on_ray: str | None, *, quiet: bool) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -81,6 +81,22 @@ class PeerCell:
         """What its file holds, of whatever settings. An empty file, as a full disk leaves it, is no run."""
         file = self.file(folder)
         return read_records(file, Point) if file.exists() and file.stat().st_size else []
+
+
+def refusals(cells: Iterable[PeerCell]) -> dict[tuple[str, str], str]:
+    """Pairs of task and method that can't be learned, with the reason, as far as it is known without learning.
+
+    Raises:
+        UnknownEnvironment: a task's environment can't be made.
+    """
+    found: dict[tuple[str, str], str] = {}
+    for task, method in dict.fromkeys((cell.task, cell.method) for cell in cells):
+        if (check := METHODS[method].check) is not None:
+            try:
+                check(make(task_of(task).environment).spec())
+            except NotApplicable as error:
+                found[task, method] = str(error)
+    return found
 
 
 def run_cell(cell: PeerCell, folder: Path, tell: Tell | None = None) -> list[Point]:
