@@ -129,7 +129,7 @@ def _keep_others(cells: Sequence[PeerCell], out: Path) -> None:
     from surrogym_client.cli.errors import CommandError
 
     if occupied := [cell.file(out) for cell in cells if cell.occupied(out)]:
-        more = f", as do {len(occupied) - 1} more files" if len(occupied) > 1 else ""
+        more = f" ({len(occupied)} such files)" if len(occupied) > 1 else ""
         raise CommandError(
             f"{occupied[0]} holds a run with other settings, such as --budget, --episodes or --minutes{more}; nothing "
             "was run: give another --out, or move the file away"
