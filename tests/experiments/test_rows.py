@@ -41,6 +41,32 @@ def test_a_file_from_before_promises_is_read(tmp_path):
     assert read_rows(path) == [ROW]
 
 
+def test_two_writers_of_one_file_do_not_disturb_each_other(tmp_path):
+    """Two studies may share a folder. The second writer moved the first one's partial file away."""
+
+    def rows(last):
+        for seed in range(3):
+            yield replace(ROW, seed=seed)
+            if last and seed == 0:
+                write_rows(tmp_path / "rows.csv", rows(last=False))
+
+    write_rows(tmp_path / "rows.csv", rows(last=True))
+    assert [row.seed for row in read_rows(tmp_path / "rows.csv")] == [0, 1, 2]
+    assert [path.name for path in tmp_path.iterdir()] == ["rows.csv"]
+
+
+def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path):
+    def broken():
+        yield ROW
+        raise RuntimeError("no more")
+
+    write_rows(tmp_path / "rows.csv", [ROW])
+    with pytest.raises(RuntimeError, match="no more"):
+        write_rows(tmp_path / "rows.csv", broken())
+    assert read_rows(tmp_path / "rows.csv") == [ROW]
+    assert [path.name for path in tmp_path.iterdir()] == ["rows.csv"]
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -55,6 +81,15 @@ def test_a_foreign_file_is_refused(tmp_path, change, words):
     path.write_text(path.read_text().replace(*change, 1))
     with pytest.raises(UnusableRows, match=words):
         read_rows(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"), [(b"task,arm\xff\n", "expected a CSV file in UTF-8"), (b"", "got an empty one")]
+)
+def test_a_file_that_is_no_text_or_empty_is_refused(tmp_path, content, words):
+    (tmp_path / "rows.csv").write_bytes(content)
+    with pytest.raises(UnusableRows, match=words):
+        read_rows(tmp_path / "rows.csv")
 
 
 def test_later_rows_win_but_no_error_hides_a_result():

@@ -50,6 +50,14 @@ def test_a_cell_ends_with_the_round_that_reaches_the_target(peers, tmp_path):
     assert not PeerCell("cartpole", "balancing", 0, episodes=2).done(tmp_path)  # other settings
 
 
+def test_an_empty_file_is_a_cell_that_was_not_run(peers, tmp_path):
+    """One such file, as a full disk leaves it, blocked every cell of the study."""
+    cell = PeerCell("cartpole", "balancing", 0, episodes=3)
+    cell.file(tmp_path).parent.mkdir()
+    cell.file(tmp_path).touch()
+    assert (cell.points(tmp_path), cell.occupied(tmp_path), cell.done(tmp_path)) == ([], False, False)
+
+
 def test_a_cell_of_other_settings_of_the_method_is_run_again(peers, monkeypatch):
     class Tuned(Balancing):
         def __init__(self, gain: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +15,7 @@ from surrogym_client.cli.reproduce.efficiency import OnRay
 
 if TYPE_CHECKING:
     from surrogym_client.experiments.peers.points import Point
+    from surrogym_client.experiments.peers.processes import AfterRound
     from surrogym_client.experiments.peers.study import PeerCell
 
     Tell = Callable[[PeerCell, list[Point]], None]
@@ -52,8 +54,9 @@ def command(
     """Run other methods on our tasks, and draw learning curves.
 
     The folder --out gets points.csv, peers.md and a picture of each task. A finished run is not repeated, so the same
-    command continues after Ctrl-C. docs/results/peers.md has the rules. The methods default, latin_hypercube and
-    barl are ours; their runs come from files of rows, which surrogym reproduce efficiency writes.
+    command continues after Ctrl-C. Runs with other settings need another --out. docs/results/peers.md has the rules.
+    The methods default, latin_hypercube and barl are ours; their runs come from files of rows, which surrogym
+    reproduce efficiency writes.
 
     Example: surrogym reproduce peers --tasks pendulum --methods sac,ppo --seeds 3
 
@@ -61,16 +64,24 @@ def command(
 
     Example: surrogym reproduce peers --rows docs/results/efficiency.csv --out runs/peers --only-table
     """
-    from surrogym_client.cli.reproduce.efficiency import names_of
-    from surrogym_client.experiments.peers.registry import METHODS
+    from surrogym_client.cli.errors import CommandError
     from surrogym_client.experiments.peers.study import PeerCell
+    from surrogym_shared.terminal import say
 
-    named, chosen = _tasks(tasks), names_of("method", methods, METHODS)
+    named, chosen = _tasks(tasks), _methods(methods)
     numbers = range(first_seed, first_seed + seeds)
     wanted = [PeerCell(t, m, s, budget, episodes, minutes) for s in numbers for t in named for m in chosen]
+    ours = _ours(rows or [], named)
     if not only_table:
-        _run([cell for cell in wanted if not cell.done(out)], out, jobs, on_ray, quiet=quiet)
-    _present(wanted, _ours(rows or [], named), out, as_json=as_json, quiet=quiet)
+        if on_ray is None:
+            _require_classes(named)
+        _keep_others(wanted, out)
+        todo = [cell for cell in wanted if not cell.done(out)]
+        say(f"{len(wanted)} runs, {len(wanted) - len(todo)} of them done already", quiet=quiet)
+        _run(todo if on_ray else _learnable(todo, quiet=quiet), out, jobs, on_ray, quiet=quiet)
+    _present(wanted, ours, out, as_json=as_json, quiet=quiet)
+    if not (only_table or any(cell.done(out) for cell in wanted)):
+        raise CommandError(f"none of {len(wanted)} runs came to its end; the reasons are above and in {out / 'cells'}")
 
 
 def _tasks(given: str) -> list[str]:
@@ -89,10 +100,67 @@ def _tasks(given: str) -> list[str]:
     return names
 
 
+def _require_classes(tasks: Sequence[str]) -> None:
+    """Refuse a class that this machine does not have. Machines of a cluster may have others."""
+    from surrogym_client.experiments.peers.registry import task_of
+    from surrogym_client.original.executables import is_executable
+    from surrogym_client.original.loading import is_own, load_factory
+
+    for environment in (task_of(name).environment for name in tasks):
+        if is_own(environment) and not is_executable(environment):
+            load_factory(environment)
+
+
+def _methods(given: str) -> list[str]:
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.cli.reproduce.efficiency import names_of
+    from surrogym_client.experiments.peers.registry import METHODS, OURS
+
+    if ours := [name for name in given.split(",") if name in OURS]:
+        raise CommandError(
+            f"{ours[0]} is ours, and --methods takes peers: give --rows FILE, which has its runs; surrogym reproduce "
+            f"efficiency --arms {ours[0]} writes one"
+        )
+    return names_of("method", given, METHODS)
+
+
+def _keep_others(cells: Sequence[PeerCell], out: Path) -> None:
+    """Refuse to overwrite runs with other settings."""
+    from surrogym_client.cli.errors import CommandError
+
+    if occupied := [cell.file(out) for cell in cells if cell.occupied(out)]:
+        more = f" ({len(occupied)} such files)" if len(occupied) > 1 else ""
+        raise CommandError(
+            f"{occupied[0]} holds a run with other settings, such as --budget, --episodes or --minutes{more}; nothing "
+            "was run: give another --out, or move the file away"
+        )
+
+
+def _learnable(cells: Sequence[PeerCell], *, quiet: bool) -> list[PeerCell]:
+    """The cells whose method may learn their task. Says which others are left out, and why.
+
+    Raises:
+        CommandError: none is left.
+    """
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.experiments.peers.study import refusals
+    from surrogym_shared.terminal import say
+
+    refused = refusals(cells)
+    words = [f"{method} can't learn {task}: {reason}" for (task, method), reason in refused.items()]
+    left = [cell for cell in cells if (cell.task, cell.method) not in refused]
+    if words and not left:
+        raise CommandError("; ".join(words))
+    for line in words:
+        say(f"{line}; left out", quiet=quiet)
+    return left
+
+
 def _run(todo: Sequence[PeerCell], out: Path, jobs: int, on_ray: str | None, *, quiet: bool) -> None:
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_shared.terminal import on_interrupt, progress, say
 
+    jobs = min(jobs, len(todo))
     stays = f"interrupted; finished runs are kept in {out / 'cells'}; the same command continues from there"
     with terminations_as_interrupts(), on_interrupt(lambda: stays), progress("peers", quiet=quiet) as update:
         done = 0
@@ -102,22 +170,27 @@ def _run(todo: Sequence[PeerCell], out: Path, jobs: int, on_ray: str | None, *, 
             done += 1
             last = points[-1]
             update(done / len(todo), f"{done} of {len(todo)} runs")
-            earned = "no return" if last.mean is None else f"mean return {last.mean:.1f}"
-            say(
-                f"{cell.task} {cell.method} seed {cell.seed}: {last.real_steps} real steps, {earned}, {last.ended}",
-                quiet=quiet,
-            )
+            say(f"{_told(cell, last)}, {last.ended}", quiet=quiet)
+
+        def after_round(cell: PeerCell, point: Point) -> None:
+            update(done / len(todo), f"{done} of {len(todo)} runs; {_told(cell, point)}, round {point.round}")
 
         if todo:
-            _runner(on_ray)(todo, out, jobs, tell)
+            update(0.0, f"0 of {len(todo)} runs, {jobs} at once; the first round of a run may take minutes")
+            _runner(on_ray, after_round)(todo, out, jobs, tell)
 
 
-def _runner(address: str | None) -> Callable[[Sequence[PeerCell], Path, int, Tell], None]:
-    """What runs cells: here, or in the Ray cluster at an address."""
+def _told(cell: PeerCell, point: Point) -> str:
+    earned = "no return" if point.mean is None else f"mean return {point.mean:.1f}"
+    return f"{cell.task} {cell.method} seed {cell.seed}: {point.real_steps} real steps, {earned}"
+
+
+def _runner(address: str | None, after_round: AfterRound) -> Callable[[Sequence[PeerCell], Path, int, Tell], None]:
+    """What runs cells: here, or in the Ray cluster at an address, from which rounds come at the end of a cell."""
     if address is None:
-        from surrogym_client.experiments.peers.study import run_cells
+        from surrogym_client.experiments.peers.processes import run_cells
 
-        return run_cells
+        return partial(run_cells, after_round=after_round)
     from surrogym_client.experiments.peers import on_ray
     from surrogym_client.runtime.ray_cluster import connect
 
@@ -127,10 +200,13 @@ def _runner(address: str | None) -> Callable[[Sequence[PeerCell], Path, int, Tel
 
 def _ours(files: Sequence[Path], tasks: Sequence[str]) -> list[Point]:
     """Points of our arms at each task's budget."""
+    from surrogym_client.cli.errors import CommandError
     from surrogym_client.experiments.peers.points import points_of
     from surrogym_client.experiments.peers.registry import OURS, task_of
     from surrogym_client.experiments.reproduce.rows import merge, read_rows
 
+    if missing := [path for path in files if not path.exists()]:
+        raise CommandError(f"expected a file of rows, got {missing[0]}, which does not exist")
     rows = merge(*map(read_rows, files))
     return points_of(
         row for row in rows if row.task in tasks and row.arm in OURS and row.budget <= task_of(row.task).budget

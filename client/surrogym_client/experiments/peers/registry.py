@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from surrogym_client.experiments.peers.port import Peer
 from surrogym_client.experiments.tasks import EVERY_TASK, DemoTask, Target
 from surrogym_client.original.loading import has_specification
+from surrogym_shared.spec import EnvironmentSpec
 
 OURS = ("default", "latin_hypercube", "barl")  # arms of the efficiency study
 CORE = ("pendulum", "cartpole", "swingup", "acrobot")
@@ -24,12 +25,15 @@ class Method:
         make: builds the peer; imports its libraries.
         budget: real steps; None follows the task's budget.
         episodes: of an evaluation.
+        check: raises ``NotApplicable`` for the specification of a task that it can't learn, as far as that is cheaply
+            known beforehand.
     """
 
     words: str
     make: Callable[[], Peer]
     budget: int | None = None
     episodes: int = 100
+    check: Callable[[EnvironmentSpec], object] | None = None
 
     def real_steps(self, task: DemoTask) -> int:
         return self.budget or max(LEAST, SHARE * task.budget)
@@ -83,13 +87,25 @@ def _bayesian_network() -> Peer:
     return BayesianNetwork()
 
 
+def _knows_reward(spec: EnvironmentSpec) -> None:
+    from surrogym_client.experiments.peers.methods.told import told
+
+    told(spec)
+
+
 METHODS = {
-    "pilco": Method("PILCO: Gaussian processes, moment matching, gradients", _pilco),
-    "black_drops": Method("Black-DROPS: Gaussian processes, sampled rollouts, CMA-ES", _black_drops),
-    "pets": Method("PETS: ensemble of networks, planning by the cross-entropy method", _pets, episodes=10),
+    "pilco": Method("PILCO: Gaussian processes, moment matching, gradients", _pilco, check=_knows_reward),
+    "black_drops": Method(
+        "Black-DROPS: Gaussian processes, sampled rollouts, CMA-ES", _black_drops, check=_knows_reward
+    ),
+    "pets": Method(
+        "PETS: ensemble of networks, planning by the cross-entropy method", _pets, episodes=10, check=_knows_reward
+    ),
     "mbpo": Method("MBPO: ensemble of networks, soft actor-critic on short rollouts", _mbpo),
     "world_model": Method("recurrent world model: mixture density network, CMA-ES in its dream", _world_model),
-    "bayesian_network": Method("a Bayesian network in PILCO's loop: dropout, particles, gradients", _bayesian_network),
+    "bayesian_network": Method(
+        "a Bayesian network in PILCO's loop: dropout, particles, gradients", _bayesian_network, check=_knows_reward
+    ),
     "sac": Method("soft actor-critic of Stable-Baselines3, model-free", _sac, budget=20_000),
     "ppo": Method("proximal policy optimisation of Stable-Baselines3, model-free", _ppo, budget=100_000),
 }

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from multiprocessing import active_children, get_context
 from pathlib import Path
 
 from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
@@ -67,28 +65,38 @@ class PeerCell:
     def points(self, folder: Path) -> list[Point]:
         """Its points so far, of a run with the same settings."""
         specification = self.specification
-        return [p for p in read_records(self.file(folder), Point) if p.specification == specification]
+        return [p for p in self._kept(folder) if p.specification == specification]
+
+    def occupied(self, folder: Path) -> bool:
+        """Whether its file holds a run with other settings, which this cell would overwrite."""
+        specification = self.specification
+        return any(p.specification != specification for p in self._kept(folder))
 
     def done(self, folder: Path) -> bool:
         """Whether it has been run to its end, without an error."""
         points = self.points(folder)
         return bool(points) and points[-1].ended in (REACHED, BUDGET, TIME)
 
+    def _kept(self, folder: Path) -> list[Point]:
+        """What its file holds, of whatever settings. An empty file, as a full disk leaves it, is no run."""
+        file = self.file(folder)
+        return read_records(file, Point) if file.exists() and file.stat().st_size else []
 
-def run_cells(todo: Sequence[PeerCell], folder: Path, jobs: int, tell: Callable[[PeerCell, list[Point]], None]) -> None:
-    """Run cells, ``jobs`` at once, each in a process of its own with one thread. ``tell`` is called after each.
 
-    An interruption ends the cells that run; what they have written stays."""
-    with ProcessPoolExecutor(jobs, get_context("spawn"), max_tasks_per_child=1) as pool:
-        running = {pool.submit(run_cell, cell, folder): cell for cell in todo}
-        try:
-            for done in as_completed(running):
-                tell(running[done], done.result())
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in active_children():
-                process.terminate()
-            raise
+def refusals(cells: Iterable[PeerCell]) -> dict[tuple[str, str], str]:
+    """Pairs of task and method that can't be learned, with the reason, as far as it is known without learning.
+
+    Raises:
+        UnknownEnvironment: a task's environment can't be made.
+    """
+    found: dict[tuple[str, str], str] = {}
+    for task, method in dict.fromkeys((cell.task, cell.method) for cell in cells):
+        if (check := METHODS[method].check) is not None:
+            try:
+                check(make(task_of(task).environment).spec())
+            except NotApplicable as error:
+                found[task, method] = str(error)
+    return found
 
 
 def run_cell(cell: PeerCell, folder: Path, tell: Tell | None = None) -> list[Point]:
@@ -100,19 +108,24 @@ def run_cell(cell: PeerCell, folder: Path, tell: Tell | None = None) -> list[Poi
     """
     _single_thread()
     points: list[Point] = []
-    begun = Point(
-        *(cell.task, cell.method, cell.seed, 0, 0), commit=commit(), specification=cell.specification, machine=machine()
-    )
+    first = begun(cell)
     try:
-        for point in _rounds(cell, begun):
+        for point in _rounds(cell, first):
             points = [*(p for p in points if p.round != point.round), point]
             write_records(cell.file(folder), Point, points)
             if tell is not None:
                 tell(point)
     except (NotApplicable, ArithmeticError, RuntimeError, ValueError) as error:
-        points.append(replace(points[-1] if points else begun, ended=f"{type(error).__name__}: {error}"[:300]))
+        points.append(replace(points[-1] if points else first, ended=f"{type(error).__name__}: {error}"[:300]))
         write_records(cell.file(folder), Point, points)
     return points
+
+
+def begun(cell: PeerCell) -> Point:
+    """The point of a cell before its first round, on this machine."""
+    return Point(
+        *(cell.task, cell.method, cell.seed, 0, 0), commit=commit(), specification=cell.specification, machine=machine()
+    )
 
 
 def _rounds(cell: PeerCell, begun: Point) -> Iterator[Point]:

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
+from uuid import uuid4
 
 from surrogym_client.errors import SurrogymClientError
 
@@ -136,34 +137,48 @@ def read_records(path: Path, kind: type[R], later: Sequence[str] = ()) -> list[R
         later: columns that older files lack.
 
     Raises:
-        UnusableRows: other columns than expected, or a value that is none.
+        UnusableRows: other columns than expected, a value that is none, an empty file, or no text in UTF-8.
     """
     if not path.exists():
         return []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return _records(path, csv.DictReader(file), kind, later)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UnusableRows(f"{path}: expected a CSV file in UTF-8: {error}") from error
+
+
+def _records(path: Path, reader: csv.DictReader[str], kind: type[R], later: Sequence[str]) -> list[R]:
     columns, kinds = _columns(kind), get_type_hints(kind)
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        given = tuple(reader.fieldnames or ())
-        if given != tuple(name for name in columns if name in given or name not in later):
-            raise UnusableRows(f"{path}: expected the columns {', '.join(columns)}, got {reader.fieldnames}")
-        records = []
-        for number, line in enumerate(reader, start=2):
-            try:
-                records.append(kind(**{name: _read(kinds[name], line.get(name, "")) for name in columns}))
-            except (ValueError, TypeError) as error:
-                raise UnusableRows(f"{path}, line {number}: {error}") from error
-        return records
+    given = tuple(reader.fieldnames or ())
+    if not given:
+        raise UnusableRows(f"{path}: expected a file of rows, got an empty one")
+    if given != tuple(name for name in columns if name in given or name not in later):
+        raise UnusableRows(f"{path}: expected the columns {', '.join(columns)}, got {reader.fieldnames}")
+    records = []
+    for number, line in enumerate(reader, start=2):
+        try:
+            records.append(kind(**{name: _read(kinds[name], line.get(name, "")) for name in columns}))
+        except (ValueError, TypeError) as error:
+            raise UnusableRows(f"{path}, line {number}: {error}") from error
+    return records
 
 
 def write_records(path: Path, kind: type[R], records: Iterable[R]) -> None:
     """Write records of a dataclass as CSV, in place of what was there at once: a reader never sees half of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    with partial.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_columns(kind))
-        writer.writerows([_write(value) for value in asdict(record).values()] for record in records)
-    os.replace(partial, path)
+    partial = path.with_name(f"{path.stem}-{uuid4().hex}.partial")  # another writer has another one
+    try:
+        with partial.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(_columns(kind))
+            writer.writerows([_write(value) for value in asdict(record).values()] for record in records)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
 
 
 def _columns(kind: type[DataclassInstance]) -> tuple[str, ...]:
