@@ -57,15 +57,20 @@ class Differences:
         return self.learn > 0 or self.learn_all
 
     def check(self, settings: EvaluationSettings) -> None:
-        """Refuse to learn from an environment that was changed on purpose.
+        """Refuse to learn from an environment that was changed on purpose, and options that contradict each other.
 
         Raises:
-            CommandError: ``--learn`` or ``--learn-all`` was given together with ``--perturb``, or with each other.
+            CommandError: ``--learn`` or ``--learn-all`` was given together with ``--perturb``, or with each other, or
+                ``--wait`` without either.
         """
         from surrogym_client.cli.errors import CommandError
 
         if self.learn and self.learn_all:
             raise CommandError("expected --learn or --learn-all, got both; give one of the two")
+        if self.wait and not self.learns:
+            raise CommandError(
+                "expected --wait with --learn or --learn-all, got neither: there is no model to wait for"
+            )
         if self.learns and settings.perturb:
             option = "--learn-all" if self.learn_all else "--learn"
             raise CommandError(
