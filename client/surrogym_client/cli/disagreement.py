@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from surrogym_client.cli.learning import Learning
     from surrogym_client.evaluation.comparing import Disagreement, Disagreements
     from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings
     from surrogym_client.policies.evidence import Promise
@@ -77,6 +78,15 @@ class Differences:
                 f"expected {option} with the environment as it is, got --perturb, which changes it; give one of the two"
             )
 
+    def learning(self, surrogate: str | None, server: str | None, token: str | None) -> Learning | None:
+        """Ask the server for the surrogate that is to learn from the steps, before the first one is taken. Returns None
+        if none is to learn. Errors as of ``learning_of``."""
+        from surrogym_client.cli.learning import learning_of
+
+        if not self.learns:
+            return None
+        return learning_of("--learn-all" if self.learn_all else "--learn", surrogate, server, token)
+
     def between(
         self,
         surrogate: str | None,
@@ -96,10 +106,7 @@ class Differences:
         from surrogym_client.errors import SurrogymClientError
         from surrogym_shared.terminal import say
 
-        if not (self.where or self.learns or left(promise, result)):
-            return None
-        if surrogate is None:
-            say("not compared with a model: expected --surrogate, got none", quiet=quiet or not self.learns)
+        if surrogate is None or not (self.where or self.learns or left(promise, result)):
             return None
         try:
             with connect(server, token) as api:

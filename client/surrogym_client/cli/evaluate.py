@@ -100,6 +100,23 @@ class Episodes:
         return EvaluationSettings(**vars(self))
 
 
+@dataclass(frozen=True)
+class Keeping:
+    """Options of what is kept of the episodes."""
+
+    video: Annotated[
+        bool,
+        typer.Option(
+            "--video",
+            help="Draw the best, the median and the worst episode into a video beside the policy, which the server "
+            "stores too. The environment must be one that can be drawn. This takes no real step.",
+        ),
+    ] = False
+    push: Annotated[
+        bool, typer.Option("--push/--no-push", help="Store the policy and its episodes on the server as well.")
+    ] = True
+
+
 def command(
     context: typer.Context,
     policy: Annotated[Path, typer.Argument(help="Policy file from surrogym train or Stable-Baselines3.")],
@@ -111,17 +128,7 @@ def command(
     differences: Differences,
     surrogate: Ledger = None,
     beside: Beside,
-    video: Annotated[
-        bool,
-        typer.Option(
-            "--video",
-            help="Draw the best, the median and the worst episode into a video beside the policy, which the server "
-            "stores too. The environment must be one that can be drawn. This takes no real step.",
-        ),
-    ] = False,
-    push: Annotated[
-        bool, typer.Option("--push/--no-push", help="Store the policy and its episodes on the server as well.")
-    ] = True,
+    keeping: Keeping,
     service: Service,
     output: Output,
 ) -> None:
@@ -144,13 +151,15 @@ def command(
     beside.check(settings)
     opener = opener_for_policy(env, read_spec(spec), card, quiet=output.quiet)
     ledger = _ledger(surrogate, service.server, card, policy, quiet=output.quiet)
+    if learning := differences.learning(ledger, service.server, token):
+        opener = learning.checked(opener)
     enter = partial(_enter, ledger, service.server, token, quiet=output.quiet)
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
     reports = _reports(beside.controllers(policy, card, reading, opener), card.spec, run, enter, settings, policy)
     result = reports[0][1]
-    if stored := push and ledger is not None:
+    if stored := keeping.push and ledger is not None:
         _keep(policy, reports, settings, quiet=output.quiet)
-    filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if video else None
+    filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if keeping.video else None
     version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
     promise = card.promise if settings.declared and not result.varied else None
     judged = promise if _judges(settings.episodes) else None
