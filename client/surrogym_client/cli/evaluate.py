@@ -13,6 +13,7 @@ from surrogym_client.cli.beside import Beside
 from surrogym_client.cli.disagreement import Differences
 from surrogym_client.cli.filming import film
 from surrogym_client.cli.groups import Output, PolicyReading, Service, add
+from surrogym_client.cli.learning import kept
 from surrogym_client.cli.opening import opener_for_policy
 from surrogym_client.cli.options import NAMES, SpecFile, read_spec
 from surrogym_client.cli.pushing import push_or_say
@@ -157,18 +158,21 @@ def command(
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
     reports = _reports(beside.controllers(policy, card, reading, opener), card.spec, run, enter, settings, policy)
     result = reports[0][1]
-    if stored := keeping.push and ledger is not None:
-        _keep(policy, reports, settings, quiet=output.quiet)
-    filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if keeping.video else None
-    version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
     promise = card.promise if settings.declared and not result.varied else None
     judged = promise if _judges(settings.episodes) else None
-    found = differences.between(ledger, service.server, token, result, settings, judged, quiet=output.quiet)
+    with kept(learning, policy, result, quiet=output.quiet) as steps:
+        if stored := keeping.push and ledger is not None:
+            _keep(policy, reports, settings, quiet=output.quiet)
+        filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if keeping.video else None
+        version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
+        found = differences.between(ledger, service.server, token, result, settings, judged, steps, quiet=output.quiet)
     summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference)}
     summary |= {"promise_kept": _kept(judged, result), "version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
     more = [*(found.in_words(card.spec) if found else []), *_why_not_judged(card, settings, result), *_repeated(result)]
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
+    if steps is not None:
+        steps.require_stored()
 
 
 def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Evaluation) -> list[str]:
