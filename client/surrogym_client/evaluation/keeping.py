@@ -12,7 +12,7 @@ import numpy as np
 from surrogym_client.evaluation.comparing import StepOfEpisode
 from surrogym_shared.logs.drafting import wrapped
 from surrogym_shared.logs.table import MAX_MEASURED
-from surrogym_shared.logs.writing import npz_of_steps
+from surrogym_shared.logs.writing import EVALUATED, npz_of_steps
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import NewSample
 
@@ -59,7 +59,7 @@ def rewrite_steps(file: Path, spec: EnvironmentSpec, samples: Sequence[NewSample
 def _content(spec: EnvironmentSpec, samples: Sequence[NewSample]) -> bytes:
     fields = ("coordinates", "action", "next_coordinates", "reward", "terminated")
     arrays = {name: np.array([getattr(sample, name) for sample in samples]) for name in fields}
-    return npz_of_steps(spec.coordinate_names, arrays)
+    return npz_of_steps(spec.coordinate_names, arrays | {EVALUATED: np.array(True)})
 
 
 def _write_new(folder: Path, stem: str, content: bytes) -> Path:

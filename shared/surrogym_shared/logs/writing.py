@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+EVALUATED = "evaluated"  # array that marks steps of an evaluation in the surrogate's own environment
+
 
 def npz_of_steps(coordinate_names: Sequence[str], arrays: Mapping[str, Any]) -> bytes:
     """Return the content of an NPZ file of n steps.
