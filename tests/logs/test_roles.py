@@ -97,3 +97,9 @@ def test_a_mapping_file_that_cant_be_read_is_refused_in_a_sentence(
     (tmp_path / name).write_bytes(content)
     with pytest.raises(UnusableLog, match=says):
         roles_by_file(tmp_path / name, NAMES)
+
+
+def test_the_next_value_of_a_state_is_found_by_the_whole_name():
+    """next.q_0 was the next value of a state called 0, although the state q_0 was there."""
+    assert roles_by_name(["q.q_0", "next.q_0", "action"]).following == {"q_0": "next.q_0"}
+    assert roles_by_name(["q_0", "next.q_0", "action"]).following == {"0": "next.q_0"}

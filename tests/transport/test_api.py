@@ -57,6 +57,17 @@ def test_samples_are_resent_with_their_key_after_a_lost_reply():
     assert keys[0] == keys[1] != keys[2]
 
 
+def test_it_is_known_which_samples_a_server_stored_before_it_refused_others():
+    """A caller that can tell the stored samples from the others loses none and sends none in vain."""
+    many, stored = [SAMPLE] * 1500, list[wire.AddedSamples]()
+    first = wire.AddedSamples(sample_ids=[1], duplicates=0, ledger=wire.Ledger(manual=1, total=1))
+    with api_of(said(first), problem(Code.TOO_LARGE)) as (api, server):
+        with pytest.raises(errors.TooLarge):
+            api.add_samples("pendulum", "me", many, purpose="logged", stored=stored.append)
+        assert [one.sample_ids for one in stored] == [[1]]
+        assert [wire.AddSamples.model_validate_json(r.body).complete for r in server.received] == [False, False]
+
+
 def test_a_claim_is_not_repeated_after_a_lost_reply():
     with api_of(lost_reply) as (api, server):
         with pytest.raises(errors.ServerUnreachable):

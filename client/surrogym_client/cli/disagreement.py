@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from surrogym_client.cli.learning import Learning, Steps
     from surrogym_client.evaluation.comparing import Disagreement, Disagreements
     from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings
     from surrogym_client.policies.evidence import Promise
     from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
-    from surrogym_shared.wire import NewSample
 
 
 @dataclass(frozen=True)
@@ -57,20 +57,34 @@ class Differences:
         return self.learn > 0 or self.learn_all
 
     def check(self, settings: EvaluationSettings) -> None:
-        """Refuse to learn from an environment that was changed on purpose.
+        """Refuse to learn from an environment that was changed on purpose, and options that contradict each other.
 
         Raises:
-            CommandError: ``--learn`` or ``--learn-all`` was given together with ``--perturb``, or with each other.
+            CommandError: ``--learn`` or ``--learn-all`` was given together with ``--perturb``, or with each other, or
+                ``--wait`` without either.
         """
         from surrogym_client.cli.errors import CommandError
 
         if self.learn and self.learn_all:
             raise CommandError("expected --learn or --learn-all, got both; give one of the two")
+        if self.wait and not self.learns:
+            raise CommandError(
+                "expected --wait with --learn or --learn-all, got neither: there is no model to wait for"
+            )
         if self.learns and settings.perturb:
             option = "--learn-all" if self.learn_all else "--learn"
             raise CommandError(
                 f"expected {option} with the environment as it is, got --perturb, which changes it; give one of the two"
             )
+
+    def learning(self, surrogate: str | None, server: str | None, token: str | None) -> Learning | None:
+        """Ask the server for the surrogate that is to learn from the steps, before the first one is taken. Returns None
+        if none is to learn. Errors as of ``learning_of``."""
+        from surrogym_client.cli.learning import learning_of
+
+        if not self.learns:
+            return None
+        return learning_of("--learn-all" if self.learn_all else "--learn", surrogate, server, token)
 
     def between(
         self,
@@ -80,33 +94,44 @@ class Differences:
         result: Evaluation,
         settings: EvaluationSettings,
         promise: Promise | None,
+        steps: Steps | None,
         *,
         quiet: bool,
     ) -> Differing | None:
-        """Compare the real steps of the episodes with the surrogate's model, and let it learn from them if asked.
+        """Compare the real steps of the episodes with the surrogate's model, and send ``steps`` if it is to learn.
 
-        Returns None if nobody asked and the promise was kept, or if the steps can't be compared.
+        With ``--learn-all`` the steps are sent first, and whether or not there is a model to compare with. Returns None
+        if nobody asked and the promise was kept, or if the steps can't be compared and none was sent.
         """
+        from surrogym_client.cli.errors import sentence
         from surrogym_client.cli.options import connect
         from surrogym_client.errors import SurrogymClientError
+        from surrogym_client.evaluation.comparing import samples_of
         from surrogym_shared.terminal import say
 
-        if not (self.where or self.learns or left(promise, result)):
+        if surrogate is None or not (self.where or self.learns or left(promise, result)):
             return None
-        if surrogate is None:
-            say("not compared with a model: expected --surrogate, got none", quiet=quiet or not self.learns)
-            return None
+        found, without = None, f"{surrogate!r} has no model yet"
         try:
             with connect(server, token) as api:
-                found = _compare(api, surrogate, result, settings.first_seed, self.learn)
-                if found is not None and self.learn_all:
-                    found = replace(found, learned=_learn_all(api, surrogate, result), all_steps=True)
-                if found is not None and found.learned and self.wait:
-                    _await_model(api, surrogate, self.wait, quiet=quiet)
-                return found
+                if steps is not None and self.learn_all:
+                    steps.send(api)
+                found = _compare(api, surrogate, result, settings.first_seed)
+                if steps is not None and self.learn and found is not None:
+                    steps.choose(samples_of(found.found, self.learn))
+                    steps.send(api)
         except SurrogymClientError as error:
-            say(f"not compared with the model of {surrogate!r}: {error}", quiet=quiet)
-            return None
+            without = str(error)
+            if steps is not None and steps.waiting:
+                steps.fault = sentence(error) or without
+            elif steps is None:
+                say(f"not compared with the model of {surrogate!r}: {error}", quiet=quiet)
+        if steps is None or steps.waiting:
+            return found
+        if steps.new and self.wait:
+            _await_model(server, token, surrogate, self.wait, quiet=quiet)
+        found = found or _not_compared(settings.first_seed, without)
+        return replace(found, learned=steps.new, all_steps=self.learn_all)
 
 
 def left(promise: Promise | None, result: Evaluation) -> bool:
@@ -114,16 +139,9 @@ def left(promise: Promise | None, result: Evaluation) -> bool:
     return promise is not None and not promise.low <= result.returns.mean() <= promise.high
 
 
-def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, learn: int) -> Differing | None:
-    """Compare steps with the model, and add at most ``learn`` of those that differ to the surrogate's samples."""
-    from surrogym_client.evaluation.comparing import (
-        Disagreements,
-        compared,
-        disagreements,
-        samples_of,
-        steady,
-        steps_of,
-    )
+def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int) -> Differing | None:
+    """Compare steps with the model. Returns None without a model, or if the model has other coordinates."""
+    from surrogym_client.evaluation.comparing import Disagreements, compared, disagreements, steady, steps_of
 
     view = api.surrogate(surrogate)
     if view.fidelity is None or result.trace.coordinates.shape[1] != len(view.spec.coordinates):
@@ -131,38 +149,35 @@ def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, lear
     known = [step for step in steps_of(result.traces) if view.spec.known(step.coordinates)]
     steps = steady(view.spec, known)
     found = disagreements(steps, compared(api, view.spec, view, steps)) if steps else Disagreements(0, (), {})
-    differing = Differing(found, first_seed, changed=result.varied, left_out=len(known) - len(steps))
-    return replace(differing, learned=_add(api, surrogate, samples_of(differing.found, learn)))
+    return Differing(found, first_seed, changed=result.varied, left_out=len(known) - len(steps))
 
 
-def _learn_all(api: Api, surrogate: str, result: Evaluation) -> int:
-    """Add all real steps to the surrogate's samples, and return how many were new."""
-    from surrogym_client.evaluation.comparing import as_samples, steady, steps_of
+def _not_compared(first_seed: int, why: str) -> Differing:
+    """Return no disagreements, because no step was compared."""
+    from surrogym_client.evaluation.comparing import Disagreements
 
-    spec = api.surrogate(surrogate).spec
-    steps = [step for step in steps_of(result.traces, result.steps) if spec.known(step.coordinates)]
-    return _add(api, surrogate, as_samples(steady(spec, steps)))
+    return Differing(Disagreements(0, (), {}), first_seed, without=why)
 
 
-def _add(api: Api, surrogate: str, samples: list[NewSample]) -> int:
-    """Add steps that were taken to the surrogate's samples, and return how many were new."""
-    if not samples:
-        return 0
-    added = api.add_samples(surrogate, "evaluate", samples, purpose="logged")
-    return len(added.sample_ids) - added.duplicates
-
-
-def _await_model(api: Api, surrogate: str, seconds: float, *, quiet: bool) -> None:
-    """Wait until the server has fitted a model to all samples. If that takes too long, say so."""
+def _await_model(server: str | None, token: str | None, surrogate: str, seconds: float, *, quiet: bool) -> None:
+    """Wait until the server has fitted a model to all samples. If that takes too long or fails, say so."""
+    from surrogym_client.cli.options import connect
+    from surrogym_client.errors import SurrogymClientError
     from surrogym_client.surrogates.waiting import DesignUnfinished, wait_for_model, words_of_design
     from surrogym_shared.terminal import on_interrupt, progress, say
 
     stays = f"interrupted while the server fits the model; surrogym status {surrogate} shows it"
     try:
-        with on_interrupt(lambda: stays), progress("fit", quiet=quiet) as update:
+        with (
+            on_interrupt(lambda: stays),
+            progress("fit", quiet=quiet) as update,
+            connect(server, token) as api,
+        ):
             wait_for_model(api, surrogate, seconds, lambda view: update(None, words_of_design(view)))
     except DesignUnfinished as error:
         say(str(error), quiet=quiet)
+    except SurrogymClientError as error:
+        say(f"the steps are stored; not waited for the model of {surrogate!r}: {error}", quiet=quiet)
 
 
 @dataclass(frozen=True)
@@ -177,6 +192,7 @@ class Differing:
         changed: names of the constants that changed within an episode.
         left_out: number of steps within which one of them changed. They are not compared, because a model keeps
             constants.
+        without: why no step was compared; empty if steps were.
     """
 
     found: Disagreements
@@ -185,12 +201,15 @@ class Differing:
     changed: tuple[str, ...] = ()
     left_out: int = 0
     all_steps: bool = False
+    without: str = ""
 
     def in_words(self, spec: EnvironmentSpec | None) -> list[str]:
         """Return one line about all steps, one for each of the worst episodes, and one for each of the worst steps."""
         from surrogym_client.evaluation.comparing import SHOWN
 
         found = self.found
+        if self.without:
+            return [f"not compared with a model: {self.without}", *self._learned()]
         if not found.found:
             none = f"none of {found.compared} real steps differs from the model by more than the model's uncertainty"
             return [none, *self._left_out(), *self._learned()]

@@ -13,6 +13,7 @@ from surrogym_client.cli.beside import Beside
 from surrogym_client.cli.disagreement import Differences
 from surrogym_client.cli.filming import film
 from surrogym_client.cli.groups import Output, PolicyReading, Service, add
+from surrogym_client.cli.learning import kept
 from surrogym_client.cli.opening import opener_for_policy
 from surrogym_client.cli.options import NAMES, SpecFile, read_spec
 from surrogym_client.cli.pushing import push_or_say
@@ -100,6 +101,23 @@ class Episodes:
         return EvaluationSettings(**vars(self))
 
 
+@dataclass(frozen=True)
+class Keeping:
+    """Options of what is kept of the episodes."""
+
+    video: Annotated[
+        bool,
+        typer.Option(
+            "--video",
+            help="Draw the best, the median and the worst episode into a video beside the policy, which the server "
+            "stores too. The environment must be one that can be drawn. This takes no real step.",
+        ),
+    ] = False
+    push: Annotated[
+        bool, typer.Option("--push/--no-push", help="Store the policy and its episodes on the server as well.")
+    ] = True
+
+
 def command(
     context: typer.Context,
     policy: Annotated[Path, typer.Argument(help="Policy file from surrogym train or Stable-Baselines3.")],
@@ -111,17 +129,7 @@ def command(
     differences: Differences,
     surrogate: Ledger = None,
     beside: Beside,
-    video: Annotated[
-        bool,
-        typer.Option(
-            "--video",
-            help="Draw the best, the median and the worst episode into a video beside the policy, which the server "
-            "stores too. The environment must be one that can be drawn. This takes no real step.",
-        ),
-    ] = False,
-    push: Annotated[
-        bool, typer.Option("--push/--no-push", help="Store the policy and its episodes on the server as well.")
-    ] = True,
+    keeping: Keeping,
     service: Service,
     output: Output,
 ) -> None:
@@ -144,22 +152,27 @@ def command(
     beside.check(settings)
     opener = opener_for_policy(env, read_spec(spec), card, quiet=output.quiet)
     ledger = _ledger(surrogate, service.server, card, policy, quiet=output.quiet)
+    if learning := differences.learning(ledger, service.server, token):
+        opener = learning.checked(opener)
     enter = partial(_enter, ledger, service.server, token, quiet=output.quiet)
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
     reports = _reports(beside.controllers(policy, card, reading, opener), card.spec, run, enter, settings, policy)
     result = reports[0][1]
-    if stored := push and ledger is not None:
-        _keep(policy, reports, settings, quiet=output.quiet)
-    filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if video else None
-    version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
     promise = card.promise if settings.declared and not result.varied else None
     judged = promise if _judges(settings.episodes) else None
-    found = differences.between(ledger, service.server, token, result, settings, judged, quiet=output.quiet)
+    with kept(learning, policy, result, quiet=output.quiet) as steps:
+        if stored := keeping.push and ledger is not None:
+            _keep(policy, reports, settings, quiet=output.quiet)
+        filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if keeping.video else None
+        version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
+        found = differences.between(ledger, service.server, token, result, settings, judged, steps, quiet=output.quiet)
     summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference)}
     summary |= {"promise_kept": _kept(judged, result), "version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
     more = [*(found.in_words(card.spec) if found else []), *_why_not_judged(card, settings, result), *_repeated(result)]
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
+    if steps is not None:
+        steps.require_stored()
 
 
 def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Evaluation) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,6 +13,7 @@ from surrogym_shared.archives import read_arrays
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.table import Cells, Table
 from surrogym_shared.logs.text import table_of_text
+from surrogym_shared.logs.writing import EVALUATED
 
 Format = Literal["csv", "npz", "parquet", "minari", "surrogate"]
 
@@ -67,7 +69,8 @@ def read_npz(path: Path) -> Table:
     except ValueError as error:
         raise UnusableLog(f"{path}: {error}") from error
     named = [str(name) for name in np.atleast_1d(arrays.pop("coordinate_names", ()))]
-    return table_of_arrays(path, arrays, named)
+    evaluated = arrays.pop(EVALUATED, np.array(False))
+    return replace(table_of_arrays(path, arrays, named), evaluated=evaluated.shape == () and bool(evaluated))
 
 
 def read_parquet(path: Path) -> Table:

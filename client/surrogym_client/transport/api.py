@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, Self, TypeVar
 from uuid import uuid4
 
@@ -280,6 +280,7 @@ class Api:
         purpose: Literal["manual", "logged"] = "manual",
         complete: bool = True,
         idempotency_key: str | None = None,
+        stored: Callable[[wire.AddedSamples], None] = lambda _: None,
     ) -> wire.AddedSamples:
         """Send real steps, and return once the server has stored them.
 
@@ -287,27 +288,25 @@ class Api:
         change nothing. The call with ``complete`` makes a fit of the log due.
 
         A batch of up to about 300 samples is stored whole or not at all. A larger one is sent in several requests, so
-        an error may leave its first part stored; the same call with the same key then adds the rest.
+        an error may leave its first part stored; the same call with the same key then adds the rest. ``stored`` is
+        called after each request that the server has answered.
         """
         batches = _batches(samples)
         keys: list[str | None] = [None] * len(batches)
         if idempotency_key or any(sample.query_id is None for sample in samples):  # otherwise leases identify them
             key = idempotency_key or new_key()
             keys = [key] if len(batches) == 1 else [f"{key}/{number}" for number in range(len(batches))]
-        added = [
-            self._post(
-                wire.AddedSamples,
-                f"{routes.surrogate(name)}/add_sample",
-                wire.AddSamples(
-                    sampler=sampler,
-                    samples=batch,
-                    purpose=purpose,
-                    complete=complete and batch is batches[-1],
-                    idempotency_key=key,
-                ),
+        added: list[wire.AddedSamples] = []
+        for one, batch in zip(keys, batches, strict=True):
+            body = wire.AddSamples(
+                sampler=sampler,
+                samples=batch,
+                purpose=purpose,
+                complete=complete and batch is batches[-1],
+                idempotency_key=one,
             )
-            for key, batch in zip(keys, batches, strict=True)
-        ]
+            added.append(self._post(wire.AddedSamples, f"{routes.surrogate(name)}/add_sample", body))
+            stored(added[-1])
         return wire.AddedSamples(
             sample_ids=[id for one in added for id in one.sample_ids],
             duplicates=sum(one.duplicates for one in added),

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from surrogym_server.storage.records import SampleRecord
+from surrogym_shared.logs.writing import npz_of_steps
 
 CSV = "text/csv"
 NPZ = "application/x-npz"
@@ -36,9 +37,7 @@ def as_npz(coordinate_names: Sequence[str], records: Sequence[SampleRecord]) -> 
     """Write samples as an NPZ archive: coordinates (n, C), action (n, F) and next_coordinates (n, C), and reward,
     termination, purpose and the like (n,)."""
     arrays: dict[str, Any] = {name: np.array([getattr(record, name) for record in records]) for name in ARRAYS}
-    buffer = io.BytesIO()
-    np.savez(buffer, coordinate_names=np.array(coordinate_names), **arrays)
-    return buffer.getvalue()
+    return npz_of_steps(coordinate_names, arrays)
 
 
 def _cell(value: Any) -> Any:

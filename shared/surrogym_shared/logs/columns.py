@@ -149,7 +149,7 @@ def roles_by_name(names: Sequence[str]) -> Roles:
     left = [name for name in left if name not in action.values()]
     marked = _single("state", [(_part(match), name) for name in left if (match := STATE.match(name))])
     ahead = [(_part(match), name) for name in left if (match := NEXT.match(name))]
-    following = _single("next state", [(_part(STATE.match(part)) or part, name) for part, name in ahead])
+    following = _single("next state", [(_of_next(part, marked), name) for part, name in ahead])
     plain = {name: name for name in left if name not in following.values()}
     state = marked or plain
     _require(names, state, action)
@@ -332,6 +332,12 @@ def _only(role: str, names: Iterable[str], known: Sequence[str]) -> str | None:
             "columns in a mapping file (--map)"
         )
     return found[0] if found else None
+
+
+def _of_next(part: str, states: Mapping[str, str]) -> str:
+    """Return the name of the state whose next value a column has: ``q_0`` in ``next.q_0`` if there is such a state,
+    otherwise ``0``."""
+    return part if part in states else _part(STATE.match(part)) or part
 
 
 def _part(match: re.Match[str] | None) -> str:

@@ -34,6 +34,8 @@ class Table:
         cells: cells of each row as text, as in the file; empty if the log is not text.
         delimiter: character between two cells of the text.
         ignored: reason for each array of the file that is not a column, by its name.
+        evaluated: whether the steps come from an evaluation in the surrogate's own environment, so that their units and
+            ends are not in doubt.
     """
 
     columns: dict[str, Cells]
@@ -42,6 +44,7 @@ class Table:
     cells: Sequence[Sequence[str]] = ()
     delimiter: str = ""
     ignored: Mapping[str, str] = field(default_factory=dict)
+    evaluated: bool = False
 
     def __len__(self) -> int:
         return len(self.lines)

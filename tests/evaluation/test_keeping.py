@@ -1,0 +1,64 @@
+"""Real steps in a file are read back to the last bit, and none is set aside, because none can be taken again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.rail import SPEC
+from surrogym_client.evaluation.keeping import rewrite_steps, write_steps
+from surrogym_client.logs import UnusableLog, read_log
+from surrogym_client.logs.importing import Options
+from surrogym_shared.logs.writing import npz_of_steps
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import NewSample
+
+
+def steps_from(first: float, count: int = 50) -> list[NewSample]:
+    places = first + np.random.default_rng(0).uniform(size=count + 1)
+    return [
+        NewSample(coordinates=[a], action=[0.5], next_coordinates=[b], reward=-a, terminated=False)
+        for a, b in zip(places[:-1].tolist(), places[1:].tolist(), strict=True)
+    ]
+
+
+def named(name: str) -> EnvironmentSpec:
+    return EnvironmentSpec.model_validate_json(SPEC.model_dump_json().replace('"x"', f'"{name}"'))
+
+
+@pytest.mark.parametrize("first", [-0.9, 50.0], ids=["in the sampling range", "far outside, and against its ends"])
+def test_every_step_is_read_as_it_was_taken(tmp_path: Path, first: float):
+    """A policy may lead far from the sampling range. A log of unknown origin there would be refused."""
+    taken = steps_from(first)
+    log = read_log(write_steps(tmp_path / "policy.zip", SPEC, taken), Options(spec=SPEC))
+    assert log.rejected == []
+    assert log.steps.q.tolist() == [step.coordinates for step in taken]
+    assert log.steps.u.tolist() == [step.action for step in taken]
+    assert log.steps.q_next.tolist() == [step.next_coordinates for step in taken]
+    assert log.reward.tolist() == [step.reward for step in taken]
+    assert log.steps.terminated.tolist() == [step.terminated for step in taken]
+
+
+def test_a_log_of_unknown_origin_is_still_checked(tmp_path: Path):
+    taken, file = steps_from(50.0), tmp_path / "log.npz"
+    fields = ("coordinates", "action", "next_coordinates", "reward", "terminated")
+    arrays = {name: np.array([getattr(step, name) for step in taken]) for name in fields}
+    file.write_bytes(npz_of_steps(("x",), arrays | {"evaluated": np.zeros(len(taken))}))
+    with pytest.raises(UnusableLog, match="half of the log lies between"):
+        read_log(file, Options(spec=SPEC))
+
+
+@pytest.mark.parametrize("name", ["q_0", "obs.left", "next_x", "action_x", "time"])
+def test_no_name_of_a_coordinate_is_in_the_way(tmp_path: Path, name: str):
+    """next.q_0 was read as the next value of a state called 0."""
+    spec = named(name)
+    assert len(read_log(write_steps(tmp_path / "policy.zip", spec, steps_from(0.0)), Options(spec=spec)).steps) == 50
+
+
+def test_fewer_steps_replace_those_in_the_file(tmp_path: Path):
+    file = write_steps(tmp_path / "policy.zip", SPEC, steps_from(0.0))
+    rewrite_steps(file, SPEC, steps_from(0.0)[:3])
+    assert len(read_log(file, Options(spec=SPEC)).steps) == 3
+    assert list(tmp_path.iterdir()) == [file]
