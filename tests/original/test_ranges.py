@@ -7,8 +7,8 @@ import pytest
 
 from support.toys import Toy
 from surrogym_client.original.describing.counting import Counted
-from surrogym_client.original.describing.description import FASTER
 from surrogym_client.original.describing.exploring import EPISODES, STEPS, Seen, explore
+from surrogym_client.original.describing.ranges import FASTER
 from surrogym_client.original.simulator import Taken, Variable
 from surrogym_shared.spec import BoxAction
 

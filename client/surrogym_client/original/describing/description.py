@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -16,6 +15,7 @@ from surrogym_client.original.describing.exploring import RESETS, STEPS, Seen, e
 from surrogym_client.original.describing.expressing import express, names_in, shown_by_itself
 from surrogym_client.original.describing.known_rewards import known_reward
 from surrogym_client.original.describing.probing import Probed, probe
+from surrogym_client.original.describing.ranges import FASTER, Ranges
 from surrogym_client.original.describing.usable import require_coordinates, require_numbers
 from surrogym_client.original.describing.words import listed, words_of_access, words_of_reward
 from surrogym_client.original.errors import UnknownEnvironment
@@ -25,24 +25,16 @@ from surrogym_client.original.state_parts import VELOCITY
 from surrogym_shared.checks import first_fault
 from surrogym_shared.spec import (
     MAX_DIMENSIONS,
-    Coordinate,
     DeclaredReward,
     EnvironmentSpec,
-    Fixed,
     ObservationEntry,
     Reward,
     Term,
-    Uniform,
     limits,
 )
 
-FASTER = 1.5  # times the largest observed speed: what a policy may reach
-MARGIN = 0.25  # of the observed range, on each side
 MOSTLY = 0.5  # of all steps with the same reward; then other rewards are met only by luck
 PLACES = 300  # at which an observation is read, without a step
-SINGLE = 1e-6  # relative error of an observation in single precision
-SHORT_WAY = 0.05  # of the way between two stops; a step that is longer may meet a stop from anywhere
-UNKNOWN_SPEED = 1.0  # of a variable that never moved, in the simulator's unit
 UNKNOWN_LIMIT = 200  # steps of an episode if the simulator has no limit
 
 
@@ -140,13 +132,14 @@ class _Draft:
     def spec(self, rng: np.random.Generator) -> EnvironmentSpec:
         """The specification, with the observation in terms of the coordinates."""
         variables = [self._simulator.variables[i] for i in self._kept]
-        coordinates = tuple(self._coordinate(i) for i in self._kept)
+        ranges = Ranges(self._simulator, self._seen, self._probed, self._all)
+        coordinates = tuple(ranges.coordinate(i) for i in self._kept)
         frame = EnvironmentSpec(
             environment=self._name,
             coordinates=coordinates,
             observation=(ObservationEntry(name="unknown", term=Term.constant(0)),),
             action=self._simulator.action,
-            start={c.name: self._start(i, c) for i, c in zip(self._kept, coordinates, strict=True)},
+            start={c.name: ranges.start(i, c) for i, c in zip(self._kept, coordinates, strict=True)},
             termination="learned" if self._seen.terminated.any() else (),
             time_limit=self._simulator.time_limit or UNKNOWN_LIMIT,
             query="step" if self._probed.settable else "rollout",
@@ -280,89 +273,6 @@ class _Draft:
             if v.motion in ("slide", "turn") and d and not m
         ]
 
-    def _is_constant(self, index: int) -> bool:
-        """Whether a variable is constant in every episode, and differs between episodes."""
-        variable, seen = self._simulator.variables[index], self._seen
-        if variable.motion in ("slide", "turn", "speed"):
-            return False
-        moved = (seen.states[:, index] != seen.next_states[:, index]).any()
-        return variable.motion == "held" or not moved
-
-    def _coordinate(self, index: int) -> Coordinate:
-        variable = self._simulator.variables[index]
-        if variable.name in self._probed.turns:
-            circle = Uniform(low=-math.pi, high=math.pi)
-            return Coordinate(name=variable.name, kind="angle", sampling=circle, unit="rad")
-        kind = "constant" if self._is_constant(index) else "linear"
-        low, high = self._range(index, constant=kind == "constant")
-        return Coordinate(name=variable.name, kind=kind, sampling=Uniform(low=low, high=high))
-
-    def _range(self, index: int, *, constant: bool) -> tuple[float, float]:
-        """The sampling range of a variable. It ends at the limits with which the environment shows the variable."""
-        low, high = self._reached(index, constant=constant)
-        for shown, ends in zip(self._seen.observations.T, self._shown_limits(), strict=True):
-            within = ends[0] <= self._all[:, index].min() and self._all[:, index].max() <= ends[1]
-            if within and np.allclose(shown, self._seen.next_states[:, index], rtol=SINGLE, atol=SINGLE):
-                low, high = max(low, float(ends[0])), min(high, float(ends[1]))
-        return low, high
-
-    def _shown_limits(self) -> Array:
-        """Limits (D, 2) of the observation's entries."""
-        given, entries = self._simulator.shown_limits, self._seen.observations.shape[1]
-        fits = given is not None and given.shape == (entries, 2)
-        return given if given is not None and fits else np.tile([-np.inf, np.inf], (entries, 1))
-
-    def _reached(self, index: int, *, constant: bool) -> tuple[float, float]:
-        """The sampling range of a variable by its own limits, or by what random actions reached."""
-        variable, seen = self._simulator.variables[index], self._all[:, index]
-        low, high = float(seen.min()), float(seen.max())
-        if variable.motion == "speed":
-            fastest = FASTER * max(abs(low), abs(high)) or UNKNOWN_SPEED
-            return -fastest, fastest
-        pushed = variable.motion == "slide" and not variable.driven  # its limits may be far away
-        trusted = not pushed and (self._probed.stays or constant)
-        if variable.low is not None and variable.high is not None and trusted:
-            if variable.motion in ("slide", "turn"):
-                return self._before_the_stops(index, variable.low, variable.high)
-            return min(low, variable.low), max(high, variable.high)
-        if pushed and variable.limited:
-            near = self._seen.starts[:, index]
-            wider = float(np.ptp(near)) or MARGIN * (high - low)
-            return float(near.min()) - wider, float(near.max()) + wider
-        margin = (0.0 if constant else MARGIN) * (high - low)
-        return low - margin, high + margin
-
-    def _before_the_stops(self, index: int, low: float, high: float) -> tuple[float, float]:
-        """The sampling range of a joint with stops. A step that meets a stop is not smooth.
-
-        The range therefore ends before each stop, by the longest way of one step. It always has all starts. If
-        that way is a large part of the whole, stops are met everywhere, and nothing is left out.
-        """
-        seen, starts = self._seen, self._seen.starts[:, index]
-        way = FASTER * float(np.abs(seen.next_states[:, index] - seen.states[:, index]).max())
-        if way > SHORT_WAY * (high - low):
-            way = 0.0
-        return min(low + way, float(starts.min())), max(high - way, float(starts.max()))
-
-    def _start(self, index: int, coordinate: Coordinate) -> Uniform | Fixed:
-        """The range of starts: that of a schedule, or else the seen one. The latter is widened, because the range of n
-        uniform draws is too narrow on average."""
-        if coordinate.name in self._simulator.scheduled:
-            low, high = self._simulator.scheduled[coordinate.name]
-            return Uniform(low=low, high=high) if low < high else Fixed(value=low)
-        if coordinate.kind == "constant" and self._simulator.variables[index].limited:
-            return Uniform(low=limits(coordinate.sampling)[0], high=limits(coordinate.sampling)[1])
-        starts = self._seen.starts[:, index]
-        if coordinate.kind == "angle":
-            starts = _on_an_arc(starts)
-        low, high = float(starts.min()), float(starts.max())
-        if high - low <= 1e-12 * max(1.0, abs(low)):
-            return Fixed(value=low)
-        wider = (high - low) / (len(starts) - 1)
-        if coordinate.kind == "angle" and high - low + 2 * wider >= 2 * math.pi:
-            return Uniform(low=-math.pi, high=math.pi)
-        return Uniform(low=low - wider, high=high + wider)
-
     def _observation(
         self, frame: EnvironmentSpec, variables: Sequence[Variable], rng: np.random.Generator
     ) -> list[ObservationEntry]:
@@ -400,20 +310,6 @@ class _Draft:
             place[:] = counted.read()[self._kept]
             observed.append(counted.observe())
         return places, np.stack(observed)
-
-
-def _on_an_arc(angles: Array) -> Array:
-    """The same angles (n,), with whole turns added, so that they lie on the shortest arc that has them all.
-
-    Its middle is within half a turn of 0. Angles near half a turn are read on both sides of the jump there.
-    """
-    turn = 2 * math.pi
-    placed = np.sort(np.mod(angles, turn))
-    gaps = np.diff(np.append(placed, placed[0] + turn))
-    first = placed[(int(gaps.argmax()) + 1) % len(placed)]
-    arc: Array = np.mod(angles - first, turn) + first
-    middle = (arc.min() + arc.max()) / 2
-    return arc - turn * round(float(middle) / turn)
 
 
 def _raw(term: Term) -> set[str]:
