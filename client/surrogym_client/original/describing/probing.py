@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -83,8 +84,7 @@ def probe(counted: Counted, seen: Seen, rng: np.random.Generator) -> Probed:
     probed = Probed(set_error, repeat_error, replay_error)
     if not probed.settable:
         return probed
-    ended = [bool(seen.terminated[i]) for i in at]
-    places = [(state, action, end, *got) for (state, action, _, _), end, got in zip(taken, ended, first, strict=True)]
+    places = [(state, action, *got) for (state, action, _, _), got in zip(taken, first, strict=True)]
     shifted = _Shifted(counted, places, scale, max(EXACT, FEW * repeat_error))
     shifts, turns = set(), set()
     for i, variable in enumerate(simulator.variables):
@@ -98,24 +98,36 @@ def probe(counted: Counted, seen: Seen, rng: np.random.Generator) -> Probed:
     return Probed(set_error, repeat_error, replay_error, frozenset(shifts), frozenset(turns), leaving)
 
 
+class _Alike(NamedTuple):
+    """What a shift of a variable leaves alike in one step.
+
+    ``itself``: its own next value, which has the shift, apart from whole turns. ``others``: the other variables, the
+    reward and the end. ``shown``: the observation.
+    """
+
+    itself: bool
+    others: bool
+    shown: bool
+
+
 class _Shifted:
     """Steps from some places with one variable shifted, compared with the same steps without the shift.
 
-    ``places``: state (V,), action (F,), whether the step ended the episode, next state (V,), and the step's results.
+    ``places``: state (V,), action (F,), next state (V,), and the step's results.
     """
 
     def __init__(
-        self, counted: Counted, places: Sequence[tuple[Array, Array, bool, Array, Taken]], scale: Array, same: float
+        self, counted: Counted, places: Sequence[tuple[Array, Array, Array, Taken]], scale: Array, same: float
     ) -> None:
         self._counted, self._places, self._scale, self._same = counted, places, scale, same
 
     def changes_nothing(self, index: int, shift: float) -> bool:
         """Whether neither the motion nor the observation changes."""
-        return all(motion and shown for motion, shown in self._alike(index, shift))
+        return all(all(alike) for alike in self._compared(index, shift))
 
     def turns(self, index: int) -> bool:
         """Whether a whole turn changes nothing about the motion."""
-        return all(motion for motion, _ in self._alike(index, TURN))
+        return all(alike.itself and alike.others for alike in self._compared(index, TURN))
 
     def is_angle(self, index: int) -> bool:
         """Whether whole turns change nothing about a variable of an unknown kind, and a part of a turn does.
@@ -125,32 +137,32 @@ class _Shifted:
         """
         whole = []
         for shift in (TURN, -2 * TURN):
-            for motion, shown in self._alike(index, shift):
-                if not motion:
+            for alike in self._compared(index, shift):
+                if not (alike.itself and alike.others):
                     return False  # the other places would cost real steps
-                whole.append(shown)
-        part = list(self._alike(index, PART, but_itself=True))
-        return not all(motion for motion, _ in part) or (all(whole) and not all(shown for _, shown in part))
+                whole.append(alike.shown)
+        part = list(self._compared(index, PART))
+        return not all(alike.others for alike in part) or (all(whole) and not all(alike.shown for alike in part))
 
-    def _alike(self, index: int, shift: float, *, but_itself: bool = False) -> Iterator[tuple[bool, bool]]:
-        """For each place, whether the motion and the observation are the same after the shift.
-
-        Reward and end belong to the motion. The shifted variable may be read without whole turns. With ``but_itself``,
-        it is not compared.
-        """
-        for state, action, ended, reached, got in self._places:
+    def _compared(self, index: int, shift: float) -> Iterator[_Alike]:
+        """The comparison at each place."""
+        for state, action, reached, got in self._places:
             moved = state.copy()
             moved[index] += shift
             try:
                 there, step = self._counted.step_from(moved, action)
             except StepFailed:
-                yield False, False
+                yield _Alike(itself=False, others=False, shown=False)
                 continue
-            wrong = 0.0 if but_itself else there[index] - shift - reached[index]
-            there[index] = reached[index] + (wrong - TURN * np.round(wrong / TURN) if shift % TURN == 0 else wrong)
-            error = _error(there, reached, self._scale, step.reward, got.reward)
-            shown = np.allclose(step.observation, got.observation, atol=1e-6)
-            yield error <= self._same and step.terminated == ended, bool(shown)
+            wrong = there[index] - shift - reached[index]
+            wrong -= TURN * np.round(wrong / TURN)  # it may be read without whole turns
+            there[index] = reached[index]
+            others = _error(there, reached, self._scale, step.reward, got.reward) <= self._same
+            yield _Alike(
+                itself=abs(wrong) / self._scale[index] <= self._same,
+                others=others and step.terminated == got.terminated,
+                shown=np.allclose(step.observation, got.observation, atol=1e-6),
+            )
 
 
 def _leaving(counted: Counted, seen: Seen, rng: np.random.Generator) -> float:
