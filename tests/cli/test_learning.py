@@ -130,7 +130,7 @@ def test_steps_that_a_killed_server_did_not_store_are_kept_and_stored_once_later
                 said = surrogym("evaluate", policy, *MACHINE, *all_steps)
             taken = diary.read_text().count("step")
             assert said.code == 1
-            assert said.json["steps"] == taken, "the result of the evaluation is told all the same"
+            assert said.json["steps"] == taken, "the result is printed although the steps were not sent"
             assert f"error: --learn-all: no Surrogym server answers at {server.url}" in said.err
             assert f"5 of {taken} real steps are known to be stored; all are in policy.steps.npz" in said.err
             command = said.err.strip().rpartition(": surrogym ")[2]

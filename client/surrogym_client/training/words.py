@@ -26,7 +26,7 @@ def words_of_result(
     Args:
         result: what was trained.
         handover: its promise and whether to trust it.
-        asked: virtual steps that were asked for, if any.
+        asked: number of virtual steps that ``--steps`` gave; None without it.
         closed_loop: whether ``--improve`` was given.
         server: address that the next command needs; None if it needs none.
         env_option: option of the next command that names the environment, with a space before it.
