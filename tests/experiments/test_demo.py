@@ -106,7 +106,7 @@ def test_a_small_demo_from_start_to_run_folder(demo, tmp_path):
     assert f"next: surrogym serve --database {folder / 'surrogym.db'}" in err
     for shown in (
         "task ",
-        "real queries",
+        f" {queries['total']} + {queries['audit']} for the audit ",
         "confidence index",
         "virtual steps",
         "real return, 3 starts",
@@ -114,7 +114,10 @@ def test_a_small_demo_from_start_to_run_folder(demo, tmp_path):
         str(folder),
     ):
         assert shown in out
-    assert "real queries" not in err
+    assert "confidence index" not in err
+    learned, after = out.split("target ")  # what was measured comes last, apart from what was learned from
+    assert str(metrics["evaluation_steps"]) not in learned
+    assert f"{metrics['evaluation_steps']} real steps, measured afterwards" in after
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

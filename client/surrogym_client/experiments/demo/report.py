@@ -69,14 +69,12 @@ def metrics_of(
 
 def table(metrics: dict[str, Any], folder: Path) -> str:
     """The result for a person, two columns."""
-    real, returns, index = metrics["real_queries"], metrics["real_return"], metrics["confidence_index"]
+    returns, index = metrics["real_return"], metrics["confidence_index"]
     design = IN_WORDS.get(metrics["phase"], metrics["phase"])
     arm = "" if metrics["arm"] == "default" else f", arm {metrics['arm']}"
     rows = [
         ("task", f"{metrics['task']} ({metrics['environment']}), seed {metrics['seed']}{arm}"),
-        ("real queries", f"{real['total']}: {real['initial']} initial, {real['adaptive']} adaptive"),
-        *([("real steps of description", str(metrics["description_steps"]))] if metrics["description_steps"] else []),
-        ("real steps of evaluation", str(metrics["evaluation_steps"])),
+        ("real steps", _real_steps(metrics)),
         (
             "confidence index",
             "-" if index is None else f"{index:.4f}, {design}",
@@ -93,6 +91,7 @@ def table(metrics: dict[str, Any], folder: Path) -> str:
         *_also(metrics),
         _without(metrics),
         ("target", f"{metrics['target']}: {'reached' if metrics['reached'] else 'not reached'}"),
+        ("evaluation", f"{metrics['evaluation_steps']} real steps, measured afterwards, nothing learned"),
         ("run folder", str(folder)),
         *([("report", str(folder / REPORT))] if (folder / REPORT).exists() else []),
     ]
@@ -124,16 +123,29 @@ def _without(metrics: dict[str, Any]) -> tuple[str, str]:
     return "without the policy", f"mean {_number(without['mean'])}, {without['episodes']} starts, {actions}"
 
 
+def _real_steps(metrics: dict[str, Any]) -> str:
+    """The real steps that something was learned from: design, description and audit."""
+    real = metrics["real_queries"]
+    others = {"description": metrics["description_steps"], "audit": _audit_steps(metrics)}
+    parts = [str(real["total"]), *(f"{steps} for the {name}" for name, steps in others.items() if steps)]
+    return f"{' + '.join(parts)} ({real['initial']} initial, {real['adaptive']} adaptive)"
+
+
+def _audit_steps(metrics: dict[str, Any]) -> int:
+    audit = metrics["audit"]
+    steps: int = metrics["real_queries"].get("audit", 0 if audit is None else audit["steps"])
+    return steps
+
+
 def _promise(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     """The promise at the handover; empty if the policy was learned in the original environment."""
-    promise, audit = metrics["promise"], metrics["audit"]
+    promise = metrics["promise"]
     if promise is None:
         return []
     low, median, high = (_number(promise[name]) for name in ("low", "median", "high"))
     varied = ", ".join(metrics["varied"])
-    steps = metrics["real_queries"].get("audit", 0 if audit is None else audit["steps"])
     return [
-        ("promise", f"{median}, between {low} and {high} with 90 % chance; {steps} more real steps of audit"),
+        ("promise", f"{median}, between {low} and {high} with 90 % chance"),
         *(
             [("not comparable", f"{varied} changed within real episodes, and not in the promised ones")]
             if varied
