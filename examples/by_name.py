@@ -1,9 +1,9 @@
 """Any environment that has a name: described, learned from a few real steps, and stepped, all in this process.
 
 python by_name.py Swimmer-v5
-python by_name.py dm_control:pendulum-swingup     # pip install "surrogym[dm-control]"
-python by_name.py gymnasium_robotics:PointMaze_UMaze-v3 --steps 40    # pip install "surrogym[robotics]"
-python by_name.py pcgym:cstr    # pip install "surrogym[pcgym]"
+python by_name.py dm_control:pendulum-swingup     # pip install ".[dm-control]"
+python by_name.py gymnasium_robotics:PointMaze_UMaze-v3 --steps 40    # pip install ".[robotics]"
+python by_name.py pcgym:cstr    # pip install ".[pcgym]"
 """
 
 import argparse

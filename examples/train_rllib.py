@@ -1,6 +1,6 @@
 """PPO of RLlib; its env runners open sessions of their own, here or on other machines.
 
-pip install "surrogym[rllib]"
+pip install ".[rllib]"
 python train_rllib.py pendulum --iterations 20
 """
 

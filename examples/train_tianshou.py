@@ -1,6 +1,6 @@
 """PPO of tianshou: its collector talks to each lane by itself, and a step of all lanes is one request.
 
-pip install "surrogym[tianshou]"
+pip install ".[tianshou]"
 python train_tianshou.py pendulum --steps 50000
 
 For continuous actions.

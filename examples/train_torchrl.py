@@ -1,6 +1,6 @@
 """PPO of TorchRL through its GymWrapper.
 
-pip install "surrogym[torchrl]"
+pip install ".[torchrl]"
 python train_torchrl.py pendulum --steps 50000
 """
 

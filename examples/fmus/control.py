@@ -3,7 +3,7 @@
 python control.py TwoTanks
 python control.py InvertedPendulum --baseline 400000    # also train in the plant, for this many steps
 
-The package pythonfmu builds the FMU: pip install "surrogym[all,fmu]" pythonfmu
+The package pythonfmu builds the FMU: pip install ".[all,fmu]" pythonfmu
 """
 
 import argparse

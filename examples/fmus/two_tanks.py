@@ -2,7 +2,7 @@
 
 A pump fills the upper tank, which drains into the lower one. Build it into this folder:
 
-pip install "surrogym[fmu]" pythonfmu
+pip install ".[fmu]" pythonfmu
 pythonfmu build -f two_tanks.py -d . --handle-state --serialize-state
 """
 

@@ -14,11 +14,16 @@ ROWS = read_rows(DOCS / "results" / "efficiency.csv")
 
 
 @pytest.mark.parametrize(
-    ("page", "name", "pictures"), [("results.md", "headline", "results"), ("results/efficiency.md", "efficiency", ".")]
+    ("page", "name", "rows", "out"),
+    [
+        ("results.md", "headline", "efficiency-audited", "runs/table"),
+        ("results/efficiency.md", "efficiency", "efficiency", "docs/results"),
+    ],
 )
-def test_the_tables_are_those_of_the_rows(page, name, pictures):
-    again = f"surrogym reproduce table --rows docs/results/efficiency.csv --out docs/results --page docs/{page}"
-    assert present_sections(DOCS / page) == {name: section(name, ROWS, pictures)}, again
+def test_the_tables_are_those_of_the_rows(page, name, rows, out):
+    made = section(name, read_rows(DOCS / "results" / f"{rows}.csv"), ".")
+    again = f"surrogym reproduce table --rows docs/results/{rows}.csv --out {out} --page docs/{page}"
+    assert present_sections(DOCS / page) == {name: made}, again
 
 
 @pytest.mark.parametrize(
