@@ -16,12 +16,17 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
 
+from surrogym_shared.removed import remark
+
 T = TypeVar("T")
 MOST_CHARACTERS = 500  # most characters of the message of a package's exception
 
 
 class UnknownMember(ValueError):
-    """No class has this name, or its package is broken. The message lists the known names."""
+    """No class has this name, or its package is broken.
+
+    The message lists the known names, and what takes the place of a removed one.
+    """
 
 
 class _Unfit(ValueError):
@@ -89,7 +94,7 @@ class Registry(Generic[T]):
         member = _same(name, self._built_in) or _same(name, self._others())
         if member is None:
             why = self.why_broken(name)
-            because = "" if why is None else f" ({why})"
+            because = remark(self.kind, name) if why is None else f" ({why})"
             raise UnknownMember(f"{self.kind}: expected one of {', '.join(self.names)}, got {name!r}{because}")
         return member
 

@@ -12,7 +12,6 @@ from support.terminal import on_terminal
 from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
 from surrogym_shared import wire
-from surrogym_shared.spec import ModelChoice
 
 EMPTY = reply(wire.SurrogateList(surrogates=[]).model_dump_json())
 
@@ -115,13 +114,3 @@ def test_on_a_narrow_terminal_nothing_is_cut_and_ctrl_c_ends_it(pendulum_server)
     assert [line for line in lines if len(line) > 60] == []
     assert "Traceback" not in terminal.shown
     assert {f"output               {name}" for name in ("theta", "speed", "reward")} <= set(lines)
-
-
-def test_scores_of_families_are_given_to_programs_too(on_server, server_process, name):
-    spec, chosen = pendulum(), ModelChoice(name="selected", settings={"steps": 20})
-    spec = spec.model_copy(update={"design": spec.design.model_copy(update={"model": chosen})})
-    with Api(server_process.url) as api:
-        teach(api, name, spec, queries=6)
-    shown = on_server("status", name, "--json").json
-    assert shown["name"] == name
-    assert set(shown["selection"]) >= {"candidates", "held_out", "standings"}

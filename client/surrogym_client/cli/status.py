@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -12,7 +12,7 @@ from surrogym_client.cli.groups import Service, add
 from surrogym_client.cli.options import AsJson, names_of_surrogates
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from surrogym_client.transport.api import Api
     from surrogym_shared.wire import ModelView, OutputFidelity, SurrogateSummary, SurrogateView
@@ -73,20 +73,10 @@ def _all(api: Api, form: Form) -> str:
 def _one(api: Api, name: str, form: Form) -> str:
     view = api.surrogate(name)
     if form == "json":
-        selection = _selection(api, view)
-        return json.dumps(view.model_dump(mode="json") | ({} if selection is None else {"selection": dict(selection)}))
+        return json.dumps(view.model_dump(mode="json"))
     if form == "short":
         return _short(view)
-    return _detail(view, api.models(name) if view.phase == "over_budget" else (), _selection(api, view))
-
-
-def _selection(api: Api, view: SurrogateView) -> Mapping[str, Any] | None:
-    """Return what the newest model says of the families that were compared; None if its family compares none."""
-    from surrogym_client.surrogates.compared import compares, selection_of
-
-    if view.model_version is None or not compares(view.spec):
-        return None
-    return selection_of(view.spec, api.model(view.name).description)
+    return _detail(view, api.models(name) if view.phase == "over_budget" else ())
 
 
 def _patiently(look: Callable[[], str], as_json: bool) -> str:
@@ -127,7 +117,7 @@ def _row(seen: SurrogateSummary) -> tuple[str | float | None, ...]:
     )
 
 
-def _detail(view: SurrogateView, models: Sequence[ModelView], selection: Mapping[str, Any] | None = None) -> str:
+def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
     from surrogym_client.cli.columns import columns
     from surrogym_client.surrogates.advice import advice, noise_in_words, verdict
 
@@ -152,7 +142,6 @@ def _detail(view: SurrogateView, models: Sequence[ModelView], selection: Mapping
             f"target {view.target:g}; as the paper counts it {view.fidelity.confidence_index_paper:.4f}",
             columns([FIDELITY, *(_judged(output) for output in view.fidelity.outputs)]),
             *_predicted(view.fidelity.outputs),
-            *_compared(selection, view.outputs),
             f"verdict: {verdict(view)}",
         ]
     if noise := noise_in_words(view):
@@ -160,14 +149,6 @@ def _detail(view: SurrogateView, models: Sequence[ModelView], selection: Mapping
     if following := advice(view, models):
         lines.append(f"next: {following}")
     return "\n".join(lines)
-
-
-def _compared(selection: Mapping[str, Any] | None, outputs: Sequence[str]) -> list[str]:
-    """Table of the families that were compared; empty if the surrogate has one family."""
-    from surrogym_client.cli.columns import columns
-    from surrogym_client.surrogates.compared import HEADING, rows_of, said_of
-
-    return [] if selection is None else [said_of(selection), columns([HEADING, *rows_of(selection, outputs)])]
 
 
 def _steps(seen: SurrogateSummary) -> str:

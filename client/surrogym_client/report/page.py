@@ -16,7 +16,6 @@ from surrogym_client.report.html import document, picture, rows, section, table
 from surrogym_client.report.known import Known
 from surrogym_client.report.maps import Cut
 from surrogym_client.runtime.versions import versions
-from surrogym_client.surrogates.compared import HEADING, rows_of, said_of, selection_of
 from surrogym_client.surrogates.phases import IN_WORDS
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import ModelView, OutputFidelity, Phase, SampleView, SurrogateView
@@ -139,16 +138,11 @@ def _maps(view: SurrogateView, cuts: Sequence[Cut]) -> str:
 def _structure(model: ModelView, spec: EnvironmentSpec) -> str:
     angles = any(coordinate.kind == "angle" for coordinate in spec.coordinates)
     described = dict(model.description if angles else _without_angles(model.description))
-    compared = ""
-    if (selection := selection_of(spec, described)) is not None:
-        del described["selection"]
-        outputs = [output.name for output in model.fidelity.outputs]
-        compared = table(HEADING, rows_of(selection, outputs), said_of(selection))
     parts = [
         f"<h3>{escape(str(output.get('name')))}</h3>{rows((k, v) for k, v in output.items() if k != 'name')}"
         for output in described.pop("outputs", [])
     ]
-    details = compared + "".join(parts) + rows(described.items())
+    details = "".join(parts) + rows(described.items())
     return section(f"Structure and hyperparameters of model {model.version}", details)
 
 

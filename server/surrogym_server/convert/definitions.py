@@ -9,8 +9,7 @@ from surrogym_server.environment import conditions, declared_reward, distributio
 from surrogym_server.environment import definition as core
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.errors import InvalidSpec
-from surrogym_server.models.registry import PROCESSES, SELECTED, learner_of
-from surrogym_server.models.singles import GAUSSIAN_PROCESS
+from surrogym_server.models.registry import GAUSSIAN_PROCESS, PROCESSES, learner_of
 from surrogym_server.plugins import Choice
 from surrogym_server.sampling.acquisition import check_acquisition
 from surrogym_shared import spec as wire
@@ -116,10 +115,6 @@ def _model(design: wire.Design) -> Choice:
     """The family of models. The preset chooses the settings of Gaussian processes that the specification
     leaves open."""
     choice, paper = _choice(design.model, GAUSSIAN_PROCESS), design.preset == "paper"
-    if choice.name == SELECTED and paper:
-        raise InvalidSpec(
-            f"design: expected another family than {SELECTED!r} with the preset 'paper', which is published with one"
-        )
     if choice.name in PROCESSES:
         kernel = "squared_exponential" if paper else "composite"
         preset: dict[str, float | bool | str] = {

@@ -57,23 +57,6 @@ function hyper(value) {
   return (typeof value[0] === "number" ? vector(value) : value.join(", ")) || "none";
 }
 
-/** The families that were compared for each output; nothing if the specification names one family. */
-function families({ version, description, fidelity }) {
-  const { selection } = description;
-  if (!selection?.standings) return [];
-  const { held_out: held } = selection;
-  const ahead = `${held.horizons.join(" and ")} ${plural(held.horizons.at(-1) ?? 1, "step").split(" ").at(-1)}`;
-  const what = held.kind === "trajectories" ? plural(held.pieces, "piece of a trajectory", "pieces of trajectories") : plural(held.pieces, "single step");
-  const said = held.pieces ? `Families were compared on ${what}, predicted ${ahead} ahead. Each was fitted ${held.folds === 1 ? "once" : `${held.folds} times`} without them. A score is a log density in nats; higher is better.` : "";
-  const rows = fidelity.outputs.flatMap(({ name }, at) => {
-    const serving = selection.serving[at];
-    const standings = selection.standings[at];
-    return standings.length ? standings.map((one) => [name, one.family, one.family === serving ? "serves" : "", number(one.score), number(one.better), number(one.error), percent(one.coverage), one.wins]) : [[name, serving, "serves", "–", "–", "–", "–", "–"]];
-  });
-  return [h("h4", {}, "Choice of families"), h("p", { class: "note" }, [said, ...held.notes.map((note) => `${note}.`)].join(" ")),
-    table(`Families of version ${version}`, [["output", ""], ["family", ""], ["", ""], ["score", "num"], ["better by", "num"], ["standard error", "num"], ["in 90 %", "num"], ["won in a row", "num"]], rows, "")];
-}
-
 function model(record) {
   const { fidelity } = record;
   const head = h("summary", {}, h("strong", {}, `version ${record.version}`), h("span", { class: "note" },
@@ -83,7 +66,7 @@ function model(record) {
     HYPER.filter((name) => output[name] !== undefined).flatMap((name) => [h("dt", {}, name.replaceAll("_", " ")),
       h("dd", {}, hyper(output[name]))]))));
   return h("details", { class: "model" }, head,
-    table(`Outputs of version ${record.version}`, [["output", ""], ["structure", ""], ["confidence", "num"], ["coverage", "num"], ["leave-one-out", "num"], ["new samples in 90 %", "num"], ["tolerance", "num"]], rows, ""), families(record), h("div", { class: "outputs" }, parts));
+    table(`Outputs of version ${record.version}`, [["output", ""], ["structure", ""], ["confidence", "num"], ["coverage", "num"], ["leave-one-out", "num"], ["new samples in 90 %", "num"], ["tolerance", "num"]], rows, ""), h("div", { class: "outputs" }, parts));
 }
 
 export function modelTable() {

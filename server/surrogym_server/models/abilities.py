@@ -1,5 +1,4 @@
-"""Abilities that only some families of models have. Each is a class that a model inherits besides ``DynamicsModel``. A
-model of several families returns an object of its own instead (``DynamicsModel.ability``).
+"""Abilities that only some families of models have. Each is a class that a model inherits besides ``DynamicsModel``.
 
 Code that uses an ability calls ``offers``, and has a fallback for models without it. The ability's docstring states it.
 
@@ -218,24 +217,6 @@ class Lookahead(ABC):
     @abstractmethod
     def as_if_answered(self, steps: PredictedSteps) -> DynamicsModel:
         """Return the model as if real steps (T, ...) had been taken as predicted: deviations shrink, means stay."""
-
-
-class RewardOfStep(ABC):
-    """Ability to predict the reward of a step whose next state is given, as if the transition were known.
-
-    Fallback of a model of several families: the reward of the next state that this family predicts itself.
-    """
-
-    @abstractmethod
-    def reward_of_step(
-        self, q: Tensor, u: Tensor, q_next: Tensor, *, paths: Tensor | None = None, deviation: bool = False
-    ) -> tuple[Tensor, Tensor | None]:
-        """Return the reward (m,) of steps from q (m, C) under u (m, F) to q_next (m, C), and its deviation (m,) if
-        requested.
-
-        Both are those of ``transition`` at the next state that it predicts; with ``paths`` (m, W), those of
-        ``transition_along``.
-        """
 
 
 class RewardEdges(ABC):

@@ -13,8 +13,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.port import DynamicsModel, StoredModel
-from surrogym_server.models.registry import learner_of
-from surrogym_server.models.singles import GAUSSIAN_PROCESS
+from surrogym_server.models.registry import GAUSSIAN_PROCESS, learner_of
 
 METADATA = "surrogym"
 FAMILY, CHECKSUM = "family", "checksum"

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from surrogym_server.models.bayesian_last_layer import BayesianLastLayers
+from surrogym_server.models.ensemble import NetworkEnsembles
+from surrogym_server.models.gaussian_process import GaussianProcesses
 from surrogym_server.models.port import Learner
-from surrogym_server.models.selected import SelectedFamilies
-from surrogym_server.models.singles import BUILT_IN, GAUSSIAN_PROCESS, GROUP, NOUN, SPARSE_GAUSSIAN_PROCESS
+from surrogym_server.models.sparse_gaussian_process import SparseGaussianProcesses
 from surrogym_server.plugins import Choice, Registry
 
-SELECTED = "selected"
-PROCESSES = (GAUSSIAN_PROCESS, SPARSE_GAUSSIAN_PROCESS, SELECTED)  # families with the settings of Gaussian processes
+GAUSSIAN_PROCESS, SPARSE_GAUSSIAN_PROCESS = "gaussian_process", "sparse_gaussian_process"
+PROCESSES = (GAUSSIAN_PROCESS, SPARSE_GAUSSIAN_PROCESS)  # families with the settings of Gaussian processes
+BUILT_IN: dict[str, type[Learner] | str] = {
+    GAUSSIAN_PROCESS: GaussianProcesses,
+    SPARSE_GAUSSIAN_PROCESS: SparseGaussianProcesses,
+    "ensemble": NetworkEnsembles,
+    "bayesian_last_layer": BayesianLastLayers,
+}
 
-MODELS: Registry[Learner] = Registry("model", GROUP, Learner, {**BUILT_IN, SELECTED: SelectedFamilies}, noun=NOUN)
+MODELS: Registry[Learner] = Registry("model", "surrogym.models", Learner, BUILT_IN, noun="model family")
 
 
 def learner_of(choice: Choice) -> Learner:

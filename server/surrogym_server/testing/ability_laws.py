@@ -16,7 +16,6 @@ from surrogym_server.models.abilities import (
     Lookahead,
     PredictedSteps,
     RewardEdges,
-    RewardOfStep,
     UncertainHyperparameters,
     offers,
 )
@@ -63,22 +62,6 @@ def a_drawn_function_may_have_columns_beyond_its_own(case: ModelCase) -> None:
         wider = torch.cat([paths, torch.zeros(2, 3, dtype=torch.float64)], 1)
         q, u = case.points.q[:2], case.points.u[:2]
         assert torch.equal(able.transition_along(paths, q, u).q_next, able.transition_along(wider, q, u).q_next)
-
-
-def the_reward_of_a_predicted_step_is_the_predicted_reward(case: ModelCase) -> None:
-    if (able := offers(case.model, RewardOfStep)) is None:
-        return
-    q, u = case.points.q, case.points.u
-    made = case.model.transition(q, u, reward_deviation=True)
-    reward, deviation = able.reward_of_step(q, u, made.q_next, deviation=True)
-    assert close(reward, made.reward)
-    assert deviation is not None
-    assert made.reward_deviation is not None
-    assert close(deviation, made.reward_deviation)
-    if (drawing := offers(case.model, FunctionDraws)) is not None:
-        paths = drawing.draw(case.noise(len(q), drawing.path_size))
-        drawn = drawing.transition_along(paths, q, u)
-        assert close(able.reward_of_step(q, u, drawn.q_next, paths=paths)[0], drawn.reward)
 
 
 def leave_one_out_errors_are_there_for_every_output(case: ModelCase) -> None:
@@ -185,7 +168,6 @@ LAWS_OF_ABILITIES: tuple[Callable[[ModelCase], None], ...] = (
     a_drawn_function_is_one_function,
     drawn_functions_scatter_as_the_deviations_say,
     a_drawn_function_may_have_columns_beyond_its_own,
-    the_reward_of_a_predicted_step_is_the_predicted_reward,
     leave_one_out_errors_are_there_for_every_output,
     learned_noise_is_there_for_every_output,
     an_outlook_begins_with_the_deviations_and_an_answer_lowers_them,

@@ -49,3 +49,7 @@ def test_what_is_unknown_or_set_wrong_is_refused(choice, said):
 
 def test_names_are_listed():
     assert MODELS.names[0] == "gaussian_process"
+
+
+def test_a_stored_surrogate_of_a_removed_family_says_what_takes_its_place():
+    assert str(MODELS.lack(Choice("selected"))).startswith("the model family 'selected', which was removed: name")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -22,16 +21,15 @@ from surrogym_server.models.abilities import (
     OutputOutlook,
     PathOutlook,
     PredictedSteps,
-    RewardOfStep,
 )
 from surrogym_server.models.bayesian_last_layer.lookahead import LayerAlongPaths, LayerOutlook
 from surrogym_server.models.bayesian_last_layer.regression import Regression
 from surrogym_server.models.ensemble.stepping import SteppedInBlocks, drawn_member
-from surrogym_server.tensors import cached, in_blocks
+from surrogym_server.tensors import cached
 
 
 @dataclass(frozen=True)
-class BayesianLastLayerModel(SteppedInBlocks, LeaveOneOut, LearnedNoise, Lookahead, RewardOfStep, Differentiable):
+class BayesianLastLayerModel(SteppedInBlocks, LeaveOneOut, LearnedNoise, Lookahead, Differentiable):
     """K members, each with a posterior of its last layers' weights. A drawn function is a member and its weights."""
 
     rows = 2_048
@@ -56,12 +54,6 @@ class BayesianLastLayerModel(SteppedInBlocks, LeaveOneOut, LearnedNoise, Lookahe
         if self.reward is not None:
             weights.append(self.reward.drawn(last, number.long()))
         return torch.cat([number[:, None], *weights], 1)
-
-    def reward_of_step(
-        self, q: Tensor, u: Tensor, q_next: Tensor, *, paths: Tensor | None = None, deviation: bool = False
-    ) -> tuple[Tensor, Tensor | None]:
-        reward, spread = in_blocks(self.rows, partial(self._rewards, deviation), q, u, q_next, paths)
-        return reward, spread if deviation else None
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         change = self.transitions.means(self._inputs.of_transition(q, u))

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.step_rules import paid
-from surrogym_server.models.abilities import Differentiable, LearnedNoise, RewardOfStep
+from surrogym_server.models.abilities import Differentiable, LearnedNoise
 from surrogym_server.models.ensemble.networks import Networks, bounded
 from surrogym_server.models.ensemble.stepping import SteppedInBlocks, between, drawn_member
 from surrogym_server.models.port import A
-from surrogym_server.tensors import cached, in_blocks
+from surrogym_server.tensors import cached
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Regression:
 
 
 @dataclass(frozen=True)
-class NetworkEnsembleModel(SteppedInBlocks, RewardOfStep, LearnedNoise, Differentiable):
+class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise, Differentiable):
     """K members. The mean is the members' mean, and the deviation that between members. The noise of a transition
     depends on the state; the reward has none, and models of older files have none at all."""
 
@@ -80,18 +80,6 @@ class NetworkEnsembleModel(SteppedInBlocks, RewardOfStep, LearnedNoise, Differen
     def draw(self, noise: Tensor) -> Tensor:
         """Draw functions. A function is a member, chosen with equal probability, and is given by its number."""
         return drawn_member(noise, self.transitions.networks.members)
-
-    def reward_of_step(
-        self, q: Tensor, u: Tensor, q_next: Tensor, *, paths: Tensor | None = None, deviation: bool = False
-    ) -> tuple[Tensor, Tensor | None]:
-        member = None if paths is None else paths[:, 0].long()
-
-        def judged(q: Tensor, u: Tensor, q_next: Tensor, member: Tensor | None) -> tuple[Tensor, Tensor]:
-            rewards = self._rewards(q, u, q_next)
-            return _chosen(rewards, member), between(rewards).sqrt()
-
-        reward, spread = in_blocks(self.rows, judged, q, u, q_next, member)
-        return reward, spread if deviation else None
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         change = self.transitions(self._inputs.of_transition(q, u)).mean(0)

@@ -29,7 +29,6 @@ from surrogym_server.models.abilities import (
     PathOutlook,
     PredictedSteps,
     RewardEdges,
-    RewardOfStep,
     RewardPeaks,
     SampledFunctions,
     UncertainHyperparameters,
@@ -62,7 +61,6 @@ class GaussianProcessModel(
     LearnedNoise,
     SampledFunctions,
     Lookahead,
-    RewardOfStep,
     RewardEdges,
     RewardPeaks,
     Differentiable,
@@ -142,11 +140,6 @@ class GaussianProcessModel(
         reward_deviation: bool = False,
     ) -> Transition:
         return self._predictor.transition(q, u, None, process, paths, deviations, reward_deviation)
-
-    def reward_of_step(
-        self, q: Tensor, u: Tensor, q_next: Tensor, *, paths: Tensor | None = None, deviation: bool = False
-    ) -> tuple[Tensor, Tensor | None]:
-        return self._predictor.reward_of_step(q, u, q_next, paths, deviation)
 
     @property
     def uncertain_functions(self) -> FunctionDraws:

@@ -63,21 +63,6 @@ class Predictor:
         reward, _ = self._rewarded(q, u, q_next, mean[:, -1])
         return mean[:, list(self._columns)], q_next, reward
 
-    def reward_of_step(
-        self, q: Tensor, u: Tensor, q_next: Tensor, paths: Tensor | None, deviation: bool
-    ) -> tuple[Tensor, Tensor | None]:
-        """Reward (m,) of steps from q (m, C) under u (m, F) to q_next (m, C), and its deviation (m,) if requested."""
-        first, _, after = self._groups
-        group, state = (first, q) if after is None else (after, q_next)
-        wanted = (self._reward_column,) if deviation else ()
-
-        def predicted(state: Tensor, u: Tensor, paths: Tensor | None) -> tuple[Tensor, Tensor]:
-            return group.predict(group.encoder(state, u), wanted, None, None, paths)
-
-        mean, spread = in_blocks(group.serving.rows, predicted, state, u, paths)
-        reward, edges = self._rewarded(q, u, q_next, mean[:, -1])
-        return reward, self._reward_spread(mean[:, -1], spread[:, -1], edges) if deviation else None
-
     @cached_property
     def path_size(self) -> int:
         """Number of weights of a drawn function, W."""

@@ -1,0 +1,27 @@
+"""Names that earlier versions knew, each with one sentence about what takes its place.
+
+Specifications, files and scripts keep such names. Code that refuses an unknown name asks here, so its message also
+says what to do instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+REMOVED: Mapping[str, Mapping[str, str]] = {
+    "model": {
+        "selected": "name the family itself, such as 'gaussian_process' or 'ensemble'",
+    },
+}
+
+
+def instead_of(kind: str, name: str) -> str | None:
+    """Return what takes the place of a removed name of a kind, such as "model"; None if it was never known."""
+    named = (instead for removed, instead in REMOVED.get(kind, {}).items() if removed.casefold() == name.casefold())
+    return next(named, None)
+
+
+def remark(kind: str, name: str) -> str:
+    """Return the end of a message "expected ..., got NAME": "; NAME was removed: ...", or nothing."""
+    instead = instead_of(kind, name)
+    return "" if instead is None else f"; {name!r} was removed: {instead}"
