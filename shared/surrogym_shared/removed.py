@@ -10,6 +10,7 @@ from collections.abc import Mapping
 
 REMOVED: Mapping[str, Mapping[str, str]] = {
     "model": {
+        "bayesian_last_layer": "use 'gaussian_process' for few real steps, 'ensemble' for contacts and many steps",
         "selected": "name the family itself, such as 'gaussian_process' or 'ensemble'",
     },
 }

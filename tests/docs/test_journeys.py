@@ -86,7 +86,6 @@ OTHERWISE = {
     "docs/how-to/ray.md": "tests/cli/test_sampling_on_ray.py reads such a runtime environment",
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
     "docs/how-to/work.md": "tests/work and tests/cli/test_jobs.py run its commands",
-    "docs/decisions/0080-bayesian-last-layers.md": "test_benchmarks imports its benchmarks",
     "docs/results/efficiency.md": "tests/cli runs its studies, in short",
     "docs/results/fresh-seeds.md": "tests/cli runs its studies, in short",
     "docs/results/fastppo.md": "tests/cli runs its studies, in short",

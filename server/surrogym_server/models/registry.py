@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from surrogym_server.models.bayesian_last_layer import BayesianLastLayers
 from surrogym_server.models.ensemble import NetworkEnsembles
 from surrogym_server.models.gaussian_process import GaussianProcesses
 from surrogym_server.models.port import Learner
@@ -15,7 +14,6 @@ BUILT_IN: dict[str, type[Learner] | str] = {
     GAUSSIAN_PROCESS: GaussianProcesses,
     SPARSE_GAUSSIAN_PROCESS: SparseGaussianProcesses,
     "ensemble": NetworkEnsembles,
-    "bayesian_last_layer": BayesianLastLayers,
 }
 
 MODELS: Registry[Learner] = Registry("model", "surrogym.models", Learner, BUILT_IN, noun="model family")

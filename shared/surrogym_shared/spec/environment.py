@@ -61,8 +61,7 @@ class Design(Frozen):
     way. A package on the server may add others.
 
     ``model``: family of models: ``gaussian_process``, the default, ``sparse_gaussian_process`` for thousands of steps,
-    ``ensemble`` (of networks), ``bayesian_last_layer`` (networks with a Bayesian last layer), or one from a package on
-    the server.
+    ``ensemble`` (of networks), or one from a package on the server.
 
     ``tolerance``: numerator of eq. 9 for outputs without a declared tolerance. ``relative`` is 5 % of the output's
     standard deviation over the initial design, ``raw`` is 1 in the output's own unit, as published.

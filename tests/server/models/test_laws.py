@@ -7,7 +7,6 @@ from surrogym_server.testing import LAWS_OF_MODELS, model_cases
 FAMILIES: dict[str, dict[str, float]] = {
     "gaussian_process": {},
     "ensemble": {"steps": 300},
-    "bayesian_last_layer": {"networks": 2, "iterations": 60},
 }
 THROUGH_INDUCING_POINTS = model_cases("sparse_gaussian_process", {"inducing": 40}, 200)  # fewer samples are exact
 CASES = {f"{family}, {case}": case for family, own in FAMILIES.items() for case in model_cases(family, own)}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,12 +16,39 @@ from surrogym_server.models.ensemble.inputs import Inputs
 from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Noise, Regression
 from surrogym_server.models.ensemble.networks import Networks
 from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel
-from surrogym_server.models.stored_networks import Header, checked_header, only_label, require_shapes
 
 NOISELESS, FORMAT = 1, 2  # models of the versions before noise was learned are written as they were read
 TRANSITIONS, REWARD, ENDING = "transitions", "reward", "ending"
 MAX_MEMBERS, MAX_UNITS = 16, 128
 Arrays = Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Header:
+    """Header of a file.
+
+    Attributes:
+        format: of the arrays.
+        terminal_reward: added on a step that ends an episode.
+        samples, digest: of what the model has learned from.
+        label: the only label of an ending, if there is one; not checked.
+    """
+
+    format: int
+    terminal_reward: float
+    samples: int
+    digest: str
+    label: object
+
+    def as_stored(self, definition: EnvironmentDefinition) -> dict[str, Any]:
+        return {
+            "format": self.format,
+            "outputs": list(definition.outputs),
+            "terminal_reward": self.terminal_reward,
+            "samples": self.samples,
+            "digest": self.digest,
+            "ending": self.label,
+        }
 
 
 class NetworkEnsembleCodec(ModelCodec):
@@ -38,7 +67,7 @@ class NetworkEnsembleCodec(ModelCodec):
         return StoredModel(header.as_stored(model.definition), tensors)
 
     def decode(self, definition: EnvironmentDefinition, stored: StoredModel) -> NetworkEnsembleModel:
-        return _checked(definition, stored.tensors, checked_header(definition, stored, (NOISELESS, FORMAT)))
+        return _checked(definition, stored.tensors, _checked_header(definition, stored, (NOISELESS, FORMAT)))
 
 
 def _checked(definition: EnvironmentDefinition, arrays: Arrays, header: Header) -> NetworkEnsembleModel:
@@ -59,7 +88,7 @@ def _checked(definition: EnvironmentDefinition, arrays: Arrays, header: Header) 
         ending = (
             _networks(ENDING, arrays, inputs.of_end(q).shape[1], 1, quadratic=False)
             if networks
-            else only_label(header.label)
+            else _only_label(header.label)
         )
     return NetworkEnsembleModel(
         definition, transitions, reward, ending, header.terminal_reward, header.samples, header.digest
@@ -79,7 +108,7 @@ def _arrays(name: str, networks: Networks) -> dict[str, Tensor]:
 
 def _regression(name: str, arrays: Arrays, inputs: int, outputs: int, *, quadratic: bool) -> Regression:
     centre, scale = arrays[f"{name}.centre"], arrays[f"{name}.scale"]
-    require_shapes(name, {"centre": centre, "scale": scale}, {"centre": (outputs,), "scale": (outputs,)})
+    _require_shapes(name, {"centre": centre, "scale": scale}, {"centre": (outputs,), "scale": (outputs,)})
     if bool((scale < 0).any()):
         raise InvalidInput(f"{name}: expected scales of at least 0, got {float(scale.min()):g}")
     return Regression(_networks(name, arrays, inputs, outputs, quadratic=quadratic), centre, scale)
@@ -87,7 +116,7 @@ def _regression(name: str, arrays: Arrays, inputs: int, outputs: int, *, quadrat
 
 def _noise(name: str, arrays: Arrays, inputs: int, outputs: int) -> Noise:
     size = arrays[f"{name}.size"]
-    require_shapes(name, {"size": size}, {"size": (outputs,)})
+    _require_shapes(name, {"size": size}, {"size": (outputs,)})
     if bool((size < 0).any()):
         raise InvalidInput(f"{name}: expected sizes of at least 0, got {float(size.min()):g}")
     return Noise(_networks(name, arrays, inputs, outputs, quadratic=False), size)
@@ -106,5 +135,40 @@ def _networks(name: str, arrays: Arrays, d: int, p: int, *, quadratic: bool) -> 
         "second_bias": (k, 1, h),
         "last": (k, h, p),
     }
-    require_shapes(name, vars(networks), shapes)
+    _require_shapes(name, vars(networks), shapes)
     return networks
+
+
+def _checked_header(definition: EnvironmentDefinition, stored: StoredModel, formats: tuple[int, ...]) -> Header:
+    """The header of a model of one of some formats, the newest last, after a check of all numbers.
+
+    Raises:
+        InvalidInput: another format or other outputs, or numbers that no fit gives.
+    """
+    header, outputs = stored.header, tuple(stored.header["outputs"])
+    if header["format"] not in formats or outputs != definition.outputs:
+        raise InvalidInput(
+            f"expected a model of format {formats[-1]} with outputs {definition.outputs}, "
+            f"got format {header['format']!r} with {outputs}"
+        )
+    terminal_reward, samples = float(header["terminal_reward"]), int(header["samples"])
+    if not math.isfinite(terminal_reward) or samples < 1:
+        raise InvalidInput(f"expected a finite terminal reward and samples, got {terminal_reward} and {samples}")
+    for name, array in stored.tensors.items():
+        if array.dtype != torch.float64 or not bool(torch.isfinite(array).all()):
+            raise InvalidInput(f"expected finite numbers of torch.float64 as {name}, got {array.dtype}")
+    return Header(header["format"], terminal_reward, samples, str(header["digest"]), header["ending"])
+
+
+def _require_shapes(name: str, arrays: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise ``InvalidInput`` if an array of a part of a model has another shape."""
+    for part, shape in shapes.items():
+        if (got := tuple(arrays[part].shape)) != shape:
+            raise InvalidInput(f"{name}: expected {part} of shape {shape}, got {got}")
+
+
+def _only_label(label: object) -> float:
+    """The label of an ending whose samples have no other one. Raises ``InvalidInput`` if it is neither 0 nor 1."""
+    if label not in (0.0, 1.0):
+        raise InvalidInput(f"expected the only label of an ending to be 0 or 1, got {str(label)[:80]}")
+    return float(bool(label))
