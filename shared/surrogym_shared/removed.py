@@ -8,7 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+PLANNED = "leave it out for the default, 'integrated_variance'"
 REMOVED: Mapping[str, Mapping[str, str]] = {
+    "acquisition": {
+        "barl": PLANNED,
+        "tip": PLANNED,
+        "opax": PLANNED,
+    },
+    "arm": {
+        "barl": "use 'no_loop'",
+    },
     "model": {
         "bayesian_last_layer": "use 'gaussian_process' for few real steps, 'ensemble' for contacts and many steps",
         "selected": "name the family itself, such as 'gaussian_process' or 'ensemble'",

@@ -41,7 +41,7 @@ def test_the_design_asks_by_an_installed_acquisition(plugin_server: ServerProces
         (
             "nobody",
             {},
-            "expected one of integrated_variance, variance, uncertainty_index, latin_hypercube, barl, tip, opax, ",
+            "expected one of integrated_variance, variance, uncertainty_index, latin_hypercube, ",
         ),
         ("broken", {}, f"package '{BROKEN}', entry point broken = 'nowhere_to_be_found:Missing'"),
         ("focused_variance", {"sigma": 1.0}, "expected a setting out of coordinate, near, width, got 'sigma'"),

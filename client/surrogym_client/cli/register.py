@@ -65,8 +65,7 @@ class DesignChoices:
         str | None,
         typer.Option(
             help="Criterion that chooses queries after the first model: integrated_variance, variance, "
-            "uncertainty_index, latin_hypercube, barl, tip, opax, or one that a package on the server adds. [default: "
-            "from the preset]"
+            "uncertainty_index, latin_hypercube, or one that a package on the server adds. [default: from the preset]"
         ),
     ] = None
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the design. [default: from the specification]")] = (

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-Acquisition = Literal["variance", "latin_hypercube", "barl"]
+Acquisition = Literal["variance", "latin_hypercube"]
 PAPERS_SHARE = 3  # the paper's initial designs were 40 of 125 and 50 of 120 steps, about a third
 
 
@@ -68,5 +68,4 @@ ARMS = {
         "paper, all queries from one Latin hypercube", preset="paper", acquisition="latin_hypercube"
     ),
     "oracle": Arm("the same PPO in the original environment, each training step a real one", original=True),
-    "barl": Arm("no_loop, each query by BARL's criterion: what tells most of the best trajectory", acquisition="barl"),
 }

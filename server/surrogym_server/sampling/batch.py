@@ -10,11 +10,11 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import distances
 from surrogym_server.environment.points import Points
-from surrogym_server.models.abilities import PredictedSteps
+from surrogym_server.models.abilities import OutputOutlook
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.acquisition import CandidateView, Outlooks, acquisition_of, value_of
+from surrogym_server.sampling.acquisition import CandidateView, acquisition_of, value_of
 from surrogym_server.sampling.candidates import Candidates
-from surrogym_server.sampling.outlook import AfterSteps, outlook_of
+from surrogym_server.sampling.outlook import outlook_of
 
 NEAR = 0.02  # queries closer than this, in deviations of the sampling range, are near-duplicates
 
@@ -27,7 +27,6 @@ def choose(
     wanted: Sequence[int],
     tolerances: Sequence[float],
     reserved: Tensor | None = None,
-    optimal: Sequence[PredictedSteps] = (),
 ) -> list[int]:
     """Choose a greedy batch: for each output in ``wanted`` the best candidate, given answers to those chosen before it.
 
@@ -39,7 +38,6 @@ def choose(
         wanted: for each query, the number of the output that it is chosen for.
         tolerances: (O,) in each output's unit.
         reserved: (m,) bool, the candidates from which the first query is chosen.
-        optimal: optimal trajectories, each (T, ...), that the acquisition reads.
 
     Returns:
         Indices of candidates; fewer than wanted if no distinct candidate is left.
@@ -50,7 +48,6 @@ def choose(
     reads = acquisition_of(acquisition).reads_reference
     reference = candidates.reference if reads else candidates.reference[:0]
     outlook = outlook_of(model, points, reference, assumed)
-    given = tuple(AfterSteps.of(model, steps).outlook(points, assumed) for steps in optimal)
     distance = nearest(definition, points, taken)
     picks: list[int] = []
     for column in wanted:
@@ -59,7 +56,7 @@ def choose(
             break
         value = distance
         if output is not None:
-            view = candidate_view(model, candidates, column, outlook, tolerances, distance, given)
+            view = candidate_view(model, candidates, column, output, tolerances[column], distance)
             value = value_of(acquisition, view)
         if reserved is not None and not picks and bool((allowed & reserved).any()):
             allowed &= reserved
@@ -68,8 +65,7 @@ def choose(
         pick = int(torch.where(allowed, value, -torch.inf).argmax())
         if allowed[pick]:
             picks.append(pick)
-            outlook = _observed(outlook, pick)
-            given = tuple(_observed(one, pick) for one in given)
+            outlook = tuple(None if output is None else output.observe(pick) for output in outlook)
             distance = torch.minimum(distance, nearest(definition, points, points[pick : pick + 1]))
     return picks
 
@@ -78,10 +74,9 @@ def candidate_view(
     model: DynamicsModel,
     candidates: Candidates,
     column: int,
-    outlook: Outlooks,
-    tolerances: Sequence[float],
+    outlook: OutputOutlook,
+    tolerance: float,
     distance: Tensor,
-    given: tuple[Outlooks, ...] = (),
 ) -> CandidateView:
     """Build an acquisition's view of the candidates, for the output ``column``, which has varied.
 
@@ -89,31 +84,20 @@ def candidate_view(
         model: the model.
         candidates: m points.
         column: number of the output.
-        outlook: of every output (O,) at the candidates.
-        tolerances: (O,) in each output's unit.
+        outlook: of the output at the candidates.
+        tolerance: in the output's unit.
         distance: (m,) to the queries so far.
-        given: outlooks as if one optimal trajectory had been answered too, one for each.
     """
-    output = outlook[column]
-    assert output is not None
     return CandidateView(
         model=model,
         points=candidates.points,
         output=column,
-        tolerance=tolerances[column],
-        deviation=output.deviation,
+        tolerance=tolerance,
+        deviation=outlook.deviation,
         distance=distance,
         log_probability=candidates.log_p,
-        _reduction=lambda: output.reduction(candidates.weights),
-        tolerances=tuple(tolerances),
-        _outlook=outlook,
-        _given_optimal=given,
+        _reduction=lambda: outlook.reduction(candidates.weights),
     )
-
-
-def _observed(outlook: Outlooks, pick: int) -> Outlooks:
-    """Outlook of every output after the candidate ``pick`` was answered."""
-    return tuple(None if output is None else output.observe(pick) for output in outlook)
 
 
 def nearest(definition: EnvironmentDefinition, points: Points, taken: Points) -> Tensor:

@@ -16,7 +16,6 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.abilities import PredictedSteps
 from surrogym_server.models.guard import learn, plugin_calls, require_deviations
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import acquisition_of
@@ -27,7 +26,6 @@ from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.excursions import excursion
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.sampling.noise import SLACK, established_noise, to_repeat, widened
-from surrogym_server.sampling.optimal import optimal_trajectories
 from surrogym_server.sampling.peaks import highest
 from surrogym_server.sampling.prequential import Predictions, from_pairs, pairs_of, scores_of
 from surrogym_server.sampling.rollouts import Aim, Rollout, first_rollouts, plan_round
@@ -145,22 +143,19 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     sure = verdict == "ready"
     testing = sure and _is_untested(definition, samples, state)
     verdict = "continue" if testing else verdict
-    optimal = _optimal(learned.model, state.round) if verdict == "continue" or request.extra else ()
     candidates, reserved = judged.candidates, judged.reserved
     chosen, rollouts = candidates.points[:0], tuple[Rollout, ...]()
     if definition.max_rollout is None:
         chosen = _repeated(learned.model, samples, usual, verdict, request)
         if not len(chosen):
-            chosen = _choose(
-                learned.model, samples, candidates, confidences, tolerances, verdict, request, reserved, optimal
-            )
+            chosen = _choose(learned.model, samples, candidates, confidences, tolerances, verdict, request, reserved)
     else:
         rng = _rng(definition, f"rollouts {state.round}")
         if testing:
             rollouts = _excursion(learned.model, samples, request, rng)
         else:
             ends = reserved is not None
-            rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, ends, optimal)
+            rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, ends)
     if verdict == "continue" and not len(chosen) and not rollouts:
         verdict = "over_budget"  # the rest of the budget is pending, or no distinct query is left
     ended = now if verdict != "continue" and not len(chosen) and not rollouts else ()
@@ -287,7 +282,6 @@ def _choose(
     verdict: Verdict,
     request: Request,
     reserved: Tensor | None,
-    optimal: Sequence[PredictedSteps],
 ) -> Points:
     """Choose one query for each output below its target, the least confident first. The first query is a
     reserved one."""
@@ -297,7 +291,7 @@ def _choose(
     else:
         wanted = [below[i % len(below)] for i in range(request.extra)]
     taken = Points.joined([Points(samples.q, samples.u), request.pending])
-    return candidates.points[choose(model, candidates, taken, request.pending, wanted, tolerances, reserved, optimal)]
+    return candidates.points[choose(model, candidates, taken, request.pending, wanted, tolerances, reserved)]
 
 
 def _plan(
@@ -309,7 +303,6 @@ def _plan(
     request: Request,
     rng: np.random.Generator,
     ending: bool,
-    optimal: Sequence[PredictedSteps],
 ) -> tuple[Rollout, ...]:
     """Plan rollouts for the outputs below their target, with a quarter as many real steps as there are samples.
 
@@ -329,18 +322,8 @@ def _plan(
         )
     longest = model.definition.max_rollout or 1
     ended = bool(samples.terminated.any())
-    aim = Aim(below, tolerances, longest, request.snapshots, request.states, ending, ended, optimal)
+    aim = Aim(below, tolerances, longest, request.snapshots, request.states, ending, ended)
     return tuple(plan_round(model, aim, steps, request.pending_rollouts, rng))
-
-
-def _optimal(model: DynamicsModel, round_: int) -> tuple[PredictedSteps, ...]:
-    """Optimal trajectories, if the acquisition reads any."""
-    acquisition = acquisition_of(model.definition.design.acquisition)
-    if not acquisition.trajectories:
-        return ()
-    with plugin_calls(model.definition):
-        rng = _rng(model.definition, f"optimal {round_}")
-        return optimal_trajectories(model, acquisition.trajectories, acquisition.horizon, rng)
 
 
 def _is_untested(definition: EnvironmentDefinition, samples: Samples, state: DesignState) -> bool:

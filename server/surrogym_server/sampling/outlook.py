@@ -40,33 +40,6 @@ def as_if_answered(model: DynamicsModel, steps: PredictedSteps) -> DynamicsModel
 
 
 @dataclass(frozen=True)
-class AfterSteps:
-    """What a model would know after some predicted steps (k, ...). Without ``Lookahead`` they count by distance."""
-
-    model: DynamicsModel  # after the steps, if its family has the ability
-    steps: PredictedSteps  # (k, ...)
-
-    @classmethod
-    def of(cls, model: DynamicsModel, steps: PredictedSteps) -> AfterSteps:
-        return cls(as_if_answered(model, steps), steps)
-
-    def outlook(self, candidates: Points, assumed: Points) -> tuple[OutputOutlook | None, ...]:
-        """Outlook of every output at m candidates, after the queries ``assumed`` are answered too."""
-        if offers(self.model, Lookahead) is None:
-            assumed = Points.joined([assumed, Points(self.steps.q, self.steps.u)])
-        return outlook_of(self.model, candidates, candidates[:0], assumed)
-
-    def along(self, steps: PredictedSteps, column: int) -> PathOutlook | None:
-        """Outlook of the output ``column`` along further steps (b, T, ...)."""
-        outlook = path_outlook(self.model, steps, column)
-        if not isinstance(outlook, IndependentSteps):
-            return outlook
-        flat = steps.flat
-        told = _told(self.model.definition, Points(flat.q, flat.u), Points(self.steps.q, self.steps.u))
-        return replace(outlook, spread=outlook.spread * (1 - told).prod(1).sqrt().reshape(outlook.spread.shape))
-
-
-@dataclass(frozen=True)
 class NearbyAnswers(OutputOutlook):
     """Outlook from distances alone. Two points at distance d, in deviations of the sampling range, have the correlation
     exp(-d^2 / 2), and an answer removes all variance at its point."""

@@ -4,8 +4,8 @@ A sequence begins at a reset, or at a snapshot: a state to which the environment
 
 The value of a sequence is the acquisition's value per real step: for most acquisitions, the information that a path
 gives about each output (``PathOutlook.information``). A step has weight 0 outside the sampling range and after the end
-of an episode. The weight falls with the deviation accumulated along a mean path, so a plan ends where it can't be
-predicted. Paths of drawn functions and optimistic ones (``forecast``) have no such weight.
+of an episode. The weight falls with the deviation accumulated along the path, so a plan ends where it can't be
+predicted.
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.distributions import scaling
 from surrogym_server.models.abilities import PathOutlook, PredictedSteps
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.acquisition import PathView, acquisition_of, path_value_of
+from surrogym_server.sampling.acquisition import PathView, path_value_of
 from surrogym_server.sampling.endings import edge_in_doubt, in_doubt
-from surrogym_server.sampling.forecast import Forecast, Move
 from surrogym_server.sampling.occupancy import log_occupancy
-from surrogym_server.sampling.outlook import AfterSteps, as_if_answered, path_outlook
+from surrogym_server.sampling.outlook import as_if_answered, path_outlook
 
 STARTS = 6  # drawn from the start distribution for each plan
 POPULATION = 48  # action sequences compared at once
@@ -50,7 +49,6 @@ class Aim:
     states: Tensor | None = None  # (v, C) visited by policies: information is weighted by their density
     ending: bool = False  # look first for an end of the episode, or an edge of the reward, if one is within reach
     ended: bool = False  # an end was seen, so a declared one need not be looked for
-    optimal: Sequence[PredictedSteps] = ()  # optimal trajectories, each (T, ...), that the acquisition reads
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,7 @@ class Rollout:
 
 @dataclass(frozen=True)
 class Paths:
-    """Predicted paths of b lanes over T steps."""
+    """Mean paths of b lanes over T steps."""
 
     q: Tensor  # (b, T, C)
     u: Tensor  # (b, T, F)
@@ -107,9 +105,7 @@ def plan_round(
 def plan_rollout(model: DynamicsModel, aim: Aim, rng: np.random.Generator) -> Rollout:
     """The sequence (T, F), 1 <= T <= ``aim.longest``, with the highest value per expected real step, from a reset or
     from the best snapshot. It is found by random shooting and by varying the best sequences."""
-    forecast = Forecast.of(model, acquisition_of(model.definition.design.acquisition), aim.optimal, rng)
-    worth = partial(_worth, model, aim, forecast)
-    return best_rollout(model.definition, worth, aim.longest, aim.snapshots, rng, forecast.controls)
+    return best_rollout(model.definition, partial(_worth, model, aim), aim.longest, aim.snapshots, rng)
 
 
 def best_rollout(
@@ -118,15 +114,13 @@ def best_rollout(
     longest: int,
     snapshots: Tensor | None,
     rng: np.random.Generator,
-    controls: int = 0,
 ) -> Rollout:
-    """The best sequence of at most ``longest`` actions, from a reset or from one of the snapshots (s, C). The sequences
-    that are valued have ``controls`` columns beside the actions, between -1 and 1."""
+    """The best sequence of at most ``longest`` actions, from a reset or from one of the snapshots (s, C)."""
     starts = start_points(definition, STARTS, rng)[None]
-    best, value = _search(definition, worth, longest, starts, POPULATION, rng, controls)
+    best, value = _search(definition, worth, longest, starts, POPULATION, rng)
     if snapshots is None or not len(snapshots):
         return best
-    returned, known = _search(definition, worth, longest, snapshots[:, None], POPULATION * STARTS, rng, controls)
+    returned, known = _search(definition, worth, longest, snapshots[:, None], POPULATION * STARTS, rng)
     return best if value >= known else returned
 
 
@@ -137,11 +131,10 @@ def _search(
     origins: Tensor,
     population: int,
     rng: np.random.Generator,
-    controls: int,
 ) -> tuple[Rollout, float]:
     """The best sequence from one of k origins, each of several equally likely states (k, s, C), and its value. The
     number of the origin is the rollout's snapshot if there is one state each."""
-    sequences = random_sequences(definition, population, longest, rng, controls)
+    sequences = random_sequences(definition, population, longest, rng)
     places = np.resize(rng.permutation(len(origins)), population)
     elite = population * ELITE // POPULATION
     value, length = worth(origins[places], sequences)
@@ -153,8 +146,7 @@ def _search(
         value, length = worth(origins[places], sequences)
     best = int(value.argmax())
     snapshot = int(places[best]) if origins.shape[1] == 1 else None
-    actions = sequences[best, : int(length[best]), : definition.action.size]
-    return Rollout(torch.from_numpy(actions), snapshot), float(value[best])
+    return Rollout(torch.from_numpy(sequences[best, : int(length[best])]), snapshot), float(value[best])
 
 
 def as_if_done(
@@ -181,25 +173,19 @@ def start_points(definition: EnvironmentDefinition, count: int, rng: np.random.G
     return torch.stack(columns, -1)
 
 
-def random_sequences(
-    definition: EnvironmentDefinition, count: int, length: int, rng: np.random.Generator, controls: int = 0
-) -> Sequences:
-    """Piecewise constant action sequences (count, length, F); holding times double from 1 to the whole length. The
-    last ``controls`` columns, beside the actions, are between -1 and 1."""
+def random_sequences(definition: EnvironmentDefinition, count: int, length: int, rng: np.random.Generator) -> Sequences:
+    """Piecewise constant action sequences (count, length, F); holding times double from 1 to the whole length."""
     times = 2 ** np.arange(int(np.log2(length)) + 1)
-    sequences = np.empty((count, length, definition.action.size + controls))
+    sequences = np.empty((count, length, definition.action.size))
     for sequence in sequences:
         hold = int(rng.choice(times))
-        values = _random_actions(definition, -(-length // hold), rng, controls)
+        values = _random_actions(definition, -(-length // hold), rng)
         sequence[:] = np.repeat(values, hold, axis=0)[:length]
     return sequences
 
 
-def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor, move: Move | None = None) -> Paths:
-    """Paths from starts (b, C) under actions (b, T, F): of the mean, or by ``move``, which also takes controls beside
-    the actions. Only the mean path drifts: the others are certain of where they lead."""
-    if move is not None:
-        return _moved_paths(model, starts, actions, move)
+def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Paths:
+    """Paths of the mean from starts (b, C) under actions (b, T, F)."""
     spread = [scaling(c.sampling)[1] for c in (model.definition.coordinates[i] for i in model.definition.moving)]
     q, running, drift = starts, starts.new_ones(len(starts)), starts.new_zeros(len(starts))
     steps: list[tuple[Tensor, ...]] = []
@@ -213,50 +199,32 @@ def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor, move: M
     return Paths(*(torch.stack(column, 1) for column in zip(*steps, strict=True)))
 
 
-def _moved_paths(model: DynamicsModel, starts: Tensor, controls: Tensor, move: Move) -> Paths:
-    q, running = starts, starts.new_ones(len(starts))
-    steps: list[tuple[Tensor, ...]] = []
-    for control in controls.unbind(1):
-        q_next = move(q, control).q_next
-        still = running * ~model.terminated(q_next)
-        action = control[:, : model.definition.action.size]
-        steps.append((q, action, q_next, running, 1 - still, torch.zeros_like(running)))
-        q, running = q_next, still
-    return Paths(*(torch.stack(column, 1) for column in zip(*steps, strict=True)))
-
-
-def path_values(model: DynamicsModel, aim: Aim, paths: Paths, optimal: Sequence[AfterSteps] = ()) -> Tensor:
-    """The acquisition's value of each beginning of paths (b, T), summed over the outputs of the aim: (b, T).
-    ``optimal`` is what the model would know after each optimal trajectory."""
+def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
+    """The acquisition's value of each beginning of paths (b, T), summed over the outputs of the aim: (b, T)."""
     acquisition = model.definition.design.acquisition
     weight = _weights(model.definition, aim, paths)
     total = torch.zeros_like(weight)
     steps = PredictedSteps(paths.q, paths.u, paths.q_next)
     for column in aim.columns:
         if (output := path_outlook(model, steps, column)) is not None:
-            known = tuple(after for one in optimal if (after := one.along(steps, column)) is not None)
-            total += path_value_of(acquisition, _view(output, weight * output.learns, aim, column, known))
+            total += path_value_of(acquisition, _view(output, weight * output.learns, aim.tolerances[column]))
     return total
 
 
-def _view(output: PathOutlook, weight: Tensor, aim: Aim, column: int, known: tuple[PathOutlook, ...] = ()) -> PathView:
+def _view(output: PathOutlook, weight: Tensor, tolerance: float) -> PathView:
     """Build an acquisition's view of one output along paths, whose steps have the weights (b, T)."""
-    tolerance = aim.tolerances[column]
-    return PathView(tolerance, weight, lambda: output.deviation, lambda: output.information(weight, tolerance), known)
+    return PathView(tolerance, weight, lambda: output.deviation, lambda: output.information(weight, tolerance))
 
 
-def _worth(
-    model: DynamicsModel, aim: Aim, forecast: Forecast, starts: Tensor, sequences: Sequences
-) -> tuple[Tensor, Tensor]:
+def _worth(model: DynamicsModel, aim: Aim, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
     """Information per expected real step of the best beginning of each sequence (k, T, F) from its states (k, s, C),
     and the length of that beginning, (k,)."""
-    starts = forecast.lanes(starts)
     count, lanes = starts.shape[:2]
     actions = torch.from_numpy(sequences).repeat_interleave(lanes, 0)
-    paths = predict_paths(model, starts.flatten(0, 1), actions, forecast.move(model, count, lanes))
+    paths = predict_paths(model, starts.flatten(0, 1), actions)
     gain = _endings(model, aim, paths) if aim.ending else paths.ended.new_zeros(1)
     if not bool((gain > DOUBTFUL).any()):
-        gain = path_values(model, aim, paths, forecast.optimal)
+        gain = path_values(model, aim, paths)
     gains, costs = (x.reshape(count, lanes, -1).mean(1) for x in (gain, paths.running.cumsum(1)))
     best = (gains / costs).max(1)
     return best.values, best.indices + 1
@@ -288,22 +256,14 @@ def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tenso
 
 
 def vary(definition: EnvironmentDefinition, sequences: Sequences, rng: np.random.Generator) -> None:
-    """Hold one stretch of each sequence (k, T, F) at another action, and at other controls beside it, in place."""
-    controls = sequences.shape[-1] - definition.action.size
+    """Hold one stretch of each sequence (k, T, F) at another action, in place."""
     for sequence in sequences:
         first, last = sorted(rng.integers(sequence.shape[0] + 1, size=2))
-        sequence[first : last + 1] = _random_actions(definition, 1, rng, controls)
+        sequence[first : last + 1] = _random_actions(definition, 1, rng)
 
 
-def _random_actions(
-    definition: EnvironmentDefinition, count: int, rng: np.random.Generator, controls: int = 0
-) -> Sequences:
-    """Random actions (count, F), and controls beside them. Half of the continuous ones lie at their limits, which reach
-    farthest."""
-    if controls:
-        actions, p = _random_actions(definition, count, rng), rng.random((count, controls))
-        extreme = rng.random((count, controls)) < 0.5
-        return np.concatenate([actions, 2 * np.where(extreme, p.round(), p) - 1], 1)
+def _random_actions(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> Sequences:
+    """Random actions (count, F). Half of the continuous ones lie at their limits, which reach farthest."""
     action = definition.action
     if action.nvec:
         return rng.integers(action.nvec, size=(count, action.size)).astype(np.float64)

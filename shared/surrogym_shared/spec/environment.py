@@ -56,9 +56,8 @@ class Design(Frozen):
     ``acquisition``: criterion that chooses the other queries, by name or with settings. ``integrated_variance``, the
     default's, takes the query that lowers the variance most, over the range and where policies went. ``variance`` takes
     the largest standard deviation. ``uncertainty_index`` is the paper's (eq. 12). ``latin_hypercube`` takes the whole
-    budget as one hypercube, whatever ``initial`` is; steps beyond the budget go to the largest gaps. ``barl`` and
-    ``tip`` take what tells most of the optimal trajectory, ``opax`` what tells most of the dynamics on an optimistic
-    way. A package on the server may add others.
+    budget as one hypercube, whatever ``initial`` is; steps beyond the budget go to the largest gaps. A package on
+    the server may add others.
 
     ``model``: family of models: ``gaussian_process``, the default, ``sparse_gaussian_process`` for thousands of steps,
     ``ensemble`` (of networks), or one from a package on the server.

@@ -13,11 +13,12 @@ from surrogym_server.environment.points import Points
 from surrogym_server.errors import ChoiceFailed
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.plugins import Choice
-from surrogym_server.sampling.acquisition import PathView, Variance, acquisition_of, path_value_of
+from surrogym_server.sampling.acquisition import ACQUISITIONS, PathView, Variance, acquisition_of, path_value_of
 from surrogym_server.sampling.batch import NEAR, candidate_view, choose, nearest
 from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.confidence import deviations
 from surrogym_server.sampling.outlook import outlook_of
+from surrogym_server.sampling.rollouts import Aim, path_values, predict_paths
 
 TOLERANCES = (0.01, 0.02, 0.1)
 CRITERIA = ("uncertainty_index", "variance", "integrated_variance")
@@ -39,8 +40,27 @@ def value(model: GaussianProcessModel, candidates: Candidates, criterion: str, c
     points = candidates.points
     outlook = outlook_of(model, points, candidates.reference, points[:0])
     distance = torch.ones(len(points), dtype=torch.float64)
-    view = candidate_view(model, candidates, column, outlook, TOLERANCES, distance)
+    output = outlook[column]
+    assert output is not None
+    view = candidate_view(model, candidates, column, output, TOLERANCES[column], distance)
     return acquisition_of(Choice(criterion)).value(view)
+
+
+@pytest.mark.parametrize("name", ACQUISITIONS.names)
+def test_every_acquisition_keeps_the_laws(model, candidates, name):
+    """Pure, one finite value for each candidate and beginning of a path, no decrease along a path."""
+    kept = candidates.points.q.clone()
+    first, again = (value(model, candidates, name, 1) for _ in range(2))
+    assert first.shape == (len(kept),)
+    assert bool(first.isfinite().all())
+    assert torch.equal(first, again)
+    assert torch.equal(candidates.points.q, kept)
+    asking, actions = by(model, name), candidates.points.u[:5][None]
+    paths = predict_paths(asking, kept[:1], actions)
+    along = path_values(asking, Aim((0, 1), TOLERANCES, longest=5), paths)
+    assert along.shape == (1, 5)
+    assert bool(along.isfinite().all())
+    assert bool((along.diff(dim=1) >= -1e-9).all())
 
 
 def test_the_index_is_uncertainty_times_probability(model, candidates):

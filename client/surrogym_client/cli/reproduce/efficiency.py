@@ -59,9 +59,9 @@ def command(
 
     The folder --out gets rows.csv, efficiency.md and a picture of each task. A run that has a row in rows.csv is not
     repeated, so the same command continues after Ctrl-C. An arm is a way to choose real steps: default, no_symmetry,
-    declared_starts, no_loop, variance, latin_hypercube, barl, paper, paper_hypercube or oracle;
+    declared_starts, no_loop, variance, latin_hypercube, paper, paper_hypercube or oracle;
     docs/results/efficiency.md explains each. --arms study runs default on every task, latin_hypercube and paper on
-    four of them, and the other arms but barl on the same four with half of the seeds.
+    four of them, and the other arms on the same four with half of the seeds.
 
     Example: surrogym reproduce efficiency --seeds 10 --jobs 2 --out runs/efficiency
 
@@ -147,6 +147,7 @@ def names_of(what: str, given: str, known: Iterable[str], *words: str) -> list[s
         CommandError: a name is not known.
     """
     from surrogym_client.cli.errors import CommandError
+    from surrogym_shared.removed import remark
 
     if given == "all":
         return list(known)
@@ -154,6 +155,7 @@ def names_of(what: str, given: str, known: Iterable[str], *words: str) -> list[s
     if unknown := [name for name in names if name not in known]:
         raise CommandError(
             f"unknown {what} {unknown[0]!r}: expected {', '.join(('all', *words))}, or some of {', '.join(known)}"
+            f"{remark(what, unknown[0])}"
         )
     return names
 

@@ -55,7 +55,7 @@ def command(
 
     The folder --out gets points.csv, peers.md and a picture of each task. A finished run is not repeated, so the same
     command continues after Ctrl-C. Runs with other settings need another --out. docs/results/peers.md has the rules.
-    The methods default, latin_hypercube and barl are ours; their runs come from files of rows, which surrogym
+    The methods default and latin_hypercube are ours; their runs come from files of rows, which surrogym
     reproduce efficiency writes.
 
     Example: surrogym reproduce peers --tasks pendulum --methods sac,ppo --seeds 3

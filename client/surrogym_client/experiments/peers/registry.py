@@ -10,7 +10,7 @@ from surrogym_client.experiments.tasks import EVERY_TASK, DemoTask, Target
 from surrogym_client.original.loading import has_specification
 from surrogym_shared.spec import EnvironmentSpec
 
-OURS = ("default", "latin_hypercube", "barl")  # arms of the efficiency study
+OURS = ("default", "latin_hypercube")  # arms of the efficiency study
 CORE = ("pendulum", "cartpole", "swingup", "acrobot")
 SHARE, LEAST = 10, 1_000  # a peer's real steps: this many times ours, and at least as many
 OWN_BUDGET = 100  # real steps of ours for a task that is none of the demo

@@ -27,7 +27,6 @@ from surrogym_client.runtime.versions import commit, machine
 
 COMPARED = ("pendulum", "cartpole", "mountaincar", "swingup")  # tasks on which a study runs every arm
 EVERY_SEED = ("latin_hypercube", "paper")  # arms that it runs with as many seeds as the default
-OF_PEERS = "barl"  # an arm of the study of peers
 LOOK_SECONDS = 0.2
 ENDING_SECONDS = 30.0  # a demo ends its own processes first
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
@@ -109,7 +108,7 @@ def study(tasks: Sequence[str], seeds: Sequence[int], **chosen: Any) -> Iterator
     """The efficiency study of the documentation: the default on every task, a hypercube and the paper's preset on the
     tasks of ``COMPARED``, and there the other arms with the first half of the seeds. ``chosen`` as for ``cells``."""
     compared = [task for task in tasks if task in COMPARED]
-    others = [name for name, arm in ARMS.items() if name not in ("default", OF_PEERS, *EVERY_SEED) and not arm.access]
+    others = [name for name, arm in ARMS.items() if name not in ("default", *EVERY_SEED) and not arm.access]
     for place, seed in enumerate(seeds):
         yield from cells(tasks, ["default"], [seed], **chosen)
         yield from cells(compared, [*EVERY_SEED, *(others if 2 * place < len(seeds) else ())], [seed], **chosen)

@@ -19,7 +19,7 @@ from surrogym_client.experiments.reproduce.table import Group, column, grouped, 
 
 OF_ARMS = (
     *("#dd8452", "#da8bc3", "#64b5cd", "#4c72b0", "#55a868", "#8172b3"),
-    *("#ccb974", "#8c8c8c", "#937860", "#c9a66b", "#555555", "#c44e52"),
+    *("#ccb974", "#8c8c8c", "#937860", "#c9a66b", "#555555"),
 )
 COLOURS = dict(zip(ARMS, OF_ARMS, strict=True))
 SIZE = (6.0, 3.6)  # inches
