@@ -141,7 +141,7 @@ help:  ## This list
 	@echo "installing RLlib, TorchRL, tianshou, sb3-contrib, MLflow and Weights & Biases into .venv-extras"
 	@$(PYTHON) -m venv .venv-extras
 	@.venv-extras/bin/python -m pip install -qq --disable-pip-version-check --constraint constraints-extras.txt \
-	    --editable ".[train,torchrl,rllib,tianshou,contrib,trackers]"
+	    --editable ".[train,torchrl,rllib,contrib,trackers]" tianshou
 	@touch $@
 
 .venv-adapters: pyproject.toml constraints-adapters.txt | .venv/bin/python

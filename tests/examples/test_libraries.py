@@ -44,8 +44,8 @@ TIANSHOU_LANES = """
 import gymnasium
 import numpy as np
 import surrogym_client
-from surrogym_client.tianshou import SurrogateVectorEnv
 from tianshou.env import DummyVectorEnv
+from train_tianshou import SurrogateVectorEnv
 
 together = SurrogateVectorEnv(None, "pendulum", num_envs=3)
 apart = DummyVectorEnv([lambda: gymnasium.make("surrogym/Remote-v0", surrogate="pendulum")] * 3)
