@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 PLANNED = "leave it out for the default, 'integrated_variance'"
+TRUST_POLICY = "use --trust-policy, which reads pickled objects"
 REMOVED: Mapping[str, Mapping[str, str]] = {
     "acquisition": {
         "barl": PLANNED,
@@ -18,6 +19,10 @@ REMOVED: Mapping[str, Mapping[str, str]] = {
     "arm": {
         "barl": "use 'no_loop'",
     },
+    "option of audit": {"--trust": TRUST_POLICY},
+    "option of evaluate": {"--trust": TRUST_POLICY},
+    "option of export-policy": {"--trust": TRUST_POLICY},
+    "option of register": {"--teleport": "use --access any", "--no-teleport": "use --access reset"},
     "model": {
         "bayesian_last_layer": "use 'gaussian_process' for few real steps, 'ensemble' for contacts and many steps",
         "selected": "name the family itself, such as 'gaussian_process' or 'ensemble'",

@@ -49,12 +49,20 @@ def test_a_pickled_policy_is_refused_in_one_sentence(surrogym, tmp_path, mark, a
     assert ended.err.count("\n") == 1
 
 
-@pytest.mark.parametrize("flag", ["--trust-policy", "--trust"])
 @pytest.mark.parametrize("arguments", [EVALUATE, EXPORT])
-def test_a_pickled_policy_is_read_when_it_is_trusted(surrogym, tmp_path, mark, arguments, flag):
+def test_a_pickled_policy_is_read_when_it_is_trusted(surrogym, tmp_path, mark, arguments):
     gift(tmp_path / "policy.zip", mark)
-    assert surrogym(*arguments, flag).code == 1  # it is no policy after all
+    assert surrogym(*arguments, "--trust-policy").code == 1  # it is no policy after all
     assert mark.exists()
+
+
+@pytest.mark.parametrize("arguments", [EVALUATE, EXPORT])
+def test_the_trust_of_a_training_reads_no_pickled_policy(surrogym, tmp_path, mark, arguments):
+    gift(tmp_path / "policy.zip", mark)
+    ended = surrogym(*arguments, "--trust")
+    assert ended.code == 2
+    assert not mark.exists()
+    assert "'--trust' was removed: use --trust-policy" in ended.err
 
 
 @pytest.mark.parametrize("options", [(), ("--json",), ("--quiet",)])

@@ -11,6 +11,7 @@ from importlib.metadata import entry_points
 
 import typer
 
+from surrogym_client.cli.commands import Commands
 from surrogym_client.cli.errors import sentence
 from surrogym_shared.terminal import say
 
@@ -63,6 +64,7 @@ def build() -> typer.Typer:
     """Assemble all commands: the client's own, and those of other packages."""
     app = typer.Typer(
         name="surrogym",
+        cls=Commands,
         help="Learn a virtual environment from a handful of real steps, serve it, and train on it.",
         no_args_is_help=True,
         rich_markup_mode=None,

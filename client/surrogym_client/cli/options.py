@@ -66,7 +66,6 @@ TrustPolicy = Annotated[
     bool,
     typer.Option(
         "--trust-policy",
-        "--trust",
         help="Unpickle the objects in the policy file. This runs any code in the file. Policies of surrogym "
         "train don't need it.",
     ),

@@ -84,10 +84,6 @@ class DesignChoices:
             "that was visited and saved, or at a reset. reset: at a reset only. [default: from the specification]"
         ),
     ] = None
-    teleport: Annotated[
-        bool | None,
-        typer.Option("--teleport/--no-teleport", hidden=True, help="Older names of --access any and --access reset."),
-    ] = None
     max_rollout: Annotated[
         int | None,
         typer.Option(
@@ -243,8 +239,6 @@ def _specification(environment: str | None, spec: EnvironmentSpec | None, **choi
     from surrogym_client.original.loading import make, with_choices
 
     given = {key: value for key, value in choices.items() if value is not None}
-    if (teleport := given.pop("teleport", None)) is not None:
-        given.setdefault("access", "any" if teleport else "reset")
     try:
         if environment is not None:
             original = make(environment, spec=spec, **given)  # type: ignore[arg-type]
