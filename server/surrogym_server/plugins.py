@@ -10,7 +10,6 @@ from typing import Any, TypeVar, get_type_hints
 
 from surrogym_server.errors import InvalidSpec, SurrogymError
 from surrogym_shared import plugins
-from surrogym_shared.removed import instead_of
 
 T = TypeVar("T")
 TYPES: dict[Any, tuple[str, tuple[type, ...]]] = {  # of settings: in words, and the types in a specification
@@ -39,7 +38,7 @@ class Registry(plugins.Registry[T]):
             self.name_of(choice.name)
         except plugins.UnknownMember:
             why = self.why_broken(choice.name)
-            if why is None and (instead := instead_of(self.kind, choice.name)) is not None:
+            if why is None and (instead := self.instead_of(choice.name)) is not None:
                 return f"{what}, which was removed: {instead}"
             if why is None:
                 return f"{what}, which no installed package provides: install its package on the server and restart"

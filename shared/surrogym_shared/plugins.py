@@ -16,7 +16,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
 
-from surrogym_shared.removed import remark
+from surrogym_shared.removed import instead_of, remark
 
 T = TypeVar("T")
 MOST_CHARACTERS = 500  # most characters of the message of a package's exception
@@ -84,6 +84,10 @@ class Registry(Generic[T]):
     def why_broken(self, name: str) -> str | None:
         """Return why an entry point can't be used; None if it can, or if there is none of this name."""
         return next((why for known, why in self.broken.items() if known.casefold() == name.casefold()), None)
+
+    def instead_of(self, name: str) -> str | None:
+        """Return what takes the place of a member that an earlier version had; None if there was none of this name."""
+        return instead_of(self.kind, name)
 
     def name_of(self, name: str) -> str:
         """Return the registered spelling of a name. Other packages are loaded only if the name is not built in.
