@@ -41,6 +41,8 @@ def evaluation(id: int = 1, **fields: Any) -> wire.EvaluationDetail:
         "created_at": 0.0,
         "note": "declared starts",
         "declared": True,
+        "environment": "",
+        "own": True,
         "first_seed": SEED,
         "episodes": 100,
         "steps": 20_000,
@@ -295,6 +297,20 @@ def test_declared_starts_are_preferred_and_the_comparison_has_the_same(modelled:
     assert found is not None
     assert found.first_seed == SEED
     assert chosen_without(listed, wide) is None
+
+
+def test_episodes_in_another_environment_are_listed_apart(modelled: Known):
+    heavy = {"own": False, "environment": "maglev:Heavy"}
+    elsewhere, other = evaluation(8, mean=-3.7, **heavy), without(**heavy)
+    listed = policy(evaluations=[evaluation(1), elsewhere, other])
+    real = chosen_real(listed)
+    assert real is not None
+    assert real.id == 1
+    assert chosen_without(listed, real) is None
+    told_ = told(replace(modelled, policy=listed, real=evaluation()))
+    assert "in maglev:Heavy: declared starts 100 -3.7" in told_["What it gives"]
+    assert "in maglev:Heavy: declared starts (100 episodes)" in told_["What was not tested"]
+    assert chosen_real(policy(evaluations=[elsewhere])) is None
 
 
 @pytest.mark.parametrize(("value", "words"), [(1, "100 %"), (0.99999, "99.9 %"), (0.5, "50 %"), (0.0, "0 %")])

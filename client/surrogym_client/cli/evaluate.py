@@ -162,17 +162,38 @@ def command(
     judged = promise if _judges(settings.episodes) else None
     with kept(learning, policy, result, quiet=output.quiet) as steps:
         if stored := keeping.push and ledger is not None:
-            _keep(policy, reports, settings, quiet=output.quiet)
+            _keep(policy, reports, settings, _named(env, card), quiet=output.quiet)
         filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if keeping.video else None
         version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
         found = differences.between(ledger, service.server, token, result, settings, judged, steps, quiet=output.quiet)
-    summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference)}
+    summary = {
+        "policy": str(policy),
+        "environment": _named(env, card),
+        **_settings(settings),
+        **_summary(reports, beside.reference),
+    }
     summary |= {"promise_kept": _kept(judged, result), "version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
-    more = [*(found.in_words(card.spec) if found else []), *_why_not_judged(card, settings, result), *_repeated(result)]
+    more = [*_elsewhere(env, card), *(found.in_words(card.spec) if found else [])]
+    more += [*_why_not_judged(card, settings, result), *_repeated(result)]
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
     if steps is not None:
         steps.require_stored()
+
+
+def _named(env: str | None, card: PolicyCard) -> str:
+    """The name of the environment in which the episodes ran."""
+    return env or (card.spec.environment if card.spec else "")
+
+
+def _elsewhere(env: str | None, card: PolicyCard) -> list[str]:
+    """Say that the episodes ran in another environment than the policy's own. Nothing if that is not known."""
+    from surrogym_shared.environments import is_name, is_same
+
+    own = card.spec.environment if card.spec else ""
+    if env is None or not is_name(own) or is_same(env, own):
+        return []
+    return [f"these episodes ran in {env}, and the policy is for {own}: the server shows them apart"]
 
 
 def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Evaluation) -> list[str]:
@@ -238,7 +259,12 @@ def _reports(
 
 
 def _keep(
-    policy: Path, reports: Sequence[tuple[Controller, Evaluation]], settings: EvaluationSettings, *, quiet: bool
+    policy: Path,
+    reports: Sequence[tuple[Controller, Evaluation]],
+    settings: EvaluationSettings,
+    environment: str,
+    *,
+    quiet: bool,
 ) -> None:
     """Write the episodes to files beside the policy, from which they are sent to the server.
 
@@ -256,7 +282,7 @@ def _keep(
     paired = paired_start(reports[0][1], settings.episodes)
     try:
         noted = [
-            as_reported(result, settings, uuid4().hex, controller=controller, paired=paired)
+            as_reported(result, settings, uuid4().hex, environment=environment, controller=controller, paired=paired)
             for controller, result in reports
         ]
     except ValidationError as error:

@@ -232,7 +232,7 @@ def _words(name: str, policy: PolicyDetail) -> str:
     files = [f"{one.form} {one.bytes} bytes" if one.stored else f"{one.form} missing" for one in policy.files]
     lines.append(f"files: {', '.join(files) or 'none'}")
     if policy.evaluations:
-        heading = ("real episodes of", "starts", "episodes", "mean return (95 %)", "success", "promise kept")
+        heading = ("real episodes of", "environment", "starts", "episodes", "mean (95 %)", "success", "promise kept")
         lines.append(columns([heading, *map(_evaluation, policy.evaluations)]))
     else:
         lines.append(f"no real episodes yet; next: surrogym policy get {name}@{policy.version} --out policy.zip")
@@ -244,4 +244,5 @@ def _evaluation(one: EvaluationView) -> tuple[str | int, ...]:
 
     success = "-" if one.success_rate is None else f"{one.success_rate:.0%}"
     kept = {True: "yes", False: "no", None: "not judged"}[one.promise_kept]
-    return one.controller, one.note or "-", one.episodes, words_of_mean(one), success, kept
+    environment = "its own" if one.own else one.environment
+    return one.controller, environment, one.note or "-", one.episodes, words_of_mean(one), success, kept

@@ -225,9 +225,10 @@ def _environment(
 def _words_of_consent(name: str) -> str:
     """Say why an environment's name from a server is not enough, and with which option it is opened."""
     from surrogym_client.original.executables import is_executable
-    from surrogym_client.original.loading import env_option, opens
+    from surrogym_client.original.loading import env_option
+    from surrogym_shared.environments import is_name
 
-    if not is_executable(name) and opens(name):
+    if not is_executable(name) and is_name(name):
         return (
             f"the surrogate's environment {name!r} may run a file of yours, so its name has to come from you: "
             f"expected{env_option(name)}"

@@ -21,6 +21,7 @@ def as_reported(
     settings: EvaluationSettings,
     key: str,
     *,
+    environment: str = "",
     controller: wire.Controller = "policy",
     paired: int = 0,
 ) -> wire.AddEvaluation:
@@ -30,6 +31,7 @@ def as_reported(
         result: the episodes.
         settings: starts, perturbation and exploration of the episodes.
         key: idempotency key, so that the same evaluation is stored once.
+        environment: name of the environment in which the episodes ran; empty for the surrogate's own.
         controller: what chose the actions.
         paired: number of the episode to compare, see ``paired_start``.
     """
@@ -38,6 +40,7 @@ def as_reported(
         controller=controller,
         note=words_of(settings, result.varied),
         declared=settings.declared and not result.varied,
+        environment=environment,
         first_seed=settings.first_seed,
         returns=result.returns.tolist(),
         lengths=result.lengths.tolist(),

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any, Literal
 
 from surrogym_client.original.actions import require_same_action
-from surrogym_client.original.adapters import adapter_of, is_same, is_trusted, open_simulator
+from surrogym_client.original.adapters import adapter_of, is_trusted, open_simulator
 from surrogym_client.original.classic import TASKS
 from surrogym_client.original.errors import UnknownEnvironment, sentence
 from surrogym_client.original.executables import Executable, is_executable, open_executable
@@ -21,6 +21,7 @@ from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_client.original.protocol import LONGEST_EPISODE, Environment
 from surrogym_client.original.rollouts import answering
 from surrogym_client.original.simulator import Simulated
+from surrogym_shared.environments import is_name, is_same
 from surrogym_shared.spec import Access, BoxAction, EnvironmentSpec
 
 Preset = Literal["default", "paper"]
@@ -122,12 +123,7 @@ def env_option(name: str) -> str:
         return ""
     if is_executable(name):
         return " --env exec:COMMAND"
-    return f" --env {shlex.quote(name) if opens(name) else PLACEHOLDER}"
-
-
-def opens(name: str) -> bool:
-    """Whether a name may open an environment: an adapter's, a factory's or a program's. Others are mere words."""
-    return ":" in name or adapter_of(name) is not None
+    return f" --env {shlex.quote(name) if is_name(name) else PLACEHOLDER}"
 
 
 def sample_command(surrogate: str, environment: str) -> str:

@@ -75,7 +75,7 @@ def _result(known: Known) -> str:
     real = known.real
     if real is None:
         why = "There is no controller yet." if known.policy is None else "It has not been tested in reality."
-        return section("What it gives", paragraph(why))
+        return section("What it gives", paragraph(why) + _further(known))
     rows = [
         ("average return", mean(real)),
         ("episodes that succeeded", "no criterion was declared" if real.success_rate is None else successes(real)),
@@ -85,7 +85,7 @@ def _result(known: Known) -> str:
         ("real steps that this took", f"{real.steps:,}"),
     ]
     said = table(("", ""), rows, "In the original environment; in brackets, 95 % intervals")
-    return section("What it gives", said + _best_to_worst(known, real) + _video(known) + _further(known, real))
+    return section("What it gives", said + _best_to_worst(known, real) + _video(known) + _further(known))
 
 
 def _best_to_worst(known: Known, real: EvaluationDetail) -> str:
@@ -101,10 +101,11 @@ def _best_to_worst(known: Known, real: EvaluationDetail) -> str:
     return picture(svg(draw_episodes(spec, shown)), alt) + paragraph(f"{words} {turns(spec)}".rstrip())
 
 
-def _further(known: Known, real: EvaluationDetail) -> str:
-    """The policy's other real episodes, such as those from other starts; nothing without any."""
+def _further(known: Known) -> str:
+    """The policy's other real episodes, such as those in other environments; nothing without any."""
     evaluations = [] if known.policy is None else known.policy.evaluations
-    others = [one for one in evaluations if one.controller == "policy" and one.id != real.id]
+    shown = None if known.real is None else known.real.id
+    others = [one for one in evaluations if one.controller == "policy" and one.id != shown]
     if not others:
         return ""
     rows = [(starts_of(one), one.episodes, mean(one), successes(one)) for one in others]

@@ -30,15 +30,14 @@ def untested(known: Known) -> list[str]:
     if policy is None:
         return ["Everything: there is no controller yet."]
     if real is None:
-        return ["The controller itself: no real episode was run with it."]
+        return ["The controller itself: no real episode was run with it in its own environment."]
     found = []
     if real.episodes < FEW:
         said = f"{counted(real.episodes, 'episode')} say{'s' if real.episodes == 1 else ''} little of an average"
         found.append(f"Many starts: {said}; {FEW} or more would.")
-    own = [one for one in policy.evaluations if one.controller == "policy"]
     if not _other_starts(policy):
         found.append("Starts outside the declared ones.")
-    if not any("changed by" in one.note for one in own):
+    if not _other_machines(policy):
         found.append("Another unit of the machine, or a worn one: masses, lengths and limits were as they are.")
     limit = known.view.spec.time_limit
     if limit is not None:
@@ -98,7 +97,7 @@ def _tests(known: Known, policy: PolicyView, real: EvaluationView, run: str) -> 
         found.append(f"Compare it with the controller in use today: {run} --reference module:Class")
     if not _other_starts(policy):
         found.append(f"See how it does from other starts: {run} --wide")
-    if not any("changed by" in one.note for one in policy.evaluations):
+    if not _other_machines(policy):
         changed = f": {run} --perturb 0.1" if is_known(known.view.environment) else ", in a machine that you changed"
         found.append(f"Find out how much change of the machine it stands{changed}")
     return found
@@ -108,6 +107,12 @@ def _other_starts(policy: PolicyView) -> bool:
     """Whether the policy was tested from starts outside the declared ones."""
     own = [one.note for one in policy.evaluations if one.controller == "policy"]
     return any("anywhere" in note or "times as far" in note for note in own)
+
+
+def _other_machines(policy: PolicyView) -> bool:
+    """Whether the policy was tested in another environment than its own, or in a changed one."""
+    own = [one for one in policy.evaluations if one.controller == "policy"]
+    return any(not one.own or "changed by" in one.note for one in own)
 
 
 def _of_the_model(known: Known) -> list[str]:

@@ -36,7 +36,7 @@ class Known:
         samples: all real steps.
         server: its address and version.
         policy: the policy of the report; None if there is none.
-        real: its newest real episodes from the declared starts.
+        real: its newest real episodes in the surrogate's own environment from the declared starts.
         without: real episodes without the policy, from the same starts.
         reference: real episodes of a reference controller, from the same starts.
         video: its form and content, as a browser plays it; None: there is none.
@@ -120,18 +120,19 @@ def cuts_of(api: Api, known: Known) -> tuple[list[Cut], str]:
 
 
 def chosen_real(policy: PolicyView) -> EvaluationView | None:
-    """The newest evaluation of the policy from the declared starts, or else from other starts."""
-    own = [one for one in policy.evaluations if one.controller == "policy"]
+    """The newest evaluation of the policy in the surrogate's own environment: from the declared starts, or else from
+    others."""
+    own = [one for one in policy.evaluations if one.controller == "policy" and one.own]
     return next((one for one in reversed(own) if one.declared), own[-1] if own else None)
 
 
 def chosen_without(policy: PolicyDetail, real: EvaluationView | None) -> EvaluationView | None:
-    """The newest evaluation without the policy that has the same starts."""
+    """The newest evaluation without the policy in the same environment that has the same starts."""
     return _beside(policy, real, ("zero", "random"))
 
 
 def chosen_reference(policy: PolicyDetail, real: EvaluationView | None) -> EvaluationView | None:
-    """The newest evaluation of a reference controller that has the same starts."""
+    """The newest evaluation of a reference controller in the same environment that has the same starts."""
     return _beside(policy, real, ("reference",))
 
 
@@ -140,8 +141,9 @@ def _beside(
 ) -> EvaluationView | None:
     if real is None:
         return None
-    starts = (real.first_seed, real.note)
-    same = [one for one in policy.evaluations if one.controller in controllers and (one.first_seed, one.note) == starts]
+    starts = (real.own, real.first_seed, real.note)
+    among = [one for one in policy.evaluations if one.controller in controllers]
+    same = [one for one in among if (one.own, one.first_seed, one.note) == starts]
     return same[-1] if same else None
 
 

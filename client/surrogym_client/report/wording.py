@@ -44,8 +44,10 @@ def steps(count: int) -> str:
 
 
 def starts_of(evaluation: EvaluationView) -> str:
-    """The starts and the machine of some episodes, without the number of the first start."""
-    return evaluation.note.replace(f", from seed {evaluation.first_seed}", "") or "starts unknown"
+    """The starts and the machine of some episodes, without the number of the first start. The environment is named
+    unless it is the surrogate's own."""
+    said = evaluation.note.replace(f", from seed {evaluation.first_seed}", "") or "starts unknown"
+    return said if evaluation.own else f"in {evaluation.environment}: {said}"
 
 
 def original(environment: str) -> str:

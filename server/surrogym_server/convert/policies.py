@@ -10,6 +10,7 @@ from surrogym_server.storage.policies import EvaluationRecord, PolicyFile, Polic
 from surrogym_server.storage.records import JSON
 from surrogym_shared import wire
 
+OLDER: JSON = {"environment": "", "own": True}  # of evaluations that were stored before these fields existed
 CARD = "the card of a policy"  # name in the error if it is damaged
 
 
@@ -28,6 +29,7 @@ def episodes(body: wire.AddEvaluation) -> Episodes:
         body.controller,
         body.note,
         body.declared,
+        body.environment,
         body.first_seed,
         body.returns,
         body.lengths,
@@ -92,8 +94,8 @@ def _fields(record: PolicyRecord, card: wire.PushedCard) -> dict[str, Any]:
 
 
 def _evaluation(record: EvaluationRecord, card: wire.PushedCard) -> dict[str, Any]:
-    summary, promise = record.summary, card.promise
-    about = summary.get("controller") == "policy" and summary.get("declared")
+    summary, promise = {**OLDER, **record.summary}, card.promise
+    about = summary.get("controller") == "policy" and summary.get("declared") and summary["own"]
     judged = about and summary["episodes"] >= wire.FEWEST_TO_JUDGE
     kept = bool(summary["mean"] >= promise.low) if promise is not None and judged else None
     return {"id": record.id, "created_at": record.created_at, **summary, "promise_kept": kept}

@@ -4,14 +4,14 @@ import { number, percent, plural } from "/page/format.js";
 
 const newest = (evaluations, wanted) => evaluations.filter(wanted).at(-1) ?? null;
 
-/** The newest real episodes of a policy from the declared starts. */
-export const realOf = ({ evaluations }) => newest(evaluations, ({ controller, declared }) => controller === "policy" && declared);
+/** The newest real episodes of a policy in the surrogate's own environment from the declared starts. */
+export const realOf = ({ evaluations }) => newest(evaluations, ({ controller, declared, own }) => controller === "policy" && declared && own);
 
 /** The newest real episodes of other controllers from the same starts. */
 function besides(policy, controllers) {
   const real = realOf(policy);
-  return real && newest(policy.evaluations, ({ controller, first_seed: seed, note }) =>
-    controllers.includes(controller) && seed === real.first_seed && note === real.note);
+  return real && newest(policy.evaluations, ({ controller, first_seed: seed, note, own }) =>
+    own && controllers.includes(controller) && seed === real.first_seed && note === real.note);
 }
 
 export const withoutOf = (policy) => besides(policy, ["zero", "random"]);

@@ -58,8 +58,8 @@ export function policyList(name, spec, { role, refresh }) {
     const trusted = policy.trusted === null ? "Nobody checked whether the promise can be trusted." : `The promise was ${policy.trusted ? "" : "not "}trusted: ${policy.reason}.`;
     const parts = [h("p", {}, trusted)];
     if (policy.differs) parts.push(h("p", { class: "bad" }, `The policy was made for another specification, which differs in ${policy.differs}.`));
-    parts.push(table(`Real episodes of version ${policy.version}`, [["actions of", ""], ["starts", ""], ["episodes", "num"], ["mean return (95 %)", "num"], ["success", "num"], ["real steps", "num"], ["", ""]],
-      policy.evaluations.map((each) => [ACTING[each.controller], each.note || "–", each.episodes, meanWords(each), percent(each.success_rate), each.steps, episodesOf(policy, each)]), "No real episodes yet; run some with surrogym evaluate."));
+    parts.push(table(`Real episodes of version ${policy.version}`, [["actions of", ""], ["environment", ""], ["starts", ""], ["episodes", "num"], ["mean return (95 %)", "num"], ["success", "num"], ["real steps", "num"], ["", ""]],
+      policy.evaluations.map((each) => [ACTING[each.controller], each.own ? "its own" : each.environment, each.note || "–", each.episodes, meanWords(each), percent(each.success_rate), each.steps, episodesOf(policy, each)]), "No real episodes yet; run some with surrogym evaluate."));
     inside.replaceChildren(...parts, files(policy), naming(policy));
     if (detail.curve.length > 1) inside.append(...curve(detail.curve));
     const video = videoPart(`${url}/${policy.version}`, policy);
@@ -94,7 +94,7 @@ export function policyList(name, spec, { role, refresh }) {
   }
 
   async function episodes(policy, inside) {
-    const own = policy.evaluations.filter((each) => each.controller === "policy");
+    const own = policy.evaluations.filter((each) => each.controller === "policy" && each.own);
     const chosen = own.findLast((each) => each.declared) ?? own.at(-1);
     if (!chosen) return;
     const { traces, missing } = await call("GET", `${url}/${policy.version}/evaluations/${chosen.id}`);

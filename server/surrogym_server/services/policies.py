@@ -17,6 +17,7 @@ from surrogym_server.storage.policies import LATEST, EvaluationRecord, NewEvalua
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import JSON
 from surrogym_shared import intervals
+from surrogym_shared.environments import is_name, is_same
 
 MUST_AGREE = ("observation", "action")  # of two specifications: a policy's inputs and outputs
 
@@ -28,6 +29,7 @@ class Episodes:
     controller: str
     note: str
     declared: bool
+    environment: str
     first_seed: int
     returns: Sequence[float]
     lengths: Sequence[int]
@@ -114,7 +116,8 @@ class PolicyService:
         content = json.dumps(episodewise, separators=(",", ":")).encode()
         digest = hashlib.sha256(content).hexdigest()
         blob = self._storage.blobs.put(content)
-        new = NewEvaluation(key, _summary(episodes), len(content), digest, blob)
+        summary = {**_summary(episodes), "own": self._is_own(name, episodes.environment)}
+        new = NewEvaluation(key, summary, len(content), digest, blob)
         with self._removed_if_refused(blob):
             stored, created, freed = self._storage.policies.evaluate(name, version, new, self._most_bytes)
         self._changed(name, freed if created else (blob,))
@@ -178,6 +181,19 @@ class PolicyService:
             raise Damaged(f"{what} has changed since it was stored: its digest differs")
         return content
 
+    def _is_own(self, name: str, environment: str) -> bool:
+        """Whether a name means the surrogate's own environment.
+
+        A specification may call the environment by free text, which no name of an evaluation can equal. Then the name
+        in the surrogate's first evaluation is its own.
+        """
+        own = str(self._storage.surrogates.get(name).spec["environment"])
+        if not is_name(own):
+            known = (one for policy in self._storage.policies.list(name) for one in policy.evaluations)
+            named = [(one.id, one.summary["environment"]) for one in known if one.summary.get("environment")]
+            own = min(named)[1] if named else environment
+        return not environment or is_same(environment, own)
+
     def _difference(self, name: str, spec: JSON | None) -> str | None:
         """Name the part in which the specification of a card differs from the surrogate's."""
         own = self._complete(self._storage.surrogates.get(name).spec)
@@ -220,6 +236,7 @@ def _summary(episodes: Episodes) -> JSON:
         "controller": episodes.controller,
         "note": episodes.note,
         "declared": episodes.declared,
+        "environment": episodes.environment,
         "first_seed": episodes.first_seed,
         "episodes": len(returns),
         "steps": sum(episodes.lengths),

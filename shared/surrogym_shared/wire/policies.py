@@ -158,6 +158,11 @@ class AddEvaluation(Request):
         description="whether starts and machine are as the specification declares them; the promise is about those "
         "only",
     )
+    environment: Text = Field(
+        default="",
+        description="name of the environment in which the episodes ran, such as ``module:Class``; empty: the "
+        "surrogate's own",
+    )
     first_seed: Count = Field(description="reset seed of the first episode; each further episode has the next seed")
     returns: Annotated[list[Measured], Field(min_length=1, max_length=MAX_EPISODES)] = Field(
         description="return of each episode"
@@ -207,6 +212,11 @@ class EvaluationView(Reply):
     created_at: float = Field(description="when it was stored, in seconds since 1970, by the server's clock")
     note: str = Field(description="remark for people")
     declared: bool = Field(description="whether starts and machine are as the specification declares them")
+    environment: str = Field(description="name of the environment in which the episodes ran; empty: not known")
+    own: bool = Field(
+        description="whether that is the surrogate's own environment. If the surrogate names it by free text only, its "
+        "own is the one of its first evaluation"
+    )
     first_seed: int = Field(description="reset seed of the first episode")
     episodes: int = Field(description="number of episodes")
     steps: int = Field(description="number of real steps")
@@ -225,7 +235,7 @@ class EvaluationView(Reply):
     success_interval: Interval | None = Field(description="interval of the success rate")
     promise_kept: bool | None = Field(
         description="whether the mean return is at least the promise's lower end; null without a promise, if "
-        "the starts are not those of the promise, or with fewer than 30 episodes"
+        "the environment or the starts are not those of the promise, or with fewer than 30 episodes"
     )
 
 

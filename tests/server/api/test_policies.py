@@ -120,6 +120,30 @@ def test_an_evaluation_has_intervals_and_says_whether_the_promise_was_kept(api: 
     assert [one.id for one in policy.evaluations] == [said.id, worse.id, kept.id, wide.id]
 
 
+def test_only_episodes_in_the_own_environment_judge_a_promise(api: Api, surrogate: str, tmp_path: Path):
+    api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
+    many: dict[str, Any] = {"returns": [-180.0] * 30, "lengths": [200] * 30}
+    names = ("", "Pendulum-v1", "plants:Heavy")
+    said = [api.policies.evaluate(surrogate, 1, episodes(name or "own", environment=name, **many)) for name in names]
+    assert [(one.environment, one.own, one.promise_kept) for one in said] == [
+        ("", True, False),
+        ("Pendulum-v1", True, False),
+        ("plants:Heavy", False, None),
+    ]
+
+
+def test_the_own_environment_of_a_free_text_is_that_of_the_first_evaluation(api: Api, name: str, tmp_path: Path):
+    spec = pendulum().model_copy(update={"environment": "a pendulum"})
+    api.create_surrogate(name, spec)
+    try:
+        api.policies.push(name, card(), [], "zip", network_file(tmp_path))
+        names = ("plants:Own", "plants:Heavy", "plants:Own")
+        said = [api.policies.evaluate(name, 1, episodes(str(i), environment=one)) for i, one in enumerate(names)]
+        assert [one.own for one in said] == [True, False, True]
+    finally:
+        api.delete_surrogate(name)
+
+
 def test_fewer_than_30_episodes_do_not_judge_a_promise(api: Api, surrogate: str, tmp_path: Path):
     """Their mean is too uncertain. `surrogym evaluate` says so, and the server has to agree."""
     api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from importlib import import_module
-from pathlib import PurePath
 from typing import NamedTuple
 
 from pydantic import ValidationError
@@ -16,8 +15,8 @@ from pydantic import ValidationError
 from surrogym_client.original.errors import RAISED, UnknownEnvironment, sentence
 from surrogym_client.original.simulator import Simulator
 from surrogym_shared.checks import first_fault
+from surrogym_shared.environments import GYMNASIUM_ID
 
-GYMNASIUM_ID = re.compile(r"(?:[A-Za-z_][\w.]*:)?[\w./-]+-v\d+")  # package:Id-v0 is Gymnasium's own spelling
 WITH_SPECIFICATION = re.compile(r"exec:.*|[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # a program, or package.module:factory
 
 
@@ -40,7 +39,6 @@ class Adapter(NamedTuple):
     separate: bool = False
 
 
-FILES = (".fmu", ".json")  # of names that are files
 NEVER = re.compile(r"(?!)")
 ADAPTERS = (
     Adapter(
@@ -64,13 +62,6 @@ ADAPTERS = (
 def adapter_of(name: str) -> Adapter | None:
     """The adapter that opens a name; None for ``package.module:factory`` and for other texts."""
     return next((adapter for adapter in ADAPTERS if adapter.names.fullmatch(name)), None)
-
-
-def is_same(name: str, other: str) -> bool:
-    """Whether two names mean the same environment. A file may lie in another folder on another machine."""
-    files = [PurePath(one.partition(":")[2]) for one in (name, other)]
-    by_file = adapter_of(name) is adapter_of(other) and all(file.suffix in FILES for file in files)
-    return name == other or (by_file and files[0].name == files[1].name)
 
 
 def is_trusted(name: str) -> bool:
