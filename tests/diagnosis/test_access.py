@@ -7,6 +7,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -14,7 +15,10 @@ import surrogym_client.cli
 from surrogym_client.diagnosis.access import Access, CheckFailed, examine
 from surrogym_client.diagnosis.doctor import environment
 from surrogym_client.original import RealStep
+from surrogym_client.original.adapters.gymnasium_ids import ResetOnly
+from surrogym_client.original.errors import StepFailed
 from surrogym_client.original.isolated import IsolatedEnvironment
+from surrogym_client.original.simulator import Simulated
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 CLI = Path(surrogym_client.cli.__file__).parent
@@ -143,6 +147,57 @@ def test_one_whose_snapshots_forget_can_only_be_reset() -> None:
     assert access.restore_error is not None
     assert access.restore_error > 0.01
     assert access.mode == "reset only (--access reset)"
+
+
+class Deaf(Rail):
+    """A rail whose start no seed decides."""
+
+    def begin(self, seed=None):
+        return super().begin(None)
+
+
+class Spring(gymnasium.Env):
+    """A mass on a spring. Its state has no public name, so it can only be reset."""
+
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    observation_space = gymnasium.spaces.Box(-10, 10, (2,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._s = self.np_random.uniform(-1, 1, 2)
+        return self._s.copy(), {}
+
+    def step(self, action):
+        x, v = self._s
+        self._s = np.array([x + 0.1 * v, v + 0.1 * (float(action[0]) - x - 0.2 * v)])
+        return self._s.copy(), -float(x**2), False, False, {}
+
+
+@pytest.mark.parametrize("query", ["step", "rollout"])
+def test_one_that_ignores_its_seed_gets_a_note(query: str) -> None:
+    opened = partial(IsolatedEnvironment, partial(Deaf, query=query))
+    said = {finding.name: finding for finding in environment(opened)}
+    assert "ignores its seed" in said["resets"].said
+    assert said["resets"].notable
+    assert all(finding.way_out is None for finding in said.values())
+    steady = {finding.name: finding for finding in environment(partial(IsolatedEnvironment, Rail))}
+    assert not steady["resets"].notable
+
+
+def test_a_gymnasium_environment_that_can_only_be_reset_is_checked_in_that_mode() -> None:
+    """Its simulator gave a state to save, and failed when it had to return to it."""
+    simulator = ResetOnly("Spring", Spring(), 60)
+    spec = Rail(query="rollout").spec().model_dump() | {
+        "coordinates": [{"name": name, "sampling": RANGE} for name in ("o0", "o1")],
+        "observation": [{"name": name, "term": Term.linear(**{name: 1})} for name in ("o0", "o1")],
+        "start": {"o0": RANGE, "o1": RANGE},
+    }
+    opened = Simulated(simulator, EnvironmentSpec.model_validate(spec))
+    said = {finding.name: finding for finding in environment(lambda: opened)}
+    assert said["mode"].way_out is None
+    assert said["mode"].said.startswith("reset only (--access reset)")
+    with pytest.raises(StepFailed):
+        opened.save()
 
 
 class Exits(Rail):

@@ -53,7 +53,7 @@ def command(
 
     The checks cover versions, server, token and round trip time. Each check prints one line; a problem's line says how
     to solve it. With --env, the command sets states and reads them back, and repeats steps and resets, to show how
-    exact the environment is. The exit status is 1 if there is a problem. With --quiet, only problems are shown.
+    exact the environment is. The exit status is 1 if there is a problem. With --quiet, only problems and notes are shown.
 
     Example: surrogym doctor --env Pendulum-v1
     """
@@ -74,7 +74,8 @@ def command(
     found: list[Finding] = []
     for finding in findings():
         found.append(finding)
-        if not output.as_json and not (output.quiet and finding.way_out is None):
+        told = finding.notable or finding.way_out is not None
+        if not output.as_json and (told or not output.quiet):
             typer.echo(_line(finding))
     problems = sum(finding.way_out is not None for finding in found)
     if output.as_json:
@@ -126,5 +127,6 @@ def _described(env: str) -> tuple[EnvironmentSpec | None, list[Finding]]:
 
 
 def _line(finding: Finding) -> str:
-    verdict, way_out = ("ok", "") if finding.way_out is None else ("problem", f"; {finding.way_out}")
-    return f"{verdict:<7}  {finding.name:<11}  {finding.said}{way_out}"
+    if finding.way_out is not None:
+        return f"problem  {finding.name:<11}  {finding.said}; {finding.way_out}"
+    return f"{'note' if finding.notable else 'ok':<7}  {finding.name:<11}  {finding.said}"

@@ -43,11 +43,13 @@ OF_THE_SERVER = {  # registries by the group of their entry points; they exist i
 
 @dataclass(frozen=True)
 class Finding:
-    """One checked thing. ``way_out`` says what to do about a problem; None if there is none."""
+    """One checked thing. ``way_out`` says what to do about a problem; None if there is none. ``notable``: no problem,
+    and a person has to know it."""
 
     name: str
     said: str
     way_out: str | None = None
+    notable: bool = False
 
 
 def installation() -> Iterator[Finding]:
@@ -135,8 +137,7 @@ def _access_of(original: IsolatedEnvironment | Executable | Simulated, spec: Env
         read, again = _error(access.set_error), _error(access.repeat_error)
         yield Finding("state", f"set and read back: {read}; two steps from one state: {again}")
     if access.reset_error is not None:
-        same, alike = _error(access.reset_error), _error(access.replay_error)
-        yield Finding("resets", f"two with one seed: {same}; the same actions from there: {alike}")
+        yield _resets(access)
     if access.memory_error is not None:
         yield Finding("memory", f"a step of an episode, and from its state set anew: {_error(access.memory_error)}")
     if access.restore_error is not None:
@@ -145,6 +146,19 @@ def _access_of(original: IsolatedEnvironment | Executable | Simulated, spec: Env
         )
     taken = f"{access.mode}; this took {access.steps + 1} real steps and {access.resets + 1} resets at most"
     yield Finding("mode", taken, _way_out(spec, access))
+
+
+def _resets(access: Access) -> Finding:
+    """Whether a seed repeats a start."""
+    same, alike = _error(access.reset_error), _error(access.replay_error)
+    if not access.ignores_seed:
+        return Finding("resets", f"two with one seed: {same}; the same actions from there: {alike}")
+    said = (
+        f"the environment ignores its seed: two resets with one seed are {same}. Two controllers never run the same "
+        "starts, so compare the means of many episodes; for the same starts, reset(seed=...) has to seed every random "
+        "number"
+    )
+    return Finding("resets", said, notable=True)
 
 
 def _history_of(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec, steps: int) -> Finding:

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from surrogym_client.original.errors import NotPerturbable, UnknownEnvironment
+from surrogym_client.original.errors import NotPerturbable, StepFailed, UnknownEnvironment
 from surrogym_client.original.gymnasium import native_action, packed, unpacked, wrapped
 from surrogym_client.original.protocol import Array, RealStep
 from surrogym_shared.spec import EnvironmentSpec
@@ -216,7 +216,9 @@ class Simulated:
         )
 
     def save(self) -> bytes:
-        """The simulator's whole state, bit for bit."""
+        """The simulator's whole state, bit for bit. Raises ``StepFailed`` if it can't return to a state."""
+        if not self.simulator.saves:
+            raise StepFailed("expected a simulator that can return to a saved state, got one that can only be reset")
         return packed(self.simulator.save())
 
     def restore(self, snapshot: bytes) -> Array:
