@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -291,3 +292,39 @@ def test_an_observation_of_too_many_entries_is_replaced_by_the_coordinates(regis
     found = describe(registered("Spiral-v0", space=space), 60)
     assert found.spec.observation_names == ("state0", "state1")
     assert "the observation has 200 entries, more than 64: the policy observes the coordinates instead" in found.found
+
+
+class Counting(gymnasium.Env):
+    """A mass on a spring whose episodes a counter of its own ends: after ``length`` steps, or at random."""
+
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    observation_space = gymnasium.spaces.Box(-10, 10, (2,), np.float64)
+
+    def __init__(self, length: int | None, terminates: bool) -> None:
+        self._length, self._terminates = length, terminates
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._s, self._left = self.np_random.uniform(-1, 1, 2), self._length or int(self.np_random.integers(5, 30))
+        return self._s.copy(), {}
+
+    def step(self, action):
+        x, v = self._s
+        self._s = np.array([x + 0.1 * v, v + 0.1 * (float(action[0]) - x - 0.2 * v)])
+        self._left -= 1
+        over = self._left == 0
+        return self._s.copy(), float(x), over and self._terminates, over and not self._terminates, {}
+
+
+@pytest.mark.parametrize("terminates", [True, False])
+def test_a_common_length_of_all_random_episodes_is_the_limit(listed, terminates: bool) -> None:
+    found = describe(listed(partial(Counting, 20, terminates)), STEPS)
+    assert found.spec.time_limit == 20
+    assert found.spec.termination == ()
+    assert any("exactly 20 steps" in line for line in found.asked)
+
+
+def test_episodes_of_different_lengths_show_no_limit(listed) -> None:
+    found = describe(listed(partial(Counting, None, True)), STEPS)
+    assert found.spec.time_limit == 200
+    assert found.spec.termination == "learned"

@@ -53,7 +53,7 @@ def command(
 
     The checks cover versions, server, token and round trip time. Each check prints one line; a problem's line says how
     to solve it. With --env, the command sets states and reads them back, and repeats steps and resets, to show how
-    exact the environment is. The exit status is 1 if there is a problem. With --quiet, only problems and notes are shown.
+    exact the environment is. The exit status is 1 if there is a problem. With --quiet, only problems and notes show.
 
     Example: surrogym doctor --env Pendulum-v1
     """

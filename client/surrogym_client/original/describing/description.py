@@ -141,7 +141,7 @@ class _Draft:
             action=self._simulator.action,
             start={c.name: ranges.start(i, c) for i, c in zip(self._kept, coordinates, strict=True)},
             termination="learned" if self._seen.terminated.any() else (),
-            time_limit=self._simulator.time_limit or UNKNOWN_LIMIT,
+            time_limit=self._seen.limit or self._simulator.time_limit or UNKNOWN_LIMIT,
             query="step" if self._probed.settable else "rollout",
             snapshots=self._simulator.saves and not self._simulator.settable,
             reward=Reward(timing="auto"),
@@ -230,7 +230,14 @@ class _Draft:
                 f"start of {scheduled}: a schedule sets it in an original episode. A virtual episode keeps one value, "
                 "drawn from those of the schedule. Widen the start if a policy should follow other values"
             )
-        if self._simulator.time_limit is None:
+        if self._seen.limit is not None and self._seen.limit != self._simulator.time_limit:
+            declared = self._simulator.time_limit
+            instead = "declares none" if declared is None else f"declares {declared} steps"
+            lines.append(
+                f"time_limit: all random episodes ended after exactly {self._seen.limit} steps, so this is the limit; "
+                f"the environment {instead}"
+            )
+        elif self._simulator.time_limit is None:
             lines.append(f"time_limit: the environment declares none; {UNKNOWN_LIMIT} steps are assumed")
         lines.append(
             "success: when does an episode count as solved? Without a criterion, evaluations report returns only"

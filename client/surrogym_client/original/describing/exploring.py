@@ -5,7 +5,8 @@ Shapes: n steps, R resets, V variables of the state, F action entries, D observa
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ EPISODES = 4  # that share the steps if none ends early
 RESETS = 32  # for the range of starts
 LONGEST_HOLD = 10  # steps in a row under one action
 ROUNDING = 1e-9  # of a variable's size or of 1: what moves by less than this moves by rounding only
+FEWEST_EQUAL = 3  # episodes of one length that show a limit
 PLACES_TRIED = 20  # random starts, of which the ones without contacts can be taken
 
 
@@ -37,6 +39,7 @@ class Seen:
         terminated: (n,).
         observations: (n, D) after each step, as the simulator showed them.
         episodes: (n,) number of the episode.
+        limit: number of steps after which every episode ended; None if they ended at different steps, or not at all.
     """
 
     starts: Array
@@ -47,6 +50,7 @@ class Seen:
     terminated: NDArray[np.bool_]
     observations: Array
     episodes: NDArray[np.int64]
+    limit: int | None = None
 
     @property
     def ended_at_once(self) -> NDArray[np.bool_]:
@@ -77,6 +81,7 @@ def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
     require_numbers(counted.name, (starts,), np.zeros(0))
     require_few(counted.name, simulator.variables, moved_by(starts) > 0)
     rows: list[tuple[Array, Array, Array, float, bool, Array, int]] = []
+    lengths: list[int] = []  # of the episodes that the environment ended
     length, number = max(1, -(-steps // EPISODES)), 0
     while len(rows) < steps:
         state = counted.reset(RESETS + number)
@@ -89,10 +94,22 @@ def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
             rows.append((state, action, reached, taken.reward, taken.terminated, taken.observation, number))
             state = reached
             if taken.terminated or taken.truncated or not np.isfinite(reached).all():
+                lengths.append(sum(row[-1] == number for row in rows))
                 break
         number += 1
     columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return Seen(starts, *columns)
+    seen = Seen(starts, *columns)
+    limit = _common_length(lengths, int(np.bincount(seen.episodes).max()))
+    # the end of the time is no state: nothing is to be learned from it
+    return seen if limit is None else replace(seen, limit=limit, terminated=np.zeros_like(seen.terminated))
+
+
+def _common_length(lengths: Sequence[int], longest: int) -> int | None:
+    """Length of several random episodes that all ended after the same number of steps; None otherwise. Such episodes
+    end by a counter."""
+    if len(lengths) < FEWEST_EQUAL or set(lengths) != {longest} or longest == 1:
+        return None
+    return longest
 
 
 def _far_from(counted: Counted, visited: Array, state: Array, rng: np.random.Generator) -> Array:
