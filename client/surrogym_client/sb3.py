@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 from surrogym_client.environments.env import LOST
 from surrogym_client.environments.lanes import Lanes, LaneStep, session_request
 from surrogym_client.environments.spaces import space
-from surrogym_client.transport.http_surrogate import HttpSurrogate, Retries, Timeouts, Transport
+from surrogym_client.transport import HttpSurrogate, Retries, Timeouts, Transport
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import SubmittedOccupancy
 

@@ -12,15 +12,17 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, PositiveInt, ValidationError
 
-from surrogym_shared.archives import Header, read_arrays, read_entries
 from surrogym_shared.checks import first_fault
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
+
+if TYPE_CHECKING:
+    from surrogym_shared.archives import Header
 
 Array = NDArray[np.float64]
 Activation = Literal["tanh", "relu"]
@@ -125,6 +127,8 @@ class Network:
         Raises:
             ValueError: the file has another form, or more than ``MAX_BYTES``.
         """
+        from surrogym_shared.archives import read_arrays, read_entries  # only who reads a file needs it
+
         try:
             entries = read_entries(path, MAX_BYTES)
             head = _read_head(entries[HEAD])

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from surrogym_client.environments.pictures import NotRenderable
 from surrogym_client.evaluation import videos
 from surrogym_client.evaluation.evaluator import Evaluation, Trace
 from surrogym_client.original.classic import cartpole
-from surrogym_client.original.errors import NotRenderable
 from surrogym_client.original.rendering import renderer_of
 
 SPEC = cartpole()

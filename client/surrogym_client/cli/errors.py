@@ -18,6 +18,7 @@ def sentence(error: Exception) -> str | None:
     """Return the sentence for an error that a person can act on; None for a defect of the program."""
     from pydantic import ValidationError
 
+    from surrogym_client.environments.pictures import NotRenderable
     from surrogym_client.errors import SurrogymClientError
     from surrogym_client.original.errors import OriginalError
     from surrogym_client.runtime.ray_cluster import NoCluster
@@ -27,7 +28,7 @@ def sentence(error: Exception) -> str | None:
     match error:
         case SurrogymClientError():
             return f"{error}{_way_out(error)}"
-        case CommandError() | OriginalError() | NotASurrogateFile() | UnusableLog() | NoCluster():
+        case CommandError() | OriginalError() | NotRenderable() | NotASurrogateFile() | UnusableLog() | NoCluster():
             return str(error)
         case ModuleNotFoundError(name=str(name)):
             return missing(name.partition(".")[0])

@@ -28,9 +28,9 @@ def film(
 
     No trouble with pictures may spoil an evaluation: the terminal then shows the reason, and the result is None.
     """
+    from surrogym_client.environments.pictures import NotRenderable
     from surrogym_client.evaluation.reporting import words_of
     from surrogym_client.evaluation.videos import FORMS, record
-    from surrogym_client.original.errors import NotRenderable
     from surrogym_shared.terminal import progress, say
 
     try:

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import LaneReset, Lanes, LaneStep, session_request
-from surrogym_client.environments.pictures import RENDER_MODES, metadata_of, pictures_for
+from surrogym_client.environments.pictures import RENDER_MODES, Picture, metadata_of, pictures_for
 from surrogym_client.environments.spaces import space
-from surrogym_client.original.rendering import Picture
 from surrogym_shared.port import SurrogatePort
 
 LOST = "surrogym_session_lost"

@@ -1,25 +1,53 @@
 """Pictures of virtual states: an observation is converted to coordinates, and the original environment's renderer draws
 them.
 
-Shapes: D observation entries, C coordinates.
+The renderer is a part of the sampler's side, and is imported when the first picture is asked for.
+
+Shapes: D observation entries, C coordinates; a picture is (height, width, 3) uint8.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.original.errors import NotRenderable
-from surrogym_client.original.protocol import Array
-from surrogym_client.original.rendering import Picture, can_be_drawn, renderer_of
 from surrogym_shared.spec import EnvironmentSpec, Part
 
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
 Read = Callable[[Array], float]  # computes a coordinate from an observation (D,)
 RENDER_MODES = ["rgb_array"]
+RENDERERS = "surrogym_client.original.rendering"  # the module that has renderer_of
+# What draws an environment of Gymnasium, and the extra that brings it, by the package of its class; None: numpy alone.
+DRAWN_WITH: dict[str, tuple[str, str] | None] = {
+    "gymnasium.envs.classic_control.": ("pygame", "render"),
+    "gymnasium.envs.mujoco.": ("mujoco", "mujoco"),
+    "surrogym_client.original.swingup:": None,
+}
+
+
+class NotRenderable(Exception):
+    """The environment has no renderer, the renderer can't run here, or the observation does not determine the state."""
+
+
+class Renderer(Protocol):
+    """Draws states of one environment."""
+
+    frames_per_second: int
+
+    def draw(self, coordinates: Array) -> Picture:
+        """Draw the state at coordinates (C,)."""
+        ...
+
+    def close(self) -> None:
+        """Release what the renderer holds."""
+        ...
 
 
 class Pictures:
@@ -36,7 +64,7 @@ class Pictures:
 
     def __init__(self, spec: EnvironmentSpec, original: str | None = None) -> None:
         self._read = coordinates_from_observation(spec)
-        self._renderer = renderer_of(spec, original)
+        self._renderer: Renderer = import_module(RENDERERS).renderer_of(spec, original)
         self.frames_per_second = self._renderer.frames_per_second
 
     def of(self, observation: NDArray[Any] | None) -> Picture:
@@ -78,6 +106,27 @@ def metadata_of(spec: EnvironmentSpec, original: str | None, pictures: Pictures 
 def _render_modes(spec: EnvironmentSpec, original: str | None) -> list[str]:
     shown = all(_read(spec, name) is not None for name in spec.coordinate_names) and can_be_drawn(spec, original)
     return list(RENDER_MODES) if shown else []
+
+
+def can_be_drawn(spec: EnvironmentSpec, original: str | None = None) -> bool:
+    """Whether a renderer is to be expected here: Gymnasium's with its package installed, or the one of a person's own
+    ``package.module:factory``. Finding out imports no renderer."""
+    if original is not None and ":" in original:
+        return True
+    name = original or spec.environment
+    return is_drawn_by_gymnasium(name) and all(find_spec(module) is not None for module, _ in drawn_with(name))
+
+
+def is_drawn_by_gymnasium(name: str) -> bool:
+    """Whether a name from a server may be opened to be drawn: it is an id of Gymnasium's own packages, or of ours."""
+    entry = gymnasium.registry.get(name)
+    return entry is not None and str(entry.entry_point).startswith(tuple(DRAWN_WITH))
+
+
+def drawn_with(name: str) -> list[tuple[str, str]]:
+    """Return the module that draws an id of Gymnasium, and the extra that brings it. Empty if numpy is enough."""
+    place = str(gymnasium.spec(name).entry_point)
+    return [needs for package, needs in DRAWN_WITH.items() if needs is not None and place.startswith(package)]
 
 
 def coordinates_from_observation(spec: EnvironmentSpec) -> Callable[[Array], Array]:

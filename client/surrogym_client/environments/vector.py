@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from surrogym_client.environments.env import LOST, Observation
 from surrogym_client.environments.lanes import Lanes, LaneStep, session_request
-from surrogym_client.environments.pictures import metadata_of, pictures_for
+from surrogym_client.environments.pictures import Picture, metadata_of, pictures_for
 from surrogym_client.environments.spaces import space
-from surrogym_client.original.rendering import Picture
 from surrogym_shared import wire
 from surrogym_shared.port import Bools, SurrogatePort
 

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from surrogym_client.environments.pictures import NotRenderable, Picture, Renderer
 from surrogym_client.evaluation.evaluator import Evaluation, Trace
-from surrogym_client.original.errors import NotRenderable
-from surrogym_client.original.rendering import Picture, Renderer, renderer_of
+from surrogym_client.original.rendering import renderer_of
 from surrogym_shared.spec import EnvironmentSpec
 
 if TYPE_CHECKING:

@@ -4,7 +4,6 @@ OriginalError
 ├── UnknownEnvironment      nothing can be made of this name, or no specification can express it
 ├── NotPerturbable          its masses, lengths and limits are unknown here
 ├── NotSettable             it can only be reset and acted on
-├── NotRenderable           no picture of its states can be made here
 ├── NotParallel             one instance is open, and the environment does not say that another may be
 ├── PolicyMisfit            the policy was trained for another environment, or gives actions that this one does not have
 ├── QueryRefused            a query asks for what the environment does not allow; nothing was sent to it
@@ -41,10 +40,6 @@ class NotPerturbable(OriginalError):
 
 class NotSettable(OriginalError):
     """The environment can't be set to a state: an episode can only begin with a reset."""
-
-
-class NotRenderable(OriginalError):
-    """The environment has no renderer, the renderer can't run here, or the observation does not determine the state."""
 
 
 class NotParallel(OriginalError):

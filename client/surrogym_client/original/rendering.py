@@ -5,25 +5,20 @@ Shapes: C coordinates; a picture is (height, width, 3) uint8.
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from surrogym_client.environments.pictures import NotRenderable, Picture, Renderer, drawn_with, is_drawn_by_gymnasium
 from surrogym_client.original.adapters.gymnasium_ids import settable
 from surrogym_client.original.classic import TASKS
-from surrogym_client.original.errors import NotRenderable
 from surrogym_client.original.executables import is_executable
 from surrogym_client.original.gymnasium import opens_task
-from surrogym_client.original.loading import is_known, is_own, load_factory
+from surrogym_client.original.loading import is_own, load_factory
 from surrogym_client.original.protocol import Array, Native
 from surrogym_shared.spec import EnvironmentSpec
 
-Picture = NDArray[np.uint8]
 FRAMES_PER_SECOND = 30
-# What an environment imports to draw itself, and the extra that brings it, by the package of Gymnasium it is in.
-DRAWN_WITH = {"gymnasium.envs.classic_control.": ("pygame", "render"), "gymnasium.envs.mujoco.": ("mujoco", "mujoco")}
 
 
 @runtime_checkable
@@ -32,20 +27,6 @@ class Drawable(Protocol):
 
     def picture(self, coordinates: Array) -> Picture:
         """The state at coordinates (C,)."""
-        ...
-
-
-class Renderer(Protocol):
-    """Draws states of one environment."""
-
-    frames_per_second: int
-
-    def draw(self, coordinates: Array) -> Picture:
-        """The state at coordinates (C,)."""
-        ...
-
-    def close(self) -> None:
-        """Release what the renderer holds."""
         ...
 
 
@@ -62,39 +43,15 @@ def renderer_of(spec: EnvironmentSpec, original: str | None = None) -> Renderer:
     if original is not None and _is_class(original):
         return _Own(original)
     name = original or spec.environment
-    if not _is_gymnasiums(name):
+    if not is_drawn_by_gymnasium(name):
         raise NotRenderable(
             f"expected original='package.module:factory' of the environment to show, got none (its name: {name!r})"
         )
     return _Native(name, spec)
 
 
-def can_be_drawn(spec: EnvironmentSpec, original: str | None = None) -> bool:
-    """Whether ``renderer_of`` has a renderer here: a built-in adapter's, with what it imports installed, or one that a
-    person names. Finding out imports nothing."""
-    if original is not None and _is_class(original):
-        return True
-    name = original or spec.environment
-    return _is_gymnasiums(name) and all(find_spec(module) is not None for module, _ in _drawn_with(name))
-
-
 def _is_class(name: str) -> bool:
     return is_own(name) and not is_executable(name)
-
-
-def _is_gymnasiums(name: str) -> bool:
-    """Whether a server's word is enough for this name, and Gymnasium itself draws it."""
-    import gymnasium
-
-    return is_known(name) and name in gymnasium.registry
-
-
-def _drawn_with(name: str) -> list[tuple[str, str]]:
-    """The module that an environment draws itself with and the extra that brings it; empty where numpy is enough."""
-    import gymnasium
-
-    place = str(gymnasium.spec(name).entry_point)
-    return [needed for package, needed in DRAWN_WITH.items() if place.startswith(package)]
 
 
 class _Own:
@@ -145,5 +102,5 @@ class _Native:
         self._env.close()
 
     def _unavailable(self, error: Exception) -> NotRenderable:
-        way_out = "".join(f" (pip install 'surrogym[{extra}]')" for _, extra in _drawn_with(self._name))
+        way_out = "".join(f" (pip install 'surrogym[{extra}]')" for _, extra in drawn_with(self._name))
         return NotRenderable(f"{self._name} can't be shown here: {error}{way_out}")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, Self, TypeVar
-from uuid import uuid4
 
 from pydantic import BaseModel
 
@@ -14,7 +13,7 @@ from surrogym_client.transport import routes
 from surrogym_client.transport.connection import Connection, Retries, Timeouts
 from surrogym_client.transport.jobs import JobCalls
 from surrogym_client.transport.policies import PolicyCalls
-from surrogym_client.transport.replies import parse
+from surrogym_client.transport.replies import check_protocol, new_key, parse
 from surrogym_shared import wire
 from surrogym_shared.codes import STATUS, Code, Problem
 from surrogym_shared.spec import EnvironmentSpec
@@ -492,17 +491,6 @@ class Api:
 
     def _send(self, path: str, body: BaseModel, *, method: str = "POST", **options: Any) -> bytes:
         return self.connection.send(method, path, body.model_dump_json().encode(), **options)
-
-
-def new_key() -> str:
-    """Return a new idempotency key."""
-    return uuid4().hex
-
-
-def check_protocol(protocol: int, url: str) -> None:
-    """Refuse a server of another protocol version."""
-    if protocol != wire.PROTOCOL:
-        raise ProtocolMismatch(f"expected protocol {wire.PROTOCOL} at {url}, got {protocol}: upgrade the older side")
 
 
 def _batches(samples: Sequence[wire.NewSample]) -> list[list[wire.NewSample]]:

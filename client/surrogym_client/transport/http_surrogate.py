@@ -13,9 +13,8 @@ import numpy as np
 
 from surrogym_client.errors import ProtocolMismatch, SeqConflict, SessionLost, SurrogymClientError, refused_here
 from surrogym_client.transport import routes
-from surrogym_client.transport.api import Api, check_protocol, new_key
 from surrogym_client.transport.connection import Connection, Retries, Timeouts
-from surrogym_client.transport.replies import parse
+from surrogym_client.transport.replies import check_protocol, new_key, parse
 from surrogym_client.transport.step_codecs import UNREADABLE, BinaryForm, Form, JsonForm
 from surrogym_client.transport.stream import Stream, StreamLost, StreamUnavailable
 from surrogym_client.transport.window import Sent, Window, digest_of
@@ -25,8 +24,6 @@ from surrogym_shared.codes import Code
 from surrogym_shared.frames import Shape
 from surrogym_shared.port import Bools, Floats, Ints, PolicyRollout, ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec
-
-__all__ = ["Api", "HttpSurrogate", "Retries", "Timeouts", "Transport"]
 
 Transport = Literal["auto", "stream", "binary", "json"]
 T = TypeVar("T")

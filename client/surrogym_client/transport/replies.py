@@ -1,8 +1,9 @@
-"""Parse the server's replies into the wire models."""
+"""Parse the server's replies into the wire models; keys that tell a repeated request from a new one."""
 
 from __future__ import annotations
 
 from typing import TypeVar
+from uuid import uuid4
 
 from pydantic import ValidationError
 
@@ -23,3 +24,14 @@ def parse(reply: type[R], content: bytes, path: str) -> R:
         return reply.model_validate_json(content)
     except ValidationError as error:
         raise ProtocolMismatch(f"unexpected answer of {path}: {first_fault(error)}") from error
+
+
+def new_key() -> str:
+    """Return a new idempotency key."""
+    return uuid4().hex
+
+
+def check_protocol(protocol: int, url: str) -> None:
+    """Refuse a server of another protocol version."""
+    if protocol != wire.PROTOCOL:
+        raise ProtocolMismatch(f"expected protocol {wire.PROTOCOL} at {url}, got {protocol}: upgrade the older side")

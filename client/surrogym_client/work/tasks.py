@@ -7,12 +7,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from uuid import uuid4
 
+from surrogym_client.environments.pictures import NotRenderable
 from surrogym_client.evaluation.evaluator import Evaluation, EvaluationInterrupted, EvaluationSettings, evaluate
 from surrogym_client.evaluation.reporting import as_reported, paired_start, words_of
 from surrogym_client.evaluation.uncontrolled import baseline
 from surrogym_client.evaluation.videos import record
 from surrogym_client.original.episodes import Episode
-from surrogym_client.original.errors import EvaluationFailed, NotRenderable
+from surrogym_client.original.errors import EvaluationFailed
 from surrogym_client.policies.card import write_card
 from surrogym_client.policies.files import load_policy
 from surrogym_client.policies.predict import Acting, Predict

@@ -7,13 +7,18 @@ Contradictions are refused, with what was expected and what came.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+from surrogym_shared.lazy import on_first_use
 from surrogym_shared.spec.actions import BoxAction, DiscreteAction, MultiDiscreteAction
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, NAME_IN_WORDS, NAME_PATTERN
 from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Lag, Normal, Uniform, limits
 from surrogym_shared.spec.environment import Access, AcquisitionChoice, Choice, Design, EnvironmentSpec, ModelChoice
-from surrogym_shared.spec.history import with_history
 from surrogym_shared.spec.rewards import DeclaredReward, Quantity, Reward, RewardTerm, Success
 from surrogym_shared.spec.terms import AllOf, Inequality, ObservationEntry, Part, Term
+
+if TYPE_CHECKING:
+    from surrogym_shared.spec.history import with_history
 
 __all__ = [
     "MAX_DIMENSIONS",
@@ -48,3 +53,5 @@ __all__ = [
     "limits",
     "with_history",
 ]
+
+__getattr__, _ = on_first_use(__name__, {"history": "with_history"})
