@@ -6,7 +6,7 @@ Shapes: n steps, R resets, V variables of the state, F action entries, D observa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,7 @@ class Seen:
     terminated: NDArray[np.bool_]
     observations: Array
     episodes: NDArray[np.int64]
-    limit: int | None = None
+    limit: int | None = field(default=None, kw_only=True)
 
     @property
     def ended_at_once(self) -> NDArray[np.bool_]:
