@@ -18,7 +18,7 @@ from support.browser import serious
 from support.server import running_server
 
 Open = Callable[..., Page]
-README = Path(__file__).parents[2] / "README.md"
+TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial.md"
 
 
 @contextmanager
@@ -43,7 +43,7 @@ def test_a_page_alone_leads_to_a_judged_policy_of_ones_own_environment(
 ):
     expect.set_options(timeout=600_000)
     (program,) = re.findall(
-        r"```python\n(from surrogym_client.original import RealStep.*?)```", README.read_text(), re.S
+        r"```python\n(from surrogym_client.original import RealStep.*?)```", TUTORIAL.read_text(), re.S
     )
     (tmp_path / "cart.py").write_text(program)
     said = [sys.executable, "-c", "import cart; print(cart.Cart().spec().model_dump_json())"]
