@@ -21,7 +21,7 @@ from surrogym_server.tensors import to_device
 from surrogym_server.virtual import LaneState, VirtualSettings
 from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
 
-FORMAT, WITHOUT_PATHS = 2, 1  # the format that is written, and an older one that can be read
+FORMAT = 2
 MALFORMED = (BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, ValueError, LookupError, TypeError)
 RAGGED = ("final_lanes", "final_observation")  # of different lengths in each step
 
@@ -78,11 +78,9 @@ def _read(definition: EnvironmentDefinition, data: bytes, surrogate_id: int) -> 
     with np.load(io.BytesIO(data), allow_pickle=False) as file:
         arrays: Arrays = {name: file[name] for name in file.files}
     header = json.loads(arrays["header"].tobytes())
-    if header["format"] == WITHOUT_PATHS:
-        arrays["lanes/path"] = np.zeros((len(arrays["versions"]), 0))
-    elif header["format"] != FORMAT:
+    if header["format"] != FORMAT:
         raise InvalidInput(f"expected a session saved in format {FORMAT}, got {header['format']}")
-    if header.get("surrogate_id", surrogate_id) != surrogate_id:
+    if header["surrogate_id"] != surrogate_id:
         raise UnknownSession(f"the surrogate of session {header['id']!r} was deleted")
     opened_by = header["opened_by"]
     return Session(
@@ -102,7 +100,7 @@ def _read(definition: EnvironmentDefinition, data: bytes, surrogate_id: int) -> 
 
 
 def _settings(saved: dict[str, Any], starts: NDArray[Any] | None, device: torch.device) -> VirtualSettings:
-    limits, noise = saved.get("reward_limits"), saved.get("sensor_noise", ())
+    limits, noise = saved["reward_limits"], saved["sensor_noise"]
     tuples = {
         "reward_limits": None if limits is None else (limits[0], limits[1]),
         "sensor_noise": tuple((name, deviation) for name, deviation in noise),

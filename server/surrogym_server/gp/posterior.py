@@ -44,7 +44,7 @@ class Sparse:
 
     points: int  # number of points that it was fitted to
     unexplained: float  # root mean square deviation that is left at them, in prior deviations; 0 if nothing is lost
-    left_out: LeftOut | None = None  # accuracy at these points; None in models stored by older versions
+    left_out: LeftOut  # accuracy at these points
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Posterior:
     @property
     def left_out(self) -> LeftOut:
         """Accuracy in predicting each of the points from all others."""
-        if self.sparse is not None and self.sparse.left_out is not None:
+        if self.sparse is not None:
             return self.sparse.left_out
         mean, variance = self.leave_one_out()
         return LeftOut.of(mean - self.y, variance)

@@ -13,7 +13,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.port import DynamicsModel, StoredModel
-from surrogym_server.models.registry import GAUSSIAN_PROCESS, learner_of
+from surrogym_server.models.registry import learner_of
 
 METADATA = "surrogym"
 FAMILY, CHECKSUM = "family", "checksum"
@@ -30,8 +30,7 @@ def to_bytes(model: DynamicsModel) -> bytes:
 
 
 def from_bytes(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
-    """Read the model that ``to_bytes`` wrote. A file without a family is one of Gaussian processes, from older
-    versions.
+    """Read the model that ``to_bytes`` wrote.
 
     Raises:
         InvalidInput: not such a file, or a damaged one, or one of another family than the definition's, or of an
@@ -48,7 +47,7 @@ def _read(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
     header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"][METADATA])
     tensors = load(data)
     _require_whole(header, tensors)
-    expected, got = definition.learning.model, header.pop(FAMILY, GAUSSIAN_PROCESS)
+    expected, got = definition.learning.model, header.pop(FAMILY)
     if got != expected.name:
         raise InvalidInput(
             f"expected a model of the family {expected.name!r}, as the specification says, got one of {str(got)[:80]!r}"
@@ -66,7 +65,7 @@ def _checksum(header: dict[str, Any], tensors: dict[str, Tensor]) -> str:
 
 
 def _require_whole(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
-    """Raise ``InvalidInput`` if the content has changed. Files of older versions have no checksum."""
+    """Raise ``InvalidInput`` if the content has changed. A file without a checksum is not checked."""
     written = header.pop(CHECKSUM, None)
     if written is not None and written != _checksum(header, tensors):
         raise InvalidInput("expected the checksum that the model was written with, got another: the file is damaged")

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
+from surrogym_server.errors import InvalidInput
 from surrogym_server.tensors import to_device
 
 A = TypeVar("A")
@@ -144,6 +145,15 @@ class StoredModel:
 
     header: dict[str, Any]
     tensors: dict[str, Tensor]
+
+
+def require_format(got: object, expected: int) -> None:
+    """Raise ``InvalidInput`` if a model is stored in another format than the one that this version writes."""
+    if got != expected:
+        raise InvalidInput(
+            f"expected a model of format {expected}, got format {str(got)[:80]}, which another version wrote: "
+            "export its samples with that version, and learn from them again"
+        )
 
 
 class ModelCodec(ABC):

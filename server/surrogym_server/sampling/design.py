@@ -34,7 +34,6 @@ from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
 
 Verdict = Literal["continue", "ready", "over_budget", "from_log"]
 SHORTEST_ROUND = 4  # real steps
-WARM = "thetas"  # name in stored states, from the time when only hyperparameters were stored
 FEW_POINTS = 500  # more points leave no large gap, and comparing all pairs takes memory in the square of their number
 
 
@@ -53,12 +52,12 @@ class DesignState:
     def to_json(self) -> dict[str, Any]:
         warm = {key: array.tolist() for key, array in self.warm.items()}
         ended, ranges = list(self.ended_with), list(self.ranges)
-        fields = {"round": self.round, "usual": list(self.usual), "ranges": ranges, WARM: warm, "ended_with": ended}
+        fields = {"round": self.round, "usual": list(self.usual), "ranges": ranges, "warm": warm, "ended_with": ended}
         return fields | {"predictions": pairs_of(self.predictions), "tested_at": self.tested_at}
 
     @classmethod
     def from_json(cls, state: dict[str, Any]) -> DesignState:
-        warm = {key: np.array(array) for key, array in state.get(WARM, {}).items()}
+        warm = {key: np.array(array) for key, array in state.get("warm", {}).items()}
         usual, ended, ranges = (tuple(state.get(name, ())) for name in ("usual", "ended_with", "ranges"))
         predictions, tested_at = from_pairs(state.get("predictions", [])), state.get("tested_at", 0)
         return cls(state.get("round", 0), usual, warm, ended, ranges, predictions, tested_at)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import json
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -110,27 +108,6 @@ def test_a_restored_session_continues_bit_for_bit(
         for name in ARRAYS:
             np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), strict=True)
     np.testing.assert_array_equal(back.visited.states, session.visited.states)
-
-
-def test_a_session_saved_before_there_were_functions_comes_back(
-    opened: Open, fitted: Fitted, definition: EnvironmentDefinition
-):
-    session, _ = reset_session(opened(), 11, None, 1)
-    with np.load(io.BytesIO(session_to_bytes(session))) as file:
-        arrays = {name: file[name] for name in file.files if name != "lanes/path"}
-    header = json.loads(arrays["header"].tobytes())
-    settings = {
-        key: value
-        for key, value in header["settings"].items()
-        if key not in ("trust", "process_noise", "sensor_noise", "compiled")
-    }
-    older = json.dumps({**header, "format": 1, "settings": settings}).encode()
-    buffer = io.BytesIO()
-    np.savez(buffer, **{**arrays, "header": np.frombuffer(older, dtype=np.uint8)})
-    back = session_from_bytes(definition, buffer.getvalue())
-    assert back.settings == session.settings
-    ours, theirs = stepped(fitted, session)[1], stepped(fitted, back)[1]
-    np.testing.assert_array_equal(ours.observation, theirs.observation)
 
 
 def test_a_saved_session_with_a_flipped_bit_is_refused_or_comes_back_the_same(

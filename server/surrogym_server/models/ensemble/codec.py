@@ -15,9 +15,9 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.models.ensemble.inputs import Inputs
 from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Noise, Regression
 from surrogym_server.models.ensemble.networks import Networks
-from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel
+from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel, require_format
 
-NOISELESS, FORMAT = 1, 2  # models of the versions before noise was learned are written as they were read
+FORMAT = 2
 TRANSITIONS, REWARD, ENDING = "transitions", "reward", "ending"
 MAX_MEMBERS, MAX_UNITS = 16, 128
 Arrays = Mapping[str, Tensor]
@@ -28,13 +28,11 @@ class Header:
     """Header of a file.
 
     Attributes:
-        format: of the arrays.
         terminal_reward: added on a step that ends an episode.
         samples, digest: of what the model has learned from.
         label: the only label of an ending, if there is one; not checked.
     """
 
-    format: int
     terminal_reward: float
     samples: int
     digest: str
@@ -42,7 +40,7 @@ class Header:
 
     def as_stored(self, definition: EnvironmentDefinition) -> dict[str, Any]:
         return {
-            "format": self.format,
+            "format": FORMAT,
             "outputs": list(definition.outputs),
             "terminal_reward": self.terminal_reward,
             "samples": self.samples,
@@ -61,13 +59,12 @@ class NetworkEnsembleCodec(ModelCodec):
         networks = isinstance(model.ending, Networks)
         if isinstance(model.ending, Networks):
             tensors |= _arrays(ENDING, model.ending)
-        form = NOISELESS if model.transitions.noise is None else FORMAT
         label = None if networks else model.ending
-        header = Header(form, model.terminal_reward, model.samples, model.digest, label)
+        header = Header(model.terminal_reward, model.samples, model.digest, label)
         return StoredModel(header.as_stored(model.definition), tensors)
 
     def decode(self, definition: EnvironmentDefinition, stored: StoredModel) -> NetworkEnsembleModel:
-        return _checked(definition, stored.tensors, _checked_header(definition, stored, (NOISELESS, FORMAT)))
+        return _checked(definition, stored.tensors, _checked_header(definition, stored))
 
 
 def _checked(definition: EnvironmentDefinition, arrays: Arrays, header: Header) -> NetworkEnsembleModel:
@@ -77,8 +74,7 @@ def _checked(definition: EnvironmentDefinition, arrays: Arrays, header: Header) 
     u = torch.zeros(1, definition.action.size, dtype=torch.float64)
     x, count = inputs.of_transition(q, u), len(definition.outputs) - 1
     transitions = _regression(TRANSITIONS, arrays, x.shape[1], count, quadratic=False)
-    if header.format == FORMAT:
-        transitions = replace(transitions, noise=_noise(f"{TRANSITIONS}.noise", arrays, x.shape[1], count))
+    transitions = replace(transitions, noise=_noise(f"{TRANSITIONS}.noise", arrays, x.shape[1], count))
     reward = None
     if definition.declared_reward is None:
         reward = _regression(REWARD, arrays, inputs.of_reward(q, u, q).shape[1], 1, quadratic=True)
@@ -139,25 +135,23 @@ def _networks(name: str, arrays: Arrays, d: int, p: int, *, quadratic: bool) -> 
     return networks
 
 
-def _checked_header(definition: EnvironmentDefinition, stored: StoredModel, formats: tuple[int, ...]) -> Header:
-    """The header of a model of one of some formats, the newest last, after a check of all numbers.
+def _checked_header(definition: EnvironmentDefinition, stored: StoredModel) -> Header:
+    """The header of a model, after a check of all numbers.
 
     Raises:
         InvalidInput: another format or other outputs, or numbers that no fit gives.
     """
     header, outputs = stored.header, tuple(stored.header["outputs"])
-    if header["format"] not in formats or outputs != definition.outputs:
-        raise InvalidInput(
-            f"expected a model of format {formats[-1]} with outputs {definition.outputs}, "
-            f"got format {header['format']!r} with {outputs}"
-        )
+    require_format(header["format"], FORMAT)
+    if outputs != definition.outputs:
+        raise InvalidInput(f"expected a model with outputs {definition.outputs}, got {outputs}")
     terminal_reward, samples = float(header["terminal_reward"]), int(header["samples"])
     if not math.isfinite(terminal_reward) or samples < 1:
         raise InvalidInput(f"expected a finite terminal reward and samples, got {terminal_reward} and {samples}")
     for name, array in stored.tensors.items():
         if array.dtype != torch.float64 or not bool(torch.isfinite(array).all()):
             raise InvalidInput(f"expected finite numbers of torch.float64 as {name}, got {array.dtype}")
-    return Header(header["format"], terminal_reward, samples, str(header["digest"]), header["ending"])
+    return Header(terminal_reward, samples, str(header["digest"]), header["ending"])
 
 
 def _require_shapes(name: str, arrays: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) -> None:

@@ -13,7 +13,6 @@ from surrogym_server.environment.step_rules import paid
 from surrogym_server.models.abilities import Differentiable, LearnedNoise
 from surrogym_server.models.ensemble.networks import Networks, bounded
 from surrogym_server.models.ensemble.stepping import SteppedInBlocks, between, drawn_member
-from surrogym_server.models.port import A
 from surrogym_server.tensors import cached
 
 
@@ -36,7 +35,7 @@ class Regression:
     networks: Networks
     centre: Tensor  # (p,)
     scale: Tensor  # (p,)
-    noise: Noise | None = None  # None if none is learned
+    noise: Noise | None = None  # None for a reward, whose noise is not learned
 
     def __call__(self, x: Tensor) -> Tensor:
         """Values of every member at x (m, d), (K, m, p)."""
@@ -44,13 +43,14 @@ class Regression:
 
     def shaken(self, x: Tensor, process: Tensor) -> Tensor:
         """Noise at x (m, d), of standard normal numbers (m, p), (m, p)."""
-        return torch.zeros_like(process) if self.noise is None else self.scale * self.noise.deviation(x) * process
+        assert self.noise is not None
+        return self.scale * self.noise.deviation(x) * process
 
 
 @dataclass(frozen=True)
 class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise, Differentiable):
     """K members. The mean is the members' mean, and the deviation that between members. The noise of a transition
-    depends on the state; the reward has none, and models of older files have none at all."""
+    depends on the state; the reward has none."""
 
     rows = 8_192
 
@@ -62,16 +62,11 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise, Differentiable):
     samples: int
     digest: str
 
-    def ability(self, kind: type[A]) -> A | None:
-        """No learned noise if none was learned."""
-        return None if kind is LearnedNoise and self.transitions.noise is None else super().ability(kind)
-
     @property
     def noise_deviations(self) -> tuple[float, ...]:
         """Root mean squares over the samples; 0 for the reward."""
-        noise = self.transitions.noise
-        found = torch.zeros_like(self.transitions.scale) if noise is None else self.transitions.scale * noise.size
-        return (*found.tolist(), 0.0)
+        assert self.transitions.noise is not None
+        return (*(self.transitions.scale * self.transitions.noise.size).tolist(), 0.0)
 
     @property
     def path_size(self) -> int:

@@ -87,7 +87,7 @@ class SqlDesigns(port.Designs):
                 extra, budget = before.extra_queries + queries, before.budget + raised
                 touch(connection, held, extra_queries=extra, budget=budget, checkpoint=checkpoint)
                 remember(connection, held, "ask", key, body, raised)
-            return Granted(stored.read(connection, name), 0 if raised is True else raised)  # True: of an older program
+            return Granted(stored.read(connection, name), raised)
 
     def left(self, name: str) -> int:
         with self._database.read() as connection:

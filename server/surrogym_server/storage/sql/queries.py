@@ -67,7 +67,7 @@ class SqlQueries(port.Queries):
         key: str | None = None,
     ) -> list[int]:
         parts = [coordinates.tolist(), action.tolist(), *(actions.tolist() for actions in rollouts)]
-        body = fingerprint(*parts, *([] if purpose == "manual" else [purpose]))
+        body = fingerprint(purpose, *parts)
         with self._database.write() as connection:
             held = hold(connection, name)
             before: list[int] | None = recall(connection, held, "enqueue", key, body)

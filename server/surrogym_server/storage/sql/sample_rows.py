@@ -16,12 +16,6 @@ from surrogym_server.storage.sql.tables import samples
 NEW_SAMPLES = sa.insert(samples).returning(samples.c.id, sort_by_parameter_order=True)
 
 
-def body_of(sample: NewSample) -> dict[str, Any]:
-    """The content that a repeat must have. The step is compared separately, because fingerprints are older than it, as
-    than snapshots, which are not compared."""
-    return {name: value for name, value in asdict(sample).items() if name not in ("step", "snapshot")}
-
-
 def insert_samples(connection: Connection, held: Row[Any], sampler: str, rows: list[dict[str, Any]]) -> list[int]:
     """Insert rows of samples and append the event. Returns their ids in order."""
     if not rows:
@@ -54,6 +48,6 @@ def row_of(
         "truncated": sample.truncated,
         "observation": sample.observation,
         "next_observation": sample.next_observation,
-        "fingerprint": fingerprint(body_of(sample)),
+        "fingerprint": fingerprint(asdict(sample)),
         "created_at": held.now,
     }

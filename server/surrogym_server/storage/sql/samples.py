@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from surrogym_server.storage.sql.answers import Answered, read_answered, settle
 from surrogym_server.storage.sql.database import Database
 from surrogym_server.storage.sql.logged import complete_log, store_logged
 from surrogym_server.storage.sql.rows import find, hold, recall, remember, touch
-from surrogym_server.storage.sql.sample_rows import body_of, insert_samples, row_of
+from surrogym_server.storage.sql.sample_rows import insert_samples, row_of
 from surrogym_server.storage.sql.snapshots import insert_snapshots
 from surrogym_server.storage.sql.tables import queries, samples
 
@@ -53,8 +53,8 @@ class SqlSamples(port.Samples):
         logged: bool = False,
         complete: bool = True,
     ) -> AddedSamples:
-        told = [body_of(sample) for sample in samples] if key else []
-        body = fingerprint(sampler, told, *(["logged"] if logged else []))  # compared only if there is a key
+        told = [asdict(sample) for sample in samples] if key else []
+        body = fingerprint(sampler, told, logged)  # compared only if there is a key
         with self._database.write() as connection:
             held = hold(connection, name)
             before: list[int] | None = recall(connection, held, "add_samples", key, body)

@@ -124,7 +124,7 @@ def test_settings_that_make_no_sense_are_refused(settings, said):
 @pytest.mark.parametrize(
     ("header", "said"),
     [
-        ({"format": 3}, "expected a model of format 2"),
+        ({"format": 1}, "expected a model of format 2, got format 1, .* export its samples with that version"),
         ({"outputs": ["theta", "reward"]}, "with outputs"),
         ({"samples": 0}, "finite terminal reward and samples"),
         ({"terminal_reward": float("inf")}, "finite terminal reward"),
@@ -178,16 +178,6 @@ def test_process_noise_moves_steps_by_the_learned_noise(model):
     paths = torch.ones(10, 1, dtype=torch.float64)
     along = [model.transition_along(paths, steps.q, steps.u, process=p).q_next[:, 1] for p in (None, torch.ones(10, 2))]
     torch.testing.assert_close(along[1] - along[0], shift)
-
-
-def test_a_file_of_format_1_has_no_noise_and_the_same_predictions(model, definition):
-    """Files of the versions before the ensemble learned noise stay readable."""
-    old = replace(model, transitions=replace(model.transitions, noise=None))
-    loaded = from_bytes(definition, with_header(old, format=1))
-    steps = random_steps(pendulum(), 10, seed=3)
-    assert offers(loaded, LearnedNoise) is None
-    shaken = loaded.transition(steps.q, steps.u, process=torch.ones(10, 2).double()).q_next
-    assert torch.equal(shaken, model.transition(steps.q, steps.u).q_next)
 
 
 def test_a_negative_size_of_noise_is_refused(model, definition):

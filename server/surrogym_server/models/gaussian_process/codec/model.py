@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 from torch import Tensor
@@ -24,19 +23,15 @@ from surrogym_server.models.gaussian_process.codec.regions import (
     require_region,
 )
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
-from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.regions import TERMINATION
-from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel
+from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel, require_format
 
 FORMAT = 7
 JUMP = "jump"  # prefix of the names of its arrays
-# 1: a reward's timing was the definition's alone; 2: no drift; 3: no warp; 4: no rates; 5: no inputs left out; 6: no
-# shared samples
-READABLE = (1, 2, 3, 4, 5, 6, 7)
 
 
 class GaussianProcessCodec(ModelCodec):
-    """Codec that reads the files of every version of this program."""
+    """Codec of one format. Models of another one are refused."""
 
     def encode(self, model: DynamicsModel) -> StoredModel:
         if type(model) is not GaussianProcessModel:  # a subclass is a model of another family
@@ -78,18 +73,15 @@ def _header(model: GaussianProcessModel) -> dict[str, Any]:
 
 def _read(definition: EnvironmentDefinition, stored: StoredModel) -> GaussianProcessModel:
     header, tensors = stored.header, stored.tensors
-    version, terminal_reward = header["format"], float(header["terminal_reward"])
+    require_format(header["format"], FORMAT)
+    terminal_reward = float(header["terminal_reward"])
     outputs = tuple(read_output(definition, entry, tensors, str(i)) for i, entry in enumerate(header["outputs"]))
-    if version == 1 and definition.reward_timing == "after":
-        outputs = (*outputs[:-1], _read_after(outputs[-1]))
     samples, digest = int(header["samples"]), str(header["digest"])
-    ending = read_region(definition, header.get("termination"), tensors, TERMINATION)
-    jumps = read_jumps(definition, header.get("jumps", []), tensors, JUMP)
+    ending = read_region(definition, header["termination"], tensors, TERMINATION)
+    jumps = read_jumps(definition, header["jumps"], tensors, JUMP)
     names = tuple(output.name for output in outputs)
-    if version not in READABLE or names != definition.outputs:
-        raise InvalidInput(
-            f"expected a model of format {FORMAT} with outputs {definition.outputs}, got format {version} with {names}"
-        )
+    if names != definition.outputs:
+        raise InvalidInput(f"expected a model with outputs {definition.outputs}, got {names}")
     return GaussianProcessModel(definition, outputs[:-1], outputs[-1], terminal_reward, samples, digest, ending, jumps)
 
 
@@ -109,7 +101,3 @@ def _require_consistent(model: GaussianProcessModel) -> None:
     known = definition.declared_reward
     if known is not None and (reward.posterior, reward.centre, reward.feature_map.after) != (None, 0.0, known.after):
         raise InvalidInput("expected a model without a learned reward, because the environment's reward is declared")
-
-
-def _read_after(reward: OutputModel) -> OutputModel:
-    return replace(reward, feature_map=replace(reward.feature_map, after=True))

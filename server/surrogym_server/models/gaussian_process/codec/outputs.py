@@ -108,10 +108,10 @@ def read_output(
         posterior = Posterior(hyper, x, y, factor, weights, jitter, sparse)
     scores = tuple((name, score) for name, score in entry["scores"])
     centre, scale = float(entry["centre"]), float(entry["scale"])
-    name, left_out, warp = str(entry["name"]), int(entry["left_out"]), _warp(entry.get("warp"))
-    past_limits = bool(entry.get("past_limits", False))
-    at_limit = tuple(int(side) for side in entry.get("at_limit", ()))
-    shared = tuple(str(other) for other in entry.get("shared", ()))
+    name, left_out, warp = str(entry["name"]), int(entry["left_out"]), _warp(entry["warp"])
+    past_limits = bool(entry["past_limits"])
+    at_limit = tuple(int(side) for side in entry["at_limit"])
+    shared = tuple(str(other) for other in entry["shared"])
     return OutputModel(
         name, feature_map, posterior, centre, scale, left_out, scores, warp, past_limits, at_limit, shared
     )
@@ -124,16 +124,15 @@ def _warp(entry: dict[str, Any] | None) -> Warp | None:
 def _sparse(entry: dict[str, Any] | None) -> Sparse | None:
     if entry is None:
         return None
-    left_out = None
-    if (found := entry.get("left_out")) is not None:
-        left_out = LeftOut(*(float(found[name]) for name in ("error", "within_one", "within_two", "log_density")))
+    found = entry["left_out"]
+    left_out = LeftOut(*(float(found[name]) for name in ("error", "within_one", "within_two", "log_density")))
     return Sparse(int(entry["points"]), float(entry["unexplained"]), left_out)
 
 
 def _feature_map(entry: dict[str, Any]) -> FeatureMap:
-    drift = tuple(tuple(float(w) for w in row) for row in entry.get("drift", ()))
-    rates = tuple(float(rate) for rate in entry.get("rates", ()))
-    dropped = tuple(int(place) for place in entry.get("dropped", ()))
+    drift = tuple(tuple(float(w) for w in row) for row in entry["drift"])
+    rates = tuple(float(rate) for rate in entry["rates"])
+    dropped = tuple(int(place) for place in entry["dropped"])
     return FeatureMap(**{**entry, "drift": drift, "rates": rates, "dropped": dropped})
 
 
@@ -215,9 +214,9 @@ def _require_numbers(output: OutputModel) -> None:
         least_zero += [hyper.linear_variance, hyper.quadratic_variance, posterior.jitter]
         if posterior.sparse is not None:
             least_zero += [posterior.sparse.points - len(posterior.y), posterior.sparse.unexplained]
-            if (left_out := posterior.sparse.left_out) is not None:
-                finite += [left_out.log_density]
-                least_zero += [left_out.error, left_out.within_one, left_out.within_two]
+            left_out = posterior.sparse.left_out
+            finite += [left_out.log_density]
+            least_zero += [left_out.error, left_out.within_one, left_out.within_two]
     if not (
         all(math.isfinite(v) for v in (*finite, *positive, *least_zero))
         and min(positive) > 0
