@@ -7,6 +7,7 @@ import pytest
 
 from support.commands import command_line
 from surrogym_client.cli import COMMANDS
+from surrogym_client.cli.commands import ADVANCED, GROUPS
 
 STUDIES = [f"reproduce {name}" for name in command_line().commands["reproduce"].commands]
 
@@ -22,7 +23,21 @@ def test_the_command_alone_lists_all_commands(surrogym):
     said = surrogym("--help")
     assert said.code == 0
     assert all(f"  {command} " in said.out for command in (*COMMANDS, "serve", "optimise"))
-    assert "..." not in said.out.partition("Commands:")[2]  # each says what it does in a line that is whole
+    listed = said.out.partition("Start:")[2]
+    assert "..." not in listed  # each says what it does in a line that is whole
+    assert [line for line in listed.splitlines() if line.endswith(":")] == ["Loop:", "After:", "Operate:", "More:"]
+
+
+def test_every_command_of_a_group_exists():
+    assert {name for names in GROUPS.values() for name in names} <= set(command_line().commands)
+
+
+@pytest.mark.parametrize("command", ADVANCED)
+def test_options_for_experts_come_last_under_a_heading_of_their_own(surrogym, command):
+    usual, _, advanced = surrogym(command, "--help").out.partition("\nAdvanced:\n")
+    for option in ADVANCED[command]:
+        assert f"\n  {option} " in f"\n{advanced}"
+        assert f"\n  {option} " not in usual.partition("\nOptions:\n")[2]
 
 
 def test_version(surrogym):

@@ -11,7 +11,7 @@ from importlib.metadata import entry_points
 
 import typer
 
-from surrogym_client.cli.commands import Commands
+from surrogym_client.cli.commands import Command, Commands
 from surrogym_client.cli.errors import sentence
 from surrogym_shared.terminal import say
 
@@ -76,6 +76,8 @@ def build() -> typer.Typer:
         register(app)
     for entry in entry_points(group=ENTRY_POINTS):
         entry.load()(app)
+    for info in app.registered_commands:
+        info.cls = Command
     return app
 
 

@@ -1,16 +1,76 @@
-"""Commands: the group of all commands, which says what takes the place of an option that was removed."""
+"""The commands as a person meets them: grouped in the help, with options for experts in a section of their own, and a
+sentence about what takes the place of an option that was removed."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from surrogym_shared.removed import remark
 
+GROUPS: Mapping[str, tuple[str, ...]] = {
+    "Start": ("demo", "serve", "doctor"),
+    "Loop": ("describe", "register", "sample", "train", "audit", "evaluate", "status"),
+    "After": (
+        *("report", "policies", "policy", "improve", "change", "export", "import", "export-policy", "delete"),
+        "optimise",
+    ),
+    "Operate": ("work", "jobs", "conformance"),
+}
+REST = "More"  # heading of the commands of no group, such as those of other packages
+ADVANCED: Mapping[str, frozenset[str]] = {  # options that a first reader does not need, by command
+    "demo": frozenset({"--arm"}),
+    "evaluate": frozenset(
+        {"--wide", "--start-scale", "--perturb", "--explore", "--parallel", "--algorithm", "--where", "--learn"}
+        | {"--learn-all", "--compare", "--reference", "--video"}
+    ),
+    "register": frozenset({"--preset", "--acquisition", "--initial", "--target", "--bins"}),
+    "sample": frozenset(
+        {"--worker", "--once", "--time-limit", "--most-snapshots", "--most-bytes", "--on-ray", "--ray-address"}
+        | {"--ray-resources", "--runtime-env"}
+    ),
+    "serve": frozenset({"--synchronous", "--engine", "--ray-address", "--ray-hosts", "--ready-file"}),
+    "train": frozenset(
+        {"--variant", "--particles", "--propagation", "--weighting", "--spread", "--process-noise", "--start-box"}
+        | {"--start-visited", "--horizon", "--caution", "--penalty", "--trust", "--num-envs", "--audit-steps"}
+        | {"--tensorboard"}
+    ),
+}
+
+
+class Command(TyperCommand):
+    """One command. Its help has the options for experts last, under "Advanced"."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the sections of arguments and options."""
+        sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": [], "Advanced": []}
+        advanced = ADVANCED.get(self.name or "", frozenset())
+        for parameter in self.get_params(ctx):
+            if (record := parameter.get_help_record(ctx)) is None:
+                continue
+            argument, expert = parameter.param_type_name == "argument", advanced.intersection(parameter.opts)
+            sections["Arguments" if argument else "Advanced" if expert else "Options"].append(record)
+        _write(formatter, sections)
+
 
 class Commands(TyperGroup):
-    """Group of commands. An unknown option that a command once had is refused with its successor."""
+    """Group of all commands. An unknown option that a command once had is refused with its successor."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write a section for each group of commands."""
+        known = {name: command for name in self.list_commands(ctx) if (command := self.get_command(ctx, name))}
+        shown = {name: command for name, command in known.items() if not command.hidden}
+        grouped = {name for names in GROUPS.values() for name in names}
+        groups = {**GROUPS, REST: tuple(name for name in shown if name not in grouped)}
+        width = max(map(len, shown), default=0)
+        limit = formatter.width - 6 - width
+        sections = {
+            heading: [(name.ljust(width), shown[name].get_short_help_str(limit)) for name in names if name in shown]
+            for heading, names in groups.items()
+        }
+        _write(formatter, sections)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the named command."""
@@ -22,3 +82,10 @@ class Commands(TyperGroup):
                 error.message += said  # type: ignore[attr-defined]
                 error.possibilities = None  # type: ignore[attr-defined]
             raise
+
+
+def _write(formatter: Any, sections: Mapping[str, list[tuple[str, str]]]) -> None:
+    for heading, rows in sections.items():
+        if rows:
+            with formatter.section(heading):
+                formatter.write_dl(rows)
