@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 
 from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
-from surrogym_client.evaluation.reporting import as_reported
+from surrogym_client.evaluation.reporting import as_reported, is_promised
 from surrogym_client.original.episodes import open_episode
 from surrogym_client.original.protocol import RealStep
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, Fixed, ObservationEntry, Term, Uniform
@@ -69,3 +70,55 @@ def test_a_constant_that_changed_within_an_episode_is_named(drift: float, names:
     told = as_reported(result, SETTINGS, "a" * 32)
     assert told.declared is not bool(names), "the server judges a promise by declared episodes alone"
     assert ("wanted changed within episodes" in told.note) is bool(names)
+
+
+RESET_ONLY = SPEC.model_copy(update={"query": "rollout"})
+
+
+class Rig:
+    """x' = x + u / 10 of a machine that ends each episode itself after ``length`` steps, or ignores its seed."""
+
+    def __init__(self, length: int = 100, deaf: bool = False) -> None:
+        self._length, self._deaf, self._steps, self._at = length, deaf, 0, np.zeros(2)
+
+    def spec(self) -> EnvironmentSpec:
+        return RESET_ONLY
+
+    def begin(self, seed: int | None = None) -> np.ndarray:
+        start = np.random.default_rng(None if self._deaf else seed).uniform(-1, 1)
+        self._steps, self._at = 0, np.array([start, 0.5])
+        return self._at
+
+    def act(self, action: np.ndarray) -> RealStep:
+        self._steps += 1
+        before, self._at = self._at, self._at + np.array([float(action[0]) / 10, 0.0])
+        return RealStep(before, action, self._at, reward=-1.0, truncated=self._steps >= self._length)
+
+    def close(self) -> None:
+        pass
+
+
+def run(**options: Any) -> Evaluation:
+    opener = partial(open_episode, "a rig", RESET_ONLY, partial(Rig, **options))
+    return evaluate(lambda observations: np.ones((len(observations), 1)), opener, SETTINGS)
+
+
+@pytest.mark.parametrize(("length", "limit"), [(100, 6), (6, 6), (4, 4)])
+def test_a_promise_is_not_for_episodes_that_the_environment_ends_earlier(length: int, limit: int) -> None:
+    result = run(length=length)
+    assert result.limit == limit
+    assert is_promised(SETTINGS, result, SPEC) is (limit == SPEC.time_limit)
+    told = as_reported(result, SETTINGS, "a" * 32, trained_for=SPEC)
+    assert told.declared is (limit == SPEC.time_limit)
+    assert ("at most 4 steps" in told.note) is (limit == 4)
+    longer = SPEC.model_copy(update={"time_limit": 200})
+    assert not is_promised(SETTINGS, result, longer), "the policy promised for longer episodes"
+
+
+@pytest.mark.parametrize("deaf", [True, False])
+def test_an_environment_that_ignores_its_seed_is_noticed(deaf: bool) -> None:
+    result = run(deaf=deaf)
+    assert result.seeded is not deaf
+    told = as_reported(result, SETTINGS, "a" * 32)
+    assert told.seeded is not deaf
+    assert ("ignored" in told.note) is deaf

@@ -43,6 +43,7 @@ def evaluation(id: int = 1, **fields: Any) -> wire.EvaluationDetail:
         "declared": True,
         "environment": "",
         "own": True,
+        "seeded": True,
         "first_seed": SEED,
         "episodes": 100,
         "steps": 20_000,
@@ -311,6 +312,11 @@ def test_episodes_in_another_environment_are_listed_apart(modelled: Known):
     assert "in maglev:Heavy: declared starts 100 -3.7" in told_["What it gives"]
     assert "in maglev:Heavy: declared starts (100 episodes)" in told_["What was not tested"]
     assert chosen_real(policy(evaluations=[elsewhere])) is None
+
+
+def test_starts_that_no_seed_repeats_are_not_compared() -> None:
+    unseeded = [evaluation(1, seeded=False), without(seeded=False)]
+    assert chosen_without(policy(evaluations=unseeded), unseeded[0]) is None
 
 
 @pytest.mark.parametrize(("value", "words"), [(1, "100 %"), (0.99999, "99.9 %"), (0.5, "50 %"), (0.0, "0 %")])

@@ -144,6 +144,7 @@ def command(
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 10 --learn 16
     """
+    from surrogym_client.evaluation.reporting import is_promised
     from surrogym_client.policies.files import card_of_policy
     from surrogym_shared.terminal import give
 
@@ -158,11 +159,11 @@ def command(
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
     reports = _reports(beside.controllers(policy, card, reading, opener), card.spec, run, enter, settings, policy)
     result = reports[0][1]
-    promise = card.promise if settings.declared and not result.varied else None
+    promise = card.promise if is_promised(settings, result, card.spec) else None
     judged = promise if _judges(settings.episodes) else None
     with kept(learning, policy, result, quiet=output.quiet) as steps:
         if stored := keeping.push and ledger is not None:
-            _keep(policy, reports, settings, _named(env, card), quiet=output.quiet)
+            _keep(policy, reports, settings, _named(env, card), card.spec, quiet=output.quiet)
         filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if keeping.video else None
         version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
         found = differences.between(ledger, service.server, token, result, settings, judged, steps, quiet=output.quiet)
@@ -175,7 +176,7 @@ def command(
     summary |= {"promise_kept": _kept(judged, result), "version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
     more = [*_elsewhere(env, card), *(found.in_words(card.spec) if found else [])]
-    more += [*_why_not_judged(card, settings, result), *_repeated(result)]
+    more += [*_why_not_judged(card, settings, result), *_unseeded(reports), *_repeated(result)]
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
     if steps is not None:
         steps.require_stored()
@@ -197,14 +198,31 @@ def _elsewhere(env: str | None, card: PolicyCard) -> list[str]:
 
 
 def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Evaluation) -> list[str]:
-    """Say that actions were changed, or which constants changed within an episode. Nothing if neither was, or without a
-    promise for these starts."""
+    """Say that actions were changed, that episodes had another limit, or which constants changed within an episode.
+    Nothing if none of these is true, or without a promise for these starts."""
+    from surrogym_client.evaluation.reporting import has_other_limit
+
     if settings.explore:
         return [f"actions were changed at random by {settings.explore:.2g}, so the promise is not judged"]
-    if card.promise is None or not (settings.declared and result.varied):
+    if card.promise is None or not settings.declared:
+        return []
+    if card.spec is not None and has_other_limit(result, card.spec):
+        return [
+            f"the promise is not judged: it is for episodes of at most {card.spec.time_limit} steps, and these had at "
+            f"most {result.limit}"
+        ]
+    if not result.varied:
         return []
     changed = ", ".join(result.varied)
     return [f"the promise is not judged: it is for episodes without a change of {changed}, which changed here"]
+
+
+def _unseeded(reports: Sequence[tuple[Controller, Evaluation]]) -> list[str]:
+    """Say that seeds repeat no start. Nothing if they do."""
+    if all(result.seeded for _, result in reports):
+        return []
+    others = ", so these controllers did not run the same starts" if len(reports) > 1 else ""
+    return [f"the environment ignores its seed: each evaluation has other starts{others}"]
 
 
 def _repeated(result: Evaluation) -> list[str]:
@@ -263,6 +281,7 @@ def _keep(
     reports: Sequence[tuple[Controller, Evaluation]],
     settings: EvaluationSettings,
     environment: str,
+    spec: EnvironmentSpec | None,
     *,
     quiet: bool,
 ) -> None:
@@ -282,7 +301,15 @@ def _keep(
     paired = paired_start(reports[0][1], settings.episodes)
     try:
         noted = [
-            as_reported(result, settings, uuid4().hex, environment=environment, controller=controller, paired=paired)
+            as_reported(
+                result,
+                settings,
+                uuid4().hex,
+                environment=environment,
+                trained_for=spec,
+                controller=controller,
+                paired=paired,
+            )
             for controller, result in reports
         ]
     except ValidationError as error:

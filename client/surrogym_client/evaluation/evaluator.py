@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -82,6 +82,8 @@ class Evaluation:
     success: NDArray[np.bool_] | None  # (N,); None where the specification has no criterion
     traces: tuple[Trace, ...]  # of every episode
     varied: tuple[str, ...] = ()  # constants of the specification that changed within an episode
+    limit: int | None = None  # most steps of an episode, by the specification or by an end of the environment's own
+    seeded: bool = True  # whether a second reset with the first seed began in the same state
 
     @property
     def trace(self) -> Trace:
@@ -122,6 +124,8 @@ class Evaluation:
             "steps": self.steps,
             "varied": list(self.varied),
             "equal": self.equal,
+            "limit": self.limit,
+            "seeded": self.seeded,
             "per_episode": [float(r) for r in self.returns],
         }
 
@@ -270,6 +274,7 @@ class _Run:
     ) -> None:
         self.settings = settings
         self.begun = 0  # real steps begun, including interrupted and failed ones
+        self._seeded = True
         self._policy = policy
         self._progress = progress
         self._remark = remark
@@ -287,11 +292,13 @@ class _Run:
                 self._look_for_equal_ones()
             self._tell()
             between_steps()
-        return _account(self._tallies)
+        return replace(_account(self._tallies), seeded=self._seeded)
 
     def _begin(self, free: Sequence[Episode]) -> list[_Tally]:
         """Begin the next episodes, one in each free instance, until all have begun."""
         first = len(self._tallies)
+        if first == 0:
+            self._seeded = _repeats_start(free[0], self.settings)
         begun = [
             _Tally(first + i, episode, _start(episode, self.settings, first + i), self._noise(first + i))
             for i, episode in enumerate(free[: self.settings.episodes - first])
@@ -351,6 +358,21 @@ def _start(episode: Episode, settings: EvaluationSettings, index: int) -> Moment
     return episode.reset(seed)
 
 
+def _repeats_start(episode: Episode, settings: EvaluationSettings) -> bool:
+    """Whether two resets with the first seed begin in the same state. True where no reset chooses the start."""
+    if settings.wide or settings.start_scale != 1:
+        return True
+    one, other = (episode.reset(settings.first_seed).coordinates for _ in range(2))
+    return all(abs(b - a) <= ROUNDING * span(c) for c, a, b in zip(episode.spec.coordinates, one, other, strict=True))
+
+
+def _limit(tallies: Sequence[_Tally]) -> int | None:
+    """The time limit of the episodes: the specification's, or a shorter one that the environment kept by itself."""
+    declared = tallies[0].episode.spec.time_limit
+    own = [t.length for t in tallies if t.moment.truncated and t.length < t.limit]
+    return min(own) if own else declared
+
+
 def _account(tallies: Sequence[_Tally]) -> Evaluation:
     spec = tallies[0].episode.spec
     criterion = spec.success
@@ -360,6 +382,7 @@ def _account(tallies: Sequence[_Tally]) -> Evaluation:
         success=None if criterion is None else np.array([_succeeds(criterion, t) for t in tallies]),
         traces=tuple(tally.trace for tally in tallies),
         varied=_varied(spec, tallies),
+        limit=_limit(tallies),
     )
 
 

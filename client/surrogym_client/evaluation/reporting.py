@@ -11,6 +11,7 @@ import numpy as np
 
 from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
 from surrogym_shared import wire
+from surrogym_shared.spec import EnvironmentSpec
 
 MAX_POINTS = 2_000  # most steps of a stored trace; longer ones are cut
 MAX_NUMBERS = 30_000  # most numbers of a trace: a request of at most 4 MiB has four traces
@@ -22,6 +23,7 @@ def as_reported(
     key: str,
     *,
     environment: str = "",
+    trained_for: EnvironmentSpec | None = None,
     controller: wire.Controller = "policy",
     paired: int = 0,
 ) -> wire.AddEvaluation:
@@ -32,14 +34,16 @@ def as_reported(
         settings: starts, perturbation and exploration of the episodes.
         key: idempotency key, so that the same evaluation is stored once.
         environment: name of the environment in which the episodes ran; empty for the surrogate's own.
+        trained_for: specification that the policy was trained for, if it is known.
         controller: what chose the actions.
         paired: number of the episode to compare, see ``paired_start``.
     """
     shown: dict[wire.TraceRank, int] = {"paired": paired, **result.ranked()}
     return wire.AddEvaluation(
         controller=controller,
-        note=words_of(settings, result.varied),
-        declared=settings.declared and not result.varied,
+        note=_note(settings, result, trained_for),
+        declared=is_promised(settings, result, trained_for),
+        seeded=result.seeded,
         environment=environment,
         first_seed=settings.first_seed,
         returns=result.returns.tolist(),
@@ -48,6 +52,17 @@ def as_reported(
         traces=[_trace(rank, settings.first_seed + at, result.traces[at]) for rank, at in shown.items()],
         idempotency_key=key,
     )
+
+
+def is_promised(settings: EvaluationSettings, result: Evaluation, trained_for: EnvironmentSpec | None) -> bool:
+    """Whether episodes are of the kind that a promise is for: declared starts, constants that stay, and the time limit
+    of the policy's specification."""
+    return settings.declared and not result.varied and not has_other_limit(result, trained_for)
+
+
+def has_other_limit(result: Evaluation, trained_for: EnvironmentSpec | None) -> bool:
+    """Whether the episodes had another time limit than the specification of the policy."""
+    return trained_for is not None and result.limit != trained_for.time_limit
 
 
 def paired_start(result: Evaluation, among: int) -> int:
@@ -67,6 +82,12 @@ def words_of(settings: EvaluationSettings, varied: Sequence[str] = ()) -> str:
     changing = f", {', '.join(varied)} changed within episodes" if varied else ""
     random = f", actions changed at random by {settings.explore:.2g}" if settings.explore else ""
     return f"{starts}, from seed {settings.first_seed}{machine}{random}{changing}"
+
+
+def _note(settings: EvaluationSettings, result: Evaluation, trained_for: EnvironmentSpec | None) -> str:
+    limit = f", episodes of at most {result.limit} steps" if has_other_limit(result, trained_for) else ""
+    seeds = "" if result.seeded else ", which the environment ignored"
+    return f"{words_of(settings, result.varied)}{limit}{seeds}"
 
 
 def _trace(rank: wire.TraceRank, seed: int, trace: Trace) -> wire.EpisodeTrace:

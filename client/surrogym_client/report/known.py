@@ -139,10 +139,10 @@ def chosen_reference(policy: PolicyDetail, real: EvaluationView | None) -> Evalu
 def _beside(
     policy: PolicyDetail, real: EvaluationView | None, controllers: Sequence[Controller]
 ) -> EvaluationView | None:
-    if real is None:
+    if real is None or not real.seeded:
         return None
     starts = (real.own, real.first_seed, real.note)
-    among = [one for one in policy.evaluations if one.controller in controllers]
+    among = [one for one in policy.evaluations if one.controller in controllers and one.seeded]
     same = [one for one in among if (one.own, one.first_seed, one.note) == starts]
     return same[-1] if same else None
 

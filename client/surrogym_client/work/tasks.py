@@ -145,7 +145,15 @@ def run_episodes(
         results[controller] = _counted(predict, environment, settings, controller, tell, gathered, trained_for)
     paired = paired_start(results["policy"], settings.episodes)
     gathered.evaluations = [
-        as_reported(result, settings, uuid4().hex, environment=environment.name, controller=controller, paired=paired)
+        as_reported(
+            result,
+            settings,
+            uuid4().hex,
+            environment=environment.name,
+            trained_for=trained_for,
+            controller=controller,
+            paired=paired,
+        )
         for controller, result in results.items()
     ]
     if task.video:

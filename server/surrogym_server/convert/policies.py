@@ -10,7 +10,11 @@ from surrogym_server.storage.policies import EvaluationRecord, PolicyFile, Polic
 from surrogym_server.storage.records import JSON
 from surrogym_shared import wire
 
-OLDER: JSON = {"environment": "", "own": True}  # of evaluations that were stored before these fields existed
+OLDER: JSON = {
+    "environment": "",
+    "own": True,
+    "seeded": True,
+}  # of evaluations that were stored before these fields existed
 CARD = "the card of a policy"  # name in the error if it is damaged
 
 
@@ -30,6 +34,7 @@ def episodes(body: wire.AddEvaluation) -> Episodes:
         body.note,
         body.declared,
         body.environment,
+        body.seeded,
         body.first_seed,
         body.returns,
         body.lengths,

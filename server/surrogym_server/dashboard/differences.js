@@ -19,7 +19,7 @@ export function tail(share) {
 /** Whether two policies ran the same starts of the same machine, and the return of each episode is known. */
 function paired(one, other) {
   const [a, b] = [realOf(one.policy), realOf(other.policy)];
-  return a.first_seed === b.first_seed && a.note === b.note && one.returns.length > 1 && one.returns.length === other.returns.length;
+  return a.seeded && b.seeded && a.first_seed === b.first_seed && a.note === b.note && one.returns.length > 1 && one.returns.length === other.returns.length;
 }
 
 function errorOf(one, other) {

@@ -10,8 +10,8 @@ export const realOf = ({ evaluations }) => newest(evaluations, ({ controller, de
 /** The newest real episodes of other controllers from the same starts. */
 function besides(policy, controllers) {
   const real = realOf(policy);
-  return real && newest(policy.evaluations, ({ controller, first_seed: seed, note, own }) =>
-    own && controllers.includes(controller) && seed === real.first_seed && note === real.note);
+  return real?.seeded && newest(policy.evaluations, ({ controller, first_seed: seed, note, own, seeded }) =>
+    own && seeded && controllers.includes(controller) && seed === real.first_seed && note === real.note);
 }
 
 export const withoutOf = (policy) => besides(policy, ["zero", "random"]);

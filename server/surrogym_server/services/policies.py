@@ -30,6 +30,7 @@ class Episodes:
     note: str
     declared: bool
     environment: str
+    seeded: bool
     first_seed: int
     returns: Sequence[float]
     lengths: Sequence[int]
@@ -237,6 +238,7 @@ def _summary(episodes: Episodes) -> JSON:
         "note": episodes.note,
         "declared": episodes.declared,
         "environment": episodes.environment,
+        "seeded": episodes.seeded,
         "first_seed": episodes.first_seed,
         "episodes": len(returns),
         "steps": sum(episodes.lengths),

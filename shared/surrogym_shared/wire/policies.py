@@ -163,6 +163,11 @@ class AddEvaluation(Request):
         description="name of the environment in which the episodes ran, such as ``module:Class``; empty: the "
         "surrogate's own",
     )
+    seeded: bool = Field(
+        default=True,
+        description="whether a reset with the same seed repeats the start; otherwise the episodes are not compared "
+        "with others start by start",
+    )
     first_seed: Count = Field(description="reset seed of the first episode; each further episode has the next seed")
     returns: Annotated[list[Measured], Field(min_length=1, max_length=MAX_EPISODES)] = Field(
         description="return of each episode"
@@ -217,6 +222,7 @@ class EvaluationView(Reply):
         description="whether that is the surrogate's own environment. If the surrogate names it by free text only, its "
         "own is the one of its first evaluation"
     )
+    seeded: bool = Field(description="whether a reset with the same seed repeats the start")
     first_seed: int = Field(description="reset seed of the first episode")
     episodes: int = Field(description="number of episodes")
     steps: int = Field(description="number of real steps")
