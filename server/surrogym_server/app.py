@@ -39,7 +39,7 @@ from surrogym_server.api.observe import Observed
 from surrogym_server.api.state import Services
 from surrogym_server.api.stepping.routes import StepDoor
 from surrogym_server.api.stepping.routes import router as stepping
-from surrogym_server.api.turns import Turns
+from surrogym_server.api.turns import Turns, Waiting
 from surrogym_server.cluster import pool
 from surrogym_server.convert import definition_from_spec, stored_definition
 from surrogym_server.convert.stored import read_stored
@@ -136,6 +136,8 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     app.state.max_body_bytes = settings.max_body_bytes
     app.state.parsing = asyncio.Lock()
     app.state.turns = Turns("predictions", at_work=2, waiting=32)
+    app.state.streams = Waiting("open streams of events")
+    app.state.claims = Waiting("waiting claims")
     app.state.log_turns = Turns("logs", at_work=1, waiting=8)
     if settings.tokens:
         known = ", ".join(f"{role} {fingerprint(token)}" for token, role in settings.tokens.items())
@@ -186,7 +188,7 @@ async def _lifespan(
     process = _build_process(settings, design, storage, app.state.metrics, engine)
     app.state.notices = process.notices
     services = _build_services(settings, design, process)
-    sweeper = Sweeper(storage, process.engine, settings.sweep_seconds, process.metrics)
+    sweeper = Sweeper(storage, process.engine, settings.sweep_seconds, process.metrics, process.notices)
     for registry in (ACQUISITIONS, MODELS):
         logger.info("%ss: %s", registry.kind, ", ".join(registry.names))
         for name, why in registry.broken.items():

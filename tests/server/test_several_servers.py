@@ -16,7 +16,7 @@ from support import pendulum
 from support.postgresql import Postgresql, running_postgresql
 from support.server import ServerProcess, running_server
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.services import queries
+from surrogym_server.services import lines
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.queries import QueryService
@@ -106,7 +106,7 @@ def test_a_claim_that_waits_at_one_server_wakes_for_a_query_of_another(
     postgresql: Postgresql, monkeypatch: pytest.MonkeyPatch
 ):
     """By an announcement alone: the look from time to time is put off."""
-    monkeypatch.setattr(queries, "POLL_SECONDS", 3_600.0)
+    monkeypatch.setattr(lines, "LOOK_SECONDS", 3_600.0)
     url = postgresql.new_database()
     storages = [open_storage(url) for _ in range(2)]
     spec = EnvironmentSpec.model_validate(pendulum.spec()).model_dump(mode="json")

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
+from functools import lru_cache
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Query
-from fastapi.concurrency import run_in_threadpool
+from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import StreamingResponse
 
 from surrogym_server import convert
@@ -14,7 +14,8 @@ from surrogym_server.api.auth import READ
 from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
-from surrogym_server.storage.records import EventRecord
+from surrogym_server.api.turns import Waiting
+from surrogym_server.services.events import Page
 from surrogym_shared.codes import Code
 
 router = APIRouter(prefix="/v1", tags=["events"], route_class=DoorRoute)
@@ -31,12 +32,15 @@ HEADERS = {"cache-control": "no-store", "x-accel-buffering": "no"}
     summary="Follow whether anything happens",
     response_class=StreamingResponse,
     dependencies=[READ],
-    responses={200: {"content": {STREAM: {"example": "event: changed\ndata: {}\n\n"}}}},
+    responses={
+        200: {"content": {STREAM: {"example": "event: changed\ndata: {}\n\n"}}},
+        **documented(Code.TOO_MANY_REQUESTS),
+    },
 )
-async def changes(use: Use) -> StreamingResponse:
+async def changes(request: Request, use: Use) -> StreamingResponse:
     """Send an event ``changed`` after a change of any surrogate. Several changes in quick succession make one event.
     Read ``/v1/surrogates`` again after it."""
-    return StreamingResponse(_changes(use.events.changes()), media_type=STREAM, headers=HEADERS)
+    return _stream(request, _changes(use.events.changes()))
 
 
 @router.get(
@@ -46,33 +50,51 @@ async def changes(use: Use) -> StreamingResponse:
     dependencies=[READ],
     responses={
         200: {"content": {STREAM: {"example": 'id: 1\nevent: created\ndata: {"id": 1, "kind": "created"}\n\n'}}},
-        **documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+        **documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_MANY_REQUESTS),
     },
 )
 async def events(
     name: str,
+    request: Request,
     use: Use,
     after: Annotated[int | None, Query(ge=0, le=2**63 - 1)] = None,
     last_event_id: Annotated[int | None, Header(ge=0, le=2**63 - 1)] = None,
 ) -> StreamingResponse:
     """Send queries, samples, fits and phases as they happen. With ``Last-Event-ID`` or ``after`` the stream continues
-    after a known event; without either it begins with the next event."""
-    newest = await run_in_threadpool(use.events.newest, name)
+    after a known event; without either it begins with the next event. The oldest of very many events are removed."""
+    newest = await use.events.newest(name)
     start = next((id for id in (last_event_id, after) if id is not None), newest)
-    return StreamingResponse(_lines(use.events.follow(name, start)), media_type=STREAM, headers=HEADERS)
+    return _stream(request, _lines(use.events.follow(name, start)))
+
+
+def _stream(request: Request, lines: AsyncIterator[str]) -> StreamingResponse:
+    """Raises ``Overloaded`` if the request's token has too many streams."""
+    streams: Waiting = request.app.state.streams
+    streams.require_room(request)
+
+    async def counted() -> AsyncIterator[str]:
+        with streams.count(request):  # a stream that never begins is never counted
+            yield CONNECTED
+            async for text in lines:
+                yield text
+
+    return StreamingResponse(counted(), media_type=STREAM, headers=HEADERS)
 
 
 async def _changes(changes: AsyncIterator[bool]) -> AsyncIterator[str]:
-    yield CONNECTED
     async for changed in changes:
         yield "event: changed\ndata: {}\n\n" if changed else SILENCE
 
 
-async def _lines(records: AsyncIterator[EventRecord | None]) -> AsyncIterator[str]:
-    yield CONNECTED
-    async for record in records:
-        if record is None:
-            yield SILENCE
-        else:
-            body = convert.event(record).model_dump_json()
-            yield f"id: {record.id}\nevent: {record.kind}\ndata: {body}\n\n"
+async def _lines(pages: AsyncIterator[Page | None]) -> AsyncIterator[str]:
+    async for page in pages:
+        yield SILENCE if page is None else _text(page)
+
+
+@lru_cache(maxsize=8)
+def _text(page: Page) -> str:
+    """A page for a stream, made once for all that wait for it."""
+    return "".join(
+        f"id: {record.id}\nevent: {record.kind}\ndata: {convert.event(record).model_dump_json()}\n\n"
+        for record in page.events
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Request
@@ -13,6 +14,7 @@ from surrogym_server.api.body import example
 from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
+from surrogym_server.api.turns import require_present
 from surrogym_server.services.activity import Offer
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
@@ -86,21 +88,18 @@ def cancel(name: str, job_id: Number, use: Use) -> JobView:
     "/jobs:claim",
     summary="Lease a job to run",
     dependencies=[TRAIN],
-    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_MANY_REQUESTS),
 )
 async def claim(
     name: str, body: Annotated[ClaimJob, example(examples.CLAIM_JOB)], request: Request, use: Use
 ) -> ClaimedJob:
     """Lease the oldest queued job to this worker only. If there is none, the reply waits for one, up to
     ``wait_seconds``."""
-    job = await use.jobs.claim(
-        name,
-        body.worker,
-        Offer(body.most_episodes, body.reference),
-        body.lease_seconds,
-        body.wait_seconds,
-        request.is_disconnected,
-    )
+    offer = Offer(body.most_episodes, body.reference)
+    present = partial(require_present, request)
+    request.app.state.claims.require_room(request)
+    with request.app.state.claims.count(request):
+        job = await use.jobs.claim(name, body.worker, offer, body.lease_seconds, body.wait_seconds, present)
     return convert.claimed_job(job, body.lease_seconds)
 
 

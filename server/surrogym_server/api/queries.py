@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -16,6 +17,7 @@ from surrogym_server.api.body import example
 from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
+from surrogym_server.api.turns import require_present
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     AddQueries,
@@ -48,16 +50,19 @@ LEASE_ERRORS = documented(
     "/queries:claim",
     summary="Lease queries to answer",
     dependencies=[SAMPLE],
-    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_MANY_REQUESTS),
 )
 async def claim(
     name: str, body: Annotated[ClaimQueries, example(examples.CLAIM)], request: Request, use: Use
 ) -> ClaimedQueries:
     """Claim up to ``max_queries`` queries, each for one sampler only. If there are none, the reply waits at most
     ``wait_seconds``, or until the design is finished."""
-    claimed = await use.queries.claim(
-        name, body.sampler, body.max_queries, body.lease_seconds, body.wait_seconds, request.is_disconnected
-    )
+    present = partial(require_present, request)
+    request.app.state.claims.require_room(request)
+    with request.app.state.claims.count(request):
+        claimed = await use.queries.claim(
+            name, body.sampler, body.max_queries, body.lease_seconds, body.wait_seconds, present
+        )
     return convert.claimed(claimed, body.lease_seconds)
 
 

@@ -4,15 +4,20 @@ has gone."""
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 from fastapi import Request
 from starlette.requests import ClientDisconnect
 
+from surrogym_server.api.auth import bearer_token
 from surrogym_server.errors import Overloaded
 
 T = TypeVar("T")
+
+MAX_WAITING = 2_000  # of a token and a kind; a quarter of all connections are enough for both kinds
 
 
 class Turns:
@@ -38,8 +43,38 @@ class Turns:
         self._inside += 1
         try:
             async with self._turn:
-                if await request.is_disconnected():
-                    raise ClientDisconnect
+                await require_present(request)
                 return await asyncio.to_thread(work)
         finally:
             self._inside -= 1
+
+
+class Waiting:
+    """Limit on the requests of each token that wait for something to happen. They cost memory, but no work."""
+
+    def __init__(self, what: str, most: int = MAX_WAITING) -> None:
+        """``what`` names the requests, for the message of a refusal."""
+        self._what = what
+        self._most = most
+        self._by_token = Counter[str | None]()
+
+    def require_room(self, request: Request) -> None:
+        """Raise ``Overloaded`` if the token of a request has as many as it may have."""
+        if self._by_token[bearer_token(request.scope)] >= self._most:
+            raise Overloaded(f"expected at most {self._most} {self._what} with one token, got one more")
+
+    @contextmanager
+    def count(self, request: Request) -> Iterator[None]:
+        """Count a request within the context."""
+        token = bearer_token(request.scope)
+        self._by_token[token] += 1
+        try:
+            yield
+        finally:
+            self._by_token[token] -= 1
+
+
+async def require_present(request: Request) -> None:
+    """Raise ``ClientDisconnect`` if the caller has closed its connection."""
+    if await request.is_disconnected():
+        raise ClientDisconnect

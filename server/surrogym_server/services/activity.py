@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -10,7 +11,8 @@ from typing import Generic, NamedTuple, TypeVar
 Clock = Callable[[], float]
 T = TypeVar("T")
 
-ALIVE_SECONDS = 60.0  # one that was silent for longer counts as gone
+ALIVE_SECONDS = 75.0  # one that was silent for longer counts as gone; the longest claim waits for 60
+FORGET_AT = 256  # entries, those of the silent included; a search through all at each call would take longer with each
 
 
 class _Alive(Generic[T]):
@@ -19,15 +21,24 @@ class _Alive(Generic[T]):
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock = clock
         self._heard: dict[tuple[str, str], tuple[float, T]] = {}
+        self._forget_at = FORGET_AT
+        self._lock = threading.Lock()
 
-    def _note(self, surrogate: str, name: str, said: T) -> None:
-        now = self._clock()
-        fresh = {key: one for key, one in self._heard.copy().items() if now - one[0] < ALIVE_SECONDS}
-        self._heard = fresh | {(surrogate, name): (now, said)}
+    def _note(self, surrogate: str, name: str, said: T) -> bool:
+        """Returns whether it is new, or was silent for so long that it counted as gone."""
+        now, key = self._clock(), (surrogate, name)
+        with self._lock:
+            before, _ = self._heard.get(key, (-ALIVE_SECONDS, said))
+            self._heard[key] = (now, said)
+            if len(self._heard) > self._forget_at:
+                self._heard = {key: one for key, one in self._heard.items() if now - one[0] < ALIVE_SECONDS}
+                self._forget_at = max(FORGET_AT, 2 * len(self._heard))
+        return now - before >= ALIVE_SECONDS
 
     def _alive(self) -> list[tuple[str, str, T]]:
         now = self._clock()
-        heard = sorted(self._heard.items(), key=lambda one: one[0])
+        with self._lock:
+            heard = sorted(self._heard.items(), key=lambda one: one[0])
         return [(*key, said) for key, (at, said) in heard if now - at < ALIVE_SECONDS]
 
 
@@ -38,7 +49,7 @@ class Samplers(_Alive[None]):
         self._note(surrogate, sampler, None)
 
     def by_surrogate(self) -> dict[str, list[str]]:
-        """Names of the samplers that claimed or answered within the last minute."""
+        """Names of the samplers that claimed or answered lately."""
         alive = defaultdict[str, list[str]](list)
         for surrogate, sampler, _ in self._alive():
             alive[surrogate].append(sampler)
@@ -55,12 +66,12 @@ class Offer(NamedTuple):
 class Workers(_Alive[Offer]):
     """When each trainer worker was last heard of, and its offer."""
 
-    def heard(self, surrogate: str, worker: str, offer: Offer | None = None) -> None:
-        """Note that a worker claimed or reported. None keeps the offer that it made before."""
+    def heard(self, surrogate: str, worker: str, offer: Offer | None = None) -> bool:
+        """Note that a worker claimed or reported, and return whether it is new. None keeps its earlier offer."""
         if offer is None:
             _, offer = self._heard.get((surrogate, worker), (0.0, Offer()))
-        self._note(surrogate, worker, offer)
+        return self._note(surrogate, worker, offer)
 
     def of(self, surrogate: str) -> dict[str, Offer]:
-        """The offer of each worker heard of within the last minute, by its name."""
+        """The offer of each worker heard of lately, by its name."""
         return {worker: offer for owner, worker, offer in self._alive() if owner == surrogate}

@@ -3,30 +3,46 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from typing import TypeVar
 
-from surrogym_server.errors import Unavailable, UnknownSurrogate
+from surrogym_server.errors import SurrogymError, Unavailable, UnknownSurrogate
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import EventRecord
 
-POLL_SECONDS = 2.0
+T = TypeVar("T")
+
 SILENCE_SECONDS = 15.0
-CHANGE_SECONDS = 0.2  # at least, between two notices that something has changed
-PAGE = 1_000
+CHANGE_SECONDS = 0.2  # at least, between two pages of new events, and between two notices that something has changed
+PAGE = 200
+RETRY_SECONDS = 2.0
+READING = 2  # reads at once: streams that open together leave the other threads and the event loop to others
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """Events in order. All streams that wait for the same ones share one page."""
+
+    events: tuple[EventRecord, ...]
 
 
 class EventService:
+    """Streams of events. Of all streams of a surrogate that wait, one reads the new events for all."""
+
     def __init__(self, storage: Storage, notices: Notices) -> None:
         self._storage = storage
         self._notices = notices
+        self._turn = asyncio.Semaphore(READING)
+        self._shared: dict[str, tuple[tuple[int, int], asyncio.Task[Page]]] = {}  # the last page of each surrogate
 
-    def newest(self, name: str) -> int:
+    async def newest(self, name: str) -> int:
         """The id of the last event, 0 before the first. Raises ``UnknownSurrogate``."""
-        after = 0
-        while page := self._storage.events.list(name, after, PAGE):
-            after = page[-1].id
-        return after
+        newest = await self._read(lambda: self._storage.events.newest([name]))
+        if name not in newest:
+            raise UnknownSurrogate(f"expected the name of a surrogate, got {name!r}, which does not exist")
+        return newest[name]
 
     async def changes(self) -> AsyncIterator[bool]:
         """Yield True after an event of any surrogate, and False after a silence, until the server stops."""
@@ -37,24 +53,45 @@ class EventService:
                     yield changed
                     await asyncio.sleep(CHANGE_SECONDS)
 
-    async def follow(self, name: str, after: int) -> AsyncIterator[EventRecord | None]:
+    async def follow(self, name: str, after: int) -> AsyncIterator[Page | None]:
         """Yield the events with an id above ``after``, and None after a silence, until the surrogate is deleted or the
         server stops."""
-        silent = 0.0
-        with self._notices.listen(name) as listener:
-            while not self._notices.closing:
-                try:
-                    page = await asyncio.to_thread(self._storage.events.list, name, after, PAGE)
-                except UnknownSurrogate:
-                    return
-                except Unavailable:  # it continues when storage is back
-                    page = []
-                for event in page:
-                    yield event
-                    after = event.id
-                silent = 0.0 if page else silent + POLL_SECONDS
-                if silent >= SILENCE_SECONDS:
-                    silent = 0.0
-                    yield None
-                if not page:
-                    await listener.wait(POLL_SECONDS)
+        try:
+            with self._notices.listen(name) as listener:
+                while not self._notices.closing:
+                    version = listener.version
+                    try:
+                        page = await self._page(name, after, version)
+                    except UnknownSurrogate:
+                        return
+                    except Unavailable:  # it continues when storage is back
+                        await asyncio.sleep(RETRY_SECONDS)
+                        continue
+                    if page.events:
+                        yield page
+                        after = page.events[-1].id
+                        if len(page.events) == PAGE:
+                            continue
+                        await asyncio.sleep(CHANGE_SECONDS)
+                    while version == listener.version and not self._notices.closing:
+                        if not await listener.wait(SILENCE_SECONDS):
+                            yield None
+        finally:
+            if name not in self._notices.listened:
+                self._shared.pop(name, None)
+
+    async def _page(self, name: str, after: int, version: int) -> Page:
+        """The events after one. Streams that ask for the same at the same version share the answer."""
+        known, task = self._shared.get(name, (None, None))
+        if task is None or known != (after, version):
+            task = asyncio.create_task(self._read(lambda: Page(tuple(self._storage.events.list(name, after, PAGE)))))
+            self._shared[name] = (after, version), task
+        try:
+            return await asyncio.shield(task)
+        except SurrogymError:
+            self._shared.pop(name, None)
+            raise
+
+    async def _read(self, read: Callable[[], T]) -> T:
+        async with self._turn:
+            return await asyncio.to_thread(read)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import asyncio
-import time
-from collections.abc import Awaitable, Callable
+from typing import NamedTuple
 
 from surrogym_server.services.activity import Offer, Workers
+from surrogym_server.services.lines import Lines, Present
 from surrogym_server.services.notices import Notices
-from surrogym_server.services.queries import POLL_SECONDS
 from surrogym_server.storage.jobs import JobProgress, JobRecord, JobResult, LeasedJob, NewJob
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import JSON
+
+
+class _Claim(NamedTuple):
+    """Answer to a claim."""
+
+    job: LeasedJob | None
 
 
 class JobService:
@@ -21,6 +25,7 @@ class JobService:
         self._storage = storage
         self._notices = notices
         self._workers = workers or Workers()
+        self._lines = Lines[_Claim](notices, has_work=lambda claim: claim.job is not None)
 
     def train(self, name: str, task: JSON, key: str | None) -> JobRecord:
         """Queue a training.
@@ -49,34 +54,27 @@ class JobService:
         offer: Offer,
         lease_seconds: float,
         wait_seconds: float,
-        gone: Callable[[], Awaitable[bool]] | None = None,
+        present: Present | None = None,
     ) -> LeasedJob | None:
         """Lease a job to a worker. If there is none, wait up to ``wait_seconds``, and then return None.
 
-        ``gone`` returns whether the worker has closed its connection; then the wait ends.
+        ``present`` raises if the worker has closed its connection; then it gets no lease.
 
         Raises:
             UnknownSurrogate: the surrogate does not exist, or was deleted while the worker waited.
         """
-        deadline = time.monotonic() + wait_seconds
+        most, reference = offer
 
-        def claim() -> LeasedJob | None:
-            self._workers.heard(name, worker, offer)
-            most, reference = offer
-            return self._storage.jobs.claim(name, worker, most, lease_seconds, reference=reference)
+        def claim() -> _Claim:
+            return _Claim(self._storage.jobs.claim(name, worker, most, lease_seconds, reference=reference))
 
-        with self._notices.listen(name) as listener:
-            job = await asyncio.to_thread(claim)
-            if job is None:
-                self._notices.post(name)  # the page shows a worker as soon as it is connected
-            while job is None and not self._notices.closing and (left := deadline - time.monotonic()) > 0:
-                await listener.wait(min(left, POLL_SECONDS))
-                if gone is not None and await gone():
-                    return None
-                job = await asyncio.to_thread(claim)
-        if job is not None:
+        if self._workers.heard(name, worker, offer):
+            self._notices.post(name)  # the page shows a worker as soon as it is connected
+        claimed = await self._lines.claim(name, offer, claim, wait_seconds, present)
+        self._workers.heard(name, worker)
+        if claimed.job is not None:
             self._notices.post(name)
-        return job
+        return claimed.job
 
     def report(self, name: str, id: int, token: str, lease_seconds: float, progress: JobProgress | None) -> bool:
         """Renew the lease of a job, and store its progress. Returns whether the worker is to stop.

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import asyncio
-from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from itertools import chain
+from itertools import chain, islice
 
 from surrogym_server.storage.announcements import Alone, Announcements
+
+AT_ONCE = 50  # listeners woken in one turn of the event loop, so that other requests are answered between the turns
 
 
 class Listener:
     """A waiting service. A notice that comes while it does not wait is remembered."""
 
-    def __init__(self) -> None:
+    def __init__(self, audience: Audience) -> None:
+        self._audience = audience
         self._event = asyncio.Event()
+
+    @property
+    def version(self) -> int:
+        """Number of the last notice that this listener could hear. Equal numbers: nothing has happened between."""
+        return self._audience.version
 
     def wake(self) -> None:
         self._event.set()
@@ -30,6 +37,14 @@ class Listener:
         return noticed
 
 
+class Audience:
+    """The listeners to one surrogate, or to all."""
+
+    def __init__(self, version: int) -> None:
+        self.version = version
+        self.listeners: dict[Listener, None] = {}  # in the order in which they came
+
+
 class Notices:
     """Listeners by surrogate. ``post`` may be called from any thread, the rest from the event loop's.
 
@@ -40,8 +55,10 @@ class Notices:
     def __init__(self, announcements: Announcements | None = None) -> None:
         self._announcements = announcements or Alone()
         self._loop = asyncio.get_running_loop()
-        self._listeners: defaultdict[str, set[Listener]] = defaultdict(set)
-        self._everything: set[Listener] = set()
+        self._audiences: dict[str, Audience] = {}
+        self._everything = Audience(0)
+        self._newest: dict[str, int | None] = {}  # id of the newest event at the last look
+        self._count = 0
         self.closing = False
         self._announcements.listen(self._hear)
 
@@ -58,15 +75,35 @@ class Notices:
     @contextmanager
     def listen(self, surrogate: str | None = None) -> Iterator[Listener]:
         """Listen to one surrogate, or to all, within the context."""
-        listener = Listener()
-        listeners = self._everything if surrogate is None else self._listeners[surrogate]
-        listeners.add(listener)
+        audience = self._everything
+        if surrogate is not None:
+            audience = self._audiences.setdefault(surrogate, Audience(self._next()))
+        listener = Listener(audience)
+        audience.listeners[listener] = None
         try:
             yield listener
         finally:
-            listeners.discard(listener)
-            if surrogate is not None and not listeners:
-                self._listeners.pop(surrogate, None)
+            del audience.listeners[listener]
+            if surrogate is not None and not audience.listeners and self._audiences.get(surrogate) is audience:
+                del self._audiences[surrogate]
+
+    @property
+    def listened(self) -> list[str]:
+        """Names of the surrogates that somebody listens to."""
+        return [*self._audiences]
+
+    def compare(self, newest: dict[str, int]) -> None:
+        """Wake the listeners to the surrogates that have changed since the last comparison.
+
+        A notice of another server may be lost, and so may the first change of a surrogate that nobody listened to.
+
+        Args:
+            newest: id of the newest event of each surrogate that was ``listened`` to and exists.
+        """
+        before, self._newest = self._newest, {name: newest.get(name) for name in self._audiences}
+        for name, id in self._newest.items():
+            if name not in before or before[name] != id:
+                self._wake(name)
 
     def _hear(self, surrogate: str | None) -> None:
         """Wake in this process; None wakes everybody, as notices may have been missed."""
@@ -77,9 +114,24 @@ class Notices:
                 self._loop.call_soon_threadsafe(self._wake, surrogate)
 
     def _wake_all(self) -> None:
-        for listener in (*self._everything, *chain.from_iterable(self._listeners.values())):
-            listener.wake()
+        self._wake_these(self._everything, *self._audiences.values())
 
     def _wake(self, surrogate: str) -> None:
-        for listener in (*self._listeners.get(surrogate, ()), *self._everything):
+        audience = self._audiences.get(surrogate)
+        self._wake_these(self._everything, *(() if audience is None else (audience,)))
+
+    def _wake_these(self, *audiences: Audience) -> None:
+        for audience in audiences:
+            audience.version = self._next()
+        self._wake_some(iter([*chain.from_iterable(audience.listeners for audience in audiences)]))
+
+    def _wake_some(self, listeners: Iterator[Listener]) -> None:
+        some = [*islice(listeners, AT_ONCE)]
+        for listener in some:
             listener.wake()
+        if len(some) == AT_ONCE:
+            self._loop.call_soon(self._wake_some, listeners)
+
+    def _next(self) -> int:
+        self._count += 1
+        return self._count

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +11,7 @@ from numpy.typing import NDArray
 from surrogym_server.errors import InvalidInput
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions, check_points, check_rollouts, check_settable
+from surrogym_server.services.lines import Lines, Present
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, Phase, Purpose, QueryRecord, QueryStatus
@@ -20,7 +19,6 @@ from surrogym_server.storage.records import LeasedQuery, Phase, Purpose, QueryRe
 Array = NDArray[np.float64]
 
 NO_STEPS = (np.zeros((0, 0)), np.zeros((0, 0)))
-POLL_SECONDS = 2.0  # a notice of another server may be lost, so its queries are also found by polling
 FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "from_log", "failed")
 
 
@@ -39,6 +37,7 @@ class QueryService:
         self._definitions = definitions
         self._notices = notices
         self._samplers = samplers or Samplers()
+        self._lines = Lines[Claim](notices, has_work=lambda claim: bool(claim.queries), ends=_finished_since)
 
     async def claim(
         self,
@@ -47,27 +46,25 @@ class QueryService:
         limit: int,
         lease_seconds: float,
         wait_seconds: float,
-        gone: Callable[[], Awaitable[bool]] | None = None,
+        present: Present | None = None,
     ) -> Claim:
         """Lease up to ``limit`` queries. If there are none, wait for some, or for the end of the design.
 
-        ``gone`` says whether the sampler has disconnected meanwhile; then it gets no lease.
+        ``present`` raises if the sampler has disconnected meanwhile; then it gets no lease.
 
         Raises:
             UnknownSurrogate: there is no such surrogate, or it was deleted meanwhile.
         """
-        deadline = time.monotonic() + wait_seconds
-        with self._notices.listen(name) as listener:
-            first = claim = await self._claim(name, sampler, limit, lease_seconds)
-            while not (claim.queries or _finished_since(first, claim) or self._notices.closing):
-                left = deadline - time.monotonic()
-                if left <= 0:
-                    break
-                await listener.wait(min(left, POLL_SECONDS))
-                if gone is not None and await gone():
-                    break
-                claim = await self._claim(name, sampler, limit, lease_seconds)
-            return claim
+
+        def claim() -> Claim:
+            queries = self._storage.queries.claim(name, sampler, limit, lease_seconds)
+            standing = self._storage.surrogates.standing(name)
+            return Claim(queries, standing.phase, standing.paused)
+
+        self._samplers.heard(name, sampler)
+        claimed = await self._lines.claim(name, None, claim, wait_seconds, present)
+        self._samplers.heard(name, sampler)
+        return claimed
 
     def renew(self, name: str, query_id: int, token: str, lease_seconds: float) -> None:
         """Renew a lease. Raises ``UnknownQuery``, ``ForeignLease`` or ``LeaseExpired``."""
@@ -134,15 +131,6 @@ class QueryService:
     def list(self, name: str, statuses: Sequence[QueryStatus]) -> list[QueryRecord]:
         """The queries of these statuses (none: all), oldest first."""
         return self._storage.queries.list(name, statuses)
-
-    async def _claim(self, name: str, sampler: str, limit: int, lease_seconds: float) -> Claim:
-        def claim() -> Claim:
-            queries = self._storage.queries.claim(name, sampler, limit, lease_seconds)
-            standing = self._storage.surrogates.standing(name)
-            self._samplers.heard(name, sampler)
-            return Claim(queries, standing.phase, standing.paused)
-
-        return await asyncio.to_thread(claim)
 
 
 def _finished_since(first: Claim, now: Claim) -> bool:

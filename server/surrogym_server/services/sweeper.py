@@ -1,4 +1,4 @@
-"""The sweeper: ends expired leases and sessions, and finds the models that other servers have stored."""
+"""The sweeper: ends expired leases and sessions, finds what other servers have changed, and removes old events."""
 
 from __future__ import annotations
 
@@ -11,20 +11,27 @@ from functools import partial
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.errors import SurrogymError
 from surrogym_server.services.metrics import ProcessMetrics
+from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 
 logger = logging.getLogger(__name__)
 
+EVENTS_KEPT = 10_000  # of a surrogate; the oldest beyond them are removed
+PRUNE_SECONDS = 60.0
 ORPHAN_SECONDS = 3_600.0  # wait before unreferenced files are removed; an upload takes less
 
 
 class Sweeper:
-    def __init__(self, storage: Storage, engine: SessionEngine, seconds: float, metrics: ProcessMetrics) -> None:
+    def __init__(
+        self, storage: Storage, engine: SessionEngine, seconds: float, metrics: ProcessMetrics, notices: Notices
+    ) -> None:
         self._storage = storage
         self._engine = engine
         self._seconds = seconds
         self._metrics = metrics
+        self._notices = notices
         self._looked_at_files = -ORPHAN_SECONDS
+        self._pruned = -PRUNE_SECONDS
 
     async def run(self) -> None:
         """Sweep in fixed intervals, until cancelled."""
@@ -37,11 +44,18 @@ class Sweeper:
         another server has deleted ends."""
         await self._try(self._engine.sweep)
         await self._try(self._sweep_leases)
+        await self._try(self._find_changes)
         await self._try(partial(asyncio.to_thread, self._sweep_files))
+        await self._try(partial(asyncio.to_thread, self._prune_events))
 
     async def _sweep_leases(self) -> None:
         self._metrics.expired_leases += await asyncio.to_thread(self._storage.queries.sweep_expired)
         self._metrics.expired_leases += await asyncio.to_thread(self._storage.jobs.sweep_expired)
+
+    async def _find_changes(self) -> None:
+        """Wake those who wait for a surrogate that has changed, although its notice was lost: one question for all."""
+        if names := self._notices.listened:
+            self._notices.compare(await asyncio.to_thread(self._storage.events.newest, names))
 
     async def _try(self, sweep: Callable[[], Awaitable[None]]) -> None:
         try:
@@ -62,3 +76,12 @@ class Sweeper:
         self._storage.blobs.remove(orphans)
         if orphans:
             logger.info("files removed that belonged to deleted policies: %d", len(orphans))
+
+    def _prune_events(self) -> None:
+        """Once in ``PRUNE_SECONDS``, remove the oldest events of surrogates that have more than ``EVENTS_KEPT``."""
+        now = time.monotonic()
+        if now - self._pruned < PRUNE_SECONDS:
+            return
+        self._pruned = now
+        if removed := self._storage.events.prune(EVENTS_KEPT):
+            logger.info("old events removed: %d", removed)

@@ -432,7 +432,25 @@ class Sessions(ABC):
 
 
 class Events(ABC):
-    """Events of a surrogate."""
+    """Events of a surrogate.
+
+    Whatever may end a wait appends one: a claim that waits for queries or jobs looks again after an event.
+    """
+
+    @abstractmethod
+    def newest(self, names: Sequence[str]) -> dict[str, int]:
+        """Return the id of each surrogate's newest event, 0 before the first. Those that do not exist are left out.
+
+        It is one statement. Its cost does not depend on the number of events.
+        """
+
+    @abstractmethod
+    def prune(self, keep: int) -> int:
+        """Remove all but the newest ``keep`` events of each surrogate. Returns the number of events removed.
+
+        Surrogates without a new event since the last call are skipped. Each transaction removes a few events only, so
+        that it blocks no writer for long.
+        """
 
     @abstractmethod
     def list(self, name: str, after: int = 0, limit: int = 1_000) -> list[EventRecord]:

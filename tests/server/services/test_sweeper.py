@@ -11,8 +11,11 @@ from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import Limits
 from surrogym_server.errors import Unavailable
 from surrogym_server.services.metrics import ProcessMetrics
+from surrogym_server.services.notices import Notices
 from surrogym_server.services.sweeper import Sweeper
 from surrogym_server.storage.port import Storage
+
+NAME = "pendulum"
 
 
 def test_a_sweep_that_fails_is_followed_by_the_next(storage: Storage, monkeypatch: pytest.MonkeyPatch):
@@ -27,7 +30,7 @@ def test_a_sweep_that_fails_is_followed_by_the_next(storage: Storage, monkeypatc
         metrics = ProcessMetrics()
         models = ModelCache(lambda *_: pytest.fail("nothing is in use"), storage.models.newest)
         engine = LocalEngine(models, lambda *_: (), limits=Limits(), max_lanes=1, idle_seconds=60.0)
-        sweeper = asyncio.create_task(Sweeper(storage, engine, 0.001, metrics).run())
+        sweeper = asyncio.create_task(Sweeper(storage, engine, 0.001, metrics, Notices()).run())
         while met:
             await asyncio.sleep(0.001)
         while not metrics.expired_leases and not sweeper.done():
@@ -38,3 +41,22 @@ def test_a_sweep_that_fails_is_followed_by_the_next(storage: Storage, monkeypatc
 
     monkeypatch.setattr(storage.queries, "sweep_expired", sweep_expired)
     assert asyncio.run(asyncio.wait_for(run(), 10)) == 3
+
+
+def test_a_change_whose_notice_was_lost_wakes_those_who_wait(storage: Storage):
+    async def run() -> None:
+        notices = Notices()
+        models = ModelCache(lambda *_: pytest.fail("nothing is in use"), storage.models.newest)
+        engine = LocalEngine(models, lambda *_: (), limits=Limits(), max_lanes=1, idle_seconds=60.0)
+        sweeper = Sweeper(storage, engine, 3_600.0, ProcessMetrics(), notices)
+        with notices.listen(NAME) as listener:
+            await sweeper.sweep()  # it also wakes those that it sees for the first time
+            assert await listener.wait(60.0)
+            await sweeper.sweep()
+            assert not await listener.wait(0.05)
+            storage.ledger.report(NAME, 5, key="k")
+            await sweeper.sweep()
+            assert await listener.wait(60.0)
+        await engine.stop()
+
+    asyncio.run(run())

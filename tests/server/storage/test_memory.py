@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
+import pytest
+import sqlalchemy as sa
 
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewSample, SavedSession
+from surrogym_server.storage.sql import memory
+from surrogym_server.storage.sql.rows import append_event, hold
 
 
 def test_occupancy_comes_back_by_checkpoint_and_the_latest_is_known(storage: Storage, make: Callable[..., str]) -> None:
@@ -92,3 +97,56 @@ def test_times_are_seconds_since_1970(storage: Storage, make: Callable[..., str]
     [leased] = storage.queries.claim(name, "a", 1, 60.0)
     assert 1.7e9 < created < 1e11
     assert 60.0 <= leased.expires - created < 600.0
+
+
+def test_the_newest_event_takes_one_statement_however_many_there_are(
+    storage: Storage, make: Callable[..., str]
+) -> None:
+    name, another = make(), make(name="another")
+    asked = []
+    for _ in range(2):
+        with statements(storage) as sent:
+            newest = storage.events.newest([name, another, "unknown"])
+        asked.append(len(sent))
+        assert newest == {one: storage.events.list(one, limit=10_000)[-1].id for one in (name, another)}
+        append(storage, name, 2_500)
+    assert asked[0] == asked[1]
+
+
+def test_the_oldest_events_are_removed_in_transactions_of_bounded_size(
+    storage: Storage, make: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, "BATCH", 20)
+    name, another = make(), make(name="another")
+    append(storage, name, 90)
+    before, other = storage.events.list(name), storage.events.list(another)
+    with statements(storage) as sent:
+        assert storage.events.prune(keep=30) == len(before) - 30
+    assert storage.events.list(name) == before[-30:]
+    assert storage.events.list(another) == other
+    assert sum(statement.startswith("DELETE") for statement in sent) > 60 / 20
+    with statements(storage) as sent:
+        assert storage.events.prune(keep=30) == 0
+    assert len(sent) == 2, "a surrogate without a new event is skipped"
+
+
+def append(storage: Storage, name: str, count: int) -> None:
+    with storage._database.write() as connection:  # type: ignore[attr-defined]
+        held = hold(connection, name)
+        for _ in range(count):
+            append_event(connection, held, "sample")
+
+
+@contextmanager
+def statements(storage: Storage) -> Iterator[list[str]]:
+    """The statements that a storage sends within the context, without those of transactions."""
+    sent: list[str] = []
+    engine = storage._database._engine  # type: ignore[attr-defined]
+
+    def note(_: object, __: object, statement: str, *___: object) -> None:
+        if not statement.startswith("BEGIN"):
+            sent.append(statement)
+
+    sa.event.listen(engine, "before_cursor_execute", note)
+    yield sent
+    sa.event.remove(engine, "before_cursor_execute", note)

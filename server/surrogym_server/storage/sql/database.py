@@ -9,7 +9,8 @@ from __future__ import annotations
 import contextlib
 import shlex
 import threading
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ from surrogym_server.storage.sql.write_ahead_log import marks
 
 BUSY_SECONDS = 5  # wait of a statement for locks of other programs or threads
 STALLED_SECONDS = 10  # PostgreSQL ends a transaction whose process has stopped, and its locks with it
+BATCH = 500  # rows that one transaction writes or removes at most, where there may be many
+PAUSE_SECONDS = 0.002  # in which a waiting writer takes its turn
 POOL = {"pool_size": 8, "max_overflow": 56, "pool_timeout": BUSY_SECONDS}
 POSTGRESQL = {  # text is UTF-8 whatever the database's encoding; if that is SQL_ASCII, psycopg would return bytes
     "client_encoding": "utf8",
@@ -104,6 +107,20 @@ class Database:
             with self._translated(), self._writing.begin() as connection:
                 self._mark_log(connection)
                 yield connection
+
+    def write_in_batches(self, batch: Callable[[Connection], int]) -> int:
+        """Repeat a write, each time in a transaction of its own, until it returns 0. Returns the sum.
+
+        Between two transactions other writers have their turn. A batch of ``BATCH`` rows takes some milliseconds.
+        """
+        total = 0
+        while True:
+            with self.write() as connection:
+                done = batch(connection)
+            if not done:
+                return total
+            total += done
+            time.sleep(PAUSE_SECONDS)
 
     def require_sound(self) -> None:
         """Raise ``Damaged`` once broken pages of the file were found. Other damage may be repaired while the server

@@ -156,11 +156,14 @@ def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], 
         .values(status=next_status, error=error)
         .returning(queries.c.id, queries.c.status)
     )
-    set_aside = sorted(row.id for row in rows if row.status == "set_aside")
+    statuses = {row.id: row.status for row in rows}
+    set_aside = sorted(id for id, status in statuses.items() if status == "set_aside")
     for query_id in set_aside:
         append_event(connection, held, "set_aside", query_id=query_id, error=error)
     if set_aside:
         touch(connection, held)
+    if len(statuses) > len(set_aside):
+        append_event(connection, held, "queries", given_back=len(statuses) - len(set_aside))
 
 
 def is_unbegun(surrogate_id: int) -> sa.ColumnElement[bool]:

@@ -10,12 +10,16 @@ import sqlalchemy as sa
 from surrogym_server.errors import TooLarge
 from surrogym_server.storage import port
 from surrogym_server.storage.records import Array, EventRecord, OccupancyRecord, SavedSession
-from surrogym_server.storage.sql.database import Database, conflict_insert
+from surrogym_server.storage.sql.database import BATCH, Database, conflict_insert
 from surrogym_server.storage.sql.rows import find, hold
-from surrogym_server.storage.sql.tables import events, occupancies
+from surrogym_server.storage.sql.tables import events, occupancies, surrogates
 from surrogym_server.storage.sql.tables import sessions as saved
 
 MAX_CHECKPOINTS = 1_000  # of a surrogate
+NEWEST = sa.select(
+    surrogates.c.name,
+    sa.select(sa.func.max(events.c.id)).where(events.c.surrogate_id == surrogates.c.id).scalar_subquery(),
+).where(surrogates.c.name.in_(sa.bindparam("names", expanding=True)))
 
 
 class SqlOccupancy(port.Occupancy):
@@ -81,6 +85,11 @@ class SqlSessions(port.Sessions):
 class SqlEvents(port.Events):
     def __init__(self, database: Database) -> None:
         self._database = database
+        self._pruned = 0  # id of the newest event at the last call of ``prune``
+
+    def newest(self, names: Sequence[str]) -> dict[str, int]:
+        with self._database.read() as connection:
+            return {name: id or 0 for name, id in connection.execute(NEWEST, {"names": [*names]})}
 
     def list(self, name: str, after: int = 0, limit: int = 1_000) -> list[EventRecord]:
         with self._database.read() as connection:
@@ -92,3 +101,23 @@ class SqlEvents(port.Events):
                 .limit(limit)
             )
             return [EventRecord(**row._mapping) for row in rows]
+
+    def prune(self, keep: int) -> int:
+        with self._database.read() as connection:
+            newest = connection.execute(sa.select(sa.func.max(events.c.id))).scalar() or 0
+            changed = sa.select(events.c.surrogate_id).where(events.c.id > self._pruned).distinct()
+            owners = [*connection.execute(changed).scalars()]
+        removed = sum(self._prune(owner, keep) for owner in owners)
+        self._pruned = newest
+        return removed
+
+    def _prune(self, owner: int, keep: int) -> int:
+        own = events.c.surrogate_id == owner
+        with self._database.read() as connection:
+            beyond = sa.select(events.c.id).where(own).order_by(events.c.id.desc()).offset(keep).limit(1)
+            last = connection.execute(beyond).scalar()
+        if last is None:
+            return 0
+        oldest = sa.select(events.c.id).where(own, events.c.id <= last).order_by(events.c.id).limit(BATCH)
+        remove = sa.delete(events).where(events.c.id.in_(oldest))
+        return self._database.write_in_batches(lambda connection: connection.execute(remove).rowcount)

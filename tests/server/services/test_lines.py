@@ -1,0 +1,92 @@
+"""Lines of claims: the first ask the database for all, work goes to one claim each, and nobody waits for nothing."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from surrogym_server.services.lines import FIRST, Lines
+from surrogym_server.services.notices import Notices
+
+PATIENCE, MANY = 60.0, 300
+
+
+class Shop:
+    """Work to claim, and the number of questions for it."""
+
+    def __init__(self) -> None:
+        self.work: list[int] = []
+        self.asked = 0
+
+    def ask(self) -> int | str:
+        self.asked += 1
+        return self.work.pop() if self.work else "none"
+
+
+def run(test: Callable[[Shop, Notices, Callable[..., Awaitable[int | str]]], Awaitable[None]]) -> None:
+    async def prepared() -> None:
+        shop, notices = Shop(), Notices()
+        lines = Lines[int | str](notices, lambda answer: isinstance(answer, int))
+
+        def claim(seconds: float = PATIENCE) -> Awaitable[int | str]:
+            return asyncio.create_task(lines.claim("a", None, shop.ask, seconds))
+
+        await asyncio.wait_for(test(shop, notices, claim), PATIENCE / 2)
+
+    asyncio.run(prepared())
+
+
+@pytest.mark.parametrize("waiting", [10, MANY])
+def test_the_number_of_questions_does_not_grow_with_those_who_wait(waiting: int):
+    async def test(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
+        claims = [claim() for _ in range(waiting)]
+        await asyncio.sleep(0.2)
+        assert shop.asked <= FIRST
+        notices.post("a")
+        await asyncio.sleep(0.2)
+        assert shop.asked <= 2 * FIRST
+        notices.close()
+        assert set(await asyncio.gather(*claims)) == {"none"}
+        assert shop.asked <= 3 * FIRST
+
+    run(test)
+
+
+def test_all_work_of_one_notice_is_handed_out_along_the_line():
+    async def test(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
+        claims = [claim() for _ in range(MANY)]
+        await asyncio.sleep(0.1)
+        shop.work = list(range(MANY))
+        notices.post("a")
+        assert sorted(await asyncio.gather(*claims), key=int) == [*range(MANY)]
+
+    run(test)
+
+
+def test_a_claim_that_does_not_wait_gets_work_past_a_line_that_knows_of_none():
+    async def test(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
+        claims = [claim(1.0) for _ in range(FIRST)]
+        await asyncio.sleep(0.1)
+        assert await claim(0.0) == "none"
+        asked, shop.work = shop.asked, [7, 8, 9, 10, 11]
+        notices.post("a")
+        assert {await claim(0.0), *(await asyncio.gather(*claims))} == {7, 8, 9, 10, 11}
+        assert shop.asked == asked + 5
+
+    run(test)
+
+
+def test_a_claim_whose_caller_has_gone_asks_for_nothing():
+    async def test(shop: Shop, notices: Notices, _: object) -> None:
+        async def present() -> None:
+            raise ConnectionError
+
+        lines = Lines[int | str](notices, lambda answer: isinstance(answer, int))
+        shop.work = [1]
+        with pytest.raises(ConnectionError):
+            await lines.claim("a", None, shop.ask, PATIENCE, present)
+        assert shop.work == [1]
+
+    run(test)
