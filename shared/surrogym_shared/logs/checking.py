@@ -37,7 +37,7 @@ class ReadLog:
         roles: roles of its columns.
         steps: its usable steps.
         spec: the specification that it was checked against, or that was drafted from it.
-        notes: reasons of the parts of a draft; empty if a specification was given.
+        notes: conclusions about the order of the rows, and reasons of the parts of a draft.
     """
 
     table: Table
@@ -85,7 +85,7 @@ def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
             require_units(rows.following, spec, "next ")
         steps = _consistent(spec, steps)
     require_steps(table, steps, 1)
-    return ReadLog(table, roles, steps, spec)
+    return ReadLog(table, roles, steps, spec, steps.notes)
 
 
 def draft_log(table: Table, roles: Roles, name: str, budget: int = 0) -> ReadLog:
@@ -107,7 +107,7 @@ def draft_log(table: Table, roles: Roles, name: str, budget: int = 0) -> ReadLog
         drafted: Draft = draft(roles, steps, name, budget)
     except ValidationError as error:
         raise UnusableLog(f"the drafted specification is not valid: {first_fault(error)}") from error
-    return ReadLog(table, roles, _shaped(drafted.spec, roles, steps), drafted.spec, drafted.notes)
+    return ReadLog(table, roles, _shaped(drafted.spec, roles, steps), drafted.spec, (*steps.notes, *drafted.notes))
 
 
 def write_rejected(path: Path, table: Table, steps: Transitions) -> None:

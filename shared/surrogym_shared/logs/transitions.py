@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from surrogym_shared.logs.clock import GAP, Ticks, episodes_of, repeated, ticks_of
 from surrogym_shared.logs.rows import Rows
 from surrogym_shared.logs.table import Bools, Floats, Ints
 
@@ -29,6 +30,7 @@ class Transitions:
         rejected: reason for each row that was set aside, by the row's index.
         ends: number of rows without a next state, because an episode ends there or a gap in time follows.
         interval: median time between two rows, in the unit of the time column; None without such a column.
+        notes: what was concluded about the order of the rows, from the clock and the names of episodes.
     """
 
     row: Ints
@@ -43,6 +45,7 @@ class Transitions:
     rejected: dict[int, str]
     ends: int
     interval: float | None
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.row)
@@ -57,19 +60,25 @@ class Transitions:
 
 
 def transitions_of(rows: Rows) -> Transitions:
-    """Find the usable transitions of a log, and a reason for each row that can't be used."""
+    """Find the usable transitions of a log, and a reason for each row that can't be used.
+
+    Raises:
+        UnusableLog: the clock does not show which row follows which.
+    """
     rejected = dict(rows.faults)
-    _reject(rejected, _duplicates(rows, rejected))
-    episode = _episodes(rows)
+    episodes = episodes_of(rows)
+    episode = episodes.number
+    ticks = ticks_of(rows, episode, rejected)
+    _reject(rejected, repeated(rows, episodes, rejected, coarse=ticks is not None))
     order = [row for row in np.argsort(episode, kind="stable").tolist() if rows.faults.get(row) or row not in rejected]
-    out_of_order = _backwards(rows, episode, order, rejected)
+    out_of_order = _backwards(rows, episode, order, rejected, coarse=ticks is not None)
     _reject(rejected, out_of_order)
     order = [row for row in order if row not in out_of_order]  # the row before continues with the one after
     follower = {a: b for a, b in pairwise(order) if episode[a] == episode[b]}
     if rows.episode is not None:
         _reject(rejected, _going_on(rows, follower, rejected))
-    interval = _interval(rows, follower, rejected)
-    paired = _paired(rows, follower, rejected, interval)
+    interval = _interval(rows, follower, rejected) if ticks is None else ticks.interval
+    paired = _paired(rows, follower, rejected, interval, ticks)
     usable = np.array([row for row in sorted(paired) if row not in rejected], dtype=np.int64)
     after = np.array([paired[row] for row in usable.tolist()], dtype=np.int64)
     begins = {first for first, row in _firsts(episode, order) if row}
@@ -82,10 +91,11 @@ def transitions_of(rows: Rows) -> Transitions:
         terminated=rows.terminated[usable],
         truncated=rows.truncated[usable],
         first=np.array([row in begins for row in usable.tolist()], dtype=np.bool_),
-        episodes=tuple(np.unique(episode, return_counts=True)[1].tolist()),
+        episodes=tuple(np.unique(episode[order], return_counts=True)[1].tolist()),
         rejected=dict(sorted(rejected.items())),
         ends=len(rows) - len(usable) - len(rejected),
         interval=interval,
+        notes=(*episodes.notes, *([] if ticks is None else [f"{rows.roles.time}: {ticks.note}"])),
     )
 
 
@@ -94,39 +104,11 @@ def _reject(rejected: dict[int, str], found: dict[int, str]) -> None:
         rejected.setdefault(row, reason)
 
 
-def _duplicates(rows: Rows, rejected: dict[int, str]) -> dict[int, str]:
-    """Find rows that repeat an earlier row in every number, including time and episode."""
-    parts: list[Floats | Ints | Bools | None] = [rows.q, rows.u, rows.following, rows.reward, rows.time, rows.episode]
-    columns = [part.reshape(len(rows), -1).astype(np.float64) for part in parts if part is not None]
-    whole = np.ascontiguousarray(np.concatenate([*columns, rows.terminated[:, None]], 1))
-    seen: dict[bytes, int] = {}
-    found = {}
-    for row in range(len(rows)):
-        before = row if row in rejected else seen.setdefault(whole[row].tobytes(), row)
-        if before != row:
-            found[row] = f"repeats line {rows.lines[before]}"
-    return found
-
-
-def _episodes(rows: Rows) -> Ints:
-    """Return the number of each row's episode, (n,).
-
-    Without a column of episodes, a new episode begins after each end, and where the time starts again.
-    """
-    if rows.episode is not None:
-        return rows.episode
-    begins = np.zeros(len(rows), dtype=np.int64)
-    ended = rows.terminated | rows.truncated
-    begins[1:] = ended[:-1]
-    if rows.time is not None and len(rows) > 2:
-        time = rows.time
-        restarts = (time[1:-1] < time[:-2]) & (time[2:] > time[1:-1]) & (time[2:] <= time[:-2])
-        begins[1:-1] |= restarts
-    return np.cumsum(begins)
-
-
-def _backwards(rows: Rows, episode: Ints, order: Iterable[int], rejected: dict[int, str]) -> dict[int, str]:
-    """Find rows whose time is not later than that of the row before in their episode."""
+def _backwards(
+    rows: Rows, episode: Ints, order: Iterable[int], rejected: dict[int, str], *, coarse: bool
+) -> dict[int, str]:
+    """Find rows whose time is not later than that of the row before in their episode; it may be equal if the clock is
+    ``coarse``."""
     if rows.time is None:
         return {}
     latest: dict[int, int] = {}
@@ -135,13 +117,15 @@ def _backwards(rows: Rows, episode: Ints, order: Iterable[int], rejected: dict[i
         if not np.isfinite(rows.time[row]):
             continue
         before = latest.get(int(episode[row]))
-        if before is not None and rows.time[row] <= rows.time[before] and row not in rejected:
+        time = rows.time[row]
+        if before is None or time > rows.time[before] or (coarse and time == rows.time[before]):
+            if row not in rejected:
+                latest[int(episode[row])] = row
+        elif row not in rejected:
             found[row] = (
                 f"{rows.roles.time}: expected a time after {rows.time[before]:g} of line {rows.lines[before]}, "
-                f"got {rows.time[row]:g}"
+                f"got {time:g}"
             )
-        elif row not in rejected:
-            latest[int(episode[row])] = row
     return found
 
 
@@ -163,10 +147,12 @@ def _interval(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) ->
     return float(np.median(steps)) if steps else None
 
 
-def _paired(rows: Rows, follower: dict[int, int], rejected: dict[int, str], interval: float | None) -> dict[int, int]:
+def _paired(
+    rows: Rows, follower: dict[int, int], rejected: dict[int, str], interval: float | None, ticks: Ticks | None
+) -> dict[int, int]:
     """Return, for each row that has a next state, the row that contains it.
 
-    If the log has columns of next states, this is the row itself, otherwise the row that follows.
+    If the log has columns of next states, this is the row itself, otherwise the row that follows at the usual interval.
     """
     if rows.following is not None:
         return {row: row for row in range(len(rows)) if row not in rejected}
@@ -176,7 +162,11 @@ def _paired(rows: Rows, follower: dict[int, int], rejected: dict[int, str], inte
             continue
         if interval and rows.time is not None:
             step = rows.time[after] - rows.time[row]
-            if not abs(step - interval) <= ONE_INTERVAL * interval:
+            if ticks is None:
+                usual = abs(step - interval) <= ONE_INTERVAL * interval
+            else:
+                usual = step <= GAP * ticks.tick and not (ticks.irregular[row] or ticks.irregular[after])
+            if not usual:
                 continue
         paired[row] = after
     return paired

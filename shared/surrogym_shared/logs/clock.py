@@ -1,0 +1,216 @@
+"""Episodes, repeated rows and clocks of a log: what says which row continues which.
+
+A row repeats another one only by evidence of its place: the same time in the same episode, or a whole file that was
+joined to itself. Equal numbers alone say nothing, because a plant at rest writes equal rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.rows import Rows
+from surrogym_shared.logs.table import Bools, Floats, Ints
+from surrogym_shared.words import counted
+
+SHARED = 0.1  # share of rows with the time of the row before, from which the clock may be coarser than the rows
+REPEATS, DIFFER = 0.02, 0.2  # of them: share that differ in other numbers, up to which they repeat rows; or don't
+IRREGULAR = 0.1  # share of ticks with another number of rows, above which such a clock does not order the rows
+GAP = 1.5  # times of a tick that are a gap
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Episodes of n rows.
+
+    Attributes:
+        number: number of each row's episode, (n,).
+        overlapping: numbers of the episodes that begin at a time within the episode before, as joined files do that
+            share some rows.
+        notes: where an episode begins without a mark of its own.
+    """
+
+    number: Ints
+    overlapping: frozenset[int]
+    notes: tuple[str, ...]
+
+
+def episodes_of(rows: Rows) -> Episodes:
+    """Number the episodes of a log.
+
+    An episode begins at each name in a column of episodes. It also begins where such a name returns after other
+    episodes, unless the rows of several episodes alternate. Without a column, it begins after each end. In both cases
+    it begins where the time starts again.
+    """
+    notes: list[str] = []
+    label = np.zeros(len(rows), dtype=np.int64) if rows.episode is None else _names(rows, rows.episode, notes)
+    order = np.argsort(label, kind="stable")
+    begins = np.zeros(len(rows), dtype=np.bool_)
+    begins[1:] = label[order][1:] != label[order][:-1]
+    if rows.episode is None:
+        begins[1:] |= (rows.terminated | rows.truncated)[order][:-1]
+    overlapping: set[int] = set()
+    if rows.time is not None:
+        time = rows.time[order]
+        restarts = _restarts(time) & ~begins
+        if restarts.any():
+            line = rows.lines[order[restarts.argmax()]]
+            notes.append(
+                f"{rows.roles.time}: goes back {counted(int(restarts.sum()), 'time')}, first in line {line}; a new "
+                "episode begins there"
+            )
+        begins |= restarts
+        overlapping = _overlapping(time, np.cumsum(begins), np.flatnonzero(restarts))
+    number = np.empty(len(rows), dtype=np.int64)
+    number[order] = np.cumsum(begins)
+    return Episodes(number, frozenset(overlapping), tuple(notes))
+
+
+def _names(rows: Rows, named: Ints, notes: list[str]) -> Ints:
+    """Return a number for each name of an episode, (n,), and a new one where a name returns after others."""
+    changes = np.zeros(len(rows), dtype=np.bool_)
+    changes[1:] = named[1:] != named[:-1]
+    stretch = np.cumsum(changes)
+    alternate = bool(np.median(np.bincount(stretch)) < 2) if len(rows) else False
+    returned = int(stretch[-1]) + 1 - len(np.unique(named)) if len(rows) else 0
+    if rows.time is not None or alternate or not returned:  # a clock shows by itself what continues
+        return named
+    first: dict[int, int] = {}
+    back = next(
+        r for r in np.flatnonzero(changes) if first.setdefault(int(named[r]), int(r)) != r or named[r] == named[0]
+    )
+    notes.append(
+        f"{rows.roles.episode}: {counted(returned, 'name')} returned after other episodes, first in line "
+        f"{rows.lines[back]}; what follows is another episode"
+    )
+    return stretch
+
+
+def _restarts(time: Floats) -> Bools:
+    """Return where the time goes back and then continues from there, (n,). A single row that is out of order does
+    not."""
+    restarts = np.zeros(len(time), dtype=np.bool_)
+    if len(time) > 2:
+        restarts[1:-1] = (time[1:-1] < time[:-2]) & (time[2:] > time[1:-1]) & (time[2:] <= time[:-2])
+    return restarts
+
+
+def _overlapping(time: Floats, number: Ints, restarts: Ints) -> set[int]:
+    """Return the numbers of the episodes that begin at one of ``restarts``, later than the episode before did."""
+    start = {int(number[row]): time[row] for row in range(len(time) - 1, -1, -1)}
+    return {int(number[row]) for row in restarts if time[row] > start[int(number[row]) - 1]}
+
+
+def repeated(rows: Rows, episodes: Episodes, faults: Mapping[int, str], *, coarse: bool) -> dict[int, str]:
+    """Find rows that repeat an earlier one: equal in every number, at the same time of the same episode unless the
+    clock is ``coarse``, or in a copy of the whole log that follows it."""
+    if rows.time is None and rows.episode is None:
+        return {}
+    whole = _content(rows)
+    if copy := _copied(whole, episodes.number):
+        return {row: f"repeats line {rows.lines[row % copy]}" for row in range(copy, len(rows))}
+    if rows.time is None or coarse:
+        return {}
+    seen: dict[tuple[int, bytes], int] = {}
+    found = {}
+    for row in range(len(rows)):
+        if row in faults:
+            continue
+        number, key = int(episodes.number[row]), whole[row].tobytes()
+        before = seen.setdefault((number, key), row)
+        if before == row and number in episodes.overlapping:
+            before = seen.get((number - 1, key), row)
+        if before != row:
+            found[row] = f"repeats line {rows.lines[before]}"
+    return found
+
+
+def _content(rows: Rows) -> Floats:
+    """Return all numbers of the rows, (n, k)."""
+    parts: list[Floats | Ints | Bools | None] = [
+        rows.q, rows.u, rows.following, rows.reward, rows.time, rows.episode, rows.terminated, rows.truncated
+    ]  # fmt: skip
+    columns = [part.reshape(len(rows), -1).astype(np.float64) for part in parts if part is not None]
+    return np.ascontiguousarray(np.concatenate(columns, 1))
+
+
+def _copied(whole: Floats, number: Ints) -> int:
+    """Return the number of rows of the log that ``whole`` (n, k) holds several times; 0 if it holds it once."""
+    begins = np.flatnonzero(number[1:] != number[:-1]) + 1
+    for start in begins[np.array([len(whole) % b == 0 for b in begins.tolist()], dtype=np.bool_)].tolist():
+        if np.array_equal(whole[start], whole[0]) and np.array_equal(whole[start:], whole[:-start], equal_nan=True):
+            return int(start)
+    return 0
+
+
+@dataclass(frozen=True)
+class Ticks:
+    """A clock that is coarser than the rows: several rows have the same time.
+
+    Attributes:
+        tick: time between two values of the clock.
+        interval: time between two rows.
+        irregular: rows at a time with another number of rows than the others, so that rows may be missing there, (n,).
+    """
+
+    tick: float
+    interval: float
+    irregular: Bools
+
+    @property
+    def note(self) -> str:
+        words = f"several rows have the same time, which grows by {self.tick:g}: they follow each other in their order"
+        rows = f"; {counted(int(self.irregular.sum()), 'row')} at times with another number of rows give no step"
+        return words + (rows if self.irregular.any() else "")
+
+
+def ticks_of(rows: Rows, episode: Ints, left_out: Mapping[int, str]) -> Ticks | None:
+    """Find out whether the clock of a log is coarser than its rows; None if it is not.
+
+    Raises:
+        UnusableLog: rows of the same time may be repeats or not; or the clock is coarser, and the number of rows at the
+            same time varies, so that rows may be missing anywhere.
+    """
+    if rows.time is None:
+        return None
+    used = np.ones(len(rows), dtype=np.bool_)
+    used[list(left_out)] = False
+    order = np.flatnonzero(used & np.isfinite(rows.time))
+    order = order[np.argsort(episode[order], kind="stable")]
+    time, number = rows.time[order], episode[order]
+    same = (time[1:] == time[:-1]) & (number[1:] == number[:-1])
+    if not len(same) or same.mean() <= SHARED:
+        return None
+    whole = _content(rows)[order]
+    differ = float((whole[1:] != whole[:-1]).any(1)[same].mean())
+    if differ <= REPEATS:
+        return None
+    if differ < DIFFER:
+        raise UnusableLog(
+            f"{rows.roles.time}: expected times that grow from row to row, got {same.mean():.0%} of the rows with the "
+            f"time of the row before, of which {differ:.0%} differ from it: they may repeat it or follow it; give "
+            "finer times, leave out the column with a mapping file (--map), or remove the repeats"
+        )
+    begins = np.concatenate([[True], ~same])
+    moment = np.cumsum(begins) - 1
+    at, of, size = time[begins], number[begins], np.bincount(moment)
+    inner = np.zeros(len(size), dtype=np.bool_)  # neither the first nor the last time of an episode, which are cut
+    inner[1:-1] = (of[1:-1] == of[:-2]) & (of[1:-1] == of[2:])
+    within = of[1:] == of[:-1]
+    if not within.any():
+        return None
+    tick = float(np.median(np.diff(at)[within]))
+    usual = float(np.median(size[inner])) if inner.any() else float(size.max())
+    odd = (np.abs(size - usual) > 1) & (inner | (size > usual))
+    if odd.mean() > IRREGULAR:
+        raise UnusableLog(
+            f"{rows.roles.time}: expected times that grow from row to row, or the same number of rows at each time, "
+            f"got {size[inner].min()} to {size[inner].max()} rows at a time: rows may be missing; give finer times, or "
+            "leave out the column with a mapping file (--map) if no row is missing"
+        )
+    irregular = np.zeros(len(rows), dtype=np.bool_)
+    irregular[order] = odd[moment]
+    return Ticks(tick, tick / float(size[inner].mean() if inner.any() else usual), irregular)
