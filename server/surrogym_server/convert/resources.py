@@ -74,7 +74,7 @@ def _view_fields(status: SurrogateStatus) -> dict[str, Any]:
         "tolerances": record.tolerances,
         "outputs": list(status.outputs),
         "fidelity": None if model is None else read_stored(replies.Fidelity, FIDELITY, model.fidelity),
-        "error": record.error,
+        "error": status.summary.error,
     }
 
 

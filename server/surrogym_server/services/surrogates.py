@@ -180,12 +180,13 @@ class SurrogateService:
 
     def _status(self, record: SurrogateRecord) -> SurrogateStatus:
         name = record.name
+        summary = self._storage.surrogates.summary(name)  # before the model, which is then never older than the phase
         try:
             model = self._storage.models.get(name)
         except NoModel:
             model = None
         return SurrogateStatus(
-            summary=self._storage.surrogates.summary(name),
+            summary=summary,
             record=record,
             outputs=self._definitions.of(record).outputs,
             model=model,

@@ -295,6 +295,7 @@ class SurrogateSummary:
     phase: Phase
     paused: bool
     round: int
+    error: str | None  # read together with the phase, of which it may be the reason
     created_at: float
     environment: str
     ledger: LedgerRecord

@@ -2,12 +2,47 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from surrogym_server.convert import resources
 from surrogym_server.errors import SpecConflict
-from surrogym_server.services.surrogates import check_same
+from surrogym_server.services.activity import Samplers
+from surrogym_server.services.definitions import Definitions
+from surrogym_server.services.surrogates import SurrogateService, check_same
+from surrogym_server.storage.port import Storage
+
+NAME = "pendulum"
+
+
+class NoSessions:
+    """An engine without sessions."""
+
+    def counts(self) -> Any:
+        return SimpleNamespace(sessions={})
+
+
+def test_a_failure_between_two_reads_is_never_shown_without_its_error(
+    storage: Storage, definitions: Definitions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = storage.surrogates.get
+
+    def fails_afterwards(name: str) -> Any:
+        record = read(name)
+        storage.surrogates.set_phase(name, "failed", "no power")
+        return record
+
+    monkeypatch.setattr(storage.surrogates, "get", fails_afterwards)
+    view = resources.surrogate_view(service(storage, definitions).status(NAME))
+    assert (view.phase, view.error) == ("failed", "no power")
+
+
+def service(storage: Storage, definitions: Definitions) -> SurrogateService:
+    unused: Any = None
+    engine: Any = NoSessions()
+    return SurrogateService(storage, definitions, unused, unused, unused, engine, unused, Samplers())
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from surrogym_server.storage.sql.tables import queries, samples, surrogates
 
 COLUMNS = [
     getattr(surrogates.c, name)
-    for name in ("id", "name", "budget", "target", "phase", "paused", "round", "created_at")  # as in the record
+    for name in ("id", "name", "budget", "target", "phase", "paused", "round", "error", "created_at")  # as in the record
 ]
 
 
