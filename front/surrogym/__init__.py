@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from surrogym.design import Design, QueriesOpen, Query
     from surrogym.environments import make, make_sb3, make_vec
     from surrogym_client.logs import Imported, UnusableLog, import_log
+    from surrogym_client.original.errors import StepRefused
     from surrogym_client.original.protocol import RealStep
     from surrogym_client.transport.api import Api as Client
 
@@ -78,6 +79,7 @@ __all__ = [
     "RealStep",
     "Reward",
     "RewardTerm",
+    "StepRefused",
     "Success",
     "Term",
     "Uniform",
@@ -97,6 +99,7 @@ _LAZY = {  # name: module, its name there, the extra that brings what the module
     "make_sb3": ("surrogym.environments", "make_sb3", ""),
     "make_vec": ("surrogym.environments", "make_vec", ""),
     "RealStep": ("surrogym_client.original.protocol", "RealStep", ""),
+    "StepRefused": ("surrogym_client.original.errors", "StepRefused", ""),
     "Imported": ("surrogym_client.logs", "Imported", ""),
     "UnusableLog": ("surrogym_client.logs", "UnusableLog", ""),
     "import_log": ("surrogym_client.logs", "import_log", ""),

@@ -32,7 +32,7 @@ from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 
 Floats = NDArray[np.float64]
 LEAST_SAMPLES = 2  # fewest samples that a model can be fitted to
-Phase = Literal["collecting", "sampling", "ready", "over_budget", "from_log"]
+Phase = Literal["collecting", "sampling", "ready", "over_budget", "unsure", "from_log"]
 
 
 class QueriesOpen(RuntimeError):
@@ -109,8 +109,8 @@ class Design:
 
     @property
     def phase(self) -> Phase:
-        """Phase of the design: ``collecting`` the initial queries, ``sampling`` adaptive ones, ``ready``, or
-        ``over_budget``."""
+        """Phase of the design: ``collecting`` the initial queries, ``sampling`` adaptive ones, ``ready``,
+        ``over_budget`` if the budget is spent, or ``unsure`` if no further query can be asked within it."""
         return self._phase
 
     @property

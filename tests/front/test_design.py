@@ -85,12 +85,12 @@ def test_a_query_without_an_answer_counts_against_the_budget():
     assert lost is not None
     design.give_up(lost)
     assert len(run(design, real)) == INITIAL - 1
-    assert (design.phase, design.steps) == ("over_budget", INITIAL - 1)
+    assert (design.phase, design.steps) == ("unsure", INITIAL - 1)
     with pytest.raises(InvalidInput, match="expected an open query"):
         design.give_up(lost)
 
 
-def test_a_round_that_is_given_up_is_followed_by_another_until_the_budget_is_spent():
+def test_a_round_that_is_given_up_is_followed_by_another_until_none_is_left_in_the_budget():
     design = surrogym.Design(small())
     real = GymnasiumEnvironment(design.spec)
     while (query := design.ask()) is not None:
@@ -98,7 +98,7 @@ def test_a_round_that_is_given_up_is_followed_by_another_until_the_budget_is_spe
             design.tell(query, real.step_from(np.array(query.coordinates), np.array(query.action)))
         else:
             design.give_up(query)
-    assert (design.phase, design.steps) == ("over_budget", INITIAL)
+    assert (design.phase, design.steps) == ("unsure", INITIAL)
 
 
 def test_without_any_answer_nothing_can_be_fitted():

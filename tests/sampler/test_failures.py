@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from support.moody import Line
-from surrogym_client.original.errors import MachineFails
+from surrogym_client.original.errors import MachineFails, StepRefused
+from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.sampler import Sampler, SamplerSettings
 from surrogym_client.sampler import failures as limits
 from surrogym_client.sampler.failures import FIRST_FEW, LONGEST_DELAY, MANY, Failures
@@ -22,6 +23,20 @@ class Switched(Line):
         if not self.on:
             raise OSError("[Errno 5] the bus is off")
         return super().step_from(coordinates, action)
+
+
+class Careful(Line):
+    """A machine that refuses what would overflow, before it moves."""
+
+    def step_from(self, coordinates, action):
+        if coordinates[0] < 0:
+            raise StepRefused("the tank would overflow")
+        return super().step_from(coordinates, action)
+
+
+class Refusing(Line):
+    def step_from(self, coordinates, action):
+        raise StepRefused("the lid is open")
 
 
 @pytest.fixture(autouse=True)
@@ -95,3 +110,29 @@ def test_after_answers_the_sampler_waits_longer_and_longer_and_then_ends(monkeyp
     failures.failed(MANY, "no power")
     with pytest.raises(MachineFails, match=f"failed at {MANY} different queries in a row.*no power"):
         failures.check([1])
+
+
+@pytest.mark.parametrize("machine", [Careful, lambda: IsolatedEnvironment(Careful)], ids=["here", "isolated"])
+def test_a_refusal_is_no_attempt_and_leaves_the_budget(api, line, machine):
+    """The initial queries are spread over both sides. The design then asks on the other one."""
+    told = []
+    environment = machine()
+    report = Sampler(api, line, environment, UNTIL_DONE, lambda _, *seen: told.append(seen)).run()
+    environment.close()
+    view = api.surrogate(line)
+    assert view.queries.refused == report.refused > 0
+    assert told.count(("refused", "the tank would overflow")) == report.refused
+    assert (report.failed, view.queries.set_aside, view.ledger.unresolved) == (0, 0, 0)
+    assert view.phase == "ready" or view.ledger.total == view.budget, "the refused ones used nothing of it"
+    assert all(query.attempts == 1 for query in api.queries(line) if query.status == "refused")
+
+
+def test_a_design_whose_first_queries_are_all_refused_says_so(api, line):
+    report = Sampler(api, line, Refusing(), UNTIL_DONE).run()
+    view = api.surrogate(line)
+    assert (report.phase, view.phase, report.failed, view.ledger.unresolved) == ("failed", "failed", 0, 0)
+    assert view.error is not None
+    assert "refused by the original environment" in view.error
+    assert "the lid is open" in view.error
+    resumed = api.patch_surrogate(line, paused=False)
+    assert (resumed.phase, resumed.queries.pending) == ("collecting", 6)

@@ -123,12 +123,14 @@ def rounds_taken(
     phase: str = "over_budget",
     certain: float | None = 1.0,
     low: float | None = None,
+    index: float = 0.9995,
 ) -> tuple[list[int], int]:
     """Run audits that all end alike, with a budget that has none left. Returns the real steps of each round that was
     taken after an audit, and the number of trainings."""
     api, ledger = Mock(), Mock(total=24)
     api.access.return_value.role = role
-    api.surrogate.return_value = Mock(budget_left=0, ledger=ledger, fidelity=None, phase=phase, target=0.999)
+    view = Mock(budget_left=0, ledger=ledger, fidelity=None, phase=phase, target=0.999, confidence_index=index)
+    api.surrogate.return_value = view
     api.improve.side_effect = lambda _name, queries, **_: setattr(ledger, "total", ledger.total + queries)
     trainings = Trainings([found(95.6, 94.0, passed, low)] * MOST_AUDITS)
     loop = Mock(unspent=unspent, train=lambda: trainings.train(None, folder / "p.zip", TrainSettings(), None))
@@ -171,6 +173,11 @@ def test_a_passed_audit_takes_them_if_the_model_is_no_longer_certain_where_the_p
 ) -> None:
     taken, made = rounds_taken(monkeypatch, tmp_path, passed=True, unspent=unspent, phase=phase, certain=certain)
     assert (taken, made) == (improved, 1 + len(improved))
+
+
+def test_a_ready_design_whose_index_fell_takes_them_where_the_policy_goes(monkeypatch, tmp_path: Path) -> None:
+    taken, _ = rounds_taken(monkeypatch, tmp_path, passed=True, unspent=3, phase="ready", certain=0.9, index=0.9986)
+    assert taken == [12, 12]
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ def _one(api: Api, name: str, form: Form) -> str:
         return json.dumps(view.model_dump(mode="json"))
     if form == "short":
         return _short(view)
-    return _detail(view, api.models(name) if view.phase == "over_budget" else ())
+    return _detail(view, api.models(name) if view.phase in ("over_budget", "unsure") else ())
 
 
 def _patiently(look: Callable[[], str], as_json: bool) -> str:
@@ -132,6 +132,8 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
     ]
     if view.queries.set_aside:
         lines[-1] += f" because they failed; surrogym change {view.name} --resume queues them again"
+    if view.queries.refused:
+        lines[-1] += f"; {view.queries.refused} refused by the environment, which took no real step of the budget"
     if hint := _hint(view):
         lines.append(hint)
     if view.error:

@@ -184,7 +184,7 @@ def _trainable(
                 )
         if view.model_version is None:
             raise CommandError(_words_without_model(view))
-        if view.phase == "over_budget":
+        if view.phase in ("over_budget", "unsure"):
             say(words_of_uncertainty(view), quiet=quiet)
         if view.phase not in COMPLETED and not view.paused:
             typer.echo(

@@ -15,6 +15,7 @@ OriginalError
 └── StepFailed              the environment did not give a step; the query fails, the worker continues
     ├── StepTimedOut        it took longer than its limit and was killed; the next step starts a fresh one
     ├── EnvironmentDied     its process ended; the next step starts a fresh one
+    ├── StepRefused         it refused the step before anything moved; the design asks elsewhere
     └── RequestRefused      its program answered with an error, and keeps running
 """
 
@@ -92,6 +93,18 @@ class StepTimedOut(StepFailed):
 
 class EnvironmentDied(StepFailed):
     """The environment's process ended."""
+
+
+class StepRefused(StepFailed):
+    """Raise it in an environment's method to refuse a step before anything moves.
+
+    The query then counts neither as an attempt nor towards the budget, and the design asks elsewhere.
+
+    Examples:
+        >>> def step_from(coordinates, action):
+        ...     if coordinates[0] + action[0] > 1.0:
+        ...         raise StepRefused("the tank would overflow")
+    """
 
 
 class RequestRefused(StepFailed):

@@ -18,6 +18,7 @@ from surrogym_client.original.errors import (
     RAISED,
     EnvironmentDied,
     StepFailed,
+    StepRefused,
     StepTimedOut,
     UnknownEnvironment,
     sentence,
@@ -106,6 +107,8 @@ class IsolatedEnvironment:
             self._kill()
             raise StepTimedOut(f"{method} took longer than {limit:g} s and was killed")
         ok, value = answer
+        if isinstance(value, StepRefused):
+            raise value
         if ok is None:
             assert self._process is not None
             self._process.join(self._step_limit + CLOSE_LIMIT)  # it closes the environment
@@ -234,6 +237,8 @@ def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -
     try:
         value = getattr(environment, method)(*arguments)
         return True, value.model_dump() if isinstance(value, EnvironmentSpec) else value
+    except StepRefused as refused:
+        return False, StepRefused(str(refused))
     except Exception as error:
         return False, sentence(error)
     except SystemExit as error:

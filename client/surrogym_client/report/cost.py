@@ -85,4 +85,6 @@ def _ended(view: SurrogateView, taken: int, allowed: int) -> str:
         return "The rest was not needed, because the model was known well enough."
     if view.phase == "over_budget":
         return "Then learning ended, although the model was not yet known well enough everywhere."
+    if view.phase == "unsure":
+        return "Learning ended before that, although the model was not yet known well enough everywhere."
     return ""

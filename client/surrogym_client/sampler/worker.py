@@ -12,7 +12,7 @@ from typing import TypeVar, get_args
 import numpy as np
 
 from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere
-from surrogym_client.original.errors import QueryRefused, SnapshotGone, StepFailed
+from surrogym_client.original.errors import QueryRefused, SnapshotGone, StepFailed, StepRefused
 from surrogym_client.original.protocol import (
     Environment,
     OriginalEnvironment,
@@ -45,13 +45,15 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class _Answer:
-    """The real steps of a query. ``outcome``: if there are none. ``remark``: what went wrong without harm to it."""
+    """The real steps of a query. ``outcome``: if there are none. ``remark``: what went wrong without harm to it.
+    ``for_good``: the environment itself refused it, so no other sampler should try."""
 
     query: Query
     taken: list[NewSample]
     outcome: Outcome
     error: str
     remark: str = ""
+    for_good: bool = False
 
     @property
     def clean(self) -> bool:
@@ -233,7 +235,7 @@ class Sampler:
 
     def _step(self, query: Query) -> _Answer:
         taken: list[NewSample] = []
-        error = ""
+        error, for_good = "", False
         outcome: Outcome = "failed"  # if no step was taken
         try:
             check_query(self._own, query)
@@ -244,6 +246,9 @@ class Sampler:
             outcome, error = "dropped", str(ended)
         except SnapshotGone as gone:
             outcome, error = "impossible", str(gone)
+        except StepRefused as refused:
+            error, for_good = str(refused) or "no reason given", not taken
+            outcome = "refused"
         except StepFailed as failed:
             error = str(failed) or "no reason given"
         except Exception as raised:  # an environment that is not isolated may raise anything
@@ -252,7 +257,8 @@ class Sampler:
             self._hand_in(taken)
             self._steps += len(taken)
             raise
-        return _Answer(query, taken, outcome, error, self._returning.remarks() if self._returning else "")
+        remark = self._returning.remarks() if self._returning else ""
+        return _Answer(query, taken, outcome, error, remark, for_good)
 
     def _deliver(self, answer: _Answer) -> _Answer:
         """Send the samples of an answer, or return its query. Returns the answer as the server took it."""
@@ -264,7 +270,9 @@ class Sampler:
             if answer.outcome == "impossible":
                 self._report_gone()  # first, or another sampler claims the query and finds its snapshot gone too
             begun = bool(answer.error) and answer.outcome == "failed"
-            give_back = partial(self._give_back, answer.query, answer.error or STOPPED, begun=begun)
+            give_back = partial(
+                self._give_back, answer.query, answer.error or STOPPED, begun=begun, refused=answer.for_good
+            )
             self._patiently(give_back, LAST_SECONDS)
         return answer
 
@@ -276,7 +284,7 @@ class Sampler:
             self._returning.handed_in([sample.snapshot for sample in answer.taken if sample.snapshot is not None])
         self._report_gone()
         said = "; ".join(filter(None, (answer.error, answer.remark)))
-        self._count(answer.query, "answered" if answer.taken else answer.outcome, said)
+        self._count(answer.query, "answered" if answer.taken else answer.outcome, said, again=not answer.for_good)
         return answer.clean
 
     def _take(self, query: Query, taken: list[NewSample]) -> None:
@@ -348,14 +356,14 @@ class Sampler:
         while not self._stopped() and (left := until - time.monotonic()) > 0:
             time.sleep(min(left, LOOK_SECONDS))
 
-    def _give_back(self, query: Query, error: str, *, begun: bool) -> None:
+    def _give_back(self, query: Query, error: str, *, begun: bool, refused: bool = False) -> None:
         try:
-            self._api.fail(self._surrogate, query.id, query.lease_token, error[:4_000], begun=begun)
+            self._api.fail(self._surrogate, query.id, query.lease_token, error[:4_000], begun=begun, refused=refused)
         except (LeaseExpired, NotThere):
             return  # another sampler has the query already
 
-    def _count(self, query: Query, outcome: Outcome, error: str) -> None:
-        if outcome == "refused":
+    def _count(self, query: Query, outcome: Outcome, error: str, *, again: bool) -> None:
+        if outcome == "refused" and again:  # the server offers it again, and it counts once
             if query.id in self._refused:
                 return
             self._refused.add(query.id)

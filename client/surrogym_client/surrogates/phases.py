@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from surrogym_shared.wire import Phase, SurrogateView
 
-COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "from_log")  # the model will not improve by itself
+COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "unsure", "from_log")  # the model will not improve by itself
 ENDED: tuple[Phase, ...] = (*COMPLETED, "failed")  # a sampler has nothing left to do
 IN_WORDS: dict[Phase, str] = {
     "ready": "the design is ready",
-    "over_budget": "the design has ended without being certain of its model",
+    "over_budget": "the design has spent its budget without being certain of its model",
+    "unsure": "the design has ended before its budget was spent, without being certain of its model",
     "from_log": "the model is fitted to the log, and the design requests no real steps",
     "failed": "the design has failed",
 }

@@ -50,9 +50,9 @@ def words_of_waiting(view: SurrogateView, start: str) -> str:
 
 
 def words_of_uncertainty(view: SurrogateView) -> str:
-    """Describe the end of a design that has spent its budget."""
+    """Describe the end of a design that is not certain of its model."""
     index = "" if view.fidelity is None else f"confidence index {view.fidelity.confidence_index:.4f}, "
-    return f"{IN_WORDS['over_budget']}: {index}target {view.target:g}"
+    return f"{IN_WORDS[view.phase]}: {index}target {view.target:g}"
 
 
 class DesignUnfinished(SurrogymClientError):
@@ -126,7 +126,7 @@ def wait_for_answers(
         if view is None:
             continue
         wanted = [query for query in api.queries(name) if query.id in queries]
-        if all(query.status in ("answered", "set_aside") for query in wanted):
+        if all(query.status in ("answered", "set_aside", "refused") for query in wanted):
             return
         begun = begun or view.queries.leased > 0 or any(query.attempts for query in wanted)
         if not begun and time.monotonic() >= started + FIRST_LEASE_SECONDS:

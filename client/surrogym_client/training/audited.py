@@ -130,7 +130,7 @@ class AuditedTraining:
         ``taken``.
         """
         view = self.api.surrogate(self.name)
-        if not needed and view.phase == "ready":
+        if not needed and view.phase == "ready" and (view.confidence_index or 0.0) >= view.target:
             return False
         round_ = self.rounds.queries if self.rounds else AUDIT_STEPS
         left = round_ if self._unspent and self.api.access().role == "admin" else view.budget_left

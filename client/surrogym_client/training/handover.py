@@ -135,7 +135,7 @@ def take(
     except BaseException:
         api.withdraw_audit(name, sorted(wanted))
         raise
-    failed = [query for query in api.queries(name) if query.id in wanted and query.status == "set_aside"]
+    failed = [query for query in api.queries(name) if query.id in wanted and query.status in ("set_aside", "refused")]
     answers = [sample for sample in api.samples(name) if sample.query_id in wanted]
     samples = [sample for sample in answers if spec.known(sample.coordinates)]
     if not samples:

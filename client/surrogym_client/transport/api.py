@@ -222,9 +222,12 @@ class Api:
         body = wire.RenewLease(lease_token=lease_token, lease_seconds=lease_seconds)
         self._send(f"{routes.surrogate(name)}/queries/{query_id}:renew", body, retries=retries)
 
-    def fail(self, name: str, query_id: int, lease_token: str, error: str, *, begun: bool = True) -> None:
-        """Return a query with the error it caused. ``begun`` says whether a real step may have been taken."""
-        body = wire.FailQuery(lease_token=lease_token, error=error, begun=begun)
+    def fail(
+        self, name: str, query_id: int, lease_token: str, error: str, *, begun: bool = True, refused: bool = False
+    ) -> None:
+        """Return a query with the error it caused. ``begun`` says whether a real step may have been taken, ``refused``
+        whether the original environment refused the query before one."""
+        body = wire.FailQuery(lease_token=lease_token, error=error, begun=begun, refused=refused)
         self._send(f"{routes.surrogate(name)}/queries/{query_id}:fail", body)
 
     def add_queries(

@@ -83,7 +83,9 @@ def renew(name: str, query_id: int, body: Annotated[RenewLease, example(examples
 def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.FAIL)], use: Use) -> QueryView:
     """Return a query with an error. It goes to the next sampler. A query that keeps failing is set aside, and the
     design continues without it."""
-    return convert.query_view(use.queries.fail(name, query_id, body.lease_token, body.error, begun=body.begun))
+    return convert.query_view(
+        use.queries.fail(name, query_id, body.lease_token, body.error, begun=body.begun, refused=body.refused)
+    )
 
 
 @router.post(

@@ -11,7 +11,7 @@ from surrogym_server.storage.records import SurrogateSummary
 Series = Iterable[tuple[str, float]]  # value of the label, and the number
 
 PURPOSES = ("initial", "adaptive", "manual", "audit", "logged", "evaluation")
-STATUSES = ("pending", "leased", "answered", "set_aside")
+STATUSES = ("pending", "leased", "answered", "set_aside", "refused")
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,7 @@ export const PHASES = {
   sampling: "sampling",
   ready: "ready",
   over_budget: "not ready",
+  unsure: "not ready",
   from_log: "from a log",
   failed: "failed",
 };
@@ -54,7 +55,8 @@ export const MEANING = {
   fitting: "the model is learning from new real steps",
   sampling: "the design queries real steps where the model is uncertain",
   ready: "the model has reached its target",
-  over_budget: "the design has ended below its target; the model can be used all the same",
+  over_budget: "the budget is spent, and the model is below its target; it can be used all the same",
+  unsure: "the design has ended before its budget was spent, and the model is below its target; it can be used all the same",
   from_log: "the model is fitted to the log, and the design requests no real steps",
   failed: "the design stopped with an error",
 };

@@ -27,18 +27,18 @@ from surrogym_server.sampling.design import (
     Decision,
     DesignState,
     Request,
+    Verdict,
     advance,
     initial_design,
     initial_rollouts,
     judge_model,
 )
 from surrogym_server.sampling.limits import reached_limits
-from surrogym_server.sampling.prequential import KEPT, continued, predicted
+from surrogym_server.sampling.prequential import KEPT, Predictions, continued, predicted
 from surrogym_server.sampling.rollouts import Rollout
 from surrogym_server.sampling.tolerances import usual_tolerances
 
 Array = NDArray[np.float64]
-Verdict = Literal["continue", "ready", "over_budget", "from_log"]
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,10 @@ class DesignJob:
     pending_action: Array | None = None  # (p, F)
     pending_rollouts: tuple[Array, ...] = ()  # unanswered rollouts, each (T, F)
     pending_snapshots: tuple[str | None, ...] = ()  # where each of them begins; None, or a name not known: a reset
+    open_steps: int = 0  # of the unanswered queries, real steps that may still be taken
+    refused_coordinates: Array | None = None  # (r, C) queries that the environment refused
+    refused_action: Array | None = None  # (r, F)
+    refused_rollouts: tuple[Array, ...] = ()  # each (T, F)
     snapshots: dict[str, tuple[float, ...]] = field(default_factory=dict)  # coordinates (C,) of each, by name
     extra_queries: int = 0  # real steps requested with improve, chosen even if the design has ended
     occupancy: Array | None = None  # (m, C) states that policies visited
@@ -85,11 +89,11 @@ class DesignResult:
     query_snapshots: tuple[str | None, ...] = ()  # where each of them begins; None: at a reset
 
     @property
-    def phase(self) -> Literal["sampling", "ready", "over_budget", "from_log"]:
-        """Next phase of the design: it takes the chosen queries, or it has ended."""
-        if len(self.query_coordinates) or self.query_rollouts:
+    def phase(self) -> Literal["sampling", "ready", "over_budget", "unsure", "from_log"]:
+        """Next phase of the design: it takes the chosen or the open queries, or it has ended."""
+        if self.verdict == "continue" or len(self.query_coordinates) or self.query_rollouts:
             return "sampling"
-        return "over_budget" if self.verdict == "continue" else self.verdict
+        return self.verdict
 
 
 def initial_queries(
@@ -165,17 +169,18 @@ def judge_stored(job: DesignJob, stored: bytes) -> DesignResult:
 
 
 def _decide(job: DesignJob) -> tuple[Decision, Samples]:
-    samples = _samples(job)
-    decision = advance(job.definition, samples, _with_predictions(job, samples), _request(job))
-    return decision, samples
+    samples, state = _samples(job), DesignState.from_json(job.state)
+    new = _new_predictions(job, samples)
+    if new:
+        state = replace(state, predictions=continued(state.predictions, new))
+    return advance(job.definition, samples, state, replace(_request(job), surprises=new)), samples
 
 
-def _with_predictions(job: DesignJob, samples: Samples) -> DesignState:
-    """The job's state, with predictions of the last new samples by the previous model. Without them if it is a model of
-    other samples, for example an imported one."""
-    state = DesignState.from_json(job.state)
+def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
+    """Predictions of the last new samples by the previous model. None if it is a model of other samples, for example an
+    imported one."""
     if job.previous is None:
-        return state
+        return ()
     with suppress(InvalidInput), plugin_calls(job.definition):
         model = from_bytes(job.definition, job.previous)
         if model.digest == samples.at(torch.arange(min(model.samples, len(samples)))).digest:
@@ -183,8 +188,8 @@ def _with_predictions(job: DesignJob, samples: Samples) -> DesignState:
                 torch.ones(len(job.reward), dtype=torch.bool) if job.chosen is None else torch.from_numpy(job.chosen)
             )
             new = chosen[_known(job)].index_fill(0, torch.arange(model.samples), value=False).nonzero()[-KEPT:, 0]
-            return replace(state, predictions=continued(state.predictions, predicted(model, samples.at(new))))
-    return state
+            return predicted(model, samples.at(new))
+    return ()
 
 
 def _samples(job: DesignJob) -> Samples:
@@ -217,6 +222,12 @@ def _request(job: DesignJob) -> Request:
         logged=job.logged,
         audited=job.audited,
         unlearned=int((~_known(job)).sum()),
+        open=job.open_steps,
+        refused=Points(
+            rows(job.refused_coordinates, len(job.definition.coordinates)),
+            rows(job.refused_action, job.definition.action.size),
+        ),
+        refused_rollouts=tuple(Rollout(torch.from_numpy(actions)) for actions in job.refused_rollouts),
     )
 
 

@@ -32,7 +32,7 @@ from surrogym_server.sampling.rollouts import Aim, Rollout, first_rollouts, plan
 from surrogym_server.sampling.serial import noise_of_sensors, sensor_noise
 from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
 
-Verdict = Literal["continue", "ready", "over_budget", "from_log"]
+Verdict = Literal["continue", "ready", "over_budget", "unsure", "from_log"]
 SHORTEST_ROUND = 4  # real steps
 FEW_POINTS = 500  # more points leave no large gap, and comparing all pairs takes memory in the square of their number
 
@@ -45,6 +45,7 @@ class DesignState:
     usual: tuple[float, ...] = ()  # default tolerances, per output; see ``tolerances``
     warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # what a fit passes to the next one
     ended_with: tuple[float, ...] = ()  # steps of the budget, budget, target and tolerances at the end of the design
+    ended_as: str = ""  # the verdict at that end; "" while the design continues
     ranges: tuple[float, ...] = ()  # of the targets, from which each tolerance was computed
     predictions: Predictions = ()  # the last ones of each output, of samples that were then learned from
     tested_at: int = 0  # number of samples when the model became sure and an excursion was planned; 0: it is not sure
@@ -53,6 +54,7 @@ class DesignState:
         warm = {key: array.tolist() for key, array in self.warm.items()}
         ended, ranges = list(self.ended_with), list(self.ranges)
         fields = {"round": self.round, "usual": list(self.usual), "ranges": ranges, "warm": warm, "ended_with": ended}
+        fields["ended_as"] = self.ended_as
         return fields | {"predictions": pairs_of(self.predictions), "tested_at": self.tested_at}
 
     @classmethod
@@ -60,7 +62,8 @@ class DesignState:
         warm = {key: np.array(array) for key, array in state.get("warm", {}).items()}
         usual, ended, ranges = (tuple(state.get(name, ())) for name in ("usual", "ended_with", "ranges"))
         predictions, tested_at = from_pairs(state.get("predictions", [])), state.get("tested_at", 0)
-        return cls(state.get("round", 0), usual, warm, ended, ranges, predictions, tested_at)
+        ended_as = state.get("ended_as", "")
+        return cls(state.get("round", 0), usual, warm, ended, ended_as, ranges, predictions, tested_at)
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,8 @@ class Request:
     """Input of a round.
 
     Pending queries, open or set aside, are treated as answered. They count towards the budget, so that a design whose
-    queries all fail comes to an end, and in the acquisition, so that the next queries go elsewhere.
+    queries all fail comes to an end, and in the acquisition, so that the next queries go elsewhere. Queries that the
+    environment refused count in the acquisition alone, because no real step was taken.
     """
 
     budget: int
@@ -81,11 +85,28 @@ class Request:
     logged: int = 0  # of the samples, from a log
     audited: int = 0  # of the samples, steps of audits
     unlearned: int = 0  # further real steps, whose lags were not known
+    open: int = 0  # real steps of the pending queries that may still be answered
+    refused: Points | None = None  # queries that the environment refused
+    refused_rollouts: tuple[Rollout, ...] = ()
+    surprises: Predictions = ()  # predictions of the samples that the last model had not learned from
 
     @property
     def free(self) -> int:
         """Number of samples that don't count towards the budget, less the real steps that are no samples."""
         return self.logged + self.audited - self.unlearned
+
+    @property
+    def assumed(self) -> Points:
+        """Queries without an answer, which the acquisition treats as answered."""
+        return self.pending if self.refused is None else Points.joined([self.pending, self.refused])
+
+    def is_mostly_refused(self, spent: float) -> bool:
+        """Whether the environment refused as many steps as it has taken, ``spent``, and the budget has in addition.
+
+        Without this limit, a design whose queries are all refused would never end.
+        """
+        steps = (0 if self.refused is None else len(self.refused)) + sum(map(len, self.refused_rollouts))
+        return steps >= self.budget + spent
 
 
 @dataclass(frozen=True)
@@ -130,15 +151,14 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     frozen = frozen_tolerances(definition, samples, Usual(state.usual, state.ranges))
     usual = frozen.tolerances
     judged = judge_model(learned.model, samples, usual, request, state.round, state.predictions)
-    confidences, tolerances, verdict = judged.confidences, judged.tolerances, judged.verdict
+    confidences, tolerances = judged.confidences, judged.tolerances
     now = (
         float(len(samples) - request.free),
         float(request.budget),
         request.target,
         *definition.tolerances_over(usual),
     )
-    if verdict == "continue" and now == state.ended_with:
-        verdict = "over_budget"  # only audits and logs have come since it ended, and they need no further real step
+    verdict = _verdict(judged, state, request, now)
     sure = verdict == "ready"
     testing = sure and _is_untested(definition, samples, state)
     verdict = "continue" if testing else verdict
@@ -155,12 +175,51 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         else:
             ends = reserved is not None
             rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, ends)
-    if verdict == "continue" and not len(chosen) and not rollouts:
-        verdict = "over_budget"  # the rest of the budget is pending, or no distinct query is left
-    ended = now if verdict != "continue" and not len(chosen) and not rollouts else ()
+    asks = bool(len(chosen) or rollouts)
+    if verdict == "continue" and not asks and not request.open:
+        verdict = "unsure"  # no distinct query is left, or those that were set aside hold the rest of the budget
+    ended, ended_as = (now, verdict) if verdict != "continue" and not asks else ((), "")
     tested_at = (len(samples) if testing else state.tested_at) if sure else 0
-    new_state = DesignState(state.round + 1, usual, learned.warm, ended, frozen.ranges, state.predictions, tested_at)
+    new_state = DesignState(
+        state.round + 1, usual, learned.warm, ended, ended_as, frozen.ranges, state.predictions, tested_at
+    )
     return Decision(learned.model, confidences, tolerances, new_state, verdict, chosen.q, chosen.u, rollouts)
+
+
+def _verdict(judged: Judged, state: DesignState, request: Request, now: tuple[float, ...]) -> Verdict:
+    """The verdict of a round, given how the design ended before.
+
+    A design that was ready stays ready, unless a person has asked for more or the steps since then contradict it. A fit
+    to more steps may lower a confidence index a little, although the model had predicted them all. Audits and logs
+    don't make a design that has ended take further real steps.
+    """
+    if judged.verdict in ("ready", "from_log"):
+        return judged.verdict
+    if state.ended_as == "ready" and not _asks_more(now, state.ended_with) and not _contradicted(judged, request):
+        return "ready"
+    if judged.verdict == "continue" and (now == state.ended_with or request.is_mostly_refused(now[0])):
+        return "unsure"
+    return judged.verdict
+
+
+def _asks_more(now: tuple[float, ...], before: tuple[float, ...]) -> bool:
+    """Whether another budget, another target or a smaller tolerance is asked for than at the design's end."""
+    smaller = any(new < old for new, old in zip(now[3:], before[3:], strict=True))
+    return now[1:3] != before[1:3] or smaller
+
+
+def _contradicted(judged: Judged, request: Request) -> bool:
+    """Whether the errors of an output are larger than its tolerance: those of the predictions of the latest steps or,
+    without any, the leave-one-out errors."""
+    surprises = request.surprises
+    for i, (confidence, tolerance) in enumerate(zip(judged.confidences, judged.tolerances, strict=True)):
+        latest = surprises[i] if surprises else ()
+        error = confidence.leave_one_out_error or 0.0
+        if latest:
+            error = math.sqrt(sum(one.error**2 for one in latest) / len(latest))
+        if error > SLACK * tolerance:
+            return True
+    return False
 
 
 @dataclass(frozen=True)
@@ -289,8 +348,8 @@ def _choose(
         wanted = below[: max(0, request.budget + request.free - len(samples) - len(request.pending))]
     else:
         wanted = [below[i % len(below)] for i in range(request.extra)]
-    taken = Points.joined([Points(samples.q, samples.u), request.pending])
-    return candidates.points[choose(model, candidates, taken, request.pending, wanted, tolerances, reserved)]
+    taken = Points.joined([Points(samples.q, samples.u), request.assumed])
+    return candidates.points[choose(model, candidates, taken, request.assumed, wanted, tolerances, reserved)]
 
 
 def _plan(
@@ -322,7 +381,7 @@ def _plan(
     longest = model.definition.max_rollout or 1
     ended = bool(samples.terminated.any())
     aim = Aim(below, tolerances, longest, request.snapshots, request.states, ending, ended)
-    return tuple(plan_round(model, aim, steps, request.pending_rollouts, rng))
+    return tuple(plan_round(model, aim, steps, (*request.pending_rollouts, *request.refused_rollouts), rng))
 
 
 def _is_untested(definition: EnvironmentDefinition, samples: Samples, state: DesignState) -> bool:

@@ -34,10 +34,12 @@ from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import (
     FREE,
     OPEN_STATUSES,
+    Array,
     FitLease,
     Granted,
     NewDesign,
     NewModel,
+    QueryRecord,
 )
 
 logger = logging.getLogger(__name__)
@@ -271,11 +273,13 @@ class Designer:
     def _job(self, lease: FitLease) -> DesignJob:
         name = lease.surrogate
         record, samples = self._storage.surrogates.get(name), self._storage.samples.arrays(name)
-        pending = self._storage.queries.list(name, (*OPEN_STATUSES, "set_aside"))
-        pending = [query for query in pending if query.purpose not in FREE]
+        unanswered = self._storage.queries.list(name, (*OPEN_STATUSES, "set_aside", "refused"))
+        unanswered = [query for query in unanswered if query.purpose not in FREE]
+        pending = [query for query in unanswered if query.status != "refused"]
+        refused = [query for query in unanswered if query.status == "refused"]
         logged, audited = (samples.purpose.count(purpose) for purpose in ("logged", "audit"))
         spoken = len(samples.reward) - logged - audited + sum(query.steps for query in pending)
-        steps = [query for query in pending if query.kind == "step"]
+        steps, refused_steps = (_steps_of(queries) for queries in (pending, refused))
         chosen = np.array([purpose not in UNCHOSEN for purpose in samples.purpose], dtype=np.bool_)
         visited = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
         definition = self._definitions.for_design(name).with_tolerances(record.tolerances)
@@ -289,10 +293,14 @@ class Designer:
             state=record.state,
             budget=record.budget,
             target=record.target,
-            pending_coordinates=np.array([query.coordinates for query in steps]) if steps else None,
-            pending_action=np.array([query.action for query in steps]) if steps else None,
+            pending_coordinates=steps[0],
+            pending_action=steps[1],
             pending_rollouts=tuple(query.actions for query in pending if query.kind == "rollout"),
             pending_snapshots=tuple(query.snapshot for query in pending if query.kind == "rollout"),
+            open_steps=sum(query.steps for query in pending if query.status != "set_aside"),
+            refused_coordinates=refused_steps[0],
+            refused_action=refused_steps[1],
+            refused_rollouts=tuple(query.actions for query in refused if query.kind == "rollout"),
             snapshots=self._storage.snapshots.all(name) if definition.snapshots else {},
             extra_queries=min(lease.extra_queries, max(0, record.budget - spoken)),  # it may be lower by now
             occupancy=None if visited is None else visited.states,
@@ -342,10 +350,10 @@ class Designer:
         wait for."""
         for name in hopeless:
             with suppress(UnknownSurrogate):  # deleted meanwhile
-                set_aside = self._storage.queries.list(name, ("set_aside",))
-                error = (
-                    f"all {len(set_aside)} initial queries were set aside; the last error was: {set_aside[-1].error}"
-                )
+                set_aside = self._storage.queries.list(name, ("set_aside", "refused"))
+                refused = all(query.status == "refused" for query in set_aside)
+                how = "refused by the original environment" if refused else "set aside"
+                error = f"all {len(set_aside)} initial queries were {how}; the last error was: {set_aside[-1].error}"
                 self._storage.surrogates.set_phase(name, "failed", error)
                 self._notices.post(name)
 
@@ -357,6 +365,14 @@ class Designer:
                 _, coordinates, action, rollouts = self._plan(self._definitions.get(name), budget)
                 self._storage.designs.ask_first(name, coordinates, action, rollouts)
                 self._notices.post(name)
+
+
+def _steps_of(queries: Sequence[QueryRecord]) -> tuple[Array | None, Array | None]:
+    """Coordinates (m, C) and actions (m, F) of the queries for single steps; None without any."""
+    steps = [query for query in queries if query.kind == "step"]
+    if not steps:
+        return None, None
+    return np.array([query.coordinates for query in steps]), np.array([query.action for query in steps])
 
 
 def _failure(name: str, error: Exception) -> str:

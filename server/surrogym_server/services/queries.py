@@ -19,7 +19,7 @@ from surrogym_server.storage.records import LeasedQuery, Phase, Purpose, QueryRe
 Array = NDArray[np.float64]
 
 NO_STEPS = (np.zeros((0, 0)), np.zeros((0, 0)))
-FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "from_log", "failed")
+FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "unsure", "from_log", "failed")
 
 
 @dataclass(frozen=True)
@@ -72,13 +72,15 @@ class QueryService:
         if sampler := self._storage.queries.get(name, query_id).sampler:
             self._samplers.heard(name, sampler)
 
-    def fail(self, name: str, query_id: int, token: str, error: str, *, begun: bool) -> QueryRecord:
-        """Return a query with an error, and whether a step of it may have been taken.
+    def fail(
+        self, name: str, query_id: int, token: str, error: str, *, begun: bool, refused: bool = False
+    ) -> QueryRecord:
+        """Return a query with an error, and whether a step of it may have been taken, or the environment refused it.
 
         Raises:
             UnknownQuery, ForeignLease, LeaseExpired: as the storage says.
         """
-        record = self._storage.queries.fail(name, query_id, token, error, begun=begun)
+        record = self._storage.queries.fail(name, query_id, token, error, begun=begun, refused=refused)
         self._notices.post(name)
         return record
 

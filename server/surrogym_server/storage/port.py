@@ -213,8 +213,9 @@ class Designs(ABC):
 class Queries(ABC):
     """The queue of queries and their leases.
 
-    A query is pending, leased, answered or set_aside. A lease that fails or expires makes it pending again; after
-    ``MAX_ATTEMPTS`` it is set aside. A query that is returned before a real step does not count as an attempt.
+    A query is pending, leased, answered, set_aside or refused. A lease that fails or expires makes it pending again;
+    after ``MAX_ATTEMPTS`` it is set aside. A query that is returned before a real step does not count as an attempt.
+    One that the original environment refuses is not claimed again, and does not count towards the budget.
     """
 
     @abstractmethod
@@ -253,10 +254,13 @@ class Queries(ABC):
         """
 
     @abstractmethod
-    def fail(self, name: str, query_id: int, token: str, error: str, *, begun: bool = True) -> QueryRecord:
+    def fail(
+        self, name: str, query_id: int, token: str, error: str, *, begun: bool = True, refused: bool = False
+    ) -> QueryRecord:
         """End the lease with an error. The query becomes pending again, or is set aside. A repeat is harmless.
 
-        ``begun`` says that a real step may have been taken, so that the ledger counts it as unresolved. A query that
+        ``begun`` says that a real step may have been taken, so that the ledger counts it as unresolved. ``refused``
+        says that the original environment refused the query before a real step, whatever ``begun`` says. A query that
         begins at a snapshot which was dropped meanwhile then goes the way of the pending ones that begin there.
 
         Raises:

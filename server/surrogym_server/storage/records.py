@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 JSON = dict[str, Any]
 Vector = tuple[float, ...]
-Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "from_log", "failed"]
+Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "unsure", "from_log", "failed"]
 Purpose = Literal["initial", "adaptive", "manual", "audit"]  # of queries
 SamplePurpose = Literal["initial", "adaptive", "manual", "audit", "logged"]
 FREE = ("audit", "logged")  # purposes of samples that don't count towards the budget
-QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
+QueryStatus = Literal["pending", "leased", "answered", "set_aside", "refused"]
 QueryKind = Literal["step", "rollout"]
 Synchronous = Literal["full", "normal"]  # of a SQLite file: whether every commit waits for the disk
 EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy", "job"]
@@ -187,6 +187,7 @@ class QueryCounts:
     leased: int = 0
     answered: int = 0
     set_aside: int = 0
+    refused: int = 0
 
     @property
     def open(self) -> int:

@@ -19,11 +19,11 @@ MAX_IMAGINED = 500  # most steps of an imagined episode
 MAX_DRAWS = 64
 MAX_MEASURED = 1e30  # variances overflow beyond it, so one larger sample would prevent every fit
 
-Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "from_log", "failed"]
+Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "unsure", "from_log", "failed"]
 Purpose = Literal["initial", "adaptive", "manual", "audit"]
 SamplePurpose = Literal["initial", "adaptive", "manual", "audit", "logged"]
 QueryKind = Literal["step", "rollout"]
-QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
+QueryStatus = Literal["pending", "leased", "answered", "set_aside", "refused"]
 Variant = Literal["deterministic", "probabilistic", "pathwise"]
 AutoresetMode = Literal["next_step", "same_step", "disabled"]
 Role = Literal["read", "train", "sample", "admin"]

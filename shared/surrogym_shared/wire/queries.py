@@ -106,6 +106,11 @@ class FailQuery(Request):
         default=True,
         description="whether a real step may have been taken; if so, it counts as an attempt and as unresolved",
     )
+    refused: bool = Field(
+        default=False,
+        description="whether the original environment refused the query before a real step; then nobody claims it "
+        "again, it counts neither as an attempt nor towards the budget, and ``begun`` is ignored",
+    )
 
 
 class QueryView(Reply):
@@ -114,7 +119,8 @@ class QueryView(Reply):
     id: int = Field(description="id of the query")
     purpose: Purpose = Field(description="why the real step is wanted")
     status: QueryStatus = Field(
-        description="pending, leased by a sampler, answered, or set aside after its last attempt"
+        description="pending, leased by a sampler, answered, set aside after its last attempt, or refused by the "
+        "original environment"
     )
     round: int = Field(description="number of fits before the query was made")
     kind: QueryKind = Field(description="one step, or a rollout from a reset or a snapshot")

@@ -165,6 +165,7 @@ class QueryCounts(Reply):
     leased: int = Field(default=0, description="a sampler has them")
     answered: int = Field(default=0, description="with samples")
     set_aside: int = Field(default=0, description="failed in all their attempts")
+    refused: int = Field(default=0, description="refused by the original environment before a real step")
 
 
 class SurrogateSummary(Reply):

@@ -26,6 +26,7 @@ from surrogym_server.sampling.design import (
     judge,
     monte_carlo,
 )
+from surrogym_server.sampling.prequential import Prediction
 from surrogym_server.sampling.tolerances import sizes_of, usual_tolerances
 from surrogym_shared.spec import Design, EnvironmentSpec
 
@@ -151,7 +152,7 @@ def test_where_nothing_distinct_is_left_to_ask_the_design_ends():
     samples = answer(spec, *monte_carlo(definition))
     made = advance(definition, samples, NEVER, request(100))
     assert len(made.q) == 0
-    assert made.verdict == "over_budget"
+    assert made.verdict == "unsure", "84 steps of its budget are left"
 
 
 @pytest.mark.parametrize(("budget", "verdict"), [(20, "ready"), (4, "ready")])
@@ -346,3 +347,68 @@ def test_an_ended_design_adds_no_queries_after_an_audit(definition, few):
     assert (after.verdict, len(after.q)) == ("over_budget", 0)
     open_again = advance(definition, more, replace(state, ended_with=()), replace(same, budget=len(few) + 8))
     assert len(open_again.q) > 0
+
+
+GENEROUS = 1e3  # tolerance of each output
+BEYOND = 1.1  # no index reaches this target
+LEARNED, AUDITED = 8, 4  # samples
+
+
+def ready() -> Decision:
+    """A design that ended as ready, long before its budget was spent."""
+    definition, samples = definition_from_spec(designed(initial=4)), random_steps(pendulum(), LEARNED, seed=0)
+    made = advance(definition, samples, DesignState(1, (GENEROUS,) * 3), request(budget=100))
+    assert made.verdict == "ready"
+    return made
+
+
+def after_audit(before: Decision, errors: float, budget: int = 100) -> Decision:
+    """The round after an audit, whose fit leaves the index below the target.
+
+    ``errors``: of each prediction by the last model, in tolerances.
+    """
+    state = DesignState.from_json(json.loads(json.dumps(before.state.to_json())))
+    state = replace(state, ended_with=(*state.ended_with[:2], BEYOND, *state.ended_with[3:]))
+    surprises = ((Prediction(errors * GENEROUS, 0.1),) * AUDITED,) * 3
+    asked = replace(request(budget, surprises=surprises, audited=AUDITED), target=BEYOND)
+    after = advance(before.model.definition, random_steps(pendulum(), LEARNED + AUDITED, seed=0), state, asked)
+    assert min(c.confidence_index for c in after.confidences) < BEYOND
+    return after
+
+
+def test_a_design_that_was_ready_stays_ready_after_steps_that_agree():
+    after = after_audit(ready(), errors=0.9)
+    assert (after.verdict, len(after.q), after.state.ended_as) == ("ready", 0, "ready")
+
+
+def test_a_design_that_was_ready_is_unsure_after_steps_that_differ():
+    after = after_audit(ready(), errors=2.0)
+    assert (after.verdict, len(after.q)) == ("unsure", 0), "92 steps of its budget are left"
+
+
+def test_a_design_that_was_ready_is_judged_anew_once_more_is_asked():
+    after = after_audit(ready(), errors=0.9, budget=101)
+    assert after.verdict == "continue"
+    assert len(after.q)
+
+
+def test_refused_queries_leave_the_budget_and_are_not_asked_again(definition, few, unseen):
+    refused = first(unseen, 3)
+    budget = len(few) + 2
+    made = advance(definition, few, NEVER, request(budget, refused=Points(refused.q, refused.u)))
+    assert len(made.q) == 2
+    assert not near(definition, Points(made.q, made.u), Points(refused.q, refused.u)).any()
+
+
+def test_a_design_ends_unsure_where_the_environment_refuses_everything(definition, few):
+    def verdict(refusals: int) -> str:
+        refused = random_steps(pendulum(), refusals, seed=3)
+        return advance(definition, few, NEVER, request(10, refused=Points(refused.q, refused.u))).verdict
+
+    assert (verdict(10 + len(few)), verdict(9 + len(few))) == ("unsure", "continue")
+
+
+def test_a_design_with_open_queries_has_not_ended(definition, few, unseen):
+    """A log may come while the rest of the budget is being answered."""
+    made = advance(definition, few, NEVER, request(len(few) + 2, first(unseen, 2), open=2))
+    assert (made.verdict, len(made.q)) == ("continue", 0)

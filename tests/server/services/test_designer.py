@@ -453,7 +453,8 @@ def test_improve_takes_the_latest_occupancy_unless_one_is_named(answered: Storag
         ("ready", 0, "ready"),
         ("ready", 2, "sampling"),
         ("over_budget", 0, "over_budget"),
-        ("continue", 0, "over_budget"),
+        ("continue", 0, "sampling"),
+        ("unsure", 0, "unsure"),
     ],
 )
 def test_the_phase_after_a_fit(answered: Storage, designer, runner: Runner, verdict: str, queries: int, phase: str):

@@ -185,6 +185,24 @@ def test_a_query_given_back_unbegun_counts_nowhere(
     assert storage.ledger.read(name) == LedgerRecord(initial=1, unresolved=3, failed=3), "it was begun after all"
 
 
+def test_a_refused_query_is_no_attempt_and_leaves_the_budget(storage: Storage, make: Callable[..., str]) -> None:
+    name = make(queries=1)
+    left = storage.designs.left(name)
+    [leased] = storage.queries.claim(name, "a", 1, LONG)
+    query = storage.queries.fail(name, leased.id, leased.token, "it would overflow", begun=False, refused=True)
+    assert (query.status, query.error) == ("refused", "it would overflow")
+    again = storage.queries.fail(name, leased.id, leased.token, "it would overflow", begun=False, refused=True)
+    assert again == query, "a repeat"
+    assert storage.queries.claim(name, "a", 1, LONG) == []
+    assert storage.ledger.read(name) == LedgerRecord()
+    assert storage.queries.counts(name) == QueryCounts(refused=1)
+    assert storage.surrogates.summary(name).queries == QueryCounts(refused=1)
+    assert storage.designs.left(name) == left + 1
+    assert storage.designs.hopeless() == [name], "none is left to ask"
+    storage.surrogates.change(name, paused=False)
+    assert storage.queries.counts(name) == QueryCounts(pending=1)
+
+
 def test_failing_twice_under_one_lease_counts_once(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=1)
     [leased] = storage.queries.claim(name, "a", 1, LONG)

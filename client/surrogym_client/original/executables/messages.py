@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 import numpy as np
 from pydantic import ValidationError
 
-from surrogym_client.original.errors import RequestRefused, StepFailed, UnknownEnvironment
+from surrogym_client.original.errors import RequestRefused, StepFailed, StepRefused, UnknownEnvironment
 from surrogym_client.original.protocol import Array
 from surrogym_shared.checks import first_fault
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
@@ -46,6 +46,7 @@ def decode(line: bytes, number: int) -> Reply:
 
     Raises:
         RequestRefused: the program answered with an error.
+        StepRefused: its code is "refused".
         StepFailed: the line is not an answer to this request.
     """
     try:
@@ -61,7 +62,8 @@ def decode(line: bytes, number: int) -> Reply:
         raise StepFailed(f"expected an answer with id {number} from the program, got {short(line)}")
     if answer.get("error") is not None:
         said, code = one_line(str(answer["error"]), SHOWN_ERROR), one_line(str(answer.get("code", "failed")), SHOWN)
-        raise RequestRefused(f"the program answered: {said or 'an error without words'}", code)
+        words = f"the program answered: {said or 'an error without words'}"
+        raise StepRefused(words) if code == "refused" else RequestRefused(words, code)
     if not isinstance(answer.get("result"), dict):
         raise StepFailed(f"expected 'result' or 'error' in the program's answer, got {short(line)}")
     result: Reply = answer["result"]

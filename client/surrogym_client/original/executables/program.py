@@ -14,6 +14,7 @@ from surrogym_client.original.errors import (
     EnvironmentDied,
     RequestRefused,
     StepFailed,
+    StepRefused,
     StepTimedOut,
     UnknownEnvironment,
 )
@@ -101,14 +102,14 @@ class Program:
             fields: of the request.
 
         Raises:
-            RequestRefused: the program answered with an error; it keeps running.
+            RequestRefused, StepRefused: the program answered with an error; it keeps running.
             StepFailed: it died, hung or sent something else; it was ended.
         """
         self._number += 1
         answer = self.exchange(encode(self._number, method, **fields), method, deadline)
         try:
             return decode(answer, self._number)
-        except RequestRefused:
+        except (RequestRefused, StepRefused):
             raise
         except StepFailed:
             self.end()

@@ -49,7 +49,7 @@ DUE = sa.select(surrogates.c.name).where(IS_DUE).order_by(surrogates.c.id)
 IS_HOPELESS = sa.and_(
     surrogates.c.phase == constant("collecting"),
     surrogates.c.paused.is_(False),
-    sa.exists(OWN_QUERIES.where(queries.c.status == constant("set_aside"))),
+    sa.exists(OWN_QUERIES.where(queries.c.status.in_([constant(status) for status in ("set_aside", "refused")]))),
     ~OPEN_QUERY,
     ~sa.exists(OWN_SAMPLES),
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
@@ -17,6 +17,8 @@ from surrogym_server.storage.sql.database import NOW, constant
 from surrogym_server.storage.sql.rows import NAMED, append_event, hold, touch, unknown_surrogate
 from surrogym_server.storage.sql.tables import leases, queries, surrogates
 
+Returned = Literal["failed", "expired", "unbegun", "refused"]  # outcome of a lease that ended without an answer
+BEFORE_A_STEP = ("unbegun", "refused")
 EXPIRED = "no answer before the lease ended"
 NEW_LEASE = sa.insert(leases)
 LEASE_QUERIES = (
@@ -133,23 +135,24 @@ def sweep(connection: Connection, held: Row[Any]) -> int:
     )
     ids = [int(id) for id in ended.scalars()]
     if ids:
-        give_back(connection, held, ids, EXPIRED, begun=True)
+        give_back(connection, held, ids, EXPIRED, "expired")
     return len(ids)
 
 
-def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], error: str, *, begun: bool) -> None:
-    """Make leased queries pending again, or set them aside after their last attempt.
+def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], error: str, outcome: Returned) -> None:
+    """Make leased queries pending again, or set them aside after their last attempt or a refusal.
 
-    A query has the same number of attempts each time it is requeued. A lease that was not ``begun`` does not count as
-    an attempt. The leases already have their outcome.
+    A query has the same number of attempts each time it is requeued. A lease that ended before a real step does not
+    count as an attempt. The leases already have their ``outcome``.
     """
     spent = (
         sa.select(sa.func.count())
         .where(leases.c.query_id == queries.c.id, leases.c.outcome.in_(("failed", "expired")))
         .scalar_subquery()
     )
-    last = sa.true() if begun else sa.false()
-    next_status = sa.case((last & (spent % MAX_ATTEMPTS == 0), "set_aside"), else_="pending")
+    last = sa.false() if outcome in BEFORE_A_STEP else sa.true()
+    if_failed = sa.case((last & (spent % MAX_ATTEMPTS == 0), "set_aside"), else_="pending")
+    next_status = sa.literal("refused") if outcome == "refused" else if_failed
     rows = connection.execute(
         sa.update(queries)
         .where(queries.c.id.in_(query_ids), queries.c.status == "leased")
@@ -157,7 +160,7 @@ def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], 
         .returning(queries.c.id, queries.c.status)
     )
     statuses = {row.id: row.status for row in rows}
-    set_aside = sorted(id for id, status in statuses.items() if status == "set_aside")
+    set_aside = sorted(id for id, status in statuses.items() if status != "pending")
     for query_id in set_aside:
         append_event(connection, held, "set_aside", query_id=query_id, error=error)
     if set_aside:
@@ -168,11 +171,12 @@ def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], 
 
 def is_unbegun(surrogate_id: int) -> sa.ColumnElement[bool]:
     """Whether a row of queries is a pending query of this surrogate that no sampler has begun."""
-    begun = sa.select(leases.c.id).where(leases.c.query_id == queries.c.id, leases.c.outcome != "unbegun")
+    begun = sa.select(leases.c.id).where(leases.c.query_id == queries.c.id, leases.c.outcome.not_in(BEFORE_A_STEP))
     return (queries.c.surrogate_id == surrogate_id) & (queries.c.status == "pending") & ~sa.exists(begun)
 
 
 def requeue_set_aside(connection: Connection, held: Row[Any]) -> int:
-    """Make the queries that were set aside pending, with as many attempts as a new query. Returns their number."""
-    set_aside = (queries.c.surrogate_id == held.id) & (queries.c.status == "set_aside")
+    """Make the queries that were set aside or refused pending, with as many attempts as a new query. Returns their
+    number."""
+    set_aside = (queries.c.surrogate_id == held.id) & queries.c.status.in_(("set_aside", "refused"))
     return connection.execute(sa.update(queries).where(set_aside).values(status="pending")).rowcount

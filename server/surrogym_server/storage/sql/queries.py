@@ -101,14 +101,16 @@ class SqlQueries(port.Queries):
                 raise _ended(query_id)
             return float(renewed)
 
-    def fail(self, name: str, query_id: int, token: str, error: str, *, begun: bool = True) -> QueryRecord:
-        outcome = "failed" if begun else "unbegun"
+    def fail(
+        self, name: str, query_id: int, token: str, error: str, *, begun: bool = True, refused: bool = False
+    ) -> QueryRecord:
+        outcome: leasing.Returned = "refused" if refused else "failed" if begun else "unbegun"
         with self._database.write() as connection:
             held = hold(connection, name)
             lease = leasing.of_query(connection, held.id, query_id, token)
             if lease.outcome == "open" and lease.expires > held.now:
                 leasing.set_outcome(connection, [lease.id], outcome)
-                leasing.give_back(connection, held, [query_id], error, begun=begun)
+                leasing.give_back(connection, held, [query_id], error, outcome)
                 given_back = _read(connection, held.id, query_id)
                 give_up_lost(connection, held, given_back)
                 return given_back

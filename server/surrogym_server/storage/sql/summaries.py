@@ -17,10 +17,8 @@ from surrogym_server.storage.sql.models import newest_of
 from surrogym_server.storage.sql.sample_counts import MOST_KEPT, CountedSamples, SampleCounts
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
 
-COLUMNS = [
-    getattr(surrogates.c, name)
-    for name in ("id", "name", "budget", "target", "phase", "paused", "round", "error", "created_at")  # as in the record
-]
+FIELDS = ("id", "name", "budget", "target", "phase", "paused", "round", "error", "created_at")  # as in the record
+COLUMNS = [getattr(surrogates.c, name) for name in FIELDS]
 
 
 ANSWERED = (
@@ -39,7 +37,7 @@ class _Named(msgspec.Struct):
 _NAMED = msgspec.json.Decoder(_Named)
 
 
-UNANSWERED = ("pending", "leased", "set_aside")  # statuses of queries; a look into the index counts each
+UNANSWERED = ("pending", "leased", "set_aside", "refused")  # statuses of queries; a look into the index counts each
 OPEN_COUNTS = [
     sa.select(sa.func.count())
     .where(queries.c.surrogate_id == surrogates.c.id, queries.c.status == status)

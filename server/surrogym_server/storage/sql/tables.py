@@ -203,7 +203,7 @@ leases = sa.Table(
     sa.Column("begun", sa.Double, nullable=False),
     sa.Column("expires", sa.Double, nullable=False),
     sa.Column("seconds", sa.Double, nullable=False, server_default="0"),  # for how long it was given out last
-    sa.Column("outcome", sa.Text, nullable=False),  # open, answered, failed, unbegun, expired
+    sa.Column("outcome", sa.Text, nullable=False),  # open, answered, failed, unbegun, refused, expired
     sa.Index(None, "surrogate_id", "outcome", "expires"),
     sa.Index(  # a query has one open lease at most
         "uq_leases_open",
