@@ -185,6 +185,13 @@ def test_an_error_that_is_nearly_all_noise_is_not_answered_by_real_steps() -> No
     assert "--queries" not in said
 
 
+def test_an_error_that_the_step_before_explains_leads_to_the_history_and_not_to_a_tolerance() -> None:
+    said = advice(view(output("x", 0.6, error=0.2, past=0.8)), models([0.6] * 12))
+    assert "surrogym doctor --env ENVIRONMENT --history 60" in said
+    assert "80 % of the squared error of x" in said
+    assert "--tolerance" not in said
+
+
 @pytest.mark.parametrize(("index", "error"), [(0.99, 0.08), (0.6, 0.042)])
 def test_an_error_beside_the_noise_or_doubt_elsewhere_is_not_called_noise(index: float, error: float) -> None:
     assert "nearly all noise" not in advice(view(noisy_output(index, error)), models([0.6, 0.6]))

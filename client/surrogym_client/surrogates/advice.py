@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from math import ceil, hypot, log, sqrt
 from statistics import NormalDist
 
 from surrogym_client.surrogates.phases import COMPLETED
+from surrogym_shared.environments import is_name
 from surrogym_shared.wire import DoubtfulRegion, ModelView, OutputFidelity, ReachedLimit, SurrogateView
 
 NEARLY = 0.9  # share of the target that counts as nearly reached
@@ -51,6 +53,8 @@ def advice(view: SurrogateView, models: Sequence[ModelView]) -> str:
     error = worst.leave_one_out_error
     if error is None:
         return ""
+    if past := [output for output in view.fidelity.outputs if output.past] if view.fidelity else []:
+        return _of_past(view, past)
     if worst.tolerance < TOLERABLE * error:
         return (
             f"all initial samples had the same {worst.name}, so its tolerance is {worst.tolerance:.2g}; declare it in "
@@ -92,6 +96,17 @@ def _share_of_noise(output: OutputFidelity) -> float:
     """Return the share of the squared leave-one-out error that is confirmed noise; 0 without an error."""
     error = output.leave_one_out_error
     return min(1.0, (output.noise / error) ** 2) if error else 0.0
+
+
+def _of_past(view: SurrogateView, outputs: Sequence[OutputFidelity]) -> str:
+    """Describe how to find what the specification lacks, if steps depend on the step before."""
+    shares = ", ".join(f"{100 * output.past:.0f} % of the squared error of {output.name}" for output in outputs)
+    name = view.environment
+    env = shlex.quote(name) if is_name(name) and not name.startswith("exec:") else "ENVIRONMENT"
+    return (
+        f"the step before explains {shares}: that is no noise, but a dead time or a state that is not measured. To see "
+        f"which earlier actions and changes the specification lacks: surrogym doctor --env {env} --history 60"
+    )
 
 
 def _of_noise(view: SurrogateView, output: OutputFidelity) -> str:

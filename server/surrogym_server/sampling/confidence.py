@@ -32,6 +32,7 @@ class OutputConfidence:
     leave_one_out_within_two: float | None
     noise: float = 0.0  # of a single step, established by repeated or by consecutive steps, in the output's unit
     sensor_noise: float = 0.0  # deviation of one measurement, if most of the noise is the sensor's
+    past: float = 0.0  # share of the squared residuals that the step before explains: a dead time or a hidden state
     region: Region | None = None  # where most of the doubt is
     prequential: PrequentialScores | None = None  # of samples that were predicted before they were learned from
 

@@ -26,6 +26,7 @@ from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.excursions import excursion
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.sampling.noise import SLACK, established_noise, to_repeat, widened
+from surrogym_server.sampling.past import owed_to_past
 from surrogym_server.sampling.peaks import highest
 from surrogym_server.sampling.prequential import Predictions, from_pairs, pairs_of, scores_of
 from surrogym_server.sampling.rollouts import Aim, Rollout, first_rollouts, plan_round
@@ -245,8 +246,10 @@ def judge_model(
     definition = model.definition
     with plugin_calls(definition):
         limits = definition.tolerances_over(usual)
-        sensors = sensor_noise(model, samples, limits)
+        past = owed_to_past(model, samples, limits)
+        sensors = tuple(None if any(past) else one for one in sensor_noise(model, samples, limits))
         noise = established_noise(model, samples, limits).maximum(noise_of_sensors(model, samples, sensors, limits))
+        noise = torch.zeros_like(noise) if any(past) else noise  # what is hidden may be in every output
     tolerances = widened(definition.tolerances_over(usual), noise)
     points = Points(*monte_carlo(definition))
     with plugin_calls(definition):
@@ -258,6 +261,7 @@ def judge_model(
             c,
             noise=float(w),
             sensor_noise=0.0 if one is None else one.deviation,
+            past=past[i],
             prequential=scores_of(predictions[i], tolerances[i]) if predictions else None,
         )
         for i, (c, w, one) in enumerate(zip(judged, noise, sensors, strict=True))

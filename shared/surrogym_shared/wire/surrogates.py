@@ -105,6 +105,11 @@ class OutputFidelity(Reply):
         description="standard deviation of one measurement's error, in the output's unit, if consecutive steps of an "
         "episode show that most of ``noise`` is the sensor's; 0: it is the process's, or can't be told",
     )
+    past: float = Field(
+        default=0.0,
+        description="share of the squared errors that the action and the change of the step before explain, if it is "
+        "most of them: the sign of a dead time or of a state that is not measured; no noise is confirmed then",
+    )
     region: DoubtfulRegion | None = Field(
         default=None, description="where most of the doubt is; null if no range of a single input has most of it"
     )

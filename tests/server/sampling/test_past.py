@@ -1,0 +1,94 @@
+"""A dead time or a state that is not measured is no noise: the step before explains the error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.points import Points
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.guard import learn
+from surrogym_server.sampling.design import Judged, Request, judge_model
+from surrogym_server.sampling.past import EXPLAINED
+from surrogym_server.sampling.tolerances import usual_tolerances
+from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
+
+COUNT, LENGTH = 60, 12
+SPEC = EnvironmentSpec(
+    environment="a mass on a spring",
+    coordinates=(Coordinate(name="x", sampling=Uniform(low=-2, high=2)),),
+    observation=(ObservationEntry(name="x", term=Term.linear(x=1)),),
+    action=BoxAction(low=(-1.0,), high=(1.0,)),
+    start={"x": Uniform(low=-1, high=1)},
+    time_limit=20,
+    query="rollout",
+)
+DEFINITION = definition_from_spec(SPEC)
+Next = Callable[[np.ndarray, float, float, np.random.Generator], tuple[np.ndarray, float]]
+
+
+def lag(s: np.ndarray, u: float, before: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    """Without a past: (next state, what is measured of it)."""
+    after = np.array([0.9 * s[0] + u / 2, 0.0])
+    return after, after[0]
+
+
+def dead_time(s: np.ndarray, u: float, before: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    return lag(s, before, u, rng)
+
+
+def hidden_speed(s: np.ndarray, u: float, before: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    after = np.array([s[0] + 0.2 * s[1], s[1] + 0.5 * (u - s[0] - 0.2 * s[1])])
+    return after, after[0]
+
+
+def of_process(s: np.ndarray, u: float, before: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    after, _ = lag(s, u, before, rng)
+    after[0] += 0.1 * rng.normal()
+    return after, after[0]
+
+
+def of_sensor(s: np.ndarray, u: float, before: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    after, seen = lag(s, u, before, rng)
+    return after, seen + 0.1 * rng.normal()
+
+
+def judged(follow: Next, seed: int = 0) -> Judged:
+    """Verdict on a model of episodes with random actions."""
+    rng = np.random.default_rng(seed)
+    rows: list[tuple[float, float, float]] = []
+    for _ in range(COUNT // LENGTH):
+        state, before = rng.uniform(-1, 1, 2), 0.0
+        seen = state[0]
+        for u in rng.uniform(-1, 1, LENGTH):
+            state, seen_after = follow(state, u, before, rng)
+            rows.append((seen, u, seen_after))
+            seen, before = seen_after, u
+    q, u, q_next = (torch.tensor(column, dtype=torch.float64)[:, None] for column in np.array(rows).T)
+    taken = Samples(q, u, q_next, -(q[:, 0] ** 2), torch.zeros(len(rows), dtype=torch.bool))
+    model = learn(DEFINITION, taken, {}).model
+    usual = usual_tolerances(DEFINITION, model.scales.tolist())
+    return judge_model(model, taken, usual, Request(COUNT, 0.9, Points(taken.q[:0], taken.u[:0])), 0)
+
+
+def longer_dead_time(s: np.ndarray, u: float, before: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    """Two steps: the second number of the state is the action of the step before."""
+    return np.array([0.9 * s[0] + s[1] / 2, before]), 0.9 * s[0] + s[1] / 2
+
+
+@pytest.mark.parametrize("follow", [dead_time, longer_dead_time, hidden_speed])
+def test_what_the_step_before_explains_is_no_noise(follow: Next) -> None:
+    position, reward = judged(follow).confidences
+    assert position.past >= EXPLAINED
+    assert position.noise == position.sensor_noise == reward.noise == 0
+
+
+@pytest.mark.parametrize("follow", [lag, of_process, of_sensor])
+def test_noise_and_plain_steps_owe_nothing_to_the_past(follow: Next) -> None:
+    position, _ = judged(follow).confidences
+    assert position.past == 0
+    assert (position.noise > 0) is (follow is of_sensor)
