@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from owned import Child, installed
 
 from surrogym_server.gp import FitOptions, Hyperparameters, fit
-from surrogym_server.gp.fit import _Objective
 from surrogym_server.gp.kernel import covariance
+from surrogym_server.gp.search import Evidence
 
 SIZES, DRAWS = (10, 40, 125, 300), 4
 LENGTHSCALES, NOISE = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0), 1e-4  # of the function that is drawn
@@ -54,14 +54,14 @@ def draw(points: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 def searched(x: torch.Tensor, y: torch.Tensor) -> tuple[Array, int]:
     """What our fit finds, and after how many evaluations."""
-    with mock.patch.object(_Objective, "__call__", autospec=True, side_effect=_Objective.__call__) as evaluation:
+    with mock.patch.object(Evidence, "__call__", autospec=True, side_effect=Evidence.__call__) as evaluation:
         return fit(x, y, OPTIONS).theta, evaluation.call_count
 
 
 def fits(points: int, out: Path, seconds: float) -> Iterator[Row]:
     """A row for each that fits: what one of ``DRAWS`` fits takes, and the evidence that it finds."""
     draws = [draw(points, seed) for seed in range(DRAWS)]
-    objectives = [_Objective(x, y, OPTIONS, None) for x, y in draws]
+    objectives = [Evidence(x, y, OPTIONS, None) for x, y in draws]
     with ExitStack() as stack:
         told = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "told.npz"
         np.savez(

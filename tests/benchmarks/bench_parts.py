@@ -61,7 +61,7 @@ from surrogym_server.environment.features import features
 from surrogym_server.environment.samples import Samples, increments
 from surrogym_server.errors import NumericalFailure
 from surrogym_server.gp import Reflection
-from surrogym_server.gp.fit import _minimum, _Objective
+from surrogym_server.gp.search import Evidence, minimum
 from surrogym_server.models.gaussian_process.feature_maps import CENTRED
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.plugins import Choice
@@ -113,12 +113,12 @@ def mirrors(made: Learned, output: OutputModel, column: int, case: Case, score: 
             if signs is None or bool((signs > 0).all()):  # no rule, or nothing that turns
                 continue
             mirror = Reflection(signs, parity)
-            objective = _Objective(case.x, case.y, case.options, mirror)
+            objective = Evidence(case.x, case.y, case.options, mirror)
             tried.append((objective(objective.theta(case.hyper))[0], mirror, entries))
     best: tuple[float, Case, list[int]] | None = None
     for _, mirror, entries in sorted(tried, key=lambda t: t[0])[:FITTED]:
-        objective = _Objective(case.x, case.y, case.options, mirror)
-        cost, theta = _minimum(objective, objective.theta(case.hyper))
+        objective = Evidence(case.x, case.y, case.options, mirror)
+        cost, theta = minimum(objective, objective.theta(case.hyper))
         if best is None or -cost > best[0]:
             best = -cost, replace(case, mirror=mirror, hyper=objective.hyper(theta)), entries
     if best is not None:
@@ -168,7 +168,7 @@ class Gate(Composite):
     def found(self, places: Sequence[float]) -> tuple[float, np.ndarray]:
         """The log evidence and parameters of the best optimum, from gates at several places."""
         start = min(map(self.start, places), key=lambda theta: self(theta)[0])
-        value, theta = _minimum(self, start)
+        value, theta = minimum(self, start)
         return -value, theta
 
 

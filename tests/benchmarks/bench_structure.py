@@ -58,8 +58,8 @@ from surrogym_client.experiments.tasks import TASKS as DEMOS
 from surrogym_client.original import make
 from surrogym_server.errors import NumericalFailure
 from surrogym_server.gp import condition
-from surrogym_server.gp.fit import _minimum
 from surrogym_server.gp.posterior import Posterior
+from surrogym_server.gp.search import minimum
 from surrogym_server.gp.selection import select_inputs
 from surrogym_server.models.gaussian_process.learning.dropping import FEWEST, LESS, ODDS, WIN
 from surrogym_server.models.gaussian_process.learning.many import EXPLAINED
@@ -120,7 +120,7 @@ class Sum(Composite):
     def found(self) -> tuple[float, dict[str, float]]:
         """The log evidence at the optimum, and the scores there; from the process as it is and from the prior."""
         starts = [self.start(), np.concatenate([self.plain.default_start, self.start()[self.inner :]])]
-        value, theta = min((_minimum(self, start) for start in starts), key=lambda pair: pair[0])
+        value, theta = min((minimum(self, start) for start in starts), key=lambda pair: pair[0])
         return -value, self.scores(theta)
 
 

@@ -19,8 +19,8 @@ from surrogym_server.environment.features import encode, features, leading
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples, increments
 from surrogym_server.gp import FitOptions, Fitted, Reflection, condition, fit
-from surrogym_server.gp.fit import _minimum, _Objective
 from surrogym_server.gp.kernel import Hyperparameters
+from surrogym_server.gp.search import Evidence, minimum
 from surrogym_server.models.gaussian_process.censoring import usable
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
@@ -111,7 +111,7 @@ class Composite:
 
     def __init__(self, case: Case, own: Sequence[tuple[float, float]], lower: np.ndarray, upper: np.ndarray) -> None:
         self.case, self.options, self.d = case, case.options, case.x.shape[1]
-        self.plain = _Objective(case.x, case.y, case.options, case.mirror)
+        self.plain = Evidence(case.x, case.y, case.options, case.mirror)
         self.inner = len(self.plain.prior)
         self.prior = torch.tensor(np.concatenate([self.plain.prior, own]))
         self.lower = np.concatenate([self.plain.lower, lower])
@@ -200,8 +200,8 @@ def case_of(
         return None
     mirror = reflection(definition, chosen)
     options = FitOptions(quadratic=output.name == REWARD)
-    objective = _Objective(posterior.x, posterior.y, options, mirror)
-    value, theta = _minimum(objective, objective.theta(posterior.hyper))
+    objective = Evidence(posterior.x, posterior.y, options, mirror)
+    value, theta = minimum(objective, objective.theta(posterior.hyper))
     entries = torch.tensor([f.entry for f in features(definition, chosen)])
     given = torch.tensor([f.function in ("affine", "equal", "grown") for f in features(definition, chosen)])
     made = Case(

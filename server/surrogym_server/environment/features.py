@@ -14,7 +14,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition, wrap
 from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.points import Points
-from surrogym_server.tensors.bending import bend
+from surrogym_server.tensors import bend
 
 State = Literal["cos_sin", "wrapped", "both", "observation", "none"]
 Encoding = Literal["value", "one_hot", "none"]  # of actions; one-hot of discrete ones

@@ -32,10 +32,11 @@ import scipy  # its parts are loaded on first use
 import torch
 from torch import Tensor
 
-from surrogym_server.gp.fit import SHORTER, _blas, _minimum
+from surrogym_server.gp.fit import SHORTER
 from surrogym_server.gp.kernel import Hyperparameters, Polynomial, Reflection
 from surrogym_server.gp.parameters import Array, FitOptions, Parameters
 from surrogym_server.gp.posterior import Posterior, condition
+from surrogym_server.gp.search import blas, minimum
 from surrogym_server.gp.sparse import condition_sparse, pivots
 from surrogym_server.gp.subsets import SOME, spread
 
@@ -59,7 +60,7 @@ def fit_bound(
     shorter[: x.shape[1]] -= SHORTER
     shorter[-1] = Parameters(x.shape[1], options, reflection).default_start[-1]
     starts = [theta, shorter]
-    with _blas().limit(limits=1):
+    with blas().limit(limits=1):
         for most, iterations in SEARCHES:
             rows = spread(len(y), len(y) if most is None else most)
             few = replace(options, max_iterations=iterations)
@@ -97,7 +98,7 @@ def fewer_inputs(
     most = HARDLY * math.sqrt(posterior.hyper.noise_variance)
     ordered = [j for j in effect.argsort().tolist() if bool(may[j]) and float(effect[j]) < most]
     sets = [ordered[: x.shape[1] - 1]] if ordered else []
-    with _blas().limit(limits=1):
+    with blas().limit(limits=1):
         inputs = _Inputs(x, y, replace(options, max_iterations=SEARCHES[-1][1]), inducing, posterior.hyper)
         for _ in range(TRIES):
             if not sets:
@@ -157,7 +158,7 @@ def _searched(
     parameters = Parameters(x.shape[1], options, reflection)
     clipped = np.clip(start, parameters.lower, parameters.upper)
     chosen = pivots(parameters.hyper(clipped), x, inducing)
-    return _minimum(Bound(x, y, chosen, options, reflection), clipped)
+    return minimum(Bound(x, y, chosen, options, reflection), clipped)
 
 
 class Bound(Parameters):

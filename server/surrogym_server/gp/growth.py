@@ -11,7 +11,7 @@ Since a is known once g is, fitting F to targets t at z is fitting G to y = t / 
     log p(t) = log p(y) - sum_i log a(z_i).
 
 The noise of F is that of G times a(z). All samples lie within ``EDGE``. Beyond it w is a line on the steep side and
-constant on the flat side (``tensors.bending``), because an exponential would overflow far away. References: P. Sampson,
+constant on the flat side (``tensors.bend``), because an exponential would overflow far away. References: P. Sampson,
 P. Guttorp (1992), JASA 87 (stationary after a deformation of the inputs); C. Paciorek, M. Schervish (2006),
 Environmetrics 17 (non-stationary covariances).
 """
@@ -26,10 +26,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogym_server.gp.fit import Fitted, _blas, _minimum, _Objective
+from surrogym_server.gp.fit import Fitted
 from surrogym_server.gp.parameters import FitOptions
 from surrogym_server.gp.posterior import condition
-from surrogym_server.tensors.bending import EDGE, STEEPEST, amplitude, bend
+from surrogym_server.gp.search import Evidence, blas, minimum
+from surrogym_server.tensors import EDGE, STEEPEST, amplitude, bend
 
 PRIOR = 1.0  # deviation of a rate; inputs have deviation near 1
 FLAT = 1e-3  # smaller rates are 0: they bend nothing
@@ -57,8 +58,8 @@ def fit_growing(z: Tensor, t: Tensor, may: Tensor, options: FitOptions, starts: 
         raise ValueError(f"expected inputs within {EDGE} where a rate is allowed")
     objective = _GrowingObjective(z, t, may, options)
     padded = [np.concatenate([start, np.zeros(objective.size - len(start))]) for start in starts]
-    with _blas().limit(limits=1):
-        value, theta = min((_minimum(objective, start) for start in padded), key=lambda pair: pair[0])
+    with blas().limit(limits=1):
+        value, theta = min((minimum(objective, start) for start in padded), key=lambda pair: pair[0])
     rates = torch.from_numpy(objective.rates(theta))
     rates = torch.where(rates.abs() < FLAT, 0.0, rates)
     w = bend(z, rates)
@@ -73,7 +74,7 @@ class _GrowingObjective:
         if options.quadratic:
             raise ValueError("expected options without a quadratic part")
         self.options, self._z, self._t, self._may = options, z.numpy(), t.numpy(), may.numpy()
-        plain = _Objective(z, t, options, None)
+        plain = Evidence(z, t, options, None)
         self.inner, count = len(plain.default_start), int(self._may.sum())
         self.size = self.inner + count
         self.lower = np.concatenate([plain.lower, np.full(count, -STEEPEST)])
@@ -85,7 +86,7 @@ class _GrowingObjective:
         rates[self._may] = theta[self.inner :]
         return rates
 
-    def plain(self, theta: Array) -> tuple[_Objective, Array]:
+    def plain(self, theta: Array) -> tuple[Evidence, Array]:
         """The objective of G given the rates, and the slopes of the bent inputs over their rates, (n, d)."""
         rates, z = self.rates(theta), self._z
         small = np.abs(rates) < FLAT
@@ -93,7 +94,7 @@ class _GrowingObjective:
         bent = np.where(small, z + 0.5 * rates * z**2, np.expm1(safe * z) / safe)
         slope = np.where(small, 0.5 * z**2 + rates * z**3 / 3, (z * np.exp(safe * z) - bent) / safe)
         y = self._t * np.exp(-(z @ rates))
-        return _Objective(torch.from_numpy(bent), torch.from_numpy(y), self.options, None), slope
+        return Evidence(torch.from_numpy(bent), torch.from_numpy(y), self.options, None), slope
 
     def __call__(self, theta: Array) -> tuple[float, Array]:
         objective, slope = self.plain(theta)

@@ -13,10 +13,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_server.gp.fit import _blas, _minimum, _Objective
 from surrogym_server.gp.kernel import Hyperparameters
 from surrogym_server.gp.parameters import MOST_NOISE, NOISE_FLOOR, FitOptions
 from surrogym_server.gp.posterior import Posterior
+from surrogym_server.gp.search import Evidence, blas, minimum
 
 BURN_IN, THINNING = 30, 10  # updates before the first sample, and between samples
 SHORTER = (0.0, 1.0, 2.0)  # logarithms of length scales, below those of the fit
@@ -43,10 +43,10 @@ def hyperparameter_samples(
     options = FitOptions(
         hyper.linear_variance > 0, hyper.quadratic_variance > 0, noise_floor=noise_floor, most_noise=most_noise
     )
-    evidence = _Objective(posterior.x, posterior.y, options, hyper.reflection)
+    evidence = Evidence(posterior.x, posterior.y, options, hyper.reflection)
     chain = _Chain(evidence, np.random.default_rng(seed))
     theta, found = evidence.theta(hyper), []
-    with _blas().limit(limits=1):
+    with blas().limit(limits=1):
         if hyper.noise_variance > most_noise:
             theta = _with_less_noise(evidence, theta)
         level = chain.log_likelihood(theta)
@@ -57,19 +57,19 @@ def hyperparameter_samples(
     return tuple(found)
 
 
-def _with_less_noise(evidence: _Objective, theta: Array) -> Array:
+def _with_less_noise(evidence: Evidence, theta: Array) -> Array:
     """The likeliest theta within the bounds of ``evidence``, by searches from ever shorter length scales, because what
     noise explained has to vary within short distances."""
     starts = [theta.copy() for _ in SHORTER]
     for start, shorter in zip(starts, SHORTER, strict=True):
         start[: evidence.d] -= shorter
-    return min((_minimum(evidence, start) for start in starts), key=lambda pair: pair[0])[1]
+    return min((minimum(evidence, start) for start in starts), key=lambda pair: pair[0])[1]
 
 
 class _Chain:
     """Updates of theta whose stationary distribution is its posterior."""
 
-    def __init__(self, evidence: _Objective, rng: np.random.Generator) -> None:
+    def __init__(self, evidence: Evidence, rng: np.random.Generator) -> None:
         self._evidence, self._rng = evidence, rng
         self._mean, self._deviation = evidence.prior.T
 

@@ -17,10 +17,10 @@ from itertools import permutations
 import torch
 from torch import Tensor
 
-from surrogym_server.gp.fit import _blas, _minimum, _Objective
 from surrogym_server.gp.kernel import Hyperparameters, Reflection
 from surrogym_server.gp.parameters import FitOptions
 from surrogym_server.gp.posterior import Posterior, condition
+from surrogym_server.gp.search import Evidence, blas, minimum
 from surrogym_server.gp.subsets import FEW, spread
 
 Inputs = tuple[int, ...]
@@ -72,7 +72,7 @@ class Part:
 
     def evidence(self, hyper: Hyperparameters, x: Tensor, y: Tensor) -> float:
         """Log evidence of targets (n,) at inputs (n, d), standardised as this part's, in the targets' unit."""
-        objective = _Objective(x, y, self.options, hyper.reflection)
+        objective = Evidence(x, y, self.options, hyper.reflection)
         return -objective(objective.theta(hyper))[0] - len(y) * math.log(self.scale)
 
 
@@ -128,7 +128,7 @@ def pools(parts: Sequence[Part], most: int) -> list[Pool]:
     """
     few = [number for number, part in enumerate(parts) if len(part.reads) <= most]
     free, found = set(range(len(parts))), list[Pool]()
-    with _blas().limit(limits=1):
+    with blas().limit(limits=1):
         for first in sorted(few, key=lambda number: parts[number].posterior.left_out.error):
             if first not in free:
                 continue
@@ -233,8 +233,8 @@ def _pooled(numbers: Sequence[int], parts: Sequence[Part], inputs: Sequence[Inpu
     x = torch.cat([part.read(read) for part, read in zip(parts, inputs, strict=True)])
     y = torch.cat([first.targets_of(part) for part in parts])
     rows = spread(len(y), FEW)
-    objective = _Objective(x[rows], y[rows], first.options, first.fewer.reflection)
-    _, theta = _minimum(objective, objective.theta(first.fewer))
+    objective = Evidence(x[rows], y[rows], first.options, first.fewer.reflection)
+    _, theta = minimum(objective, objective.theta(first.fewer))
     hyper = objective.hyper(theta)
     apart = sum(part.alone for part in parts)
     apart += sum(_orders(part, len(inputs[0])) for part in parts[1:])

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from surrogym_server.gp.fit import _blas, _minimum, _Objective
 from surrogym_server.gp.kernel import Hyperparameters
 from surrogym_server.gp.parameters import Array, FitOptions
 from surrogym_server.gp.posterior import Posterior
+from surrogym_server.gp.search import Evidence, blas, minimum
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def select_inputs(posterior: Posterior, options: FitOptions, may: Tensor, odds: 
         odds: log odds before any data that it leaves out one input more.
     """
     search = _Search(posterior, options, may)
-    with _blas().limit(limits=1):
+    with blas().limit(limits=1):
         whole = subset = search.whole()
         while (less := search.without_one(subset, subset.cost + odds)) is not None:
             subset = less
@@ -63,10 +63,10 @@ class _Search:
     def __init__(self, posterior: Posterior, options: FitOptions, may: Tensor) -> None:
         self._posterior, self._options, self._may = posterior, options, may
 
-    def objective(self, kept: Tensor) -> _Objective:
+    def objective(self, kept: Tensor) -> Evidence:
         mirror = self._posterior.hyper.reflection
         part = None if mirror is None else replace(mirror, signs=mirror.signs[kept])
-        return _Objective(self._posterior.x[:, kept], self._posterior.y, self._options, part)
+        return Evidence(self._posterior.x[:, kept], self._posterior.y, self._options, part)
 
     def whole(self) -> _Subset:
         """All inputs, with hyperparameters near those of the process, which may come from other points."""
@@ -76,7 +76,7 @@ class _Search:
 
     def fitted(self, subset: _Subset) -> _Subset:
         """The subset with hyperparameters of its own."""
-        cost, theta = _minimum(self.objective(subset.kept), subset.theta)
+        cost, theta = minimum(self.objective(subset.kept), subset.theta)
         return replace(subset, theta=theta, cost=cost)
 
     def without_one(self, subset: _Subset, most: float) -> _Subset | None:

@@ -25,7 +25,7 @@ from surrogym_server.gp import (
     fit_bound,
 )
 from surrogym_server.gp.bound import Bound
-from surrogym_server.gp.fit import _Objective
+from surrogym_server.gp.search import Evidence
 from surrogym_server.gp.sparse import pivots
 
 with warnings.catch_warnings():
@@ -80,7 +80,7 @@ def test_the_gradient_is_that_of_finite_differences(linear, quadratic, seed, noi
 @kernels
 def test_it_never_exceeds_the_evidence(linear, quadratic, seed, noise, parity):
     x, y, options, reflection, theta = drawn(linear, quadratic, seed, noise, parity)
-    negative, _ = _Objective(x, y, options, reflection)(theta)
+    negative, _ = Evidence(x, y, options, reflection)(theta)
     costs = [Bound(x, y, torch.arange(m), options, reflection)(theta)[0] for m in (1, 3, 8, 20)]
     assert costs == sorted(costs, reverse=True), "more inducing points never lower it"
     assert costs[-1] >= negative - 1e-9 * abs(negative)
@@ -92,7 +92,7 @@ def test_with_all_points_it_is_the_evidence(linear, quadratic, seed, noise, pari
     """But for the jitter, which is as small as 1e-9 of the prior's variance."""
     x, y, options, reflection, theta = drawn(linear, quadratic, seed, noise, parity)
     whole = Bound(x, y, torch.arange(len(y)), options, reflection)
-    for ours, theirs in zip(whole(theta), _Objective(x, y, options, reflection)(theta), strict=True):
+    for ours, theirs in zip(whole(theta), Evidence(x, y, options, reflection)(theta), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-3)
 
 

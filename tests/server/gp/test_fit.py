@@ -15,7 +15,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, WhiteKernel
 
 from surrogym_server.gp import FitOptions, Reflection, fit, noisy_explanation
-from surrogym_server.gp.fit import _Objective
+from surrogym_server.gp.search import Evidence
 
 FLAT = (0.0, 1e4)  # a prior that says nothing
 WITHOUT_PRIORS = {f"{name}_prior": FLAT for name in ("lengthscale", "signal", "linear", "quadratic", "noise")}
@@ -40,7 +40,7 @@ def test_the_gradient_is_that_of_finite_differences(linear, quadratic, seed, noi
     rng = np.random.default_rng(seed)
     x, y = draw(rng, 12, [1.0, 2.0], 0.1)
     reflection = Reflection(torch.tensor([-1.0, 1.0], dtype=torch.float64), parity) if parity else None
-    objective = _Objective(x, y, FitOptions(linear=linear, quadratic=quadratic), reflection)
+    objective = Evidence(x, y, FitOptions(linear=linear, quadratic=quadratic), reflection)
     theta = rng.uniform(-1.5, 1.5, len(objective.default_start))
     theta[-1] = noise
     _, gradient = objective(theta)
@@ -59,7 +59,7 @@ def test_without_priors_the_objective_is_scikit_learns_evidence(rng, linear):
         kernel += ConstantKernel(0.6) * DotProduct(1.0)
         theta.append(0.6)
     reference = GaussianProcessRegressor(kernel, alpha=1e-3, optimizer=None).fit(x.numpy(), y.numpy())
-    objective = _Objective(x, y, FitOptions(linear=linear, **WITHOUT_PRIORS), None)
+    objective = Evidence(x, y, FitOptions(linear=linear, **WITHOUT_PRIORS), None)
     constant = (len(theta) + 1) * math.log(1e4)
     value, _ = objective(np.log([*theta, 1e-3]))
     assert -(value - constant) == pytest.approx(reference.log_marginal_likelihood_value_, rel=1e-6)
@@ -67,7 +67,7 @@ def test_without_priors_the_objective_is_scikit_learns_evidence(rng, linear):
 
 def test_a_covariance_that_cannot_be_factored_has_a_huge_cost(rng):
     x, y = draw(rng, 10, [1.0], 1e-2)
-    objective = _Objective(x, y, FitOptions(linear=False), None)
+    objective = Evidence(x, y, FitOptions(linear=False), None)
     theta = np.array([40.0, 40.0, -80.0])  # all points alike, far outside the bounds
     value, gradient = objective(theta)
     assert value == 1e10
@@ -76,8 +76,8 @@ def test_a_covariance_that_cannot_be_factored_has_a_huge_cost(rng):
 
 def test_priors_lower_the_score_by_their_log_density(rng):
     x, y = draw(rng, 10, [1.0], 1e-2)
-    vague = _Objective(x, y, FitOptions(linear=False, **WITHOUT_PRIORS), None)
-    informed = _Objective(x, y, FitOptions(linear=False, **(WITHOUT_PRIORS | {"signal_prior": (0.5, 0.25)})), None)
+    vague = Evidence(x, y, FitOptions(linear=False, **WITHOUT_PRIORS), None)
+    informed = Evidence(x, y, FitOptions(linear=False, **(WITHOUT_PRIORS | {"signal_prior": (0.5, 0.25)})), None)
     theta = np.array([0.0, 1.0, -3.0])
     expected = 0.5 * ((1.0 - 0.5) / 0.25) ** 2 + math.log(0.25) - math.log(1e4)
     assert informed(theta)[0] - vague(theta)[0] == pytest.approx(expected, abs=1e-6)
@@ -146,13 +146,13 @@ def test_noise_of_a_fifth_of_the_variance_is_seen(seed):
 LIMITED = """
 import torch
 from surrogym_server.gp import FitOptions, fit
-from surrogym_server.gp.fit import _blas
+from surrogym_server.gp.search import blas
 x = torch.linspace(0, 1, 8, dtype=torch.float64)[:, None]
 fit(x, x[:, 0].sin(), FitOptions())
 from threadpoolctl import ThreadpoolController
 def libraries(controller):
     return {library.filepath for library in controller.lib_controllers if library.user_api == "blas"}
-print(libraries(ThreadpoolController()) - libraries(_blas()))
+print(libraries(ThreadpoolController()) - libraries(blas()))
 """
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from surrogym_server.gp import FitOptions, covariance, fit, fit_growing
 from surrogym_server.gp.growth import _GrowingObjective
-from surrogym_server.tensors.bending import amplitude, bend
+from surrogym_server.tensors import amplitude, bend
 
 
 def points(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from surrogym_server.gp import FitOptions, condition, fit, hyperparameter_samples
-from surrogym_server.gp.fit import _Objective
+from surrogym_server.gp.search import Evidence
 
 
 def wave(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -17,7 +17,7 @@ def wave(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
 def test_free_parameters_become_hyperparameters_and_back(hyper):
     x = torch.from_numpy(np.random.default_rng(0).normal(size=(6, 3)))
     options = FitOptions(linear=hyper.linear_variance > 0, quadratic=hyper.quadratic_variance > 0)
-    objective = _Objective(x, x[:, 0], options, hyper.reflection)
+    objective = Evidence(x, x[:, 0], options, hyper.reflection)
     back = objective.hyper(objective.theta(hyper))
     torch.testing.assert_close(back.lengthscale, hyper.lengthscale)
     for name in ("signal_variance", "linear_variance", "quadratic_variance", "noise_variance"):
@@ -28,7 +28,7 @@ def test_samples_have_the_mean_of_the_posterior_on_a_grid():
     """One point says nothing of two parameters but its own density, which a grid integrates."""
     x, y = torch.zeros(1, 1, dtype=torch.float64), torch.tensor([2.5], dtype=torch.float64)
     options = FitOptions(linear=False)
-    objective = _Objective(x, y, options, None)
+    objective = Evidence(x, y, options, None)
     signal, noise = np.meshgrid(np.linspace(-7, 7, 61), np.linspace(-18.4, 0.7, 61), indexing="ij")
     middle = objective.prior[0, 0]
     log = np.array([-objective(np.array([middle, *pair]))[0] for pair in zip(signal.flat, noise.flat, strict=True)])

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.gp import FitOptions, Reflection, fit, select_inputs
-from surrogym_server.gp.fit import _Objective
+from surrogym_server.gp.search import Evidence
 
 OPTIONS, ODDS = FitOptions(), -1.0
 
@@ -35,7 +35,7 @@ def test_inputs_that_are_not_read_are_left_out():
 def test_score_is_that_of_a_process_of_these_inputs_alone():
     x, y = points(25)
     found = select_inputs(fit(x, y, OPTIONS).posterior, OPTIONS, torch.ones(5, dtype=torch.bool), ODDS)
-    cost, _ = _Objective(x[:, found.kept], y, OPTIONS, None)(found.theta)
+    cost, _ = Evidence(x[:, found.kept], y, OPTIONS, None)(found.theta)
     assert abs(found.score + cost) < 1e-6
 
 

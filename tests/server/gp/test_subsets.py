@@ -19,7 +19,7 @@ from surrogym_server.gp import (
     spread,
     subsets,
 )
-from surrogym_server.gp.fit import _minimum, _Objective
+from surrogym_server.gp.search import Evidence, minimum
 
 
 @pytest.mark.parametrize("points", [1, 30, 31, 1_000])
@@ -59,7 +59,7 @@ def test_more_points_resolve_what_few_explain_as_noise():
     """From where few points end, the search ends in noise; the second start finds the wave."""
     x = torch.linspace(-1.7, 1.7, 200, dtype=torch.float64)[:, None]
     y, found = torch.sin(6 * x[:, 0]), np.array([0.7, 0.0, -10.0, 0.0])  # as theta: the last is log sigma_n^2
-    _, alone = _minimum(_Objective(x, y, FitOptions(), None), found)
+    _, alone = minimum(Evidence(x, y, FitOptions(), None), found)
     assert math.exp(alone[-1]) > 0.1
     assert refine(x, y, FitOptions(), found)[-1].noise_variance < 1e-4
 

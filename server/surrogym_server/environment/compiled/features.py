@@ -12,7 +12,7 @@ from surrogym_server.compiled.tables import TablesBuilder, matrix
 from surrogym_server.environment.compiled.terms import evaluate
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import Encoder
-from surrogym_server.tensors.bending import EDGE
+from surrogym_server.tensors import EDGE
 from surrogym_shared.compiled.jit import compiled
 
 Floats = NDArray[np.float64]

@@ -17,7 +17,7 @@ from surrogym_server.gp import Hyperparameters, LeftOut, Posterior, Sparse
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.warp import Warp
-from surrogym_server.tensors.bending import STEEPEST
+from surrogym_server.tensors import STEEPEST
 
 KNOWN_MAPS = frozenset(
     FeatureMap(state, action, lead, after, parity=parity)

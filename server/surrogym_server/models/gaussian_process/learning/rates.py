@@ -13,7 +13,7 @@ from surrogym_server.errors import NumericalFailure
 from surrogym_server.gp import fit_growing, spread, subsets
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner, is_unexplained
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
-from surrogym_server.tensors.bending import EDGE, amplitude, bend
+from surrogym_server.tensors import EDGE, amplitude, bend
 
 ODDS = -3.0  # log odds of each rate before any data
 FEWEST = 8  # samples for each rate: fewer leave a rate uncertain, and predictions with it are too sure

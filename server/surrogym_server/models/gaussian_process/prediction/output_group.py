@@ -11,7 +11,7 @@ from torch import Tensor
 
 from surrogym_server.environment.features import Encoder
 from surrogym_server.gp import Output, Pathwise, Serving
-from surrogym_server.tensors.bending import amplitude
+from surrogym_server.tensors import amplitude
 
 
 @dataclass(frozen=True)

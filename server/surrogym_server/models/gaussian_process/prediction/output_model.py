@@ -12,7 +12,7 @@ from surrogym_server.environment.features import FeatureMap
 from surrogym_server.gp import NOISE_FLOOR, FitOptions, LeftOut, Posterior, noisy_explanation
 from surrogym_server.models.abilities import LeaveOneOutErrors
 from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE, Warp
-from surrogym_server.tensors.bending import amplitude
+from surrogym_server.tensors import amplitude
 
 
 @dataclass(frozen=True)
