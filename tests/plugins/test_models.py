@@ -89,7 +89,7 @@ def test_a_file_of_one_family_is_not_taken_by_a_surrogate_of_another(plugin_serv
         (
             "nobody",
             {},
-            "model: expected one of gaussian_process, sparse_gaussian_process, ensemble, bayesian_linear, got 'nobody'",
+            "model: expected one of gaussian_process, ensemble, bayesian_linear, got 'nobody'",
         ),
         ("broken", {}, "package 'broken_model', entry point broken = 'nowhere_to_be_found:Missing' of surrogym.models"),
         ("bayesian_linear", {"depth": 1}, "expected a setting out of ridge, got 'depth'"),
@@ -108,7 +108,7 @@ def test_missing_packages_and_wrong_settings_are_refused(
 
 def test_a_server_starts_without_a_broken_package_and_names_it(plugin_server: ServerProcess):
     assert "the model 'broken' is left out" in plugin_server.log
-    assert "models: gaussian_process, sparse_gaussian_process, ensemble, bayesian_linear" in plugin_server.log
+    assert "models: gaussian_process, ensemble, bayesian_linear" in plugin_server.log
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from surrogym_server.environment import conditions, declared_reward, distributio
 from surrogym_server.environment import definition as core
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.errors import InvalidSpec
-from surrogym_server.models.registry import GAUSSIAN_PROCESS, PROCESSES, learner_of
+from surrogym_server.models.registry import GAUSSIAN_PROCESS, in_full, learner_of
 from surrogym_server.plugins import Choice
 from surrogym_server.sampling.acquisition import check_acquisition
 from surrogym_shared import spec as wire
@@ -114,8 +114,8 @@ def _learning(spec: wire.EnvironmentSpec) -> core.LearningDefinition:
 def _model(design: wire.Design) -> Choice:
     """The family of models. The preset chooses the settings of Gaussian processes that the specification
     leaves open."""
-    choice, paper = _choice(design.model, GAUSSIAN_PROCESS), design.preset == "paper"
-    if choice.name in PROCESSES:
+    choice, paper = in_full(_choice(design.model, GAUSSIAN_PROCESS)), design.preset == "paper"
+    if choice.name == GAUSSIAN_PROCESS:
         kernel = "squared_exponential" if paper else "composite"
         preset: dict[str, float | bool | str] = {
             "kernel": kernel,

@@ -5,14 +5,14 @@ from __future__ import annotations
 from surrogym_server.models.ensemble import NetworkEnsembles
 from surrogym_server.models.gaussian_process import GaussianProcesses
 from surrogym_server.models.port import Learner
-from surrogym_server.models.sparse_gaussian_process import SparseGaussianProcesses
 from surrogym_server.plugins import Choice, Registry
 
-GAUSSIAN_PROCESS, SPARSE_GAUSSIAN_PROCESS = "gaussian_process", "sparse_gaussian_process"
-PROCESSES = (GAUSSIAN_PROCESS, SPARSE_GAUSSIAN_PROCESS)  # families with the settings of Gaussian processes
+GAUSSIAN_PROCESS = "gaussian_process"
+SHORT: dict[str, Choice] = {
+    "sparse_gaussian_process": Choice(GAUSSIAN_PROCESS, (("inducing", 300),))
+}  # see ``in_full``
 BUILT_IN: dict[str, type[Learner] | str] = {
     GAUSSIAN_PROCESS: GaussianProcesses,
-    SPARSE_GAUSSIAN_PROCESS: SparseGaussianProcesses,
     "ensemble": NetworkEnsembles,
 }
 
@@ -22,3 +22,10 @@ MODELS: Registry[Learner] = Registry("model", "surrogym.models", Learner, BUILT_
 def learner_of(choice: Choice) -> Learner:
     """Return the learner with a family's name and settings. Raises ``InvalidSpec``."""
     return MODELS.make(choice)
+
+
+def in_full(choice: Choice) -> Choice:
+    """Return a choice by a name that stands for a family with some settings, as this family; any other as it is."""
+    if (short := SHORT.get(choice.name.casefold())) is None:
+        return choice
+    return Choice(short.name, tuple({**dict(short.settings), **dict(choice.settings)}.items()))

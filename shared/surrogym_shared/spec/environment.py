@@ -59,7 +59,8 @@ class Design(Frozen):
     budget as one hypercube, whatever ``initial`` is; steps beyond the budget go to the largest gaps. A package on
     the server may add others.
 
-    ``model``: family of models: ``gaussian_process``, the default, ``sparse_gaussian_process`` for thousands of steps,
+    ``model``: family of models: ``gaussian_process``, the default, ``sparse_gaussian_process`` (the same with the
+    setting ``inducing`` of 300) for thousands of steps,
     ``ensemble`` (of networks), or one from a package on the server.
 
     ``tolerance``: numerator of eq. 9 for outputs without a declared tolerance. ``relative`` is 5 % of the output's

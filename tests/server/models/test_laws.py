@@ -8,9 +8,9 @@ FAMILIES: dict[str, dict[str, float]] = {
     "gaussian_process": {},
     "ensemble": {"steps": 300},
 }
-THROUGH_INDUCING_POINTS = model_cases("sparse_gaussian_process", {"inducing": 40}, 200)  # fewer samples are exact
+THROUGH_INDUCING_POINTS = model_cases("gaussian_process", {"inducing": 40}, 200)  # fewer samples are exact
 CASES = {f"{family}, {case}": case for family, own in FAMILIES.items() for case in model_cases(family, own)}
-CASES |= {f"sparse_gaussian_process, {case}": case for case in THROUGH_INDUCING_POINTS}
+CASES |= {f"through inducing points, {case}": case for case in THROUGH_INDUCING_POINTS}
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -1,4 +1,4 @@
-"""GaussianProcesses: exact Gaussian processes, as a family for the registry of models."""
+"""GaussianProcesses: Gaussian processes, as a family for the registry of models."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from surrogym_server.models.port import Learned, Learner, ModelCodec, Warm
 
 @dataclass(frozen=True)
 class GaussianProcesses(Settings, Learner):
-    """One exact process for each output, with a structure chosen by evidence. The warm start is hyperparameters."""
+    """One process for each output, with a structure chosen by evidence. The warm start is hyperparameters."""
 
     @property
     def codec(self) -> ModelCodec:

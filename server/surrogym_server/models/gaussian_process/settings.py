@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from surrogym_server.models.setting_checks import require_whole
+
 CHOICES = {"kernel": ("composite", "squared_exponential"), "symmetry": ("auto", "none")}
+FEWEST, MOST = 10, 2_000  # inducing points
 
 
 @dataclass(frozen=True)
@@ -20,6 +23,8 @@ class Settings:
         drop_inputs: whether an output may leave out inputs that it does not read; see ``gp.selection``.
         repeated_parts: whether outputs that do the same with inputs of their own may share samples; see ``gp.pooling``.
             Needs ``drop_inputs``.
+        inducing: most inducing points of a process of many samples, whose hyperparameters then maximise a bound of all
+            samples; with so few samples it is exact. 0: see ``learning.many.BySubsets``.
     """
 
     kernel: str = "composite"
@@ -29,6 +34,7 @@ class Settings:
     rates: bool = True
     drop_inputs: bool = True
     repeated_parts: bool = True
+    inducing: int = 0
 
     def __post_init__(self) -> None:
         for name, known in CHOICES.items():
@@ -37,3 +43,5 @@ class Settings:
         for name in ("reward_jumps", "reward_peaks", "rates", "drop_inputs", "repeated_parts"):
             if not isinstance(given := getattr(self, name), bool):
                 raise ValueError(f"expected {name} to be true or false, got {given!r}")
+        if self.inducing != 0 or isinstance(self.inducing, bool):
+            require_whole("inducing", self.inducing, FEWEST, MOST)

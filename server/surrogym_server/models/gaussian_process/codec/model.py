@@ -34,7 +34,7 @@ class GaussianProcessCodec(ModelCodec):
     """Codec of one format. Models of another one are refused."""
 
     def encode(self, model: DynamicsModel) -> StoredModel:
-        if type(model) is not GaussianProcessModel:  # a subclass is a model of another family
+        if not isinstance(model, GaussianProcessModel):
             raise TypeError(f"expected a model of Gaussian processes, got {type(model).__name__}")
         return StoredModel(_header(model), _tensors(model))
 

@@ -13,7 +13,7 @@ from surrogym_server.models.gaussian_process.feature_maps import candidates
 from surrogym_server.models.gaussian_process.learning.angle_prediction import learn_drift
 from surrogym_server.models.gaussian_process.learning.dropping import without_inputs
 from surrogym_server.models.gaussian_process.learning.limits import held, past_limits
-from surrogym_server.models.gaussian_process.learning.many import BySubsets, ManySamples
+from surrogym_server.models.gaussian_process.learning.many import ByBound, BySubsets
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.rates import output_with_rates
 from surrogym_server.models.gaussian_process.learning.region import learn_termination
@@ -27,21 +27,16 @@ from surrogym_server.models.port import Learned, Warm
 MIN_POINTS = 2
 
 
-def learn(
-    settings: Settings,
-    definition: EnvironmentDefinition,
-    samples: Samples,
-    warm: Warm,
-    many: ManySamples | None = None,
-) -> Learned:
-    """Learn as ``Learner.learn`` says. ``many`` fits processes to many samples, by default ``BySubsets``.
+def learn(settings: Settings, definition: EnvironmentDefinition, samples: Samples, warm: Warm) -> Learned:
+    """Learn as ``Learner.learn`` says.
 
     Raises:
         InvalidInput: fewer than two samples.
     """
     if len(samples) < MIN_POINTS:
         raise InvalidInput(f"a model needs at least {MIN_POINTS} samples, got {len(samples)}")
-    learner = OutputLearner(definition, settings, warm, {}, many or BySubsets())
+    many = ByBound(settings.inducing) if settings.inducing else BySubsets()
+    learner = OutputLearner(definition, settings, warm, {}, many)
     transitions = _transitions(learner, samples)
     paying, terminal_reward, jumps = learn_reward(learner, samples)
     ends = learn_termination(learner, samples) if definition.learns_termination else None

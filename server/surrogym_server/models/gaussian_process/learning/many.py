@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from surrogym_server.gp import (
     Reflection,
     condition_many,
     condition_sparse,
+    fewer_inputs,
+    fit_bound,
     refine,
     refine_where_hard,
 )
@@ -90,3 +93,30 @@ class BySubsets(ManySamples):
 
     def conditioned(self, hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
         return condition_sparse(hyper, x, y)
+
+
+@dataclass(frozen=True)
+class ByBound(ManySamples):
+    """Hyperparameters that maximise the variational bound of all samples, through at most ``inducing`` points."""
+
+    inducing: int
+
+    def fitted(
+        self,
+        x: Tensor,
+        y: Tensor,
+        options: FitOptions,
+        theta: NDArray[np.float64],
+        mirror: Reflection | None,
+        at_limit: Censored | None,
+    ) -> Posterior:
+        del at_limit  # the bound counts what inducing points leave, so nothing is left to choose
+        return fit_bound(x, y, options, theta, self.inducing, mirror)
+
+    def conditioned(self, hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
+        return condition_sparse(hyper, x, y, self.inducing)
+
+    def fewer_inputs(
+        self, x: Tensor, y: Tensor, options: FitOptions, posterior: Posterior, may: Tensor, odds: float
+    ) -> Fewer | None:
+        return fewer_inputs(x, y, posterior, options, self.inducing, may, odds)

@@ -16,19 +16,18 @@ from surrogym_client.experiments.unseen.machine import Array, Machine
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples, increments
-from surrogym_server.errors import InvalidInput, InvalidSpec
+from surrogym_server.errors import InvalidSpec
 from surrogym_server.models.files import from_bytes, to_bytes
-from surrogym_server.models.gaussian_process.codec.model import GaussianProcessCodec
+from surrogym_server.models.gaussian_process import GaussianProcesses
+from surrogym_server.models.gaussian_process.learning.many import ByBound
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.registry import learner_of
-from surrogym_server.models.sparse_gaussian_process import SparseGaussianProcesses
-from surrogym_server.models.sparse_gaussian_process.codec import SparseGaussianProcessCodec
-from surrogym_server.models.sparse_gaussian_process.learning import ByBound
-from surrogym_server.models.sparse_gaussian_process.model import SparseGaussianProcessModel
 from surrogym_server.plugins import Choice
 from surrogym_shared import compiled
 from surrogym_shared.spec import EnvironmentSpec, ModelChoice
 
 NOISE = 0.02
+SHORT_NAMES = ("sparse_gaussian_process", "Sparse_Gaussian_Process")
 
 
 class Springs(Machine):
@@ -62,14 +61,14 @@ def steps(count: int, seed: int, noise: float = 0.0) -> Samples:
 
 
 @cache
-def model(inducing: int = 120) -> SparseGaussianProcessModel:
+def model(inducing: int = 120) -> GaussianProcessModel:
     definition = definition_from_spec(designed(Springs().spec(), "sparse_gaussian_process", inducing=inducing))
     found = learn(definition, steps(1_200, seed=0, noise=NOISE)).model
-    assert isinstance(found, SparseGaussianProcessModel)
+    assert isinstance(found, GaussianProcessModel)
     return found
 
 
-def test_with_few_samples_it_is_the_exact_family():
+def test_with_few_samples_it_is_exact():
     spec = pendulum()
     samples = random_steps(spec, 40, seed=0)
     exact, sparse = (
@@ -106,17 +105,10 @@ def test_inputs_that_an_output_does_not_read_are_left_out():
     assert model().transitions[5].feature_map.dropped == (0, 3, 4, 6)
 
 
-def test_a_stored_model_predicts_the_same_and_is_of_no_other_family():
+def test_a_stored_model_predicts_the_same():
     found, unseen = model(), steps(20, seed=3)
     loaded = from_bytes(found.definition, to_bytes(found))
-    assert isinstance(loaded, SparseGaussianProcessModel)
     assert torch.equal(loaded.means(unseen.q, unseen.u), found.means(unseen.q, unseen.u))
-    with pytest.raises(TypeError, match="of Gaussian processes, got SparseGaussianProcessModel"):
-        GaussianProcessCodec().encode(found)
-    with pytest.raises(TypeError, match="of sparse Gaussian processes, got GaussianProcessModel"):
-        SparseGaussianProcessCodec().encode(found.plain)
-    with pytest.raises(InvalidInput, match="the family 'gaussian_process'"):
-        from_bytes(definition_from_spec(Springs().spec()), to_bytes(found))
 
 
 def test_drawn_functions_scatter_as_deviations_say():
@@ -160,11 +152,18 @@ def test_a_process_that_learns_again_from_more_samples_has_no_more_inducing_poin
     assert (again.sparse.points, len(again.y)) == (300, 30)
 
 
+def test_its_name_in_a_specification_stands_for_the_setting():
+    chosen = [definition_from_spec(designed(pendulum(), name)).learning.model for name in SHORT_NAMES]
+    learners = [learner_of(choice) for choice in chosen]
+    assert learners[0] == learners[1] == GaussianProcesses(inducing=300)
+    assert {choice.name for choice in chosen} == {"gaussian_process"}
+
+
 def test_what_the_design_says_of_processes_holds_for_sparse_ones():
     spec = designed(Springs().spec(), "sparse_gaussian_process", inducing=50)
     chosen = spec.design.model_copy(update={"symmetry": "none", "preset": "paper"})
     learner = learner_of(definition_from_spec(spec.model_copy(update={"design": chosen})).learning.model)
-    assert isinstance(learner, SparseGaussianProcesses)
+    assert isinstance(learner, GaussianProcesses)
     assert (learner.symmetry, learner.kernel, learner.inducing) == ("none", "squared_exponential", 50)
 
 
@@ -190,10 +189,11 @@ def test_large_steps_are_divided_between_threads_to_the_same_bits(monkeypatch):
         ({"inducing": 9}, "inducing to be a whole number from 10 to 2000, got 9"),
         ({"inducing": 2_001}, "inducing to be a whole number from 10 to 2000"),
         ({"inducing": True}, "expected inducing to be a whole number, got True"),
+        ({"inducing": -1}, "inducing to be a whole number from 10 to 2000, got -1"),
         ({"kernel": "matern"}, "expected kernel to be one of"),
         ({"points": 3}, "inducing, got 'points'"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(settings, said):
     with pytest.raises(InvalidSpec, match=said):
-        learner_of(Choice("sparse_gaussian_process", tuple(settings.items())))
+        learner_of(Choice("gaussian_process", tuple(settings.items())))
