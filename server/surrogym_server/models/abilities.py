@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +19,14 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.port import A, DynamicsModel, Transition
+from surrogym_server.models.port import DynamicsModel, Transition
+
+A = TypeVar("A")
 
 
 def offers(model: DynamicsModel, ability: type[A]) -> A | None:
     """Return the model as an object with this ability; None if the model lacks the ability."""
-    return model.ability(ability)
+    return model if isinstance(model, ability) else None
 
 
 class FunctionDraws(ABC):

@@ -14,7 +14,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +26,6 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.errors import InvalidInput
 from surrogym_server.tensors import to_device
 
-A = TypeVar("A")
 Warm = Mapping[str, NDArray[np.float64]]  # named arrays that one fit leaves for a warm start of the next
 
 
@@ -121,10 +120,6 @@ class DynamicsModel(ABC):
     @abstractmethod
     def description(self) -> dict[str, Any]:
         """Describe the model in detail as JSON: ``outputs`` with one entry each, and further fields of the family."""
-
-    def ability(self, kind: type[A]) -> A | None:
-        """Return an object that has one of the ``models.abilities`` of this model; None if the model lacks it."""
-        return self if isinstance(self, kind) else None
 
     def on(self, device: torch.device) -> DynamicsModel:
         """Return the same model with its arrays on a device."""
