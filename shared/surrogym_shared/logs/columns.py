@@ -57,7 +57,7 @@ class Roles:
         following: column of each coordinate's next value, by the coordinate's name; empty without such columns.
         reward, terminated, truncated, episode, time: column of that name's role; None without one.
         limits: declared limits of coordinates and action entries, by name; None is no limit.
-        angles: names of coordinates that are declared as angles.
+        angles: names of the coordinates that are angles; None lets the data decide.
         constants: names of coordinates that are declared as constants of an episode.
         discrete: whether the action is declared as discrete; None lets the data decide.
         ignored: columns without a role.
@@ -72,7 +72,7 @@ class Roles:
     episode: str | None = None
     time: str | None = None
     limits: Mapping[str, tuple[float | None, float | None]] = field(default_factory=dict)
-    angles: frozenset[str] = frozenset()
+    angles: frozenset[str] | None = None
     constants: frozenset[str] = frozenset()
     discrete: bool | None = None
     ignored: tuple[str, ...] = ()
@@ -94,7 +94,7 @@ class Roles:
             action=dict(self.action),
             next=dict(self.following),
             limits={name: list(ends) for name, ends in self.limits.items()},
-            angles=sorted(self.angles),
+            angles=None if self.angles is None else sorted(self.angles),
             constants=sorted(self.constants),
             discrete=self.discrete,
             **single,
@@ -126,8 +126,8 @@ class LogMapping(FailFast):
     limits: dict[str, Limits] = Field(
         default_factory=dict, max_length=MOST, description="lowest and highest value by name; null: no limit"
     )
-    angles: list[str] = Field(
-        default_factory=list, max_length=MOST, description="names of coordinates that are angles in radians"
+    angles: Annotated[list[str], Field(max_length=MOST)] | None = Field(
+        default=None, description="names of the coordinates that are angles in radians; null: the data decide"
     )
     constants: list[str] = Field(
         default_factory=list, max_length=MOST, description="names of coordinates that don't change within an episode"
@@ -204,7 +204,7 @@ def roles_by_mapping(mapped: LogMapping, names: Sequence[str], where: str = "the
             mapped.next,
             **fields,
             limits={name: (ends[0], ends[1]) for name, ends in mapped.limits.items()},
-            angles=frozenset(mapped.angles),
+            angles=None if mapped.angles is None else frozenset(mapped.angles),
             constants=frozenset(mapped.constants),
             discrete=mapped.discrete,
             ignored=tuple(name for name in names if name not in wanted),
@@ -246,13 +246,13 @@ def _require_declared(mapped: LogMapping, state: Iterable[str], action: Iterable
     states, actions = list(state), list(action)
     for key, given, known in (
         ("limits", mapped.limits, [*states, *actions]),
-        ("angles", mapped.angles, states),
+        ("angles", mapped.angles or (), states),
         ("constants", mapped.constants, states),
     ):
         if unknown := sorted(set(given) - set(known)):
             what = "one of" if key == "limits" else "one of the states"
             raise UnusableLog(f"{where} names {unknown[0]!r} in {key}: expected {what} {known}")
-    if both := sorted(set(mapped.angles) & set(mapped.constants)):
+    if both := sorted(set(mapped.angles or ()) & set(mapped.constants)):
         raise UnusableLog(f"{where}: expected {both[0]!r} in angles or in constants, got it in both")
     if both := sorted(set(mapped.limits) & set(states) & set(actions)):
         raise UnusableLog(f"{where}: expected limits of a state or of an action, got {both[0]!r}, which names both")

@@ -13,6 +13,7 @@ from surrogym_shared.logs.columns import Roles
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.table import Bools, Floats
 from surrogym_shared.logs.transitions import Transitions
+from surrogym_shared.logs.turns import FULL_TURN, turn_of
 from surrogym_shared.spec import (
     Bounds,
     BoxAction,
@@ -33,7 +34,6 @@ MARGIN = 0.05  # share of the data's width that a sampling range adds on each si
 SATURATED_ROWS = 5  # fewest steps that end exactly at an extreme value before it counts as a limit
 SATURATED_SHARE = 0.002  # the same as a share of all steps
 MOST_DISCRETE = 16  # most different values of a discrete action
-FULL_TURN = (0.9 * 2 * math.pi, 1.1 * 2 * math.pi)  # sizes of a jump that is a turn around the circle
 FEW_EPISODES = 2  # with fewer, a log shows neither starts nor a time limit
 USUAL_LIMIT = 200  # time limit of virtual episodes if the log has too few episodes to show one
 MOST_STARTS = 64
@@ -97,11 +97,8 @@ def _coordinate(roles: Roles, steps: Transitions, name: str, index: int, notes: 
         notes.append(f"{name}: always {low:g}, left out")
         return None
     _require_range(name, low, high)
-    if name in roles.angles or _turns(before, after):
-        notes.append(f"{name}: an angle in radians, as it {_why(name in roles.angles, 'jumps by a full turn')}")
+    if _is_angle(roles, steps, name, index, notes):
         return Coordinate(name=name, kind="angle", sampling=Uniform(low=-math.pi, high=math.pi))
-    if _turns(np.deg2rad(before), np.deg2rad(after)):
-        notes.append(f"{name}: jumps by 360, as an angle in degrees does: give it in radians")
     if name in roles.constants or bool((before == after).all()):
         notes.append(f"{name}: a constant of each episode, as it {_why(name in roles.constants, 'never moves in one')}")
         return Coordinate(name=name, kind="constant", sampling=Uniform(low=low, high=high))
@@ -143,14 +140,26 @@ def _why(declared: bool, shown: str) -> str:
     return "is declared" if declared else shown
 
 
-def _turns(before: Floats, after: Floats) -> bool:
-    """Whether the values look like an angle in radians: within one turn, with jumps of a whole turn, and otherwise with
-    small steps."""
-    change = np.abs(after - before)
-    jumps = change > math.pi
-    width = max(before.max(), after.max()) - min(before.min(), after.min())
-    around = (change[jumps] > FULL_TURN[0] / 1.5) & (change[jumps] < FULL_TURN[1])
-    return bool(jumps.any() and width <= 2 * math.pi + 1e-3 and around.all() and np.median(change) < math.pi / 2)
+def _is_angle(roles: Roles, steps: Transitions, name: str, index: int, notes: list[str]) -> bool:
+    """Whether a state is an angle in radians. If the mapping has a list of angles, this list decides."""
+    if roles.angles is not None:
+        if name in roles.angles:
+            notes.append(f"{name}: an angle in radians, as it is declared")
+        return name in roles.angles
+    turn = turn_of(steps, index)
+    if turn is None:
+        return False
+    if turn.sure and turn.size == FULL_TURN:
+        notes.append(f"{name}: an angle in radians, as its motion continues across jumps of a full turn")
+        return True
+    unit = f", as an angle or a clock in {turn.unit} does" if turn.unit else ""
+    if not turn.sure:
+        unit = f"{unit}, but too irregularly to tell" if unit else ", but too irregularly to tell"
+    way = "declare it in angles in a mapping file (--map)"
+    if turn.size != FULL_TURN:
+        way = f"multiply the column by 2 pi / {turn.size:g}, and {way}"
+    notes.append(f"{name}: jumps by {turn.size:g}{unit}. It is drafted as linear. If it wraps, {way}")
+    return False
 
 
 def _bounds(roles: Roles, name: str, after: Floats, ends: tuple[float, float], notes: list[str]) -> Bounds | None:

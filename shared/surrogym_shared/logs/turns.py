@@ -1,0 +1,102 @@
+"""Evidence that a column of a log wraps: an angle, a time of day, an encoder.
+
+A jump alone is no evidence: a siphon empties a tank at once, too. A column wraps if the value after each jump is where
+the motion leads, once a whole turn is added. The motion is what the steps without a jump show: a linear regression of
+the change on the actions, on the other states, on the place in the turn, and on the change before.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from surrogym_shared.logs.table import Bools, Floats
+from surrogym_shared.logs.transitions import Transitions
+
+FULL_TURN = 2 * math.pi
+KNOWN = {FULL_TURN: "radians", 360.0: "degrees", 400.0: "gon", 1.0: "turns", 24.0: "hours", 60.0: "minutes"} | {
+    float(2**bits): "counts" for bits in range(8, 25)
+}
+FILLED = 0.8  # of a turn: least width of the values
+MOST_JUMPS = 1 / 3  # of the steps
+CONTINUES = 4.0  # deviations from the motion that a jump may have
+ROUGHLY = 0.1  # of a usual change: the same for a motion that is not linear
+OUTLIERS = 0.05  # share of jumps that may have more
+BY_CHANCE = 1e-3  # probability that a column without turns looks as if it had
+NEAR = 1e-3  # of a turn: by how much the size of the jumps may differ from it
+FINEST = 1e-6  # of the width: least deviation of the motion
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A turn of a column.
+
+    Attributes:
+        size: size of the turn, in the unit of the column.
+        unit: name of the unit in which a turn has this size; empty for an unknown one.
+        sure: whether the motion continues across the jumps more closely than by chance.
+    """
+
+    size: float
+    unit: str
+    sure: bool
+
+
+def turn_of(steps: Transitions, index: int) -> Turn | None:
+    """Return the turn of a column of states; None if it does not wrap."""
+    before, after = steps.q[:, index], steps.q_next[:, index]
+    change, low, high = after - before, min(before.min(), after.min()), max(before.max(), after.max())
+    width = float(high - low)
+    jumps = np.abs(change) > width / 2
+    count = int(jumps.sum())
+    if not 0 < count <= MOST_JUMPS * len(change):
+        return None
+    expected, deviation = _motion(steps, index, change, jumps, width)
+    deviation = max(deviation, FINEST * width)
+    across = np.abs(change - expected)[jumps]
+    size = float(np.median(across))
+    known = [turn for turn in KNOWN if abs(turn - size) <= max(NEAR * turn, CONTINUES * deviation / math.sqrt(count))]
+    whole = bool((before == np.floor(before)).all() and (after == np.floor(after)).all())
+    known = [turn for turn in known if not (whole and turn in (1.0, FULL_TURN)) and _lies_in(low, high, turn)]
+    size = min(known, key=lambda turn: abs(turn - size), default=size)
+    if width < FILLED * size:
+        return None
+    usual = max(float(np.quantile(np.abs(change[~jumps]), 0.95)), deviation)
+    for within in (CONTINUES * deviation, max(CONTINUES * deviation, ROUGHLY * usual)):
+        if (np.abs(across - size) > within).mean() > OUTLIERS:
+            continue
+        chance = min(1.0, 2 * within / usual)
+        sure = chance ** (count if known else count - 1) < BY_CHANCE
+        if known or (sure and count > 1):
+            return Turn(size, KNOWN.get(size, ""), sure)
+    return None
+
+
+def _lies_in(low: float, high: float, turn: float) -> bool:
+    """Whether values from ``low`` to ``high`` lie within one turn that begins at 0, or is centred there."""
+    slack = NEAR * turn
+    return (low >= -slack and high <= turn + slack) or (low >= -turn / 2 - slack and high <= turn / 2 + slack)
+
+
+def _motion(steps: Transitions, index: int, change: Floats, jumps: Bools, width: float) -> tuple[Floats, float]:
+    """Return the changes that the steps without a jump let expect of all steps (m,), and their deviation from it."""
+    slow = ~jumps
+    follows = np.zeros(len(change), dtype=np.bool_)
+    follows[1:] = (steps.row[1:] == steps.row[:-1] + 1) & (steps.q[1:] == steps.q_next[:-1]).all(1) & slow[:-1]
+    earlier = np.full(len(change), float(change[slow].mean()))
+    earlier[1:][follows[1:]] = change[:-1][follows[1:]]
+    turn = min((turn for turn in KNOWN if FILLED * turn <= width <= turn * (1 + NEAR)), default=width)
+    place = 2 * math.pi * steps.q[:, index] / turn
+    others = np.delete(steps.q, index, 1)
+    columns = [np.sin(place)[:, None], np.cos(place)[:, None], earlier[:, None], steps.u, others]
+    x = np.concatenate(columns, 1)
+    x = (x - x[slow].mean(0)) / np.where(x[slow].std(0) > 0, x[slow].std(0), 1)
+    x = np.concatenate([np.ones((len(x), 1)), x], 1)
+    if slow.sum() < 3 * x.shape[1]:
+        x = x[:, :1]
+    weights = np.linalg.lstsq(x[slow], change[slow], rcond=None)[0]
+    expected = x @ weights
+    left = (change - expected)[slow]
+    return expected, float(math.sqrt((left**2).sum() / max(1, len(left) - x.shape[1])))
