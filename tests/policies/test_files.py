@@ -31,9 +31,10 @@ from surrogym_client.policies.card import (
     read_card,
     write_card,
 )
+from surrogym_client.policies.defaults import decaying
 from surrogym_client.policies.export import export_policy
 from surrogym_client.policies.files import load_learner, load_policy, save_policy
-from surrogym_client.policies.networks import PaperPolicy, Standardise, decaying
+from surrogym_client.policies.networks import PaperPolicy, Standardise
 from surrogym_client.policies.saved_settings import MAX_EXPERIENCE_BYTES
 from surrogym_client.policies.structure import ENTRY, Structure, describe
 from surrogym_client.training import TrainSettings, train

@@ -17,7 +17,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
-from surrogym_client.policies.defaults import CRITIC, EXPLORATION, HIDDEN, decaying
+from surrogym_client.policies.defaults import CRITIC, EXPLORATION, HIDDEN
 from surrogym_client.policies.defaults import WIDER as WIDER_ACTOR
 
 WIDER = {"pi": list(WIDER_ACTOR), "vf": list(CRITIC)}
@@ -28,8 +28,7 @@ __all__ = [
     "Bounded",
     "PaperPolicy",
     "Standardise",
-    "decaying",
-]  # older files refer to ``decaying`` in this module
+]
 
 
 class Standardise(BaseFeaturesExtractor):

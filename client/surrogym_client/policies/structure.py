@@ -27,7 +27,8 @@ from stable_baselines3.td3.policies import TD3Policy
 from torch.optim import RMSprop
 
 from surrogym_client.environments.spaces import space
-from surrogym_client.policies.networks import PaperPolicy, Standardise, decaying
+from surrogym_client.policies.defaults import decaying
+from surrogym_client.policies.networks import PaperPolicy, Standardise
 from surrogym_client.policies.saved_settings import PolicySettings
 from surrogym_shared.archives import read_entries, stored
 from surrogym_shared.checks import first_fault

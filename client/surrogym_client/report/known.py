@@ -155,8 +155,4 @@ def _policy(api: Api, name: str, which: str | None) -> PolicyDetail | None:
             return api.policies.get(name, wanted)
         except UnknownPolicy:
             continue
-        except SurrogymClientError as error:  # an older server, which keeps no policies
-            if getattr(getattr(error, "problem", None), "status", None) != 404:
-                raise
-            return None
     return None

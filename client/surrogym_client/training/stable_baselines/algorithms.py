@@ -10,8 +10,8 @@ from typing import Any
 import stable_baselines3
 from stable_baselines3.common.vec_env import VecNormalize
 
-from surrogym_client.policies.defaults import LANES
-from surrogym_client.policies.networks import WIDER, PaperPolicy, decaying
+from surrogym_client.policies.defaults import LANES, decaying
+from surrogym_client.policies.networks import WIDER, PaperPolicy
 from surrogym_client.training.proportions import even_batch, explores_further
 from surrogym_client.training.stable_baselines.search import StableBaselinesSearch
 from surrogym_shared.spec import EnvironmentSpec
