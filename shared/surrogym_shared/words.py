@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+SHOWN = 10  # names of a list
+
 
 def counted(count: int, noun: str) -> str:
     """Return a number with its noun, such as 1 row and 2,000 rows."""
@@ -11,3 +15,9 @@ def counted(count: int, noun: str) -> str:
 def has(count: int, noun: str) -> str:
     """Return a number with its noun and verb: 1 row has, 2 rows have."""
     return f"{counted(count, noun)} {'has' if count == 1 else 'have'}"
+
+
+def listed(names: Iterable[object]) -> str:
+    """Return names as a list: all of them, or the first ones and how many more there are."""
+    every = [str(name) if len(str(name)) <= 60 else f"{str(name)[:60]}..." for name in names]
+    return str(every) if len(every) <= SHOWN else f"{str(every[:SHOWN])[:-1]} and {len(every) - SHOWN:,} more]"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ import numpy as np
 
 from surrogym_shared.logs.columns import ACTION, SINGLE, STATE
 from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.sizes import MOST_COLUMNS, require_sizes
 from surrogym_shared.logs.table import Cells, Table
+from surrogym_shared.logs.text import is_unnamed
 
 STATES = ("coordinates", "observations", "observation", "states", "state", "obs", "q")
-ACTIONS = ("actions", "action", "u")
+ACTIONS = ("actions", "action", "acts", "u")
 NEXT = ("next_coordinates", "next_observations", "next_observation", "next_states", "next_state", "next_obs", "next_q")
 
 
@@ -52,7 +55,16 @@ def table_of_arrays(path: Path, arrays: dict[str, Any], names: Sequence[str] = (
     lengths = {name: len(arrays[name]) for name in columns}
     if len(set(lengths.values())) > 1:
         raise UnusableLog(f"expected columns of one length in {path}, got {lengths}")
-    return Table(flat, np.arange(1, 1 + rows), ignored=ignored)
+    return Table(flat, np.arange(1, 1 + rows), unnamed=tuple(filter(is_unnamed, flat)), ignored=ignored)
+
+
+def require_shapes(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Refuse arrays that are too many or too large, before any of them is read. Raises ``UnusableLog``."""
+    if len(shapes) > MOST_COLUMNS:
+        raise UnusableLog(f"expected at most {MOST_COLUMNS:,} arrays in {path}, got {len(shapes):,}")
+    require_sizes(
+        path, max((shape[0] for shape in shapes.values() if shape), default=0), sum(map(prod, shapes.values()))
+    )
 
 
 def _require_names(path: Path, arrays: Mapping[str, Cells], names: Sequence[str]) -> None:

@@ -15,8 +15,8 @@ from surrogym_client.logs.outputs import rejected_file, require_outputs, write_d
 from surrogym_client.logs.reading import read
 from surrogym_client.transport.api import Api
 from surrogym_shared.logs.checking import ReadLog, check_log, draft_log, is_of_rejected, write_rejected
-from surrogym_shared.logs.columns import Roles, roles_by_file, roles_by_map, roles_by_name
 from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.roles import read_roles
 from surrogym_shared.logs.table import Floats, Table
 from surrogym_shared.logs.too_few import TooFewSteps
 from surrogym_shared.logs.transitions import Transitions
@@ -71,8 +71,7 @@ def read_log(path: str | Path, options: Options | None = None) -> ReadLog:
     """
     path, options = Path(path), options or Options()
     options.progress(0.0, f"reading {path}")
-    table = read(path)
-    roles = _roles(table, options.mapping)
+    table, roles = read_roles(read(path), options.mapping)
     options.progress(0.1, f"checking {len(table)} rows")
     if options.spec is None:
         return draft_log(table, roles, options.name or path.stem, options.budget or 0)
@@ -226,14 +225,6 @@ def _read_or_keep(path: Path, options: Options, where: str | Path | None) -> tup
             words = f"{error}; {other}"
         raise TooFewSteps(words, error.table, error.steps) from error
     return log, keep_rejected(path, log, where)
-
-
-def _roles(table: Table, mapping: Path | Mapping_ | None) -> Roles:
-    if mapping is None:
-        return roles_by_name(table.names)
-    if isinstance(mapping, Path):
-        return roles_by_file(mapping, table.names)
-    return roles_by_map(mapping, table.names)
 
 
 def _sample(steps: Transitions, reward: Floats, row: int) -> NewSample:

@@ -1,23 +1,35 @@
-"""Files to tables: CSV, NPZ, Parquet, Minari. What a file is, is decided by what is in it."""
+"""Files to tables: text, NPZ, Parquet, HDF5, Minari. What a file is, is decided by what is in it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
+from zipfile import is_zipfile
 
 import numpy as np
 
-from surrogym_client.logs.arrays import table_of_arrays
-from surrogym_shared.archives import read_arrays
+from surrogym_client.logs.arrays import require_shapes, table_of_arrays
+from surrogym_shared.archives import Header, read_arrays
+from surrogym_shared.logs.decoding import decoded
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.table import Cells, Table
 from surrogym_shared.logs.text import table_of_text
 from surrogym_shared.logs.writing import EVALUATED
+from surrogym_shared.words import listed
 
-Format = Literal["csv", "npz", "parquet", "minari", "surrogate"]
+Format = Literal["csv", "npz", "parquet", "hdf5", "minari", "surrogate"]
 
-MOST_BYTES = 4 * 1024**3  # of the arrays in an NPZ file
+MOST_BYTES = 1024**3  # of the arrays in an NPZ file
+HDF5 = b"\x89HDF\r\n\x1a\n"
+OFFICE = {
+    "[Content_Types].xml": "a workbook of Excel or another file of Microsoft Office",
+    "_rels/.rels": "a workbook of Excel or another file of Microsoft Office",
+    "mimetype": "a file of LibreOffice or OpenDocument",
+    "modelDescription.xml": "an FMU",
+    "META-INF/MANIFEST.MF": "a Java archive",
+}  # first entries of zips that are no NPZ
 SURROGATE = ".surrogate"
 
 
@@ -39,6 +51,8 @@ def format_of(path: Path) -> Format:
         return "parquet"
     if head[:2] == b"PK":
         return "npz"
+    if head[:8] == HDF5:
+        return "hdf5"
     is_header = len(head) == 9 and head[8:] == b"{" and int.from_bytes(head[:8], "little") < 2**40
     return "surrogate" if is_header else "csv"
 
@@ -48,29 +62,78 @@ def read(path: Path) -> Table:
     kind = format_of(path)
     if kind == "surrogate":
         raise UnusableLog(f"expected a log, got a surrogate's file: surrogym import {path} without options for logs")
-    table = {"csv": read_csv, "npz": read_npz, "parquet": read_parquet, "minari": read_minari}[kind](path)
+    readers = {"csv": read_csv, "npz": read_npz, "parquet": read_parquet, "hdf5": read_hdf5, "minari": read_minari}
+    table = readers[kind](path)
     if not len(table):
         raise UnusableLog(f"expected a surrogate's file, or a log with a heading and rows, got neither in {path}")
     return table
 
 
 def read_csv(path: Path) -> Table:
-    """A table of text with a heading; separated by commas, semicolons or tabs."""
-    try:
-        return table_of_text(path.read_text(encoding="utf-8-sig"), str(path))
-    except UnicodeDecodeError as error:
-        raise UnusableLog(f"expected text, NPZ, Parquet or a surrogate's file, got other bytes in {path}") from error
+    """A table of text with a heading, in UTF-8 or an encoding that the file shows."""
+    text, remarks = decoded(path.read_bytes(), str(path))
+    return table_of_text(text, str(path), remarks=remarks)
 
 
 def read_npz(path: Path) -> Table:
     """The arrays of an NPZ file, as ``table_of_arrays`` has them. Nothing is unpickled."""
+    _require_npz(path)
     try:
-        arrays = read_arrays(path.read_bytes(), MOST_BYTES)
+        arrays = read_arrays(path, MOST_BYTES, lambda headers: require_shapes(path, _shapes(headers)))
+    except UnusableLog:
+        raise
     except ValueError as error:
         raise UnusableLog(f"{path}: {error}") from error
     named = [str(name) for name in np.atleast_1d(arrays.pop("coordinate_names", ()))]
     evaluated = arrays.pop(EVALUATED, np.array(False))
     return replace(table_of_arrays(path, arrays, named), evaluated=evaluated.shape == () and bool(evaluated))
+
+
+def _shapes(headers: Mapping[str, Header]) -> dict[str, tuple[int, ...]]:
+    return {name: header.shape for name, header in headers.items()}
+
+
+def _require_npz(path: Path) -> None:
+    """Raise ``UnusableLog`` if a zip is damaged, or another kind of file. Its first entry is read even if it is cut."""
+    with path.open("rb") as file:
+        head = file.read(512)
+    first = head[30 : 30 + int.from_bytes(head[26:28], "little")].decode("utf-8", "replace")
+    name = next((words for entry, words in OFFICE.items() if first.startswith(entry)), None)
+    if name is not None:
+        raise UnusableLog(f"expected a log as text, NPZ, Parquet or HDF5 in {path}, got {name}: save the table as CSV")
+    if not is_zipfile(path):
+        raise UnusableLog(f"expected an NPZ file in {path}, as its first bytes show, got a damaged or incomplete zip")
+
+
+def read_hdf5(path: Path) -> Table:
+    """The data sets at the top of an HDF5 file, such as those of D4RL. Groups, such as infos and metadata, are ignored.
+
+    D4RL marks the end of an episode by ``terminals``, and by ``timeouts`` if it was cut off. The observation in the row
+    after such an end begins another episode.
+    """
+    try:
+        import h5py
+    except ModuleNotFoundError as error:
+        raise UnusableLog("a log in HDF5 needs the package h5py: pip install 'surrogym[logs]'") from error
+    try:
+        with h5py.File(path, "r") as file:
+            found = {name: one for name, one in file.items() if isinstance(one, h5py.Dataset)}
+            groups = {name: "it is a group" for name in file if name not in found}
+            require_shapes(path, {name: one.shape for name, one in found.items()})
+            if not found:
+                raise UnusableLog(f"expected data sets of one row a step in {path}, got the groups {listed(groups)}")
+            table = table_of_arrays(path, {name: _cells(one[()]) for name, one in found.items()})
+    except (OSError, KeyError, ValueError, RuntimeError) as error:
+        if isinstance(error, UnusableLog):
+            raise
+        raise UnusableLog(f"expected an HDF5 file in {path}, got one that can't be read: {_line(error)}") from error
+    return replace(table, ignored={**table.ignored, **groups})
+
+
+def _cells(array: Any) -> Cells:
+    """Return an array of HDF5 with its text as text."""
+    cells = np.asarray(array)
+    return np.char.decode(cells.astype(np.bytes_), "utf-8", "replace") if cells.dtype.kind in "SO" else cells
 
 
 def read_parquet(path: Path) -> Table:

@@ -10,8 +10,9 @@ from surrogym_server.services.samples import AddedLog
 from surrogym_server.storage.records import NewSample
 from surrogym_shared import wire
 from surrogym_shared.logs.checking import ReadLog, check_log, draft_log
-from surrogym_shared.logs.columns import Roles, roles_by_mapping, roles_by_name
+from surrogym_shared.logs.columns import Roles
 from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.roles import read_roles
 from surrogym_shared.logs.table import Table
 from surrogym_shared.logs.text import table_of_text
 from surrogym_shared.spec import EnvironmentSpec
@@ -64,12 +65,14 @@ def added_report(log: ReadLog, added: AddedLog) -> wire.AddedLog:
 
 
 def _table(body: wire.DraftLog | wire.AddLog) -> tuple[Table, Roles]:
+    if "\0" in body.text or "\ufffd" in body.text:
+        raise UnusableLog(
+            f"expected text in UTF-8 in {WHERE}, got another encoding: surrogym import reads more of them"
+        )
     table = table_of_text(body.text.removeprefix("\ufeff"), WHERE, MOST_ROWS)
     if not len(table):
         raise UnusableLog(f"expected rows below the heading in {WHERE}, got none")
-    if body.mapping is None:
-        return table, roles_by_name(table.names)
-    return table, roles_by_mapping(body.mapping, table.names)
+    return read_roles(table, body.mapping)
 
 
 def _report(log: ReadLog) -> dict[str, Any]:

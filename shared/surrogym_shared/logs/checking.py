@@ -37,7 +37,7 @@ class ReadLog:
         roles: roles of its columns.
         steps: its usable steps.
         spec: the specification that it was checked against, or that was drafted from it.
-        notes: conclusions about the order of the rows, and reasons of the parts of a draft.
+        notes: how the file was read, conclusions about the order of the rows, and reasons of the parts of a draft.
     """
 
     table: Table
@@ -54,7 +54,7 @@ class ReadLog:
     @property
     def ignored(self) -> dict[str, str]:
         """Reason for each column or array of the file that is not used."""
-        return {**self.table.ignored, **dict.fromkeys(self.roles.ignored, "it has no role")}
+        return {**dict.fromkeys(self.roles.ignored, "it has no role"), **self.table.ignored}
 
     def write_rejected(self, path: Path) -> None:
         """Write the rows that were set aside as CSV: line, reason, and the cells as in the log."""
@@ -85,7 +85,7 @@ def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
             require_units(rows.following, spec, "next ")
         steps = _consistent(spec, steps)
     require_steps(table, steps, 1)
-    return ReadLog(table, roles, steps, spec, steps.notes)
+    return ReadLog(table, roles, steps, spec, (*table.remarks, *steps.notes))
 
 
 def draft_log(table: Table, roles: Roles, name: str, budget: int = 0) -> ReadLog:
@@ -107,14 +107,15 @@ def draft_log(table: Table, roles: Roles, name: str, budget: int = 0) -> ReadLog
         drafted: Draft = draft(roles, steps, name, budget)
     except ValidationError as error:
         raise UnusableLog(f"the drafted specification is not valid: {first_fault(error)}") from error
-    return ReadLog(table, roles, _shaped(drafted.spec, roles, steps), drafted.spec, (*steps.notes, *drafted.notes))
+    notes = (*table.remarks, *steps.notes, *drafted.notes)
+    return ReadLog(table, roles, _shaped(drafted.spec, roles, steps), drafted.spec, notes)
 
 
 def write_rejected(path: Path, table: Table, steps: Transitions) -> None:
     """Write the rows that were set aside as CSV: line, reason, and the cells as in the log."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow([*HEADING, *table.names])
+        writer.writerow([*HEADING, *(table.heading or table.names)])
         for row, reason in steps.rejected.items():
             writer.writerow([table.lines[row], reason, *table.row(row)])
 

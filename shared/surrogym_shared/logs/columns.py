@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,18 +16,25 @@ from pydantic import ConfigDict, Field, ValidationError
 from surrogym_shared.bounded import FailFast
 from surrogym_shared.checks import LARGEST
 from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.headings import TIMES, Heading, heading, timed
 from surrogym_shared.spec.base import MAX_DIMENSIONS
+from surrogym_shared.words import listed
 
 SINGLE = {
-    "reward": ("reward", "rewards", "r"),
-    "terminated": ("terminated", "terminations", "terminal", "terminals", "done"),
+    "reward": ("reward", "rewards", "rews", "r"),
+    "terminated": ("terminated", "terminations", "terminal", "terminals", "done", "dones"),
     "truncated": ("truncated", "truncations", "timeout", "timeouts"),
     "episode": ("episode", "episode_id", "trajectory", "run"),
-    "time": ("time", "t", "timestamp", "seconds"),
+    "time": ("time", "t", "timestamp", "time_stamp", "seconds"),
 }
-ACTION = re.compile(r"^(?:actions?|act|u)(?:[._](.+)|\[(\d+)\])?$", re.IGNORECASE)
+EITHER_END = (
+    "done",
+    "dones",
+)  # what Gym and Stable-Baselines3 call any end; with timeouts beside it, only others count
+SHORT_TIMES = ("s", "ms", "us", "ns")  # units that may follow t: t_s is a time, t_d is not
+ACTION = re.compile(r"^(?:actions?|acts?|u)(?:[._](.+)|\[(\d+)\])?$|^actions?[\s-]+(.+)$", re.IGNORECASE)
 STATE = re.compile(r"^(?:q|states?|obs|observations?|coordinates?)(?:[._](.+)|\[(\d+)\])$", re.IGNORECASE)
-NEXT = re.compile(r"^next[._](.+)$|^(.+)[._]next$", re.IGNORECASE)
+NEXT = re.compile(r"^next[._\s-]+(.+)$|^(.+)[._\s-]+next$", re.IGNORECASE)
 
 COLUMN, COLUMNS = "the name of a column", "a list of columns, or a table of your names and their columns"
 NAMES = "a list of names of states"
@@ -61,6 +69,7 @@ class Roles:
         constants: names of coordinates that are declared as constants of an episode.
         discrete: whether the action is declared as discrete; None lets the data decide.
         ignored: columns without a role.
+        units: unit of each used column whose heading has one, by the column's name.
     """
 
     state: Mapping[str, str]
@@ -76,6 +85,7 @@ class Roles:
     constants: frozenset[str] = frozenset()
     discrete: bool | None = None
     ignored: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def used(self) -> dict[str, str]:
@@ -83,7 +93,10 @@ class Roles:
         found = {column: f"state {name}" for name, column in self.state.items()}
         found |= {column: f"action {name}" for name, column in self.action.items()}
         found |= {column: f"next state {name}" for name, column in self.following.items()}
-        return found | {column: role for role in SINGLE if (column := getattr(self, role)) is not None}
+        found |= {column: role for role in SINGLE if (column := getattr(self, role)) is not None}
+        return {
+            column: f"{role} ({self.units[column]})" if column in self.units else role for column, role in found.items()
+        }
 
     @property
     def mapping(self) -> LogMapping:
@@ -143,20 +156,62 @@ def roles_by_name(names: Sequence[str]) -> Roles:
     Raises:
         UnusableLog: states or actions have no column, too many, or two for one name, or another role has two.
     """
-    single: dict[str, Any] = {role: _only(role, names, known) for role, known in SINGLE.items()}
-    left = [name for name in names if name not in single.values()]
-    action = _single("action", [(_part(match) or "0", name) for name in left if (match := ACTION.match(name))])
-    left = [name for name in left if name not in action.values()]
-    marked = _single("state", [(_part(match), name) for name in left if (match := STATE.match(name))])
-    ahead = [(_part(match), name) for name in left if (match := NEXT.match(name))]
+    headings = [heading(name) for name in names]
+    single: dict[str, Any] = {role: _only(role, headings, known) for role, known in SINGLE.items()}
+    left = [one for one in headings if one.column not in single.values()]
+    action = _single("action", [(_part(match) or "0", one.column) for one in left if (match := ACTION.match(one.name))])
+    left = [one for one in left if one.column not in action.values()]
+    marked = _single("state", [(_part(match), one.column) for one in left if (match := STATE.match(one.name))])
+    ahead = [(_part(match), one.column) for one in left if (match := NEXT.match(one.name))]
     following = _single("next state", [(_of_next(part, marked), name) for part, name in ahead])
-    plain = {name: name for name in left if name not in following.values()}
-    state = marked or plain
+    plain = [one for one in left if one.column not in following.values()]
+    often = Counter(one.name for one in plain)
+    state = marked or {one.name if often[one.name] == 1 else one.column: one.column for one in plain}
     _require(names, state, action)
     used = {*state.values(), *action.values(), *following.values(), *single.values()}
-    return _checked(
-        Roles(state, action, following, **single, ignored=tuple(name for name in names if name not in used))
-    )
+    ignored = tuple(name for name in names if name not in used)
+    return _checked(Roles(state, action, following, **single, ignored=ignored, units=_units(names, used)))
+
+
+def _units(names: Iterable[str], used: Iterable[str | None]) -> dict[str, str]:
+    """Return the unit of each used column whose heading has one."""
+    found = {name: _as_time(heading(name)) or heading(name) for name in names if name in set(used)}
+    return {name: one.unit for name, one in found.items() if one.unit}
+
+
+def _as_time(one: Heading) -> Heading | None:
+    """Return the heading of a column of times with its unit; None if it is no such column."""
+    for found in (one, timed(one)):
+        short = len(found.plain) == 1
+        known = SHORT_TIMES if short and found is not one else TIMES
+        if found.plain in SINGLE["time"] and (not found.unit or not short or found.unit in known):
+            return found
+    return None
+
+
+def mapping_of(given: Path | Mapping[str, Any] | LogMapping, where: str) -> LogMapping:
+    """Parse a mapping: a file in JSON or TOML, or what stands in one.
+
+    Raises:
+        OSError: the file can't be read.
+        UnusableLog: it is not a mapping.
+    """
+    if isinstance(given, LogMapping):
+        return given
+    return _mapped(_content(given) if isinstance(given, Path) else given, where)
+
+
+def _content(path: Path) -> Mapping[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+        content: Mapping[str, Any] = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
+    except UnicodeDecodeError as error:
+        raise UnusableLog(f"expected JSON or TOML in {path}, got bytes that are no text in UTF-8") from error
+    except RecursionError as error:
+        raise UnusableLog(f"expected a table of columns in {path}, got lists or tables nested too deeply") from error
+    except ValueError as error:
+        raise UnusableLog(f"expected JSON or TOML in {path}: {error}") from error
+    return content
 
 
 def roles_by_file(path: Path, names: Sequence[str]) -> Roles:
@@ -166,21 +221,12 @@ def roles_by_file(path: Path, names: Sequence[str]) -> Roles:
         OSError: the file can't be read.
         UnusableLog: the file is not a mapping, or names a column that the log does not have.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-        content = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
-    except UnicodeDecodeError as error:
-        raise UnusableLog(f"expected JSON or TOML in {path}, got bytes that are no text in UTF-8") from error
-    except RecursionError as error:
-        raise UnusableLog(f"expected a table of columns in {path}, got lists or tables nested too deeply") from error
-    except ValueError as error:
-        raise UnusableLog(f"expected JSON or TOML in {path}: {error}") from error
-    return roles_by_map(content, names, str(path))
+    return roles_by_mapping(mapping_of(path, str(path)), names, str(path))
 
 
 def roles_by_map(content: Mapping[str, Any], names: Sequence[str], where: str = "the mapping") -> Roles:
     """Find the roles of columns by a mapping. Raises ``UnusableLog`` like ``roles_by_file``."""
-    return roles_by_mapping(_mapped(content, where), names, where)
+    return roles_by_mapping(mapping_of(content, where), names, where)
 
 
 def roles_by_mapping(mapped: LogMapping, names: Sequence[str], where: str = "the mapping") -> Roles:
@@ -193,7 +239,7 @@ def roles_by_mapping(mapped: LogMapping, names: Sequence[str], where: str = "the
     state, action = _by_name(mapped.state), _by_name(mapped.action)
     wanted = [*state.values(), *action.values(), *mapped.next.values(), *filter(None, fields.values())]
     if missing := [column for column in wanted if column not in names]:
-        raise UnusableLog(f"{where} names the column {missing[0]!r}: expected one of {list(names)}")
+        raise UnusableLog(f"{where} names the column {missing[0]!r}: expected one of {listed(names)}")
     _require(names, state, action)
     _require_one_role(mapped, where)
     _require_declared(mapped, state, action, where)
@@ -208,6 +254,7 @@ def roles_by_mapping(mapped: LogMapping, names: Sequence[str], where: str = "the
             constants=frozenset(mapped.constants),
             discrete=mapped.discrete,
             ignored=tuple(name for name in names if name not in wanted),
+            units=_units(names, wanted),
         )
     )
 
@@ -305,9 +352,16 @@ def _checked(roles: Roles) -> Roles:
     if roles.following and set(roles.following) != set(roles.state):
         odd = sorted(set(roles.following) ^ set(roles.state))[0]
         raise UnusableLog(
-            f"expected next states of all of {list(roles.state)} or of none, got {list(roles.following)} "
+            f"expected next states of all of {listed(roles.state)} or of none, got {listed(roles.following)} "
             f"({odd!r} differs): name the columns in a mapping file (--map)"
         )
+    for name, column in roles.following.items():
+        unit, other = roles.units.get(roles.state[name], ""), roles.units.get(column, "")
+        if unit and other and unit != other:
+            raise UnusableLog(
+                f"expected the next state {name!r} in {unit}, as {roles.state[name]!r} is, got {column!r}: convert"
+                " the column"
+            )
     return roles
 
 
@@ -315,17 +369,20 @@ def _require(names: Iterable[str], state: Mapping[str, str], action: Mapping[str
     for what, found, example in (("action", action, "action_valve"), ("state", state, "state_temperature")):
         if not found:
             raise UnusableLog(
-                f"expected a column of the {what}, such as {example}, got {list(names)}: rename it, or name the "
+                f"expected a column of the {what}, such as {example}, got {listed(names)}: rename it, or name the "
                 "columns in a mapping file (--map)"
             )
 
 
-def _only(role: str, names: Iterable[str], known: Sequence[str]) -> str | None:
+def _only(role: str, headings: Iterable[Heading], known: Sequence[str]) -> str | None:
     """Return the column with a known name of a role; None without one. Raises ``UnusableLog`` if there are several.
 
-    Case only matters for single letters: t is a time, T a temperature.
+    Case only matters for single letters: t is a time, T a temperature. A letter with a physical unit is a quantity.
     """
-    found = [name for name in names if (name.lower() if len(name) > 1 else name) in known]
+    if role == "time":
+        found = [one.column for one in headings if _as_time(one) is not None]
+    else:
+        found = [one.column for one in headings if one.plain in known and not (len(one.plain) == 1 and one.unit)]
     if len(found) > 1:
         raise UnusableLog(
             f"expected one column for the role {role}, got {' and '.join(found)}: rename one, or name the "

@@ -285,9 +285,9 @@ def _reward(steps: Transitions, notes: list[str]) -> Reward | DeclaredReward:
 def _about(roles: Roles, steps: Transitions) -> list[str]:
     notes = []
     if steps.interval is not None:
-        notes.append(
-            f"sampling interval: {steps.interval:g}, in the unit of {roles.time}; a virtual step covers the same time"
-        )
+        unit = roles.units.get(roles.time or "", "")
+        length = f"{steps.interval:g} {unit}" if unit else f"{steps.interval:g}, in the unit of {roles.time}"
+        notes.append(f"sampling interval: {length}; a virtual step covers the same time")
     return notes
 
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surrogym_shared.logs.columns import Roles
+from surrogym_shared.logs.columns import EITHER_END, Roles
+from surrogym_shared.logs.headings import heading
 from surrogym_shared.logs.table import Bools, Floats, Ints, Table, flags, groups, numbers, times
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 
@@ -76,6 +77,8 @@ def rows_of(table: Table, roles: Roles, spec: EnvironmentSpec | None = None) -> 
     if roles.truncated is not None:
         truncated, faulty = flags(roles.truncated, table.columns[roles.truncated])
         found.append(faulty)
+        if heading(roles.terminated or "").plain in EITHER_END:
+            terminated &= ~truncated
     for one in found:
         for row, reason in one.items():
             if whole[row]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -18,6 +19,9 @@ Bools = NDArray[np.bool_]
 Cells = NDArray[Any]  # (n,) numbers, or text
 
 TRUE, FALSE = ("true", "t", "yes"), ("false", "f", "no")
+NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+NO_FINITE = ("nan", "+nan", "-nan", "inf", "+inf", "-inf", "infinity", "+infinity", "-infinity")
+BOOLEANS = {"True": 1.0, "False": 0.0, "true": 1.0, "false": 0.0, "TRUE": 1.0, "FALSE": 0.0}
 DATES, DURATIONS = "M", "m"  # kinds of NumPy types
 NO_NUMBERS = {DATES: "dates", DURATIONS: "durations", "c": "complex numbers", "V": "records"}
 MAX_MEASURED = 1e30  # the server takes no larger number
@@ -33,7 +37,11 @@ class Table:
         faults: reason for each row that can't be read as a whole, by the row's index.
         cells: cells of each row as text, as in the file; empty if the log is not text.
         delimiter: character between two cells of the text.
+        heading: names as the text has them, with empty and repeated ones; empty if the log is not text.
+        unnamed: columns without a name in the file, by the words that stand for it.
+        repeated: how often a name stands in the heading, if more than once. Such columns are not in ``columns``.
         ignored: reason for each array of the file that is not a column, by its name.
+        remarks: what the report on the log says about the form of the file.
         evaluated: whether the steps come from an evaluation in the surrogate's own environment, so that their units and
             ends are not in doubt.
     """
@@ -43,7 +51,11 @@ class Table:
     faults: dict[int, str] = field(default_factory=dict)
     cells: Sequence[Sequence[str]] = ()
     delimiter: str = ""
+    heading: tuple[str, ...] = ()
+    unnamed: tuple[str, ...] = ()
+    repeated: Mapping[str, int] = field(default_factory=dict)
     ignored: Mapping[str, str] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
     evaluated: bool = False
 
     def __len__(self) -> int:
@@ -51,7 +63,8 @@ class Table:
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(self.columns)
+        """Names of the columns that have one, each once."""
+        return (*(name for name in self.columns if name not in self.unnamed), *self.repeated)
 
     def row(self, index: int) -> list[str]:
         """Return the cells of a row as text."""
@@ -121,18 +134,34 @@ def _plain(cells: Cells) -> Floats:
     return cells.astype(np.float64)
 
 
-def _parsed(cells: Cells) -> Floats:
+def is_number(cell: str) -> bool:
+    """Whether text is a decimal number in ASCII digits, as CSV has it: no ``1_000`` and no digits of other scripts."""
+    return NUMBER.fullmatch(cell.strip()) is not None
+
+
+def is_date(cell: str) -> bool:
+    """Whether text is a date in ISO 8601."""
     try:
-        return cells.astype(np.float64)
+        datetime.fromisoformat(cell.strip())
     except ValueError:
-        return np.array([_number(cell) for cell in cells], dtype=np.float64)
+        return False
+    return True
 
 
-def _number(cell: Any) -> float:
-    try:
+def _parsed(cells: Cells) -> Floats:
+    text = "".join(map(str, cells))
+    if text.isascii() and "_" not in text:  # what NumPy takes beyond decimal numbers
+        try:
+            return cells.astype(np.float64)
+        except ValueError:
+            pass
+    return np.array([_number(str(cell).strip()) for cell in cells], dtype=np.float64)
+
+
+def _number(cell: str) -> float:
+    if NUMBER.fullmatch(cell) or cell.lower() in NO_FINITE:
         return float(cell)
-    except (TypeError, ValueError):
-        return float("nan")
+    return BOOLEANS.get(cell, float("nan"))
 
 
 def _reason(cell: Any, value: float) -> str:

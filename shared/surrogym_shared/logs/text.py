@@ -1,56 +1,190 @@
-"""Read a log from text: CSV with a heading."""
+"""Read a log from text: a heading and rows, whose cells a comma, semicolon, tab, bar or blanks separate."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
 from surrogym_shared.logs.errors import UnusableLog
-from surrogym_shared.logs.table import Table
+from surrogym_shared.logs.sizes import MOST_COLUMNS, MOST_ROWS, require_sizes
+from surrogym_shared.logs.table import Table, is_date, is_number
+from surrogym_shared.words import counted
 
-DELIMITERS = ",;\t"
-MOST_COLUMNS = 1_000
+DELIMITERS = ",;\t|"
+BLANKS = " "
+COMMENTS = ("#", "%", "//")
 LONGEST_NAME = 200  # letters
+JSON = re.compile(r"[{\[]\s*[{\[\"]")
+UNIT_APART = re.compile(r"\s+(?=[\[(])")  # time [s] is one name, also where blanks separate the columns
+UNNAMED = re.compile(r"^(?:unnamed column \d+|Unnamed: \d+|__index_level_\d+__)$")  # pandas has the last two
 
 
-def table_of_text(text: str, where: str, most_rows: int | None = None) -> Table:
-    """Read a table from CSV whose cells are separated by commas, semicolons or tabs.
+@dataclass(frozen=True)
+class _Head:
+    """Beginning of a log: comment lines, the line after them, a row below it, and the line that names the columns."""
+
+    comments: tuple[str, ...]
+    line: str
+    row: str
+    before: int  # lines before ``line``
+
+
+def table_of_text(text: str, where: str, most_rows: int = MOST_ROWS, remarks: Sequence[str] = ()) -> Table:
+    """Read a table from text with a heading.
+
+    Lines before the heading that begin with ``#``, ``%`` or ``//`` are comments. The last of them is the heading if no
+    other line is, as ``numpy.savetxt`` writes it. A column without a name is left out.
 
     Args:
         text: the log.
         where: source of the text, for messages.
-        most_rows: largest number of rows; None for any number.
+        most_rows: largest number of rows.
+        remarks: what is known of the text, for the report on the log.
 
     Raises:
-        UnusableLog: the text has no heading, two columns of the same name, or too many rows or columns.
+        UnusableLog: the text has no heading, or too many rows, columns or cells.
     """
-    heading = text.partition("\n")[0]
-    delimiter = max(DELIMITERS, key=heading.count)
-    reader = csv.reader(io.StringIO(text), delimiter=delimiter)
+    if JSON.match(text.lstrip()[:20]) or text.lstrip()[:1] == "<":
+        raise UnusableLog(f"expected a log with a heading and rows in {where}, got JSON, XML or HTML: write it as CSV")
+    head = _head(text)
+    delimiter = _delimiter(head)
+    names, first, remarks = _heading(head, delimiter, where, list(remarks))
+    _require_names(where, names)
     rows: list[list[str]] = []
     lines: list[int] = []
     faults: dict[int, str] = {}
-    try:
-        names = [name.strip() for name in next(reader, [])]
-        _require_names(where, names)
-        for row in reader:
-            if not row:
-                continue
-            if len(rows) == most_rows:
-                raise UnusableLog(f"expected at most {most_rows} rows in {where}, got more")
-            if len(row) != len(names):
-                faults[len(rows)] = f"expected {len(names)} columns, got {len(row)}"
-            rows.append(row)
-            lines.append(reader.line_num)
-    except csv.Error as error:
-        raise UnusableLog(f"expected CSV in {where}, got other text in line {reader.line_num}: {error}") from error
+    comments = 0
+    for line, row in _rows(text, delimiter, first, where):
+        if len(row) != len(names) and row[0].lstrip().startswith(COMMENTS):
+            comments += 1
+            continue
+        if len(rows) == most_rows:
+            raise UnusableLog(f"expected at most {most_rows:,} rows in {where}, got more: import a part of the log")
+        if len(row) != len(names):
+            faults[len(rows)] = f"expected {len(names)} columns, got {len(row)}"
+        rows.append(row)
+        lines.append(line)
+    require_sizes(where, len(rows), len(rows) * len(names))
+    if comments:
+        remarks.append(f"{counted(comments, 'comment line')} between the rows left out")
     padded = [row if len(row) == len(names) else [*row, *([""] * len(names))][: len(names)] for row in rows]
     # An array of text of one width would be as wide as its longest cell, in every row.
-    columns = {name: np.array([row[i] for row in padded], dtype=object) for i, name in enumerate(names)}
-    return Table(columns, np.array(lines, dtype=np.int64), faults, rows, delimiter)
+    columns = {
+        name: np.array([row[i] for row in padded], dtype=object)
+        for i, name in enumerate(_with_places(names))
+        if names[i] == "" or names.count(names[i]) == 1
+    }
+    return Table(
+        columns,
+        np.array(lines, dtype=np.int64),
+        faults,
+        rows,
+        delimiter,
+        heading=tuple(names),
+        unnamed=tuple(name for name in columns if is_unnamed(name)),
+        repeated={name: count for name, count in Counter(names).items() if name and count > 1},
+        remarks=tuple(remarks),
+    )
+
+
+def is_unnamed(name: str) -> bool:
+    """Whether a name stands for none: that of pandas for the index of a table, or for a column without a heading."""
+    return UNNAMED.match(name) is not None
+
+
+def _with_places(names: Sequence[str]) -> list[str]:
+    return [name or f"unnamed column {place}" for place, name in enumerate(names, 1)]
+
+
+def _head(text: str) -> _Head:
+    """Return the beginning of a log. Its lines are empty if the text has none."""
+    comments, found, before = [], list[str](), 0
+    for number, line in enumerate(io.StringIO(text, newline=None)):
+        if not line.strip():
+            continue
+        if line.strip().strip('"').startswith(COMMENTS):
+            comments += [line.strip()] if not found else []
+            continue
+        before = before if found else number
+        found.append(line.rstrip("\n"))
+        if len(found) == 2:
+            break
+    line, row = [*found, "", ""][:2]
+    return _Head(tuple(comments), line, row, before)
+
+
+def _delimiter(head: _Head) -> str:
+    """Return the delimiter that gives the first two lines the same number of cells, or the first one most of them."""
+
+    def fit(delimiter: str) -> tuple[bool, int]:
+        cells = len(_cells(head.line, delimiter))
+        return cells > 1 and cells == len(_cells(head.row, delimiter)), cells
+
+    best = max(DELIMITERS, key=fit)
+    return best if fit(best)[1] > 1 or not head.line.strip().count(" ") else BLANKS
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    if delimiter == BLANKS:
+        return line.split()
+    try:
+        return next(csv.reader([line], delimiter=delimiter), [])
+    except csv.Error:
+        return [line]
+
+
+def _heading(head: _Head, delimiter: str, where: str, remarks: list[str]) -> tuple[list[str], int, list[str]]:
+    """Return the names of the columns, the number of lines before the first row, and the remarks."""
+    skipped = f"{counted(len(head.comments), 'comment line')} before the heading left out"
+    cells = [name.strip() for name in _cells(head.line, delimiter)]
+    if not _is_row(cells):
+        if head.comments:
+            remarks.append(skipped)
+        row = _cells(head.row, delimiter)
+        if delimiter == BLANKS and len(cells) != len(row):
+            joined = _cells(UNIT_APART.sub("", head.line), delimiter)
+            cells = joined if len(joined) == len(row) else cells
+        return cells, head.before + 1, remarks
+    if head.comments:
+        line = head.comments[-1].strip('"').lstrip("".join(COMMENTS) + " ")
+        named = [name.strip() for name in _cells(line, delimiter)]
+        if delimiter == BLANKS and len(named) != len(cells):
+            named = _cells(UNIT_APART.sub("", line), delimiter)
+        if len(named) == len(cells) and not _is_row(named):
+            remarks.append("the heading is the comment line before the first row")
+            return named, head.before, remarks
+    raise UnusableLog(
+        f"expected a heading that names the columns in {where}, got a row of numbers ({', '.join(cells[:4])[:60]}) as "
+        "its first line: write a heading above it, such as time,level,action_valve,reward"
+    )
+
+
+def _is_row(cells: Sequence[str]) -> bool:
+    """Whether a line is a row and no heading: numbers, or dates and numbers. 0, 1, 2, ... may name columns."""
+    if list(cells) == [str(number) for number in range(len(cells))] and len(cells) > 1:
+        return False
+    return any(map(is_number, cells)) and all(not cell or is_number(cell) or is_date(cell) for cell in cells)
+
+
+def _rows(text: str, delimiter: str, first: int, where: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the cells of each row that is not empty, with the number of its last line."""
+    lines = islice(io.StringIO(text, newline=None), first, None)
+    if delimiter == BLANKS:
+        yield from ((first + number, cells) for number, line in enumerate(lines, 1) if (cells := line.split()))
+        return
+    reader = csv.reader(lines, delimiter=delimiter)
+    try:
+        yield from ((first + reader.line_num, row) for row in reader if row)
+    except csv.Error as error:
+        line = first + reader.line_num
+        raise UnusableLog(f"expected CSV in {where}, got other text in line {line}: {error}") from error
 
 
 def _require_names(where: str, names: Sequence[str]) -> None:
@@ -60,6 +194,3 @@ def _require_names(where: str, names: Sequence[str]) -> None:
         raise UnusableLog(f"expected at most {MOST_COLUMNS} columns in {where}, got {len(names)}")
     if long := [name for name in names if len(name) > LONGEST_NAME]:
         raise UnusableLog(f"expected names of at most {LONGEST_NAME} letters in {where}, got {long[0][:40]!r}...")
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise UnusableLog(f"expected each column once in {where}, got {twice[0]!r} {names.count(twice[0])} times")

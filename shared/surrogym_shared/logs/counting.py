@@ -1,0 +1,94 @@
+"""What the cells of a column show: numbers of rows, clocks, numbers of episodes, or marks."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.table import Cells, Floats, flags, groups, times
+
+Numbering = Literal["rows", "episodes", "gaps"]
+
+FEWEST = 4  # rows that show what a column is
+MOST_TURNS = 0.5  # share of rows at which numbers of episodes change, or a clock restarts, at most
+EQUAL = 1e-6  # share of a step by which the steps of a clock may differ
+
+
+def measured(cells: Cells) -> Floats | None:
+    """Return a column of numbers or times (n,); None if a cell is neither."""
+    try:
+        values, faults = times("", cells)
+    except UnusableLog:
+        return None
+    return None if faults or len(values) < FEWEST else values
+
+
+def numbering(cells: Cells) -> Numbering | None:
+    """Whether whole numbers count the rows, the rows of each episode, or rows of which some are missing."""
+    values = measured(cells)
+    if values is None or (values != np.floor(values)).any():
+        return None
+    change = np.diff(values)
+    if (change == 1).all():
+        return "rows"
+    restarts = change != 1
+    again = values[1:][restarts]
+    if restarts.mean() <= MOST_TURNS and (change[restarts] <= 0).all() and (again == values[0]).all():
+        return "episodes"
+    return "gaps" if (change > 0).all() else None
+
+
+def grows(cells: Cells) -> bool:
+    """Whether a column never falls but to where it began, as a time does that restarts."""
+    values = measured(cells)
+    if values is None:
+        return False
+    change = np.diff(values)
+    if not (change > 0).any() or (change < 0).mean() > MOST_TURNS:
+        return False
+    began = values[0] + 1.5 * np.median(change[change > 0])
+    return bool((values[1:][change < 0] <= began).all())
+
+
+def is_steady(cells: Cells) -> bool:
+    """Whether a column grows by the same amount in each row, whatever the actions are, as a clock does."""
+    values = measured(cells)
+    if values is None or len(values) < 2 * FEWEST:
+        return False
+    change = np.diff(values)
+    step = float(np.median(change))
+    return bool(step > 0 and (np.abs(change - step) <= EQUAL * max(step, np.abs(values).max() * 1e-9)).all())
+
+
+def is_mark(cells: Cells) -> bool:
+    """Whether all cells are 0 or 1, or true or false."""
+    try:
+        return not flags("", cells)[1]
+    except UnusableLog:
+        return False
+
+
+def is_in_blocks(cells: Cells) -> bool:
+    """Whether a column stays for several rows at a whole number or a text, as numbers of episodes do."""
+    found = groups(cells)
+    if len(found) < FEWEST or found[-1] == found[0]:
+        return False
+    values = measured(cells)
+    whole = values is None or bool((values == np.floor(values)).all())
+    return whole and bool((np.diff(found) != 0).mean() <= MOST_TURNS)
+
+
+def episodes_by(name: str, cells: Cells) -> Cells:
+    """Number the episodes that a column of marks of starts, or a counter that starts again, shows, (n,).
+
+    Raises:
+        UnusableLog: the column is neither.
+    """
+    if is_mark(cells):
+        return np.cumsum(flags(name, cells)[0])
+    values = measured(cells)
+    if values is None:
+        raise UnusableLog(f"{name}: expected marks of the starts of episodes, 0 or 1, or numbers that start again")
+    return np.cumsum(np.concatenate([[0], np.diff(values) <= 0]))

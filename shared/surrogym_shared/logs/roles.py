@@ -1,0 +1,157 @@
+"""Roles of the columns of a table: by a mapping, or by their names and by what their cells show."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from surrogym_shared.logs.columns import (
+    STATE,
+    LogMapping,
+    Roles,
+    mapping_of,
+    roles_by_mapping,
+    roles_by_name,
+)
+from surrogym_shared.logs.counting import Numbering, episodes_by, grows, is_in_blocks, is_mark, is_steady, numbering
+from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.headings import heading, timed
+from surrogym_shared.logs.rlds import from_rlds
+from surrogym_shared.logs.table import Cells, Table
+from surrogym_shared.words import listed
+
+BY = "episodes by "  # beginning of the name of a column that is made of marks of starts, or of a counter
+STARTS = ("is_first", "episode_start", "episode_starts")  # the names of RLDS and Stable-Baselines3
+COUNTERS = {"index", "step", "steps", "step_index", "time_step", "timestep", "row", "line", "sample", "frame", "tick"}
+COUNTERS |= {"counter", "count", "number", "no", "nr", "id", "i", "k", "n", "index_level_0"}
+COUNTED = "it grows by one in each row, as the number of a row does"
+WITHIN = "it numbers the rows of each episode"
+LONGEST_HINT = 600  # letters of a mapping that a message proposes
+
+Shown = Callable[[Cells], bool]
+LIKELY: dict[str, tuple[set[str], set[str], Shown]] = {
+    "reward": (
+        {"reward", "rewards", "rew", "return", "returns"},
+        {"cost", "costs", "score", "payoff", "penalty", "profit", "utility"},
+        lambda _: True,
+    ),
+    "terminated": (
+        {"done", "dones", "terminated", "terminal", "terminate", "ended", "failed", "failure", "crashed", "absorbing"},
+        {"end", "is_end", "episode_end", "end_of_episode", "game_over", "episode_over", "finished", "is_last", "last"}
+        | {"fail", "crash", "dead", "stopped"},
+        is_mark,
+    ),
+    "truncated": ({"truncated", "truncation", "timeout", "timeouts"}, {"time_limit", "limit_reached"}, is_mark),
+    "episode": (
+        {"episode", "episodes", "traj", "trajectory", "rollout", "trial"},
+        {"ep", "run_id", "run_number", "batch", "experiment"},
+        is_in_blocks,
+    ),
+    "time": ({"time", "timestamp", "date", "datetime", "clock", "elapsed", "seconds", "millis", "utc"}, {"ms"}, grows),
+    "action": ({"action", "actions"}, set(), lambda _: True),
+    "next state": ({"next"}, set(), lambda _: True),
+}  # words of a name, whole names, and what the cells of a column with this likely role show
+
+
+def read_roles(table: Table, mapping: Path | Mapping[str, Any] | LogMapping | None) -> tuple[Table, Roles]:
+    """Return the roles of a table's columns, and the table with the columns that they need.
+
+    Without a mapping, the names decide. A column that numbers the rows is then left out.
+
+    Raises:
+        OSError: the mapping file can't be read.
+        UnusableLog: a role has no column or several, a column without a known name is likely a reward, an end, an
+            episode or a time, or the mapping does not fit the log.
+    """
+    table = from_rlds(table)
+    if mapping is None:
+        table, roles = _by_name(table)
+    else:
+        where = str(mapping) if isinstance(mapping, Path) else "the mapping"
+        mapped = mapping_of(mapping, where)
+        if mapped.episode is not None and mapped.episode.removeprefix(BY) in table.columns:
+            table = _with_episodes(table, mapped.episode.removeprefix(BY))
+        roles = roles_by_mapping(mapped, (*table.names, *table.unnamed), where)
+    if twice := [name for name in roles.used if name in table.repeated]:
+        count = table.repeated[twice[0]]
+        raise UnusableLog(f"expected each column that is used once in the heading, got {twice[0]!r} {count} times")
+    return table, roles
+
+
+def _by_name(table: Table) -> tuple[Table, Roles]:
+    roles = roles_by_name(table.names)
+    starts = [name for name in table.columns if heading(name).plain in STARTS and is_mark(table.columns[name])]
+    plain = [name for name in _plain(table, roles) if name not in starts]
+    kinds = {name: kind for name in (*table.unnamed, *plain) if (kind := _numbering(name, table)) is not None}
+    if plain and all(name in kinds for name in plain):
+        raise UnusableLog(
+            f"expected a column of the state besides {listed(plain)}, which only number the rows: name the columns in "
+            "a mapping file (--map)"
+        )
+    roles = roles_by_name([name for name in table.names if name not in (*starts, *kinds)])
+    _ask(table, roles, [name for name in plain if name not in kinds])
+    ignored = {name: WITHIN if kind == "episodes" else COUNTED for name, kind in kinds.items()}
+    ignored |= {name: "it has no name" for name in table.unnamed if name not in kinds}
+    if roles.episode is None and (by := [*starts, *(name for name, kind in kinds.items() if kind == "episodes")]):
+        table = _with_episodes(table, by[0])
+        roles = replace(roles, episode=f"{BY}{by[0]}")
+    if roles.time is None and (gaps := [name for name, kind in kinds.items() if kind == "gaps"]):
+        roles = replace(roles, time=gaps[0])
+        del ignored[gaps[0]]
+    return replace(table, ignored={**table.ignored, **ignored}), roles
+
+
+def _with_episodes(table: Table, name: str) -> Table:
+    """Return the table with a column of episodes that a column of marks of starts, or a counter, shows."""
+    return replace(table, columns={**table.columns, f"{BY}{name}": episodes_by(name, table.columns[name])})
+
+
+def _plain(table: Table, roles: Roles) -> list[str]:
+    """Return the columns that are states because no name says otherwise."""
+    free = [column for name, column in roles.state.items() if name not in roles.following and column in table.columns]
+    return [column for column in free if not STATE.match(heading(column).name)]
+
+
+def _numbering(name: str, table: Table) -> Numbering | None:
+    """What a column counts. That it restarts or has gaps only counts if its name is that of a counter."""
+    kind = numbering(table.columns[name])
+    known = name in table.unnamed or timed(heading(name)).plain in COUNTERS or heading(name).plain in COUNTERS
+    return kind if kind == "rows" or known else None
+
+
+def _ask(table: Table, roles: Roles, plain: Sequence[str]) -> None:
+    """Refuse columns that are likely a reward, an end, an episode or a time, and would be states or be left out."""
+    ignored = [name for name in roles.ignored if name in table.columns]
+    likely: dict[str, str] = {}
+    for name in [*plain, *ignored]:
+        role = _likely(name, table.columns[name], roles)
+        if role is not None and (name in plain or getattr(roles, role, True) is None):
+            likely[name] = role
+    if roles.time is None and not likely:
+        likely |= {name: "time" for name in plain if is_steady(table.columns[name])}
+    if not likely:
+        return
+    words = ", ".join(f"{name!r} is likely the {role}" for name, role in likely.items())
+    single: dict[str, Any] = {
+        role: name for name, role in reversed(likely.items()) if getattr(roles, role, True) is None
+    }
+    state = {name: column for name, column in roles.state.items() if column not in likely}
+    proposed = replace(roles, state=state, **single).mapping.model_dump(exclude_defaults=True)
+    hint = json.dumps(proposed, ensure_ascii=False)
+    example = f" such as {hint}" if len(hint) <= LONGEST_HINT and state else ""
+    raise UnusableLog(
+        f"expected a known name for each reward, end, episode and time, got other ones: {words}. Say what each column "
+        f"is in a mapping file (--map map.json),{example} with the column among the states if it is one"
+    )
+
+
+def _likely(name: str, cells: Cells, roles: Roles) -> str | None:
+    one = timed(heading(name))
+    for role, (words, names, shown) in LIKELY.items():
+        by_name = one.plain in names and getattr(roles, role, True) is None
+        if (by_name or words.intersection(one.words)) and shown(cells):
+            return role
+    return None
