@@ -15,7 +15,7 @@ PINS := pyproject.toml constraints.txt
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: demo install test audit test-all docs docs-serve format-check lint types imports unit chaos bench bench-memory acquisition audit-power compare format postgresql haproxy chromium languages screenshots clean help
+.PHONY: demo install test lab-test audit test-all docs docs-serve format-check lint types imports unit chaos bench bench-memory acquisition audit-power compare format postgresql haproxy chromium languages screenshots clean help
 
 demo: .venv/demo  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
@@ -40,7 +40,10 @@ imports: .venv/dev  ## Check which room imports which
 unit: .venv/dev postgresql chromium languages  ## The tests alone (ARGS="-k pendulum")
 	$(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
-test-all: test .venv-extras .venv-adapters  ## make test, every command of the docs, and trainers and trackers with packages of their own
+lab-test: .venv/dev  ## The tests of the lab: studies, peers, unseen tasks (ARGS="-k pilco")
+	$(BIN)/pytest lab/tests --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
+
+test-all: test lab-test .venv-extras .venv-adapters  ## make test, every command of the docs, and trainers and trackers with packages of their own
 	$(BIN)/pytest -m long --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 	DOCS=full $(BIN)/pytest -m "" --durations 0 tests/docs tests/examples
 	.venv-adapters/bin/python -m pytest -m "" tests/original/test_adapters.py tests/original/test_describing.py
@@ -58,19 +61,19 @@ chaos: .venv/dev postgresql haproxy  ## Faults, attacks and clusters in full len
 	CHAOS=full $(BIN)/pytest -m "" --durations 0 tests/chaos tests/security tests/server/cluster $(ARGS)
 
 bench: .venv/dev  ## What steps, predictions and trainings cost here, beside echoes, libraries and other systems (ARGS="--quick")
-	$(BIN)/python tests/benchmarks/bench.py $(ARGS)
+	$(BIN)/python lab/benchmarks/bench.py $(ARGS)
 
 bench-memory: .venv/dev  ## Resident memory of a server with 64 sessions of 256 lanes, 10 minutes (ARGS="--minutes 1")
-	$(BIN)/python tests/benchmarks/bench_memory.py $(ARGS)
+	$(BIN)/python lab/benchmarks/bench_memory.py $(ARGS)
 
 acquisition: .venv/dev  ## Adaptive queries beside a Latin hypercube, by model error (ARGS="--tasks pendulum --seeds 10")
-	$(BIN)/python tests/benchmarks/acquisition.py $(ARGS)
+	$(BIN)/python lab/benchmarks/acquisition.py $(ARGS)
 
 audit-power: .venv/dev  ## Do audits find 100 wrong models, and leave 100 right ones alone? (ARGS="--right 2 --wrong 1")
-	$(BIN)/python tests/benchmarks/audit_power.py $(ARGS)
+	$(BIN)/python lab/benchmarks/audit_power.py $(ARGS)
 
 compare: .venv/dev  ## Behaviour and speed of two commits, side by side (ARGS="BEFORE AFTER")
-	$(BIN)/python tests/benchmarks/compare_commits.py $(ARGS)
+	$(BIN)/python lab/benchmarks/compare_commits.py $(ARGS)
 
 format: .venv/dev  ## Put the code into shape
 	$(BIN)/ruff check --fix
@@ -117,7 +120,7 @@ screenshots: .venv/dev chromium  ## Pictures of the page for the docs, from a li
 
 clean:  ## Remove the virtual environment, caches and builds; run folders stay
 	rm -rf .venv .venv-extras .venv-adapters build dist .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
-	find client server shared tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find client server shared lab tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## This list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)

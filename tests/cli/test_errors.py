@@ -137,7 +137,6 @@ def test_the_way_out_stands_beside_what_is_wrong(surrogym, answer, way_out):
         ("sample", "pendulum", "--wait", "inf"),
         ("change", "pendulum", "--target", "nan"),
         ("evaluate", "policy.zip", "--perturb", "nan"),
-        ("reproduce", "peers", "--minutes", "nan"),
     ],
 )
 def test_options_that_are_no_finite_numbers(surrogym, arguments):

@@ -15,7 +15,7 @@ from surrogym_client.cli.train_options import SessionOptions
 from surrogym_shared.wire import OpenSession
 
 SHARED = {"server", "token", "token_file"}
-WITHOUT_A_SERVER = {"describe", "export-policy", "demo", "policy", "reproduce"}  # or commands in a group of their own
+WITHOUT_A_SERVER = {"describe", "export-policy", "demo", "policy"}  # or commands in a group of their own
 
 
 @dataclass(frozen=True)

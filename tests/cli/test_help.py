@@ -5,14 +5,11 @@ import sys
 
 import pytest
 
-from support.commands import command_line
 from surrogym_client.cli import COMMANDS
 from surrogym_client.cli.commands import ADVANCED, GROUPS
 
-STUDIES = [f"reproduce {name}" for name in command_line().commands["reproduce"].commands]
 
-
-@pytest.mark.parametrize("command", [*COMMANDS, *STUDIES, "serve"])
+@pytest.mark.parametrize("command", [*COMMANDS, "serve"])
 def test_help_has_an_example(surrogym, command):
     said = surrogym(*command.split(), "--help")
     assert said.code == 0

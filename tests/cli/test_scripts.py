@@ -5,19 +5,17 @@ from __future__ import annotations
 import json
 import uuid
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from support.commands import command_line, options
 from support.server import ServerProcess
-from surrogym_client.experiments.reproduce.rows import Row, write_rows
 
 ELSEWHERE = {
     "audit": "tests/training/test_handover.py",
     "conformance": "tests/diagnosis/test_conformance.py",
-    "demo": "tests/experiments/test_demo.py",
+    "demo": "tests/demo/test_demo.py",
     "describe": "test_describe.py",
     "evaluate": "test_commands.py",
     "export-policy": "tests/policies/test_export.py",
@@ -27,10 +25,6 @@ ELSEWHERE = {
     "policy get": "test_commands.py",
     "policy push": "test_commands.py",
     "policy show": "test_commands.py",
-    "reproduce efficiency": "test_reproduce.py",
-    "reproduce paper": "test_reproduce_paper.py",
-    "reproduce peers": "test_reproduce_peers.py",
-    "reproduce trust": "tests/experiments/test_unseen.py",
     "serve": "tests/server/cli/test_serve.py",
     "train": "test_commands.py",
     "jobs": "test_jobs.py",
@@ -67,15 +61,12 @@ def test_every_command_speaks_json_and_keeps_quiet(command: str) -> None:
     assert {"--json", "--quiet"} <= options(*command.split())
 
 
-def test_a_script_reads_one_document_and_nothing_else(surrogym, pendulum_server: ServerProcess, tmp_path: Path) -> None:
-    write_rows(
-        tmp_path / "rows.csv", [Row("pendulum", "oracle", 0, 14, 0, 0, 300_000, mean=-170.0, min=-300.0, seconds=9.0)]
-    )
+def test_a_script_reads_one_document_and_nothing_else(surrogym, pendulum_server: ServerProcess) -> None:
     name, server, run = f"script-{uuid.uuid4().hex[:8]}", ("--server", pendulum_server.url), set()
-    for line in ["reproduce table --rows rows.csv", *LINES.replace("NAME", name).strip().splitlines()]:
+    for line in LINES.replace("NAME", name).strip().splitlines():
         words = line.split()
-        run.add(" ".join(words[: 1 + (words[0] == "reproduce")]))
-        said = surrogym(*words, "--json", "--quiet", *(server if words[0] != "reproduce" else ()))
+        run.add(words[0])
+        said = surrogym(*words, "--json", "--quiet", *server)
         assert (said.code, said.err) == (0, ""), line
         assert isinstance(json.loads(said.out), dict), line
     assert run | ELSEWHERE.keys() == set(all_commands())

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from surrogym_client.experiments.reproduce.page import present_sections, section
-from surrogym_client.experiments.reproduce.promises import promise_tables
-from surrogym_client.experiments.reproduce.rows import merge, read_rows
-from surrogym_client.experiments.reproduce.table import contrasts, grouped, summary, tasks_with_results
+from surrogym_lab.reproduce.page import present_sections, section
+from surrogym_lab.reproduce.promises import promise_tables
+from surrogym_lab.reproduce.rows import merge, read_rows
+from surrogym_lab.reproduce.table import contrasts, grouped, summary, tasks_with_results
 
 DOCS = Path(__file__).parents[2] / "docs"
 ROWS = read_rows(DOCS / "results" / "efficiency.csv")
@@ -22,7 +22,7 @@ ROWS = read_rows(DOCS / "results" / "efficiency.csv")
 )
 def test_the_tables_are_those_of_the_rows(page, name, rows, out):
     made = section(name, read_rows(DOCS / "results" / f"{rows}.csv"), ".")
-    again = f"surrogym reproduce table --rows docs/results/{rows}.csv --out {out} --page docs/{page}"
+    again = f"python -m surrogym_lab table --rows docs/results/{rows}.csv --out {out} --page docs/{page}"
     assert present_sections(DOCS / page) == {name: made}, again
 
 
@@ -42,7 +42,7 @@ def test_the_tables_are_those_of_the_rows(page, name, rows, out):
 )
 def test_tables_from_before_a_change_or_of_fresh_seeds_are_those_of_their_rows(page, name):
     rows = read_rows(DOCS / "results" / f"efficiency-{name}.csv")
-    again = f"surrogym reproduce table --rows docs/results/efficiency-{name}.csv"
+    again = f"python -m surrogym_lab table --rows docs/results/efficiency-{name}.csv"
     text = (DOCS / "results" / f"{page}.md").read_text()
     assert summary(rows) in text, again
     assert contrasts(rows) in text, again

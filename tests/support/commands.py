@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -11,12 +12,13 @@ from surrogym_client.cli import build
 
 
 @cache
-def command_line() -> Any:
+def command_line(build: Callable[[], typer.Typer] = build) -> Any:
+    """The parser of ``surrogym``, or of another program."""
     return typer.main.get_command(build())
 
 
 def options(*names: str) -> set[str]:
-    """All spellings of a command's options, without a name those of the program; ``options("reproduce", "paper")`` for
+    """All spellings of a command's options, without a name those of the program; ``options("policy", "show")`` for
     one within a group.
 
     Raises:
@@ -29,14 +31,14 @@ def options(*names: str) -> set[str]:
     return spellings | {"--help"}
 
 
-def parse(arguments: list[str]) -> dict[str, Any]:
-    """The values that ``surrogym ARGUMENTS`` gives its command, which is not run.
+def parse(arguments: list[str], build: Callable[[], typer.Typer] = build) -> dict[str, Any]:
+    """The values that ``surrogym ARGUMENTS`` gives its command, or another program its own, which is not run.
 
     Raises:
         KeyError: no such command.
         Exception: the usage error that a person would see.
     """
-    command, name, rest = command_line(), "surrogym", arguments
+    command, name, rest = command_line(build), "surrogym", arguments
     while hasattr(command, "commands"):
         name, *rest = rest
         if name not in command.commands and (default := getattr(command, "default", None)):

@@ -65,11 +65,13 @@ def _heed_interrupts() -> None:
 
 
 @contextmanager
-def on_terminal(*arguments: str, width: int = 80, folder: str | None = None) -> Iterator[Terminal]:
-    """``surrogym ARGUMENTS`` on a terminal of ``width`` characters; killed at the end if it still runs."""
+def on_terminal(
+    *arguments: str, module: str = "surrogym_client", width: int = 80, folder: str | None = None
+) -> Iterator[Terminal]:
+    """``python -m MODULE ARGUMENTS`` on a terminal of ``width`` characters; killed at the end if it still runs."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, width, 0, 0))
-    command = [sys.executable, "-m", "surrogym_client", *arguments]
+    command = [sys.executable, "-m", module, *arguments]
     kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
     environment = kept | {"TERM": "xterm", "COLUMNS": str(width)}
     process = subprocess.Popen(

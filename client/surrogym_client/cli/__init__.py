@@ -37,7 +37,6 @@ COMMANDS = (
     "doctor",
     "conformance",
     "demo",
-    "reproduce",
 )
 ENTRY_POINTS = "surrogym.commands"
 INTERRUPTED = 130
@@ -48,8 +47,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     The exit status is 0 for success, 1 for failure, 2 for wrong usage, and 130 after Ctrl-C.
     """
+    run(build, "surrogym", arguments)
+
+
+def run(built: Callable[[], typer.Typer], name: str, arguments: Sequence[str] | None = None) -> None:
+    """Build an app, run one of its commands under this program's name, and exit as ``main`` does."""
     try:
-        build()(args=None if arguments is None else list(arguments), prog_name="surrogym")
+        built()(args=None if arguments is None else list(arguments), prog_name=name)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
     except Exception as error:

@@ -10,26 +10,23 @@ import typer
 
 from surrogym_client.cli.groups import add
 from surrogym_client.cli.options import ExitWithParent, Quiet, require_known
-from surrogym_client.experiments.arms import ARMS
-from surrogym_client.experiments.tasks import EVERY_TASK
+from surrogym_client.demo.tasks import TASKS
 
 if TYPE_CHECKING:
     Task = str
-    ArmName = str
 else:
-    Task, ArmName = Literal[tuple(EVERY_TASK)], Literal[tuple(ARMS)]
+    Task = Literal[tuple(TASKS)]
 
 
 RunFolder = Annotated[
     Path | None, typer.Option(help="Folder for the results of the run. [default: runs/TASK-seedSEED-TIME]")
 ]
-Arm = Annotated[ArmName, typer.Option(help="Method to choose real steps by; docs/results/efficiency.md explains each.")]
 Budget = Annotated[int | None, typer.Option(min=2, help="Maximum number of real steps. [default: from the task]")]
 Steps = Annotated[int | None, typer.Option(min=1, help="Virtual steps of the training. [default: from the task]")]
 Algorithm = Annotated[
     str | None,
     typer.Option(
-        help="Policy search, as in surrogym train. [default: fastppo; ppo with the paper's arms and oracle]",
+        help="Policy search, as in surrogym train. [default: fastppo]",
         show_default=False,
     ),
 ]
@@ -48,7 +45,6 @@ def command(
         typer.Option("--json", help="Write the metrics to this file as well. With -, print them instead of the table."),
     ] = None,
     out: RunFolder = None,
-    arm: Arm = "default",
     budget: Budget = None,
     steps: Steps = None,
     algorithm: Algorithm = None,
@@ -65,9 +61,9 @@ def command(
     Example: surrogym demo pendulum --seed 0 --json metrics.json
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.experiments.demo.report import table
-    from surrogym_client.experiments.demo.run import run_demo
-    from surrogym_client.experiments.settings import DemoSettings
+    from surrogym_client.demo.report import table
+    from surrogym_client.demo.run import run_demo
+    from surrogym_client.demo.settings import DemoSettings
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_shared.terminal import give
 
@@ -81,7 +77,6 @@ def command(
     settings = DemoSettings(
         task=task,
         seed=seed,
-        arm=arm,
         budget=budget,
         steps=steps,
         algorithm=algorithm,

@@ -1,4 +1,0 @@
-"""Other methods on our tasks: a port, small implementations of peers, and their learning curves.
-
-Only ``surrogym reproduce peers`` imports this folder (docs/decisions/0069).
-"""

@@ -1,0 +1,1 @@
+"""Studies, peers and unseen tasks: what measures the product and is no part of it."""

@@ -1,0 +1,111 @@
+"""Settings of one run of a study: a demo with an arm, on a task of any kind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+from surrogym_client.demo.settings import DemoSettings
+from surrogym_client.demo.tasks import ROUNDS, DemoTask, design_budget, queries_a_round
+from surrogym_client.original import make
+from surrogym_client.original.loading import has_specification, with_choices
+from surrogym_client.training.search import FAST, REFERENCE, SEARCHES
+from surrogym_client.training.settings import SUGGESTED_STEPS, TrainSettings, prolongs
+from surrogym_lab.arms import ARMS, Arm
+from surrogym_lab.tasks import EVERY_TASK
+from surrogym_shared.spec import EnvironmentSpec
+
+if TYPE_CHECKING:
+    from surrogym_client.original.describing import Description
+
+
+@dataclass(frozen=True)
+class StudySettings(DemoSettings):
+    """Settings of a demo, and the arm that chooses its real steps."""
+
+    arm: str = "default"
+
+    @property
+    def run_name(self) -> str:
+        return self.task if self.arm == "default" else f"{self.task}-{self.arm}"
+
+    @property
+    def labels(self) -> dict[str, str]:
+        return {"arm": self.arm}
+
+    @property
+    def demo_task(self) -> DemoTask:
+        return EVERY_TASK[self.task]
+
+    @property
+    def way(self) -> Arm:
+        return ARMS[self.arm]
+
+    @property
+    def virtual_steps(self) -> int | None:
+        """Where the default has rounds before its last training, those that have none learn for as long as it may."""
+        alone = not self.way.closed_loop and not self.way.original and queries_a_round(self.real_steps) > 0
+        return self.steps or self.demo_task.steps or (SUGGESTED_STEPS if alone else None)
+
+    @property
+    def search(self) -> str:
+        """Name of the policy search. By default, the reference where the paper or the original environment is one side
+        of a comparison."""
+        if self.algorithm is not None:
+            return SEARCHES.name_of(self.algorithm)
+        return REFERENCE if self.way.original or self.way.preset == "paper" else FAST
+
+    @property
+    def prolong(self) -> bool:
+        """Whether a training that still gains takes as many virtual steps again: as ``prolongs`` where a task or an arm
+        chose their number, and not where each is a real one or the search can't be prolonged."""
+        if not SEARCHES.get(self.search).prolongable:
+            return False
+        return not self.way.original and prolongs(TrainSettings(total_steps=self.steps), self.spec())
+
+    @property
+    def training_options(self) -> list[str]:
+        options = [] if self.virtual_steps is None else ["--steps", str(self.virtual_steps)]
+        if self.algorithm is not None:
+            options += ["--algorithm", self.algorithm]
+        if self.way.start_box is not None:
+            options += ["--start-box", str(self.way.start_box)]
+        options.append("--prolong" if self.prolong else "--no-prolong")
+        queries = queries_a_round(self.real_steps)
+        if self.way.closed_loop and queries:
+            options += ["--improve", str(queries), "--rounds", str(ROUNDS)]
+        return options
+
+    @property
+    def description_steps(self) -> int:
+        """Real steps that the description of the environment took; 0 with a specification of its own."""
+        name = self.demo_task.environment
+        return 0 if has_specification(name) else _described(name, self.seed).steps
+
+    def spec(self) -> EnvironmentSpec:
+        """The environment's specification with the design of this arm."""
+        plain = self._specified(preset=self.way.preset, seed=self.seed)
+        budget = design_budget(self.real_steps) if self.way.closed_loop else self.real_steps
+        design = self.way.design(budget, len(plain.observation) + plain.action.size)
+        return with_choices(plain, design, access=self.way.access)
+
+    def judged_by(self) -> EnvironmentSpec:
+        """The original environment as every arm is judged by it, also one that learns another form of it."""
+        return self._specified()
+
+    def asked(self) -> dict[str, Any]:
+        return super().asked() | {"arm": self.way.fields()}
+
+    def _specified(self, **design: Any) -> EnvironmentSpec:
+        """The environment's own specification, or the one that ``surrogym describe`` drafts, with these choices."""
+        name = self.demo_task.environment
+        drafted = None if has_specification(name) else _described(name, self.seed).spec
+        return make(name, spec=drafted, **design).spec()
+
+
+@cache
+def _described(name: str, seed: int) -> Description:
+    from surrogym_client.original.describing import describe
+
+    return describe(name, seed=seed)
