@@ -73,7 +73,7 @@ def _names(rows: Rows, named: Ints, notes: list[str]) -> Ints:
     """Return a number for each name of an episode, (n,), and a new one where a name returns after others."""
     changes = np.zeros(len(rows), dtype=np.bool_)
     changes[1:] = named[1:] != named[:-1]
-    stretch = np.cumsum(changes)
+    stretch = np.cumsum(changes, dtype=np.int64)
     alternate = bool(np.median(np.bincount(stretch)) < 2) if len(rows) else False
     returned = int(stretch[-1]) + 1 - len(np.unique(named)) if len(rows) else 0
     if rows.time is not None or alternate or not returned:  # a clock shows by itself what continues
