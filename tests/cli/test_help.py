@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from support.commands import command_line
 from surrogym_client.cli import COMMANDS
 from surrogym_client.cli.commands import ADVANCED, GROUPS
 
@@ -22,7 +23,7 @@ def test_the_command_alone_lists_all_commands(surrogym):
     assert all(f"  {command} " in said.out for command in (*COMMANDS, "serve", "optimise"))
     listed = said.out.partition("Start:")[2]
     assert "..." not in listed  # each says what it does in a line that is whole
-    assert [line for line in listed.splitlines() if line.endswith(":")] == ["Loop:", "After:", "Operate:", "More:"]
+    assert [line for line in listed.splitlines() if line.endswith(":")] == ["Loop:", "After:", "Operate:"]
 
 
 def test_every_command_of_a_group_exists():
