@@ -3,7 +3,7 @@ numbers."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Annotated
 
 from pydantic import BaseModel, Field, ValidationError
@@ -44,6 +44,27 @@ def require_known(where: str, given: Iterable[str], known: Iterable[str]) -> Non
     known = list(known)
     unknown = [name for name in given if name not in known]
     require(not unknown, f"{where} names unknown {unknown}: expected some of {known}")
+
+
+def trace_fault(
+    coordinates: Sequence[Sequence[float]],
+    action: Sequence[Sequence[float]],
+    reward: Sequence[float],
+    *,
+    c: int,
+    f: int,
+) -> str | None:
+    """What is wrong with the shape of an episode of T steps; None for (T + 1, c) states, (T, f) actions and T rewards,
+    with T at least 1."""
+    steps, widths = len(reward), ({*map(len, coordinates)}, {*map(len, action)})
+    if steps and (len(coordinates), len(action)) == (steps + 1, steps) and widths == ({c}, {f}):
+        return None
+    came = [
+        f"{len(rows)} of {' and '.join(map(str, sorted(each))) or 'no'}"
+        for rows, each in zip((coordinates, action), widths, strict=True)
+    ]
+    expected = f"expected {max(steps, 1) + 1} states of {c} and {max(steps, 1)} actions of {f} numbers"
+    return f"{expected} for {max(steps, 1)} rewards, got states: {came[0]}, actions: {came[1]}, rewards: {steps}"
 
 
 def first_fault(error: ValidationError, *, got: bool = False, of: type[BaseModel] | None = None) -> str:

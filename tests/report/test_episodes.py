@@ -7,7 +7,8 @@ import pytest
 
 from surrogym_client.original.classic import pendulum
 from surrogym_client.report.episodes import Meet, draw_episodes
-from surrogym_shared.wire import EpisodeTrace
+from surrogym_client.report.known import with_whole_traces
+from surrogym_shared.wire import EpisodeTrace, EvaluationDetail
 
 ONE = [[3.0, 0.0], [-3.0, 0.0], [3.1, 0.0], [-3.1, 0.0]]
 OTHER = [[-2.8, 0.0], [-3.1, 0.0], [3.0, 0.0], [2.9, 0.0]]
@@ -27,3 +28,13 @@ def test_angles_are_drawn_without_a_jump_and_meet_where_asked(meet: Meet, at: in
         assert np.exp(1j * values) == pytest.approx(np.exp(1j * np.array(given)[:, 0]))
     assert drawn[0][at] == ONE[at][0]
     assert abs(drawn[1][at] - drawn[0][at]) <= np.pi
+
+
+def test_traces_of_another_shape_are_left_out_and_said():
+    ragged = EpisodeTrace.model_construct(coordinates=[[0.0, 0.0], [0.0]], action=[[0.0]], reward=[0.0])
+    wide = EpisodeTrace.model_construct(coordinates=[[0.0] * 3] * 2, action=[[0.0]], reward=[0.0])
+    missing: list[str] = []
+    stored = EvaluationDetail.model_construct(id=3, traces=[trace(ONE), ragged, wide])
+    assert with_whole_traces(stored, pendulum(), missing).traces == [trace(ONE)]
+    assert len(missing) == 1
+    assert "2 traces of evaluation 3" in missing[0]

@@ -219,6 +219,8 @@ def _words(name: str, policy: PolicyDetail) -> str:
 
     aliases = f", {', '.join(policy.aliases)}" if policy.aliases else ""
     lines = [f"{name}@{policy.version}{aliases}: {policy.algorithm or 'unknown algorithm'}"]
+    if policy.pushed_by is not None:
+        lines.append(f"stored by: {policy.pushed_by}")
     if policy.virtual_steps is not None:
         lines.append(f"training: {policy.virtual_steps} virtual steps")
     if policy.promise is None:

@@ -9,6 +9,8 @@ from functools import partial
 from surrogym_client.errors import NotInstalled, SurrogymClientError, UnknownPolicy
 from surrogym_client.report.maps import Cut, cuts
 from surrogym_client.transport import Api
+from surrogym_shared.checks import trace_fault
+from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import (
     Controller,
     EvaluationDetail,
@@ -80,13 +82,27 @@ def collect(api: Api, name: str, which: str | None = None) -> Known:
         detail = None if evaluation is None else api.policies.evaluation(name, policy.version, evaluation.id)
         if detail is not None and detail.missing:
             missing.append(f"the single episodes of evaluation {detail.id} are missing: {detail.missing}")
-        details.append(detail)
+        details.append(detail and with_whole_traces(detail, view.spec, missing))
     video, lacks = _video(api, name, policy)
     missing += lacks
     others = tuple(one for one in api.policies.list(name) if one.version != policy.version)
     return Known(
         view, models, samples, server, policy, details[0], details[1], details[2], video, others, tuple(missing)
     )
+
+
+def with_whole_traces(detail: EvaluationDetail, spec: EnvironmentSpec, missing: list[str]) -> EvaluationDetail:
+    """Leave out the traces that don't have the shape of this specification. Earlier servers took them."""
+    whole = [
+        trace
+        for trace in detail.traces
+        if not trace_fault(trace.coordinates, trace.action, trace.reward, c=len(spec.coordinates), f=spec.action.size)
+    ]
+    if beyond := len(detail.traces) - len(whole):
+        missing.append(
+            f"{beyond} traces of evaluation {detail.id} are left out: they have another shape than its steps"
+        )
+    return detail.model_copy(update={"traces": whole})
 
 
 def _video(api: Api, name: str, policy: PolicyDetail) -> tuple[tuple[str, bytes] | None, list[str]]:

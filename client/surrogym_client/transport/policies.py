@@ -41,7 +41,7 @@ class PolicyCalls:
         form: wire.PolicyForm,
         file: bytes,
     ) -> wire.PushedPolicy:
-        """Store a policy with its file. If the server has this file already, the same policy gets the new card.
+        """Store a policy with its file. A version never changes: the same file with another card is a new one.
 
         Raises:
             SpecConflict: the policy was made for other observations or actions.
@@ -57,7 +57,7 @@ class PolicyCalls:
         return pushed
 
     def put_file(self, surrogate: str, version: int, form: wire.PolicyForm, file: bytes) -> wire.PolicyView:
-        """Store a further file of a policy. It replaces a file of the same form."""
+        """Store a further file of a policy. One that is there is never replaced: another of its form is refused."""
         route = f"{routes.policy(surrogate, version)}/files/{form}"
         digest = {"digest": _digest(file)}
         reply = self._connection.send("PUT", route, file, params=digest, media_type=_FILE, timeout=_SECONDS)

@@ -30,7 +30,7 @@ def role_of(scope: Scope) -> Role:
 def caller(scope: Scope) -> str:
     """Role and fingerprint of a request's token, and the address of its sender. Only known tokens have a fingerprint,
     because a mistyped one may be the password of something else."""
-    return f"{_holder(scope)} from {_address(scope)}"
+    return f"{holder(scope)} from {_address(scope)}"
 
 
 @lru_cache(maxsize=1_024)
@@ -39,7 +39,8 @@ def fingerprint(token: str) -> str:
     return hashlib.scrypt(token.encode(), salt=SALT, n=WORK, r=8, p=1, dklen=FINGERPRINT_BYTES).hex()
 
 
-def _holder(scope: Scope) -> str:
+def holder(scope: Scope) -> str:
+    """Role and fingerprint of a request's token; ``anybody`` if the server has no tokens."""
     gate: Gate = scope["app"].state.gate
     if gate.open:
         return "anybody"

@@ -12,6 +12,7 @@ from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import ADMIN, READ, TRAIN
 from surrogym_server.api.body import example
+from surrogym_server.api.caller import holder, role_of
 from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
@@ -56,11 +57,12 @@ def list_all(name: str, use: Use) -> PolicyList:
     openapi_extra=json_up_to(256),
     responses=documented(Code.UNKNOWN_SURROGATE, Code.SPEC_CONFLICT, Code.INVALID_REQUEST, Code.TOO_LARGE),
 )
-def add(name: str, body: Annotated[AddPolicy, example(examples.POLICY)], use: Use) -> PushedPolicy:
+def add(name: str, body: Annotated[AddPolicy, example(examples.POLICY)], request: Request, use: Use) -> PushedPolicy:
     """Store a policy's card, the curve of its training, and the form of the file that follows with ``PUT
-    .../files/{form}``. A policy with a known file keeps its version and gets this card. A policy for other observations
-    or actions is refused; other differences of its specification are named in ``differs``."""
-    record, created = use.policies.add(name, *convert.new_policy(body))
+    .../files/{form}``. A version never changes: the same file with another card or curve is a new version, and a repeat
+    of all three returns the version that is there. A policy for other observations or actions is refused; other
+    differences of its specification are named in ``differs``."""
+    record, created = use.policies.add(name, *convert.new_policy(body), by=holder(request.scope))
     return convert.pushed_policy(record, created=created)
 
 
@@ -87,7 +89,7 @@ def delete(name: str, version: Version, use: Use) -> Response:
     openapi_extra={
         "requestBody": {"required": True, "content": {BINARY: {"schema": {"type": "string", "format": "binary"}}}}
     },
-    responses=documented(*THERE, Code.TOO_LARGE),
+    responses=documented(*THERE, Code.FORBIDDEN, Code.TOO_LARGE),
 )
 async def put_file(
     name: str,
@@ -97,11 +99,13 @@ async def put_file(
     request: Request,
     use: Use,
 ) -> PolicyView:
-    """Send a file as the body. Its size, digest and outer form are checked; it is never loaded. If the files of a
+    """Send a file as the body. Its size, digest and outer form are checked; it is never loaded. A file
+    that is there is never replaced, and only the token that stored the version adds files to it. If the files of a
     surrogate's policies exceed their limit, the files of the oldest policies without an alias are removed."""
     content = await request.body()
     file = convert.policy_file(FileNotice(form=form, bytes=max(1, len(content)), digest=digest))
-    return convert.policy_view(await run_in_threadpool(use.policies.put_file, name, version, file, content))
+    by = None if role_of(request.scope) == "admin" else holder(request.scope)
+    return convert.policy_view(await run_in_threadpool(use.policies.put_file, name, version, file, content, by))
 
 
 @router.get(

@@ -6,7 +6,7 @@ from typing import Any
 
 from surrogym_server.convert.stored import read_stored
 from surrogym_server.services.policies import Episodes
-from surrogym_server.storage.policies import EvaluationRecord, PolicyFile, PolicyRecord
+from surrogym_server.storage.policies import PUSHED_BY, EvaluationRecord, PolicyFile, PolicyRecord
 from surrogym_server.storage.records import JSON
 from surrogym_shared import wire
 
@@ -90,6 +90,7 @@ def _fields(record: PolicyRecord, card: wire.PushedCard) -> dict[str, Any]:
         "aliases": list(record.aliases),
         **{name: getattr(card, name) for name in names},
         "differs": record.card.get("differs"),
+        "pushed_by": record.card.get(PUSHED_BY),
         "files": [
             {"form": file.form, "bytes": file.bytes, "digest": file.digest, "stored": file.blob is not None}
             for file in record.files

@@ -56,7 +56,7 @@ export function policyList(name, spec, { role, refresh }) {
   async function fill(policy, inside) {
     const detail = await call("GET", `${url}/${policy.version}`);
     const trusted = policy.trusted === null ? "Nobody checked whether the promise can be trusted." : `The promise was ${policy.trusted ? "" : "not "}trusted: ${policy.reason}.`;
-    const parts = [h("p", {}, trusted)];
+    const parts = [h("p", {}, trusted, policy.pushed_by ? ` The card is as its trainer sent it: ${policy.pushed_by}.` : "")];
     if (policy.differs) parts.push(h("p", { class: "bad" }, `The policy was made for another specification, which differs in ${policy.differs}.`));
     parts.push(table(`Real episodes of version ${policy.version}`, [["actions of", ""], ["environment", ""], ["starts", ""], ["episodes", "num"], ["mean return (95 %)", "num"], ["success", "num"], ["real steps", "num"], ["", ""]],
       policy.evaluations.map((each) => [ACTING[each.controller], each.own ? "its own" : each.environment, each.note || "–", each.episodes, meanWords(each), percent(each.success_rate), each.steps, episodesOf(policy, each)]), "No real episodes yet; run some with surrogym evaluate."));

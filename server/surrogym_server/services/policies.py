@@ -9,14 +9,22 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from surrogym_server.errors import Damaged, InvalidInput, NotThere, SpecConflict, UnknownPolicy
+from surrogym_server.errors import Damaged, Forbidden, InvalidInput, NotThere, SpecConflict, UnknownPolicy
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.policy_files import check_file
 from surrogym_server.services.surrogates import Complete, difference, short
-from surrogym_server.storage.policies import LATEST, EvaluationRecord, NewEvaluation, PolicyFile, PolicyRecord
+from surrogym_server.storage.policies import (
+    LATEST,
+    PUSHED_BY,
+    EvaluationRecord,
+    NewEvaluation,
+    PolicyFile,
+    PolicyRecord,
+)
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import JSON
 from surrogym_shared import intervals
+from surrogym_shared.checks import trace_fault
 from surrogym_shared.environments import is_name, is_same
 
 MUST_AGREE = ("observation", "action")  # of two specifications: a policy's inputs and outputs
@@ -50,15 +58,15 @@ class PolicyService:
         self._notices = notices
         self._most_bytes = most_bytes
 
-    def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile) -> tuple[PolicyRecord, bool]:
-        """Store a policy before its file is sent. Returns it, and whether it is new: a policy with the same file is
-        known.
+    def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile, by: str) -> tuple[PolicyRecord, bool]:
+        """Store a policy before its file is sent. Returns it, and whether it is new: a policy with the same file, card
+        and curve is known. ``by`` says who stores it.
 
         Raises:
             SpecConflict: it was made for a specification with other observations or actions.
         """
         differs = self._difference(name, card["spec"])
-        kept = {**card, "spec": card["spec"] if differs else None, "differs": differs}
+        kept = {**card, "spec": card["spec"] if differs else None, "differs": differs, PUSHED_BY: by}
         version, created, freed = self._storage.policies.add(name, kept, curve, file)
         self._changed(name, freed)
         return self._storage.policies.get(name, str(version)), created
@@ -71,14 +79,21 @@ class PolicyService:
         """Return a policy. Raises ``UnknownPolicy``."""
         return self._storage.policies.get(name, which)
 
-    def put_file(self, name: str, version: int, file: PolicyFile, content: bytes) -> PolicyRecord:
-        """Store an announced file. ``add`` announces a policy's own file.
+    def put_file(
+        self, name: str, version: int, file: PolicyFile, content: bytes, by: str | None = None
+    ) -> PolicyRecord:
+        """Store an announced file. ``add`` announces a policy's own file. ``by`` says who sends it; None may add to any
+        policy.
 
         Raises:
+            Forbidden: somebody else stored the policy.
             InvalidInput: it differs from the announcement, or does not have its form.
             TooLarge: there is no room for it.
         """
         record = self._storage.policies.get(name, str(version))
+        owner = record.card.get(PUSHED_BY, by)
+        if by not in (None, owner):
+            raise Forbidden(f"expected the token that stored version {version}, {owner}, or an admin's, got {by}")
         own = next((known for known in record.files if known.form == file.form and known.main), None)
         if own is not None and own.digest != file.digest:
             raise InvalidInput(f"expected the file that version {version} was announced with, got a different file")
@@ -112,7 +127,7 @@ class PolicyService:
             InvalidInput: lists of different lengths.
             TooLarge: there is no room for it.
         """
-        _require_lengths(episodes)
+        _require_lengths(episodes, self._storage.surrogates.get(name).spec)
         episodewise = {name: getattr(episodes, name) for name in ("returns", "lengths", "success", "traces")}
         content = json.dumps(episodewise, separators=(",", ":")).encode()
         digest = hashlib.sha256(content).hexdigest()
@@ -215,17 +230,18 @@ class PolicyService:
         self._notices.post(name)
 
 
-def _require_lengths(episodes: Episodes) -> None:
+def _require_lengths(episodes: Episodes, spec: JSON) -> None:
+    """Check that lists belong together, and that traces have the specification's numbers of coordinates and actions."""
     count = len(episodes.returns)
     for what in ("lengths", "success"):
         values = getattr(episodes, what)
         if values is not None and len(values) != count:
             raise InvalidInput(f"{what}: expected one entry for each of {count} returns, got {len(values)}")
+    action = spec["action"]
+    sizes = {"c": len(spec["coordinates"]), "f": len(action.get("low") or action.get("nvec") or (0,))}
     for number, trace in enumerate(episodes.traces):
-        steps = len(trace["reward"])
-        if (len(trace["coordinates"]), len(trace["action"])) != (steps + 1, steps):
-            came = f"{len(trace['coordinates'])} states and {len(trace['action'])} actions"
-            raise InvalidInput(f"traces.{number}: expected {steps + 1} states and {steps} actions, got {came}")
+        if fault := trace_fault(trace["coordinates"], trace["action"], trace["reward"], **sizes):
+            raise InvalidInput(f"traces.{number}: {fault}")
 
 
 def _summary(episodes: Episodes) -> JSON:

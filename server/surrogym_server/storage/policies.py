@@ -15,6 +15,7 @@ from surrogym_server.storage.records import JSON
 MAX_POLICIES = 200  # of a surrogate
 MAX_EVALUATIONS = 100  # of a policy
 LATEST = "latest"
+PUSHED_BY = "pushed_by"  # entry of a card: who stored it
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class Policies(ABC):
     def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile) -> tuple[int, bool, Freed]:
         """Store a policy before its ``file`` is sent. Returns its version, and whether that is new.
 
-        A main file with the same digest is the same policy: it keeps its version, and gets this card and curve. Beyond
+        A version never changes. The same main file, card and curve are the same version, whoever stores them. Beyond
         ``MAX_POLICIES`` the oldest policy without an alias is removed.
 
         Raises:
@@ -87,12 +88,13 @@ class Policies(ABC):
 
     @abstractmethod
     def attach(self, name: str, version: int, file: PolicyFile, most: int) -> Freed:
-        """Store a file of a policy. It replaces a file of the same form.
+        """Store a file of a policy. A file of this form that was stored or announced is the same one.
 
         If the files of the surrogate's policies then exceed ``most`` bytes together, files of the oldest policies
         without an alias are removed first. Their descriptions stay.
 
         Raises:
+            InvalidInput: the policy has another file of this form.
             TooLarge: the files of policies with aliases and of this one exceed the limit.
         """
 

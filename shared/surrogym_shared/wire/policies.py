@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire.base import VISIBLE, Key, Measured, Reply, Request, Vector
+from surrogym_shared.wire.base import MAX_MEASURED, VISIBLE, Key, Measured, Reply, Request, Vector
 
 PolicyForm = Literal["zip", "onnx", "pt2", "mp4", "gif"]  # endings of policy files
 Controller = Literal["policy", "zero", "random", "reference"]
@@ -22,6 +22,7 @@ MAX_CURVE = 500
 MAX_EPISODES = 10_000
 MAX_TRACE = 10_000  # most steps of one episode's trace
 MAX_TRACES = 16
+CARD_DEPTH = 8  # levels of lists and objects in the settings of a card
 
 
 class PolicyPromise(BaseModel):
@@ -116,7 +117,7 @@ class FileNotice(Request):
 class AddPolicy(Request):
     """A policy: its card, its training curve, and the announcement of its file.
 
-    If the server has this file already, the policy keeps its version, and its card and curve are replaced.
+    A version never changes: if the server has this file with another card or curve, this is a new version.
     """
 
     model_config = ConfigDict(extra="forbid", strict=False)  # the card validates its own types
@@ -124,6 +125,40 @@ class AddPolicy(Request):
     card: PushedCard = Field(description="settings and results of the training")
     curve: list[CurvePoint] = Field(default=[], max_length=MAX_CURVE, description="curve of the training")
     file: FileNotice = Field(description="announcement of the policy's file")
+
+    @field_validator("card")
+    @classmethod
+    def _sane(cls, card: PushedCard) -> PushedCard:
+        """Refuse numbers that are not finite or are too large, also within the settings, which have any form."""
+        _require_sane("card", card.model_dump(exclude={"spec"}), CARD_DEPTH)
+        promises = [card.promise, *((card.audit.before, card.audit.after) if card.audit else ())]
+        for promise in [one for one in promises if one is not None]:
+            if not promise.low <= promise.median <= promise.high:
+                came = f"{promise.low:g}, {promise.median:g} and {promise.high:g}"
+                raise ValueError(f"expected a promise with low <= median <= high, got {came}")
+        return card
+
+    @field_validator("curve")
+    @classmethod
+    def _sane_curve(cls, curve: list[CurvePoint]) -> list[CurvePoint]:
+        _require_sane("curve", [point.model_dump() for point in curve], CARD_DEPTH)
+        return curve
+
+
+def _require_sane(place: str, value: Any, depth: int) -> None:
+    """Require finite numbers of at most ``MAX_MEASURED`` and text without NUL, at most ``depth`` levels deep."""
+    if depth < 0:
+        raise ValueError(f"{place}: expected at most {CARD_DEPTH} levels of lists and objects, got more")
+    if isinstance(value, dict):
+        for name, each in value.items():
+            _require_sane(f"{place}.{name}", each, depth - 1)
+    elif isinstance(value, (list, tuple)):
+        for number, each in enumerate(value):
+            _require_sane(f"{place}.{number}", each, depth - 1)
+    elif isinstance(value, (int, float)) and not abs(value) <= MAX_MEASURED:  # NaN compares false
+        raise ValueError(f"{place}: expected a finite number of at most {MAX_MEASURED:g} in size, got {value:g}")
+    elif isinstance(value, str) and "\0" in value:
+        raise ValueError(f"{place}: expected text without the character NUL, got {value[:40]!r}")
 
 
 class EpisodeTrace(Request):
@@ -271,6 +306,11 @@ class PolicyView(Reply):
     differs: str | None = Field(
         description="difference between the specification that the policy was trained for and the surrogate's; "
         "null if there is none"
+    )
+    pushed_by: str | None = Field(
+        default=None,
+        description="who stored it: role and fingerprint of the token, or ``anybody`` without tokens; null for "
+        "policies of earlier programs",
     )
     files: list[PolicyFileView] = Field(description="files of the policy")
     evaluations: list[EvaluationView] = Field(

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 
@@ -74,8 +75,33 @@ def test_a_policy_is_given_out_as_it_came(api: Api, surrogate: str, tmp_path: Pa
     assert api.policies.file(surrogate, "latest", "zip") == file
     found = api.policies.get(surrogate, 1)
     assert (found.settings, found.curve) == ({"units": 4}, curve)
-    again = api.policies.push(surrogate, card(reason="audited"), curve, "zip", file)
-    assert (again.version, again.created, again.reason) == (1, False, "audited")
+    again = api.policies.push(surrogate, card(settings={"units": 4}), curve, "zip", file)
+    assert (again.version, again.created, again.pushed_by) == (1, False, "anybody")
+    audited = api.policies.push(surrogate, card(reason="audited"), curve, "zip", file)
+    assert (audited.version, audited.created, audited.reason) == (2, True, "audited")
+    assert [one.stored for one in audited.files] == [True]
+    assert api.policies.get(surrogate, 1) == found
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ('"settings": {"rate": [NaN]}', "card.settings.rate.0"),
+        ('"settings": {"rate": 1e999}', "card.settings.rate"),
+        ('"imagined_return": 1e308', "card.imagined_return"),
+        ('"promise": {"median": 2, "low": 3, "high": 4}', "low <= median <= high"),
+        ('"settings": {"a": "\\u0000"}', "NUL"),
+        ('"settings": ' + 20 * '{"a":' + "1" + 20 * "}", "levels"),
+    ],
+)
+def test_a_card_with_impossible_values_is_refused(client: httpx.Client, surrogate: str, fields: str, named: str):
+    body = f'{{"card": {{{fields}}}, "file": {{"form": "zip", "bytes": 1, "digest": "{"0" * 64}"}}}}'
+    reply = client.post(
+        f"/v1/surrogates/{surrogate}/policies", content=body, headers={"content-type": "application/json"}
+    )
+    assert reply.status_code == 422
+    assert named in reply.json()["detail"]
+    assert client.get(f"/v1/surrogates/{surrogate}/policies").json()["policies"] == []
 
 
 def test_an_audit_is_given_out_as_it_came(api: Api, surrogate: str, tmp_path: Path):
@@ -228,9 +254,15 @@ def test_lists_that_do_not_belong_together_change_nothing(api: Api, surrogate: s
     api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
     with pytest.raises(InvalidInput, match="lengths: expected one entry for each of 3 returns, got 2"):
         api.policies.evaluate(surrogate, 1, episodes(lengths=[200, 200]))
-    trace = wire.EpisodeTrace(rank="best", seed=1, coordinates=[[0.0, 0.0]], action=[[1.0]], reward=[0.0])
-    with pytest.raises(InvalidInput, match=r"traces.0: expected 2 states and 1 actions, got 1 states"):
-        api.policies.evaluate(surrogate, 1, episodes(traces=[trace]))
+    for ragged in (
+        {"coordinates": [[0.0, 0.0]], "action": [[1.0]]},
+        {"coordinates": [[0.0, 0.0], [0.0]], "action": [[1.0]]},
+        {"coordinates": [[0.0, 0.0, 0.0]] * 2, "action": [[1.0]]},
+        {"coordinates": [[0.0, 0.0]] * 2, "action": [[1.0, 2.0]]},
+    ):
+        trace = wire.EpisodeTrace(rank="best", seed=1, reward=[0.0], **ragged)
+        with pytest.raises(InvalidInput, match=r"traces.0: expected 2 states of 2 and 1 actions of 1 numbers"):
+            api.policies.evaluate(surrogate, 1, episodes(traces=[trace]))
     assert api.policies.get(surrogate, 1).evaluations == []
 
 

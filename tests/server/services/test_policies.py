@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from surrogym_server.errors import TooLarge, Unavailable
+from surrogym_server.errors import Forbidden, TooLarge, Unavailable
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.policies import Episodes, PolicyService
 from surrogym_server.storage.policies import PolicyFile
@@ -15,7 +15,7 @@ from surrogym_server.storage.port import Storage
 
 NAME = "pendulum"
 GIF = b"GIF89a and so on"
-EPISODES = Episodes("policy", "", True, 0, [-1.0], [3], None, [])
+EPISODES = Episodes("policy", "", True, "", True, 0, [-1.0], [3], None, [])
 
 
 class Silent(Notices):
@@ -30,7 +30,7 @@ def service(storage: Storage, most: int = 10_000) -> tuple[PolicyService, Policy
     """With a policy whose file is to come."""
     file = PolicyFile("gif", len(GIF), hashlib.sha256(GIF).hexdigest())
     policies = PolicyService(storage, lambda spec: spec, Silent(), most)
-    policies.add(NAME, {"spec": None}, [], file)
+    policies.add(NAME, {"spec": None}, [], file, by="train one")
     return policies, file
 
 
@@ -72,3 +72,13 @@ def test_file_that_is_refused_leaves_nothing(storage: Storage):
     with pytest.raises(TooLarge):
         policies.put_file(NAME, 1, file, GIF)
     assert storage.blobs.older(-1.0) == set()
+
+
+def test_only_who_stored_a_version_adds_files_to_it(storage: Storage):
+    policies, file = service(storage)
+    with pytest.raises(Forbidden, match="train one"):
+        policies.put_file(NAME, 1, file, GIF, by="train two")
+    assert [one.blob for one in policies.get(NAME, "1").files] == [None]
+    policies.put_file(NAME, 1, file, GIF, by="train one")
+    policies.put_file(NAME, 1, file, GIF)
+    assert policies.file(NAME, "1", "gif") == (1, GIF)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from surrogym_server.errors import Damaged, TooLarge, UnknownPolicy, UnknownSurrogate
+from surrogym_server.errors import Damaged, InvalidInput, TooLarge, UnknownPolicy, UnknownSurrogate
 from surrogym_server.storage.policies import NewEvaluation, PolicyFile
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
@@ -50,14 +50,20 @@ def test_a_policy_comes_back_with_card_curve_and_file(storage: Storage, make: Ma
     assert storage.policies.blobs() == {stored.blob}
 
 
-def test_the_same_file_again_is_the_same_policy_with_the_newer_card(storage: Storage, make: Make) -> None:
+def test_a_stored_version_never_changes(storage: Storage, make: Make) -> None:
     name = make()
     pushed(storage, name, b"one")
-    version, created, _ = storage.policies.add(name, {"algorithm": "SAC"}, [], file_of(b"one"))
-    assert (version, created) == (1, False)
-    found = storage.policies.get(name, "1")
-    assert found.card == {"algorithm": "SAC"}
-    assert found.files[0].blob is not None  # the file stays
+    storage.policies.put_alias(name, "production", 1)
+    before = storage.policies.get(name, "production")
+    again = storage.policies.add(name, {**CARD, "pushed_by": "another"}, [], file_of(b"one"))
+    assert again == (1, False, ())
+    other = storage.policies.add(name, {"algorithm": "SAC"}, [], file_of(b"one"))
+    assert other == (2, True, ())
+    assert storage.policies.add(name, {"algorithm": "SAC"}, [], file_of(b"one")) == (2, False, ())
+    blob = storage.blobs.put(b"another")
+    with pytest.raises(InvalidInput, match="never replaced"):
+        storage.policies.attach(name, 1, file_of(b"another", blob=blob), PLENTY)
+    assert storage.policies.get(name, "production") == before
 
 
 def test_a_version_is_never_used_again(storage: Storage, make: Make) -> None:

@@ -9,12 +9,13 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
-from surrogym_server.errors import TooLarge, UnknownPolicy
+from surrogym_server.errors import InvalidInput, TooLarge, UnknownPolicy
 from surrogym_server.storage import policies as port
 from surrogym_server.storage.policies import (
     LATEST,
     MAX_EVALUATIONS,
     MAX_POLICIES,
+    PUSHED_BY,
     EvaluationRecord,
     Freed,
     NewEvaluation,
@@ -36,11 +37,8 @@ class SqlPolicies(port.Policies):
     def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile) -> tuple[int, bool, Freed]:
         with self._database.write() as connection:
             held = hold(connection, name)
-            known = _known(connection, held.id, file.digest)
+            known = _known(connection, held.id, card, curve, file.digest)
             if known is not None:
-                update = sa.update(policies).where(_own(policies, held.id, known))
-                connection.execute(update.values(card=card, curve=curve))
-                append_event(connection, held, "policy", version=known, what="card")
                 return known, False, ()
             freed = _make_place(connection, held.id, name)
             version = _next_version(connection, held.id)
@@ -66,10 +64,15 @@ class SqlPolicies(port.Policies):
             held = hold(connection, name)
             _require(connection, held.id, name, version)
             own = _own(policy_files, held.id, version) & (policy_files.c.form == file.form)
-            before = connection.execute(sa.select(policy_files.c.blob, policy_files.c.main).where(own)).one_or_none()
+            before = connection.execute(sa.select(policy_files).where(own)).one_or_none()
             if before is None:
                 place = {"surrogate_id": held.id, "version": version, "main": False}
                 connection.execute(sa.insert(policy_files).values(**place, **_of_file(file)))
+            elif before.digest != file.digest:
+                raise InvalidInput(
+                    f"expected the {file.form} file that version {version} has, got another one: "
+                    "what was stored is never replaced"
+                )
             else:
                 connection.execute(sa.update(policy_files).where(own).values(**_of_file(file)))
             freed = _within(connection, held.id, version, most, name)
@@ -148,11 +151,20 @@ def _of_file(file: PolicyFile) -> dict[str, Any]:
     return {"form": file.form, "bytes": file.bytes, "digest": file.digest, "blob": file.blob}
 
 
-def _known(connection: Connection, surrogate: int, digest: str) -> int | None:
-    """The version with this file."""
+def _known(connection: Connection, surrogate: int, card: JSON, curve: list[JSON], digest: str) -> int | None:
+    """The newest version with this file, card and curve."""
     files = policy_files.c
     same = sa.select(files.version).where(files.surrogate_id == surrogate, files.digest == digest, files.main)
-    return connection.execute(same.limit(1)).scalar()
+    own = (policies.c.surrogate_id == surrogate) & policies.c.version.in_(same)
+    wanted = sa.select(policies.c.version, policies.c.card, policies.c.curve).where(own)
+    for row in connection.execute(wanted.order_by(policies.c.version.desc())):
+        if (_without_owner(row.card), row.curve) == (_without_owner(card), curve):
+            return int(row.version)
+    return None
+
+
+def _without_owner(card: JSON) -> JSON:
+    return {name: value for name, value in card.items() if name != PUSHED_BY}
 
 
 def _resolve(connection: Connection, surrogate: int, name: str, which: str) -> int:
