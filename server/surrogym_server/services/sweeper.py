@@ -46,7 +46,7 @@ class Sweeper:
         await self._try(self._sweep_leases)
         await self._try(self._find_changes)
         await self._try(partial(asyncio.to_thread, self._sweep_files))
-        await self._try(partial(asyncio.to_thread, self._prune_events))
+        await self._try(partial(asyncio.to_thread, self._prune))
 
     async def _sweep_leases(self) -> None:
         self._metrics.expired_leases += await asyncio.to_thread(self._storage.queries.sweep_expired)
@@ -77,11 +77,14 @@ class Sweeper:
         if orphans:
             logger.info("files removed that belonged to deleted policies: %d", len(orphans))
 
-    def _prune_events(self) -> None:
-        """Once in ``PRUNE_SECONDS``, remove the oldest events of surrogates that have more than ``EVENTS_KEPT``."""
+    def _prune(self) -> None:
+        """Once in ``PRUNE_SECONDS``, remove the oldest events of surrogates that have more than ``EVENTS_KEPT``, and
+        what a crash has left of deleted surrogates."""
         now = time.monotonic()
         if now - self._pruned < PRUNE_SECONDS:
             return
         self._pruned = now
+        if completed := self._storage.surrogates.complete_removals():
+            logger.info("surrogates whose removal was interrupted: %d", completed)
         if removed := self._storage.events.prune(EVENTS_KEPT):
             logger.info("old events removed: %d", removed)

@@ -61,6 +61,9 @@ class Surrogates(ABC):
     def create(self, new: NewSurrogate) -> tuple[SurrogateRecord, bool]:
         """Create a surrogate in phase ``collecting`` with its initial queries, and return whether it is new.
 
+        Many queries are queued in several transactions, so that they block no writer for long. No fit is due before
+        all are there. If a crash interrupts it, ``Designs.unbegun`` has the surrogate, and ``ask_first`` continues.
+
         If the name is taken, return the existing surrogate unchanged, and False. The caller checks whether it is the
         same.
         """
@@ -114,7 +117,14 @@ class Surrogates(ABC):
 
     @abstractmethod
     def delete(self, name: str) -> None:
-        """Delete the surrogate and everything that belongs to it."""
+        """Delete the surrogate and everything that belongs to it.
+
+        Its name is free at once. Its rows are removed in transactions that block no writer for long.
+        """
+
+    @abstractmethod
+    def complete_removals(self) -> int:
+        """Remove what a crash has left of deleted surrogates. Returns the number of these surrogates."""
 
 
 class Designs(ABC):
@@ -169,14 +179,15 @@ class Designs(ABC):
 
     @abstractmethod
     def unbegun(self) -> list[str]:
-        """Return the names of surrogates whose design has a budget but never had a query, oldest first.
+        """Return the names of surrogates whose design lacks initial queries, oldest first.
 
-        Such a surrogate is collecting and not paused, and has no samples: it was created with a budget of 0.
+        Such a surrogate has a budget but never had a query, is collecting and not paused, and has no samples: it was
+        created with a budget of 0. Or a crash has interrupted ``Surrogates.create`` a minute ago or earlier.
         """
 
     @abstractmethod
     def ask_first(self, name: str, coordinates: Array, action: Array, rollouts: Sequence[Array]) -> None:
-        """Queue the initial queries of an ``unbegun`` surrogate. If it is no longer unbegun, nothing changes."""
+        """Queue the initial queries of an ``unbegun`` surrogate that are missing. If none are, nothing changes."""
 
     @abstractmethod
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:

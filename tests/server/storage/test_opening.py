@@ -323,3 +323,21 @@ def test_a_killed_writer_loses_nothing_it_acknowledged(url: str) -> None:
     storage.close()
     assert {int(id): float(number) for number, id in acknowledged}.items() <= stored.items()
     assert len(stored) <= len(acknowledged) + 1, "at most the one that was on its way"
+
+
+def test_a_pipe_is_refused_instead_of_waiting_for_its_other_end(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InvalidInput, match=r"expected a file for the database, got .*pipe"):
+        open_storage(f"sqlite:///{tmp_path}/pipe")
+
+
+def test_both_databases_refuse_the_same_values_in_the_same_words(storage: Storage) -> None:
+    said = set()
+    for name in ("nul \0", "half \ud800"):
+        with pytest.raises(InvalidInput) as refused:
+            storage.surrogates.create(NewSurrogate(name, {}, 1, 0.9))
+        said.add(str(refused.value))
+    with pytest.raises(InvalidInput) as refused:
+        storage.surrogates.name_of(2**64)
+    assert said == {str(refused.value)} == {database.STORABLE}
+    assert storage.surrogates.summaries() == []

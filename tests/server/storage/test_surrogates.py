@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import ModuleType
 
 import numpy as np
 import pytest
+import sqlalchemy as sa
 
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewSurrogate
+from surrogym_server.storage.sql import designs, initial, removal
+from surrogym_server.storage.sql.tables import metadata, surrogates
+
+NAME = "pendulum"
 
 
 def test_a_new_surrogate_is_collecting_with_its_initial_queries(storage: Storage, make: Callable[..., str]) -> None:
@@ -141,3 +149,83 @@ def test_every_operation_refuses_an_unknown_surrogate(storage: Storage, by_hand:
     for operation in operations:
         with pytest.raises(UnknownSurrogate, match="'no'"):
             operation()
+
+
+def test_many_initial_queries_are_queued_in_bounded_transactions_and_after_a_crash(
+    storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(initial, "BATCH", 10)
+    unbegun = sa.select(surrogates.c.name).where(designs.IS_UNBEGUN | initial.IS_INCOMPLETE)
+    monkeypatch.setattr(designs, "UNBEGUN", unbegun)  # without the minute in which the creating server may be alive
+    planned = np.arange(70.0).reshape(35, 2), np.full((35, 1), 0.5)
+    with committed(storage) as commits:
+        whole = make(queries=35, name="whole")
+    assert len(commits) >= 4
+    with monkeypatch.context() as patched:
+        crash_at(patched, initial, "insert_queries", call=3)
+        with pytest.raises(ZeroDivisionError):
+            make(queries=35)
+    assert storage.queries.counts(NAME).pending == 20
+    answer_all(NAME)
+    assert storage.designs.due() == []
+    assert storage.designs.unbegun() == [NAME]
+    storage.designs.ask_first(NAME, *planned, ())
+    assert storage.designs.unbegun() == []
+    for name in (whole, NAME):
+        assert [query.coordinates for query in storage.queries.list(name)] == [tuple(row) for row in planned[0]]
+    answer_all(NAME)
+    assert storage.designs.due() == [NAME]
+
+
+def test_a_surrogate_is_deleted_in_bounded_transactions_and_after_a_crash(
+    storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(removal, "BATCH", 10)
+    kept, whole = make(name="kept"), make(queries=35, name="whole")
+    with committed(storage) as commits:
+        storage.surrogates.delete(whole)
+    assert len(commits) >= 4
+    old = storage.surrogates.get(make(queries=35)).id
+    answer_all(NAME)
+    with monkeypatch.context() as patched:
+        crash_at(patched, removal, "_remove_some", call=12)
+        with pytest.raises(ZeroDivisionError):
+            storage.surrogates.delete(NAME)
+    assert [one.name for one in storage.surrogates.summaries()] == [kept]
+    with pytest.raises(UnknownSurrogate):
+        storage.surrogates.name_of(old)
+    make(queries=2)
+    assert storage.surrogates.complete_removals() == 1
+    assert storage.surrogates.complete_removals() == 0
+    owners = {storage.surrogates.get(name).id for name in (kept, NAME)}
+    with storage._database.read() as connection:  # type: ignore[attr-defined]
+        assert {*connection.execute(sa.select(surrogates.c.id)).scalars()} == owners
+        for table in metadata.sorted_tables:
+            if "surrogate_id" in table.c:
+                assert {*connection.execute(sa.select(table.c.surrogate_id)).scalars()} <= owners
+
+
+def crash_at(patched: pytest.MonkeyPatch, module: ModuleType, function: str, call: int) -> None:
+    """Let a call of a function raise, counted from 1."""
+    calls, proper = itertools.count(1), getattr(module, function)
+
+    def crashing(*arguments: object, **options: object) -> object:
+        if next(calls) == call:
+            raise ZeroDivisionError
+        return proper(*arguments, **options)
+
+    patched.setattr(module, function, crashing)
+
+
+@contextmanager
+def committed(storage: Storage) -> Iterator[list[object]]:
+    """The transactions that a storage commits within the context."""
+    commits: list[object] = []
+    engine = storage._database._engine  # type: ignore[attr-defined]
+
+    def note(connection: object) -> None:
+        commits.append(connection)
+
+    sa.event.listen(engine, "commit", note)
+    yield commits
+    sa.event.remove(engine, "commit", note)

@@ -30,13 +30,15 @@ from surrogym_server.storage.sql.write_ahead_log import marks
 
 BUSY_SECONDS = 5  # wait of a statement for locks of other programs or threads
 STALLED_SECONDS = 10  # PostgreSQL ends a transaction whose process has stopped, and its locks with it
-BATCH = 500  # rows that one transaction writes or removes at most, where there may be many
+BATCH = 250  # rows that one transaction writes or removes at most, where there may be many
 PAUSE_SECONDS = 0.002  # in which a waiting writer takes its turn
 POOL = {"pool_size": 8, "max_overflow": 56, "pool_timeout": BUSY_SECONDS}
 POSTGRESQL = {  # text is UTF-8 whatever the database's encoding; if that is SQL_ASCII, psycopg would return bytes
     "client_encoding": "utf8",
     "connect_timeout": BUSY_SECONDS,
 }
+
+STORABLE = "expected text without the character NUL and without halves of characters, and whole numbers below 2^63"
 
 CLOCKS = {
     "sqlite": "((julianday('now') - 2440587.5) * 86400.0)",
@@ -189,7 +191,7 @@ class Database:
         try:
             yield
         except UNSTORABLE as error:
-            raise InvalidInput(f"expected a value the database can store: {_reason(error)}") from error
+            raise InvalidInput(STORABLE) from error
         except UnicodeDecodeError as error:  # SQLite's message contains a damaged name, which the driver can't decode
             raise self._damaged(error.object.decode(errors="replace"), pages=True) from error
         except sa.exc.TimeoutError as error:
@@ -244,11 +246,14 @@ def _sqlite(path: Path, synchronous: Synchronous) -> Database:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise Unavailable(f"expected a folder for the database, got {path.parent}: {error}") from None
+    if path.exists() and not (path.is_file() or path.is_dir()):  # opening a pipe would wait for ever
+        raise InvalidInput(f"expected a file for the database, got {path}, which is a pipe, a socket or a device")
     lock = FileLock(path)
     engine = sa.create_engine(URL.create("sqlite", database=str(path)), connect_args={"timeout": BUSY_SECONDS}, **POOL)
     sa.event.listen(engine, "do_connect", lambda *_: lock.require_in_place())  # or SQLite would create another file
     sa.event.listen(engine, "connect", partial(_prepare_sqlite, synchronous))
     sa.event.listen(engine, "begin", _begin_sqlite)
+    sa.event.listen(engine, "before_cursor_execute", _require_storable)
     recover = f"sqlite3 {shlex.quote(str(path))} .recover | sqlite3 recovered.db"
     return Database(engine, lock, way_out=f"restore a copy of the file, or save what can be read: {recover}")
 
@@ -257,6 +262,20 @@ def _prepare_sqlite(synchronous: Synchronous, connection: Any, _: object) -> Non
     connection.isolation_level = None  # the driver starts no transactions; _begin_sqlite does
     for pragma in ("journal_mode=WAL", f"synchronous={synchronous}", "foreign_keys=ON"):
         connection.execute(f"PRAGMA {pragma}").close()
+
+
+def _require_storable(_: Connection, __: Any, ___: str, parameters: Any, *____: Any) -> None:
+    """Refuse what PostgreSQL can't store, so that both databases take the same. SQLite would store NUL."""
+    if _has_nul(parameters):
+        raise InvalidInput(STORABLE)
+
+
+def _has_nul(value: Any) -> bool:
+    if isinstance(value, str):
+        return "\0" in value
+    if isinstance(value, dict):
+        return any(map(_has_nul, value.values()))
+    return isinstance(value, (tuple, list)) and any(map(_has_nul, value))
 
 
 def _begin_sqlite(connection: Connection) -> None:

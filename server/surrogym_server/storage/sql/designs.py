@@ -22,12 +22,15 @@ from surrogym_server.storage.records import (
     SurrogateRecord,
     fingerprint,
 )
+from surrogym_server.storage.sql import initial
 from surrogym_server.storage.sql import surrogates as stored
 from surrogym_server.storage.sql.database import NOW, Database, constant
 from surrogym_server.storage.sql.models import insert_model
+from surrogym_server.storage.sql.removal import NO_RIGHT
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, recall, remember, touch
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
 
+INTERRUPTED_SECONDS = 60.0  # after which initial queries that are not all queued are those of a server that has died
 # conditions on a row of surrogates
 OWN_QUERIES = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogates.c.id)
 OWN_SAMPLES = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogates.c.id)
@@ -44,6 +47,7 @@ IS_DUE = sa.and_(  # the law of ``Designs.due``
     _EXPIRES.is_(None) | (_EXPIRES <= NOW) | _SET_BACK,
     sa.exists(OWN_SAMPLES),
     ~OPEN_QUERY | (surrogates.c.logged_revision > surrogates.c.fitted_revision),
+    ~initial.IS_INCOMPLETE,
 )
 DUE = sa.select(surrogates.c.name).where(IS_DUE).order_by(surrogates.c.id)
 IS_HOPELESS = sa.and_(
@@ -52,6 +56,7 @@ IS_HOPELESS = sa.and_(
     sa.exists(OWN_QUERIES.where(queries.c.status.in_([constant(status) for status in ("set_aside", "refused")]))),
     ~OPEN_QUERY,
     ~sa.exists(OWN_SAMPLES),
+    ~initial.IS_INCOMPLETE,
 )
 IS_UNBEGUN = sa.and_(
     surrogates.c.phase == constant("collecting"),
@@ -59,8 +64,10 @@ IS_UNBEGUN = sa.and_(
     surrogates.c.budget > 0,
     ~sa.exists(OWN_QUERIES),
     ~sa.exists(OWN_SAMPLES),
+    ~initial.IS_INCOMPLETE,
 )
-UNBEGUN = sa.select(surrogates.c.name).where(IS_UNBEGUN).order_by(surrogates.c.id)
+INTERRUPTED = initial.IS_INCOMPLETE & (surrogates.c.created_at < NOW - INTERRUPTED_SECONDS)
+UNBEGUN = sa.select(surrogates.c.name).where(IS_UNBEGUN | INTERRUPTED).order_by(surrogates.c.id)
 HOPELESS = sa.select(surrogates.c.name).where(IS_HOPELESS).order_by(surrogates.c.id)
 
 
@@ -109,7 +116,8 @@ class SqlDesigns(port.Designs):
         with self._database.write() as connection:
             held = hold(connection, name)
             if connection.execute(sa.select(surrogates.c.id).where(surrogates.c.id == held.id, IS_UNBEGUN)).first():
-                insert_queries(connection, held, "initial", 0, coordinates, action, rollouts)
+                initial.begin(connection, held, coordinates, action, rollouts)
+        initial.ask(self._database, name, coordinates, action, rollouts)
 
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
         with self._database.write() as connection:
@@ -150,7 +158,7 @@ class SqlDesigns(port.Designs):
             except (LeaseExpired, UnknownSurrogate):
                 return
             seen = {} if error is None else {"fitted_revision": lease.revision}
-            _update(connection, held, **stored.NO_RIGHT, **seen)
+            _update(connection, held, **NO_RIGHT, **seen)
             stored.update_phase(connection, held, _phase_after(held, error), error)
 
 
@@ -191,7 +199,7 @@ def _finish(connection: Connection, held: Row[Any], lease: FitLease, design: New
     _update(
         connection,
         held,
-        **stored.NO_RIGHT,
+        **NO_RIGHT,
         state=design.state,
         phase=design.phase,
         error=None,

@@ -18,6 +18,7 @@ from surrogym_server.storage.live_sessions import (
 )
 from surrogym_server.storage.sql.database import NOW, Database, conflict_insert
 from surrogym_server.storage.sql.expiry import has_ended, shorten
+from surrogym_server.storage.sql.removal import IS_THERE
 from surrogym_server.storage.sql.tables import live_sessions as live
 from surrogym_server.storage.sql.tables import surrogates
 
@@ -113,7 +114,9 @@ def _held(update: sa.Update, lease: SessionLease) -> sa.Update:
 
 def _require_surrogate(connection: Connection, id: int) -> None:
     """Keep the surrogate from being deleted until the transaction ends. Raises ``UnknownSurrogate``."""
-    wanted = sa.select(surrogates.c.id).where(surrogates.c.id == id).with_for_update(read=True, key_share=True)
+    wanted = (
+        sa.select(surrogates.c.id).where(surrogates.c.id == id, IS_THERE).with_for_update(read=True, key_share=True)
+    )
     if connection.execute(wanted).one_or_none() is None:
         raise UnknownSurrogate(f"expected the id of a surrogate, got {id}, which is not there")
 

@@ -15,6 +15,7 @@ from surrogym_server.storage import port
 from surrogym_server.storage.records import ModelRecord, NewModel
 from surrogym_server.storage.sql.damage import damaged
 from surrogym_server.storage.sql.database import Database
+from surrogym_server.storage.sql.removal import NAMELESS
 from surrogym_server.storage.sql.rows import Span, append_event, find, hold, touch, within
 from surrogym_server.storage.sql.tables import models
 
@@ -49,7 +50,7 @@ class SqlModels(port.Models):
     def newest(self) -> dict[int, int]:
         with self._database.read() as connection:
             newest = sa.select(models.c.surrogate_id, sa.func.max(models.c.version))
-            wanted = newest.where(INTACT).group_by(models.c.surrogate_id)
+            wanted = newest.where(INTACT, models.c.surrogate_id.not_in(NAMELESS)).group_by(models.c.surrogate_id)
             return {int(surrogate): int(version) for surrogate, version in connection.execute(wanted)}
 
     def blob(self, name: str, version: int | None = None) -> bytes:

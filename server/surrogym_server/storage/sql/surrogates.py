@@ -10,14 +10,14 @@ from sqlalchemy.engine import Connection, Row
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage import port
 from surrogym_server.storage.records import FREE, NewSurrogate, Phase, Standing, SurrogateRecord, SurrogateSummary
+from surrogym_server.storage.sql import initial, removal
 from surrogym_server.storage.sql.database import NOW, Database, conflict_insert
 from surrogym_server.storage.sql.leases import is_unbegun, requeue_set_aside
-from surrogym_server.storage.sql.rows import NAMED, append_event, hold, insert_queries, touch, unknown_surrogate
+from surrogym_server.storage.sql.rows import NAMED, append_event, hold, touch, unknown_surrogate
 from surrogym_server.storage.sql.sample_counts import CountedSamples
 from surrogym_server.storage.sql.summaries import Counted, read_summaries
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
 
-NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None, "fit_seconds": None}
 COLUMNS = [
     getattr(surrogates.c, name)
     for name in (
@@ -40,8 +40,10 @@ class SqlSurrogates(port.Surrogates):
                 return read(connection, new.name), False
             held = hold(connection, new.name)
             append_event(connection, held, "created", name=new.name)
-            insert_queries(connection, held, "initial", 0, new.query_coordinates, new.query_action, new.query_rollouts)
-            return read(connection, new.name), True
+            queries = (new.query_coordinates, new.query_action, new.query_rollouts)
+            initial.begin(connection, held, *queries)
+        initial.ask(self._database, new.name, *queries)
+        return self.get(new.name), True
 
     def get(self, name: str) -> SurrogateRecord:
         with self._database.read() as connection:
@@ -56,7 +58,8 @@ class SqlSurrogates(port.Surrogates):
 
     def name_of(self, id: int) -> str:
         with self._database.read() as connection:
-            name = connection.execute(sa.select(surrogates.c.name).where(surrogates.c.id == id)).scalar()
+            named = sa.select(surrogates.c.name).where(surrogates.c.id == id, removal.IS_THERE)
+            name = connection.execute(named).scalar()
         if name is None:
             raise UnknownSurrogate("expected an existing surrogate, got one that was deleted")
         return str(name)
@@ -70,7 +73,7 @@ class SqlSurrogates(port.Surrogates):
 
     def summaries(self, after: int = 0, limit: int | None = None) -> list[SurrogateSummary]:
         with self._database.read() as connection:
-            return read_summaries(connection, surrogates.c.id > after, limit, self._counted)
+            return read_summaries(connection, (surrogates.c.id > after) & removal.IS_THERE, limit, self._counted)
 
     def change(
         self,
@@ -95,6 +98,8 @@ class SqlSurrogates(port.Surrogates):
             if not changes and not again:
                 return before
             smaller = budget if budget is not None and budget < before.budget else None
+            if smaller is not None:
+                initial.end(connection, held)
             if smaller is not None or changes.keys() & {"target", "tolerances"}:
                 changes |= _withdraw_unbegun(connection, held, before, smaller)
             if changes:
@@ -110,9 +115,15 @@ class SqlSurrogates(port.Surrogates):
 
     def delete(self, name: str) -> None:
         with self._database.write() as connection:
-            gone = connection.execute(sa.delete(surrogates).where(surrogates.c.name == name))
-            if gone.rowcount == 0:
-                raise unknown_surrogate(name)
+            id = removal.take_name(connection, name)
+        removal.remove(self._database, id)
+
+    def complete_removals(self) -> int:
+        with self._database.read() as connection:
+            ids = removal.interrupted(connection)
+        for id in ids:
+            removal.remove(self._database, id)
+        return len(ids)
 
 
 def read(connection: Connection, name: str) -> SurrogateRecord:
@@ -174,7 +185,7 @@ def _withdraw_unbegun(
     unbegun = is_unbegun(held.id)
     chosen = sa.delete(queries).where(unbegun, queries.c.purpose == "adaptive")
     withdrawn = connection.execute(chosen.returning(queries.c.steps, queries.c.extra)).all()
-    connection.execute(sa.update(surrogates).where(surrogates.c.id == held.id).values(**NO_RIGHT))
+    connection.execute(sa.update(surrogates).where(surrogates.c.id == held.id).values(**removal.NO_RIGHT))
     changes = {"phase": resting_phase(held.round)} if held.phase == "fitting" else {}
     if budget is None:
         again = sum(row.steps for row in withdrawn if row.extra)

@@ -1,0 +1,65 @@
+"""The initial queries of a design, queued in transactions that block nobody for long.
+
+A row of ``requests`` holds how many are queued as long as some are missing. Until then no fit is due. If a crash
+interrupts it, another call of ``ask`` with the same queries continues.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection, Row
+
+from surrogym_server.storage.records import Array
+from surrogym_server.storage.sql.database import BATCH, Database
+from surrogym_server.storage.sql.rows import NAMED, hold, insert_queries, remember
+from surrogym_server.storage.sql.tables import requests, surrogates
+
+OPERATION, KEY = "initial", ""  # no request of a client has an empty key
+_OF_DESIGN = (requests.c.operation == OPERATION) & (requests.c.key == KEY)
+IS_INCOMPLETE = sa.exists(  # a condition on a row of surrogates
+    sa.select(requests.c.key).where(requests.c.surrogate_id == surrogates.c.id, _OF_DESIGN)
+)
+
+
+def begin(connection: Connection, held: Row[Any], coordinates: Array, action: Array, rollouts: Sequence[Array]) -> None:
+    """Queue as many as one transaction may, and note whether others are missing."""
+    remember(connection, held, OPERATION, KEY, "", 0)
+    _ask_some(connection, held, coordinates, action, rollouts)
+
+
+def end(connection: Connection, held: Row[Any]) -> None:
+    """Let the queries that are queued be all."""
+    connection.execute(sa.delete(requests).where(requests.c.surrogate_id == held.id, _OF_DESIGN))
+
+
+def ask(database: Database, name: str, coordinates: Array, action: Array, rollouts: Sequence[Array]) -> None:
+    """Queue the initial queries that are missing. If none are, nothing changes. Raises ``UnknownSurrogate``."""
+
+    def batch(connection: Connection) -> int:
+        return _ask_some(connection, hold(connection, name), coordinates, action, rollouts)
+
+    with database.read() as connection:
+        missing = connection.execute(sa.select(surrogates.c.id).where(NAMED, IS_INCOMPLETE), {"named": name}).first()
+    if missing:
+        database.write_in_batches(batch)
+
+
+def _ask_some(
+    connection: Connection, held: Row[Any], coordinates: Array, action: Array, rollouts: Sequence[Array]
+) -> int:
+    """Returns how many were queued; 0 if none was missing."""
+    own = (requests.c.surrogate_id == held.id) & _OF_DESIGN
+    queued = connection.execute(sa.select(requests.c.result).where(own)).scalar()
+    if queued is None:
+        return 0
+    steps, first, last = len(coordinates), int(queued), int(queued) + BATCH
+    some = rollouts[max(0, first - steps) : max(0, last - steps)]
+    ids = insert_queries(connection, held, "initial", 0, coordinates[first:last], action[first:last], some)
+    if last >= steps + len(rollouts):
+        end(connection, held)
+    else:
+        connection.execute(sa.update(requests).where(own).values(result=last))
+    return len(ids)
