@@ -23,3 +23,21 @@ def test_a_hundred_surrogates_are_shown_and_more_on_demand(tmp_path: Path, open_
         expect(rows).to_have_count(104)
         expect(more).to_be_hidden()
     assert complaints == []
+
+
+def test_addresses_that_lead_nowhere_throw_nothing(tmp_path: Path, open_page: Open):
+    with running_server(tmp_path) as server:
+        page = open_page(server.url)
+        thrown: list[str] = []
+        page.on("pageerror", lambda error: thrown.append(str(error)))
+        for address, words in (
+            ("#/s/unknown", "no surrogate of this name"),
+            ("#/compare/unknown", "Compare"),
+            ("#/s/%E0%A4%A", "no surrogate"),
+        ):
+            page.goto(f"{server.url}/{address}")
+            expect(page.locator("main")).to_contain_text(words)
+        page.goto(f"{server.url}/#/%E0%A4%A")
+        expect(page.locator("main")).to_contain_text("Register")
+        page.wait_for_timeout(200)
+    assert thrown == []

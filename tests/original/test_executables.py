@@ -238,3 +238,8 @@ def test_a_program_that_can_no_longer_be_started_is_the_machines_fault(tmp_path)
             plant.restore(snapshot)
     finally:
         plant.close()
+
+
+def test_an_answer_with_a_key_twice_is_refused():
+    with pytest.raises(StepFailed, match=r"each key once .* 'reward' twice"):
+        decode(b'{"id": 1, "result": {"reward": 1, "reward": 2}}', 1)

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box, Discrete, Space
 from support.simulators import Register, Spiral
 from surrogym_client.original.adapters import open_simulator
 from surrogym_client.original.describing import describe
-from surrogym_client.original.errors import StepFailed, UnknownEnvironment
+from surrogym_client.original.errors import StepFailed, UnknownEnvironment, sentence
 
 STEPS = 60
 
@@ -240,3 +240,20 @@ def test_an_environment_in_which_nothing_moves_is_refused_with_a_way_out(registe
     message = rf"no variable of Fails-v0 differed between resets or moved in {STEPS} random steps: .* \(--steps\), or"
     with pytest.raises(UnknownEnvironment, match=message):
         describe(registered("Fails-v0", space=space), STEPS)
+
+
+class Mute(Exception):
+    """An error whose message can't be read."""
+
+    def __str__(self) -> str:
+        raise RuntimeError("no words")
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [(ValueError("valve \ud800 stuck"), r"ValueError: valve \ud800 stuck"), (Mute(), "its message can't be read")],
+)
+def test_any_error_is_described_by_text_that_can_be_sent(error: Exception, said: str):
+    for described in (sentence(error), sentence(StepFailed(str(error))) if error.args else said):
+        assert said.partition(": ")[2] in described
+        described.encode()

@@ -10,6 +10,7 @@ import pytest
 from support.fmus import EXAMPLES, STATES, build, changed, mapping
 from surrogym_client.original.adapters.fmu import open_simulator
 from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.fmus import archive
 
 pytest.importorskip("fmpy")
 pytest.importorskip("pythonfmu")
@@ -86,3 +87,16 @@ def test_files_of_other_forms_are_named_without_words_of_python(tmp_path: Path) 
         bare.writestr("modelDescription.xml", "<fmiModelDescription/>")
     with pytest.raises(UnknownEnvironment, match=r"can't be read \(it lacks a part\): export the FMU anew"):
         open_simulator(f"fmu:{tmp_path / 'bare.fmu'}")
+
+
+@pytest.mark.parametrize("name", ["resources/zeros.bin", "modelDescription.xml"])
+def test_a_bomb_is_refused_by_its_directory_before_it_is_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr(archive, "MOST_BYTES", 1_000_000)
+    monkeypatch.setattr(archive, "MOST_XML_BYTES", 1_000_000)
+    with zipfile.ZipFile(tmp_path / "bomb.fmu", "w", zipfile.ZIP_DEFLATED) as bomb:
+        bomb.writestr(name, bytes(2_000_000))
+    monkeypatch.setattr(zipfile.ZipFile, "open", lambda *_: pytest.fail("it was unpacked"))
+    with pytest.raises(UnknownEnvironment, match=r"expected an FMU of at most 1,000,000 bytes .* with 2,000,000"):
+        archive.read_archive(tmp_path / "bomb.fmu")

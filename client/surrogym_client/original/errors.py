@@ -119,11 +119,21 @@ class RequestRefused(StepFailed):
         return type(self), self._arguments
 
 
+def message_of(error: BaseException) -> str:
+    """The message of somebody's exception, as text that can be sent and printed. Never raises, whatever its own code
+    does."""
+    try:
+        said = str(error)
+    except RAISED as failed:
+        return f"its message can't be read, because of {type(failed).__name__}"
+    return said.encode(errors="backslashreplace").decode()
+
+
 def sentence(error: BaseException) -> str:
     """Describe an exception of somebody's environment: its type, its message, and the line that raised it."""
     if isinstance(error, OriginalError):  # complete by itself; the line does not help the environment's author
-        return str(error)
+        return message_of(error)
     frame = traceback.extract_tb(error.__traceback__)[-1:]
     where = f" ({os.path.basename(frame[0].filename)}:{frame[0].lineno})" if frame else ""
-    message = f": {error}" if str(error) else ""
-    return f"{type(error).__name__}{message}{where}"
+    message = message_of(error)
+    return f"{type(error).__name__}{f': {message}' if message else ''}{where}"

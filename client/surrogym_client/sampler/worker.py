@@ -12,7 +12,7 @@ from typing import TypeVar, get_args
 import numpy as np
 
 from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere
-from surrogym_client.original.errors import QueryRefused, SnapshotGone, StepFailed, StepRefused
+from surrogym_client.original.errors import QueryRefused, SnapshotGone, StepFailed, StepRefused, message_of
 from surrogym_client.original.protocol import (
     Environment,
     OriginalEnvironment,
@@ -247,12 +247,12 @@ class Sampler:
         except SnapshotGone as gone:
             outcome, error = "impossible", str(gone)
         except StepRefused as refused:
-            error, for_good = str(refused) or "no reason given", not taken
+            error, for_good = message_of(refused) or "no reason given", not taken
             outcome = "refused"
         except StepFailed as failed:
-            error = str(failed) or "no reason given"
+            error = message_of(failed) or "no reason given"
         except Exception as raised:  # an environment that is not isolated may raise anything
-            error = f"{type(raised).__name__}: {raised}"
+            error = f"{type(raised).__name__}: {message_of(raised)}"
         except BaseException:  # Ctrl-C: real steps that were taken are reported all the same
             self._hand_in(taken)
             self._steps += len(taken)

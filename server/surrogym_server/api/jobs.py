@@ -122,7 +122,7 @@ def report(
     "/jobs/{job_id}:finish",
     summary="End a job",
     dependencies=[TRAIN],
-    responses=documented(*THERE, Code.LEASE_EXPIRED),
+    responses=documented(*THERE, Code.UNKNOWN_POLICY, Code.LEASE_EXPIRED),
 )
 def finish(name: str, job_id: Number, body: Annotated[FinishJob, example(examples.FINISH_JOB)], use: Use) -> JobView:
     """End a job, with the version of the policy that was stored. A repeat is harmless."""

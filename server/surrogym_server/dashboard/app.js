@@ -26,8 +26,17 @@ function say(state, text = state) {
   banner.hidden = state !== "gone";
 }
 
+/** A part of the address; as it is if it is no encoded text. */
+function decoded(part) {
+  try {
+    return decodeURIComponent(part);
+  } catch {
+    return part;
+  }
+}
+
 function route() {
-  const [kind, ...names] = location.hash.slice(2).split("/").map(decodeURIComponent);
+  const [kind, ...names] = location.hash.slice(2).split("/").map(decoded);
   page.view?.close();
   if (kind === "compare") page.view = compareView(main, names);
   else if (kind === "register") page.view = registerView(main, { role: () => page.role });

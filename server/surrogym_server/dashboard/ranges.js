@@ -5,6 +5,7 @@ import { number } from "/page/format.js";
 
 const WIDEST = 600;
 const STEP = 11; // from a mark to the next in a row
+const MOST = 1e30; // beyond it, differences overflow
 const MARKS = 3; // that a row has room for, at least
 const LETTER = 7; // width of one
 const PAD = { right: 8, top: 4, bottom: 22 };
@@ -27,9 +28,13 @@ function shape({ kind, value, low, high }, x, y) {
   return parts;
 }
 
+const within = (value) => value && Math.max(-MOST, Math.min(MOST, value));
+const bounded = ({ kind, value, low, high }) => ({ kind, value: within(value), low: within(low), high: within(high) });
+
 /** `rows` are {label, marks: [{kind: "promise" | "real" | "without" | "reference", value, low, high}]}; null where nothing is known. */
 export function ranges(rows, label, least = MARKS) {
   const row = 7 + STEP * Math.max(least, ...rows.map(({ marks }) => marks.length));
+  rows = rows.map((one) => ({ ...one, marks: one.marks.map(bounded) }));
   const all = rows.flatMap(({ marks }) => marks.flatMap(({ value, low, high }) => [value, low ?? value, high ?? value]));
   if (!all.length) return null;
   const [lowest, most] = [Math.min(...all), Math.max(...all)];

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from surrogym_server.errors import UnknownPolicy
 from surrogym_server.services.activity import Offer, Workers
 from surrogym_server.services.lines import Lines, Present
 from surrogym_server.services.notices import Notices
@@ -89,7 +90,18 @@ class JobService:
         return cancel
 
     def finish(self, name: str, id: int, token: str, result: JobResult) -> JobRecord:
-        """End a job. Raises ``UnknownJob``, or ``LeaseExpired`` if another worker has it."""
+        """End a job.
+
+        Raises:
+            UnknownJob: the job does not exist.
+            UnknownPolicy: the surrogate has no policy of the result's version, or that has no such evaluation.
+            LeaseExpired: another worker has the job.
+        """
+        if result.version is not None:
+            policy = self._storage.policies.get(name, str(result.version))
+            if result.evaluation not in (None, *(one.id for one in policy.evaluations)):
+                place = f"version {result.version} of {name!r}'s policies"
+                raise UnknownPolicy(f"expected an evaluation of {place}, got {result.evaluation}")
         return self._changed(name, self._storage.jobs.finish(name, id, token, result))
 
     def cancel(self, name: str, id: int) -> JobRecord:

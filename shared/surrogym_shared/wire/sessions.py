@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, FiniteFloat, model_validator
 
 from surrogym_shared.acting import MAX_UNITS
+from surrogym_shared.checks import LARGEST
 from surrogym_shared.network import MAX_LAYERS, Activation
 from surrogym_shared.spec import MAX_DIMENSIONS
 from surrogym_shared.wire.base import (
@@ -63,7 +64,7 @@ class OpenSession(Request):
         default=0.0, description="share of episodes that start at the state of a real step from before the session"
     )
     process_noise: bool = Field(default=False, description="whether the learned noise of a step is added to the state")
-    sensor_noise: dict[str, Annotated[FiniteFloat, Field(ge=0)]] = Field(
+    sensor_noise: dict[str, Annotated[FiniteFloat, Field(ge=0, le=LARGEST)]] = Field(
         default={},
         description="standard deviation of the error with which observations show each named coordinate; the error "
         "does not move the state, so its share of the learned noise is left out of ``process_noise``",

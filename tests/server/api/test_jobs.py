@@ -49,8 +49,13 @@ def test_a_job_is_seen_from_its_queue_to_its_end(api: Api, known: str):
     ]
     assert api.jobs.cancel(known, job.id).cancelling
     assert api.jobs.report(known, job.id, job.lease_token)
-    ended = api.jobs.finish(known, job.id, job.lease_token, "cancelled", error="stopped by a person", version=2)
-    assert (ended.status, ended.error, ended.version) == ("cancelled", "stopped by a person", 2)
+    with pytest.raises(UnknownPolicy):
+        api.jobs.finish(known, job.id, job.lease_token, "cancelled", version=2**30)
+    version = api.policies.push(known, wire.PushedCard(), [], "zip", network_file(seed=2)).version
+    with pytest.raises(UnknownPolicy, match="evaluation"):
+        api.jobs.finish(known, job.id, job.lease_token, "done", version=version, evaluation=2**40)
+    ended = api.jobs.finish(known, job.id, job.lease_token, "cancelled", error="stopped by a person", version=version)
+    assert (ended.status, ended.error, ended.version) == ("cancelled", "stopped by a person", version)
     with pytest.raises(LeaseExpired):
         api.jobs.report(known, job.id, job.lease_token)
     with pytest.raises(UnknownJob):

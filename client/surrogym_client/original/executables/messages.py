@@ -50,9 +50,11 @@ def decode(line: bytes, number: int) -> Reply:
         StepFailed: the line is not an answer to this request.
     """
     try:
-        answer = json.loads(line, parse_constant=_not_finite)
+        answer = json.loads(line, parse_constant=_not_finite, object_pairs_hook=_once)
     except _NotFinite as error:
         raise StepFailed(f"expected finite numbers from the program, got {error} in {short(line)}") from error
+    except _Twice as error:
+        raise StepFailed(f"expected each key once from the program, got {error} twice in {short(line)}") from error
     except (ValueError, RecursionError) as error:
         raise StepFailed(
             f"expected one line of JSON from the program, got {short(line)}; let it print everything else to "
@@ -147,6 +149,19 @@ def _is_number(value: object) -> bool:
         return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     except OverflowError:  # an int beyond the range of a float
         return False
+
+
+class _Twice(ValueError):
+    """A key that an object has twice: which of the values is meant is unknown."""
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise _Twice(repr(one_line(key, SHOWN)))
+        found[key] = value
+    return found
 
 
 class _NotFinite(ValueError):

@@ -14,6 +14,7 @@ from surrogym_client.original.errors import UnknownEnvironment
 
 REAL = ("Real", "Float64", "Float32")  # types of numbers that change gradually
 DESCRIPTION = "modelDescription.xml"
+MOST_ENTRIES, MOST_BYTES, MOST_XML_BYTES = 20_000, 2**30, 2**26
 SHOWN = 20  # names that an error lists
 
 
@@ -126,6 +127,7 @@ def _names_in(path: Path) -> list[str]:
         raise UnknownEnvironment(f"expected an FMU, or a JSON file that names one, got no file {path}")
     try:
         with zipfile.ZipFile(path) as file:
+            _require_bounded(path, file.infolist())
             damaged = file.testzip()
             names = file.namelist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, RuntimeError) as error:
@@ -135,6 +137,19 @@ def _names_in(path: Path) -> list[str]:
     if damaged is not None:
         raise UnknownEnvironment(f"{damaged} in {path} is damaged: copy or export the FMU anew")
     return names
+
+
+def _require_bounded(path: Path, entries: list[zipfile.ZipInfo]) -> None:
+    """Refuse an archive that is larger inside than any real FMU, by its directory, before anything is unpacked."""
+    total = sum(entry.file_size for entry in entries)
+    xml = max((entry.file_size for entry in entries if entry.filename.lower().endswith(".xml")), default=0)
+    for what, size, most in (
+        ("files", len(entries), MOST_ENTRIES),
+        ("bytes inside", total, MOST_BYTES),
+        ("bytes of an XML file", xml, MOST_XML_BYTES),
+    ):
+        if size > most:
+            raise UnknownEnvironment(f"expected an FMU of at most {most:,} {what}, got {path} with {size:,}")
 
 
 def _archive(path: Path, names: list[str], described: Any) -> Archive:
