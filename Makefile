@@ -15,7 +15,7 @@ PINS := pyproject.toml constraints.txt
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: demo install test lab-test audit test-all docs docs-serve format-check lint types imports unit chaos bench bench-memory acquisition audit-power compare format postgresql haproxy chromium languages screenshots clean help
+.PHONY: demo install test lab-test audit test-all docs docs-serve format-check lint types imports unit chaos bench bench-memory acquisition audit-power compare format postgresql haproxy chromium languages screenshots picture clean help
 
 demo: .venv/demo  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
@@ -117,6 +117,9 @@ languages:
 
 screenshots: .venv/dev chromium  ## Pictures of the page for the docs, from a live Pendulum
 	$(BIN)/python tests/dashboard/screenshots.py
+
+picture: .venv/dev  ## The moving picture of the README, from a Pendulum that is learned anew
+	$(BIN)/python tests/docs/moving_picture.py
 
 clean:  ## Remove the virtual environment, caches and builds; run folders stay
 	rm -rf .venv .venv-extras .venv-adapters build dist .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
