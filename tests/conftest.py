@@ -32,9 +32,11 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("surrogym")
 
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # A run in a shell's background ignores Ctrl-C, and so would every program that a test starts and interrupts.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A run in a shell's background ignores Ctrl-C, and one under nohup ignores hang-ups. So would every program that a test
+# starts and signals.
+for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, usual)
 
 LASTING = ("slow", "e2e", "timeout")  # marks; a limit of its own is one of more time
 

@@ -40,9 +40,9 @@ class Terminal:
             assert time.monotonic() < deadline, self.shown[-2_000:]
             assert self._read(0.2) or self.process.poll() is None, self.shown[-2_000:]
 
-    def interrupt(self) -> int:
-        """Press Ctrl-C; the exit status, once everything it said is read."""
-        self.process.send_signal(signal.SIGINT)
+    def interrupt(self, number: int = signal.SIGINT) -> int:
+        """Press Ctrl-C, or send another signal; the exit status, once everything it said is read."""
+        self.process.send_signal(number)
         deadline = time.monotonic() + PATIENCE
         while self._read(0.2) or self.process.poll() is None:
             assert time.monotonic() < deadline, self.shown[-2_000:]
@@ -60,8 +60,9 @@ class Terminal:
 
 
 def _heed_interrupts() -> None:
-    """A shell that starts the tests in the background has them, and their children, ignore Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    """A shell that starts the tests in the background has them, and their children, ignore Ctrl-C and hang-ups."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 @contextmanager
