@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -233,7 +234,7 @@ def _again(context: typer.Context, log: OfLogs) -> str:
 
 def _await_model(name: str, wait: float, server: str | None, token: str | None, *, quiet: bool) -> SurrogateView:
     """Wait until the server has fitted a model to the log, and return the surrogate. Raises ``DesignUnfinished``."""
-    from surrogym_client.surrogates.waiting import wait_for_model, words_of_design
+    from surrogym_client.surrogates.waiting import wait_for_model, words_of_long_fit
     from surrogym_shared.terminal import on_interrupt, progress
 
     stays = f"interrupted while the server fits the model; surrogym status {name} shows it"
@@ -242,7 +243,9 @@ def _await_model(name: str, wait: float, server: str | None, token: str | None, 
         progress("fit", quiet=quiet) as update,
         connect(server, token) as api,
     ):
-        return wait_for_model(api, name, wait, lambda view: update(None, words_of_design(view)))
+        began = time.monotonic()
+        look = lambda view: update(None, words_of_long_fit(view, time.monotonic() - began))  # noqa: E731
+        return wait_for_model(api, name, wait, look)
 
 
 def _as_json(imported: Imported, view: SurrogateView | None) -> dict[str, Any]:

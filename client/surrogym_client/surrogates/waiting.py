@@ -11,6 +11,7 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.wire import SurrogateView
 
 LOOK_SECONDS = 0.25
+MANY = 1_500  # samples from which on a fit by the default model takes about the same time
 FIRST_LEASE_SECONDS = 5.0  # a running sampler begins queries within a second
 
 
@@ -27,6 +28,13 @@ def words_of_design(view: SurrogateView) -> str:
     logged = f"{ledger.logged} logged steps"
     parts = [*([taken] if view.budget or not ledger.logged else []), *([logged] if ledger.logged else [])]
     return f"{', '.join(parts)}{fidelity}{_words_of_fit(view)}"
+
+
+def words_of_long_fit(view: SurrogateView, seconds: float) -> str:
+    """Describe a fit that has been waited for: its steps, the time so far, and how long such a fit takes."""
+    waited = f" for {seconds:.0f} s" if view.phase == "fitting" else ""
+    usual = "; fits of so many steps took 20 to 160 s on two free cores" if waited and view.samples >= MANY else ""
+    return f"{words_of_design(view)}{waited}{usual}"
 
 
 def words_of_audit(view: SurrogateView) -> str:
@@ -147,6 +155,11 @@ def wait_for_model(
             return view
         if view.phase == "failed":
             raise DesignUnfinished(f"the fit of {name!r} failed: {view.error}")
+    if view is not None and view.phase == "fitting":
+        raise DesignUnfinished(
+            f"the fit of {view.samples} steps of {name!r} has not ended after {seconds:g} s; it "
+            f"continues on the server, and surrogym status {name} shows the model once it is there"
+        )
     raise DesignUnfinished(f"there was no model of {name!r} after {seconds:g} s: its phase is {_phase(view)}")
 
 

@@ -47,14 +47,15 @@ logger = logging.getLogger(__name__)
 FIT_LEASE_SECONDS = 30.0
 RENEWALS_PER_LEASE = 3
 ATTEMPTS = 5  # of a fit whose process died, or whose result could not be stored
-LONG_SECONDS = 60.0  # the log names a fit that takes longer, and other fits start beside it
+LONG_SECONDS = 60.0  # the log names a fit that takes longer
+PASSED_SECONDS = 5.0  # other fits start beside one that takes longer
 MOST_PASSED = 3  # long fits that don't count towards ``fit_workers``; each is a process
 UNCHOSEN = ("initial", "logged")  # purposes of samples that nobody chose to test a model
 PAUSE_SECONDS = 1.0  # between checks whether a fit is still wanted
 
 
 class _Turn:
-    """A turn to fit: a few fits run at a time. A long fit lets others start beside it, if there are few long ones."""
+    """A turn to fit: a few fits run at a time. A long fit lets others start beside it."""
 
     def __init__(self, usual: asyncio.Semaphore, passed: asyncio.Semaphore) -> None:
         self._usual, self._passed, self._held = usual, passed, usual
@@ -67,10 +68,11 @@ class _Turn:
         self._held.release()
 
     async def let_others_pass(self) -> None:
-        if self._held is self._usual and not self._passed.locked():
-            await self._passed.acquire()
-            self._held = self._passed
-            self._usual.release()
+        """Let other fits start beside this one after a while, as soon as there are few long ones."""
+        await asyncio.sleep(PASSED_SECONDS)
+        await self._passed.acquire()
+        self._held = self._passed
+        self._usual.release()
 
 
 class Designer:
@@ -231,7 +233,8 @@ class Designer:
         """
         job = await asyncio.to_thread(self._job, lease)
         work = asyncio.create_task(self._fits.run(job))
-        keeper = asyncio.create_task(self._keep(lease, turn))
+        keeper = asyncio.create_task(self._keep(lease))
+        passing = asyncio.create_task(turn.let_others_pass())
         try:
             await asyncio.wait({work, keeper}, timeout=self._fit_seconds, return_when=asyncio.FIRST_COMPLETED)
             if work.done():
@@ -244,11 +247,11 @@ class Designer:
                 "surrogym serve --fit-seconds sets a longer limit"
             )
         finally:
-            for task in (work, keeper):
+            for task in (work, keeper, passing):
                 task.cancel()
-            await asyncio.gather(work, keeper, return_exceptions=True)
+            await asyncio.gather(work, keeper, passing, return_exceptions=True)
 
-    async def _keep(self, lease: FitLease, turn: _Turn) -> None:
+    async def _keep(self, lease: FitLease) -> None:
         """Renew the right to fit while the fit is wanted, and log a long fit. Raises ``LeaseExpired`` or
         ``UnknownSurrogate`` if nobody wants it any more."""
         began, tell_after = time.monotonic(), LONG_SECONDS
@@ -267,7 +270,6 @@ class Designer:
                     logger.warning(
                         "the fit of %s has been running for %.0f s, and is stopped after %g s", name, took, most
                     )
-                    await turn.let_others_pass()
                 await asyncio.sleep(PAUSE_SECONDS)
 
     def _job(self, lease: FitLease) -> DesignJob:

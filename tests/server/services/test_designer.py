@@ -264,6 +264,7 @@ def watchful(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("surrogym_server.services.designer.RENEWALS_PER_LEASE", 3000)
     monkeypatch.setattr("surrogym_server.services.designer.PAUSE_SECONDS", 0.01)
     monkeypatch.setattr("surrogym_server.services.designer.LONG_SECONDS", 0.1)
+    monkeypatch.setattr("surrogym_server.services.designer.PASSED_SECONDS", 0.1)
 
 
 def test_a_fit_that_takes_too_long_is_ended_and_named(answered: Storage, designer, runner: Runner):

@@ -1,0 +1,32 @@
+"""Waiting for a model: a long fit is counted in seconds, and one that outlasts the wait is said to continue."""
+
+from __future__ import annotations
+
+from typing import Any
+from unittest.mock import Mock
+
+import pytest
+
+from surrogym_client.surrogates import waiting
+from surrogym_client.surrogates.waiting import DesignUnfinished, wait_for_model, words_of_long_fit
+from surrogym_shared.wire import Ledger
+
+
+def view(phase: str, samples: int = 2_000) -> Any:
+    return Mock(phase=phase, samples=samples, budget=0, ledger=Ledger(logged=samples), fidelity=None)
+
+
+def test_a_fit_is_counted_in_seconds_while_it_runs():
+    said = words_of_long_fit(view("fitting"), 12.3)
+    assert "a model is being fitted to 2000 steps for 12 s" in said
+    assert "20 to 160 s" in said
+    assert "160 s" not in words_of_long_fit(view("fitting", samples=40), 12.3)
+    assert words_of_long_fit(view("from_log"), 12.3) == "2000 logged steps"
+
+
+@pytest.mark.parametrize(("phase", "said"), [("fitting", "continues on the server"), ("sampling", "phase is sampling")])
+def test_a_wait_that_ends_before_the_fit_says_what_goes_on(monkeypatch: pytest.MonkeyPatch, phase: str, said: str):
+    monkeypatch.setattr(waiting, "LOOK_SECONDS", 0.0)
+    api: Any = Mock(surrogate=lambda _: view(phase))
+    with pytest.raises(DesignUnfinished, match=said):
+        wait_for_model(api, "tank", 0.01)
