@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 
 import pytest
 
 from support.server import ServerProcess
 from support.terminal import Terminal, on_terminal
+from surrogym_client.cli.train import _keeping
 from surrogym_client.evaluation import EvaluationInterrupted
 from surrogym_client.original.errors import EvaluationFailed
 from surrogym_client.policies import load_policy
@@ -43,11 +45,13 @@ def test_sampling_shows_the_design_and_keeps_every_real_step(surrogym, pendulum_
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_training_saves_its_policy(pendulum_server: ServerProcess, surrogym_on_terminal, tmp_path: Path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_training_saves_its_policy(pendulum_server: ServerProcess, surrogym_on_terminal, tmp_path: Path, number: int):
+    """Ctrl-C, the stop of a service manager, and a terminal that is closed."""
     options = ("--steps", "900000", "--num-envs", "16", "--set", "n_steps=64", "--variant", "pathwise")
     with surrogym_on_terminal("train", "pendulum", *options, "--out", "policy.zip") as terminal:
-        terminal.await_text("of 899072 virtual steps")
-        assert terminal.interrupt() == INTERRUPTED
+        terminal.await_text("of about 899072 virtual steps")
+        assert terminal.interrupt(number) == INTERRUPTED
     given = " ".join([*options, "--server", pendulum_server.url])
     again = f"surrogym train pendulum {given} --start-from policy.zip --out policy.zip"
     assert f"to continue: {again}" in said(terminal)
@@ -127,3 +131,12 @@ def test_an_interruption_before_the_first_real_step_says_so(surrogym, monkeypatc
     ended = surrogym("register", "Pendulum-v1")
     assert (ended.code, ended.out) == (INTERRUPTED, ""), ended.err
     assert ended.err == "interrupted before the first real step; nothing was registered\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_training_takes_a_polite_kill_like_ctrl_c(capsys, number: int):
+    before = signal.getsignal(number)
+    with pytest.raises(KeyboardInterrupt), _keeping(lambda _: None, "pendulum"):
+        signal.raise_signal(number)
+    assert "interrupted before there was a policy" in capsys.readouterr().err
+    assert signal.getsignal(number) is before

@@ -59,7 +59,7 @@ def test_the_closed_loop_says_how_well_the_policys_region_is_known():
     after = replace(RESULT, visited_confidence=(0.9, 0.99914))
     assert "; 2 rounds, confidence index 0.9991 where the policy went; next" in words_of_result(after, closed_loop=True)
     now = TrainProgress(100, 512, None, 0.0, visited_confidence=0.9)
-    assert words_of(vars(now)) == "100 of 512 virtual steps, confidence index 0.9000 where the policy went"
+    assert words_of(vars(now)) == "100 of about 512 virtual steps, confidence index 0.9000 where the policy went"
 
 
 def test_a_training_that_still_improves_shows_how_to_continue():

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from surrogym_client.policies import load_policy
+
 pytestmark = [pytest.mark.e2e, pytest.mark.slow]
 
 MARK = "DEMO_TEST_MARK"
@@ -123,11 +125,14 @@ def test_an_interrupted_demo_ends_all_its_processes(demo, number):
     interrupted = demo()
     interrupted.await_training()
     assert len(interrupted.family()) >= 5  # the demo, the server, the sampler and its environment, the trainer
+    interrupted.await_(lambda: (interrupted.folder / "training.jsonl").stat().st_size > 0)
     interrupted.process.send_signal(number)
     interrupted.process.wait(60)
     assert interrupted.process.returncode == 130
     said = interrupted.process.stderr.read()
     assert f"interrupted; all processes have ended; {interrupted.folder} keeps the real samples" in said
+    assert f"and the policy so far ({interrupted.folder / 'policy.zip'})" in said
+    assert load_policy(interrupted.folder / "policy.zip")
     assert interrupted.family() == []
 
 

@@ -138,13 +138,15 @@ def _import(settings: TrainSettings, *, quiet: bool) -> None:
 
 @contextmanager
 def _keeping(write_card: Callable[[TrainResult], object], asked: str) -> Iterator[None]:
-    """After Ctrl-C, say what was saved and how to continue. A saved policy gets its card."""
+    """After Ctrl-C or a polite kill, say what was saved and how to continue. A saved policy gets its card."""
+    from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_client.training.settings import TrainingInterrupted
     from surrogym_client.training.words import words_of_interruption
     from surrogym_shared.terminal import say
 
     try:
-        yield
+        with terminations_as_interrupts():
+            yield
     except TrainingInterrupted as interruption:
         result = interruption.result
         write_card(result)
@@ -209,15 +211,17 @@ def _words_without_model(view: SurrogateView) -> str:
 @contextmanager
 def _recording(path: Path | None, curve: list[CurvePoint], update: Update) -> Iterator[Record]:
     """Show progress, collect the training curve, and append it to a file that other processes can watch."""
+    from surrogym_client.training.course import Course, words_of_time_left
     from surrogym_client.training.words import words_of
     from surrogym_shared.wire import CurvePoint
 
-    started = time.monotonic()
+    started, course = time.monotonic(), Course()
     with path.open("a", encoding="utf-8") if path is not None else nullcontext() as file:
 
         def record(now: TrainProgress) -> None:
             seconds = round(time.monotonic() - started, 3)
-            update(now.steps / now.total_steps, words_of(asdict(now)))
+            left = words_of_time_left(now.steps, now.total_steps, seconds)
+            update(course.share(now.steps, now.total_steps), f"{words_of(asdict(now))}{left}")
             curve.append(CurvePoint(steps=now.steps, imagined_return=now.imagined_return, seconds=seconds))
             if file is not None:
                 file.write(json.dumps({**asdict(now), "seconds": seconds}) + "\n")

@@ -21,6 +21,7 @@ from surrogym_client.evaluation.reporting import as_reported, paired_start
 from surrogym_client.policies import pushing
 from surrogym_client.policies.card import read_card
 from surrogym_client.surrogates.waiting import share_of_design, wait_for_design, words_of_design
+from surrogym_client.training.course import Course, words_of_time_left
 from surrogym_client.training.search import ALGORITHMS
 from surrogym_client.training.words import words_of
 from surrogym_client.transport.api import Api
@@ -166,12 +167,15 @@ class SurrogateRun:
 
     def _train(self, trainer: Child) -> None:
         threading.Thread(target=_warm_up, args=(later_imports(self._settings),), daemon=True).start()
+        course = Course()
         with progress("train", quiet=self._quiet) as update:
             while trainer.process.poll() is None:
                 self._children.check()
                 for line in read_curve(self._curve)[-1:]:
                     real = self._api.surrogate(self._settings.task).ledger.total
-                    update(line["steps"] / line["total_steps"], f"{words_of(line)}, {real} real steps")
+                    steps, total = line["steps"], line["total_steps"]
+                    left = words_of_time_left(steps, total, line["seconds"])
+                    update(course.share(steps, total), f"{words_of(line)}, {real} real steps{left}")
                 with suppress(subprocess.TimeoutExpired):
                     trainer.process.wait(LOOK_SECONDS)
             trainer.check()

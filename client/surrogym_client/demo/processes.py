@@ -80,12 +80,11 @@ class Children:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Ask every group to stop, newest first, so that none loses its server. Then make sure that all have
-        stopped."""
+        """Ask every group to stop, newest first, and each after the one before, so that none loses its server while it
+        saves its work. Then make sure that all have stopped."""
+        deadline = time.monotonic() + STOPPING_SECONDS
         for child in reversed(self._children):
             _signal(child, signal.SIGTERM)
-        deadline = time.monotonic() + STOPPING_SECONDS
-        for child in self._children:
             with suppress(subprocess.TimeoutExpired):
                 child.process.wait(max(0.0, deadline - time.monotonic()))
         for child in self._children:

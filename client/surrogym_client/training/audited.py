@@ -12,6 +12,7 @@ from surrogym_client.policies.files import load_policy
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.training.candidates import Candidates
 from surrogym_client.training.closed_loop import ClosedLoop, LoopSettings, visit
+from surrogym_client.training.course import after
 from surrogym_client.training.handover import AuditSettings, Handover, Subject, hand_over
 from surrogym_client.training.search import search_for, with_algorithm
 from surrogym_client.training.settings import (
@@ -151,9 +152,14 @@ class AuditedTraining:
         now = self._chosen
         if search_for(self.settings).resumable:
             now = replace(now, start_from=self.out, trust_policy=False)
-        after = train(self.port, self.out, now, self.progress)
-        self.candidates.keep(after)
-        return self._best(_joined(result, after))
+        later = train(self.port, self.out, now, self._shifted(result.virtual_steps))
+        self.candidates.keep(later)
+        return self._best(_joined(result, later))
+
+    def _shifted(self, done: int) -> Callable[[TrainProgress], None] | None:
+        """The progress of a training after ``done`` virtual steps."""
+        progress = self.progress
+        return None if progress is None else lambda now: progress(after(now, done))
 
 
 def _joined(before: TrainResult, after: TrainResult) -> TrainResult:

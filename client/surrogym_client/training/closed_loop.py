@@ -10,6 +10,7 @@ from typing import Any
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.training.candidates import Candidates
+from surrogym_client.training.course import after
 from surrogym_client.training.search import is_prolonged, planned_steps, search_for, with_algorithm
 from surrogym_client.training.settings import (
     SUGGESTED_STEPS,
@@ -224,6 +225,4 @@ def _shifted(
 ) -> Callable[[TrainProgress], None] | None:
     if progress is None:
         return None
-    return lambda now: progress(
-        replace(now, steps=done + now.steps, total_steps=max(total, done + now.total_steps), visited_confidence=known)
-    )
+    return lambda now: progress(after(replace(now, visited_confidence=known), done, total))

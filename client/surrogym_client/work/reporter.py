@@ -13,6 +13,7 @@ from typing import Self
 from surrogym_client.errors import ServerUnreachable, SurrogymClientError, Unavailable
 from surrogym_client.policies.pushing import thinned
 from surrogym_client.training import TrainProgress
+from surrogym_client.training.course import Course
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import Retries
 from surrogym_shared import wire
@@ -30,17 +31,13 @@ class Stand:
     share: float = 0.0
     now: TrainProgress | None = None
     curve: tuple[wire.CurvePoint, ...] = ()
-    base: int = 0  # virtual steps of the trainings before the present one
+    course: Course = field(default_factory=Course, compare=False)  # of the training; it goes on from stand to stand
 
     def trained(self, now: TrainProgress, seconds: float) -> Stand:
-        """Add the progress of a training. One that begins anew, after an audit, continues the curve."""
-        before = self.now
-        base = self.base + before.steps if before is not None and now.steps < before.steps else self.base
-        point = wire.CurvePoint(steps=base + now.steps, imagined_return=finite(now.imagined_return), seconds=seconds)
-        curve = (*self.curve, point)
-        return replace(
-            self, stage="training", share=now.steps / max(now.total_steps, 1), now=now, curve=curve, base=base
-        )
+        """Add the progress of a training."""
+        point = wire.CurvePoint(steps=now.steps, imagined_return=finite(now.imagined_return), seconds=seconds)
+        share = self.course.share(now.steps, now.total_steps)
+        return replace(self, stage="training", share=share, now=now, curve=(*self.curve, point))
 
     def as_sent(self) -> wire.JobState:
         """Return the form that the server stores."""
@@ -48,8 +45,8 @@ class Stand:
         return wire.JobState(
             stage=self.stage,
             share=min(max(self.share, 0.0), 1.0),
-            steps=None if now is None else self.base + now.steps,
-            total_steps=None if now is None else self.base + now.total_steps,
+            steps=None if now is None else now.steps,
+            total_steps=None if now is None else now.total_steps,
             imagined_return=None if now is None else finite(now.imagined_return),
             curve=[
                 wire.JobPoint(steps=point.steps, imagined_return=point.imagined_return) for point in thinned(self.curve)

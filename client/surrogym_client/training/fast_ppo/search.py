@@ -146,6 +146,7 @@ class _Training:
         self._objective = Objective(search.clip_range, search.vf_coef, search.max_grad_norm)
         self._lanes, self._lost = lanes, 0
         planned = max(task.steps // self._rollout, 1) * self._rollout
+        self._most = planned * (1 + task.prolong + (fine is not None) + twice)  # virtual steps, if all follow
         saved = self._earlier() if settings.anew else None
         self._verdicts = Verdicts(planned, self._imagined(self._new), saved, patient=task.patient)
         self._kept: LearnedNetwork | None = None
@@ -288,7 +289,8 @@ class _Training:
             verdicts.judge()
         steps = min(verdicts.steps, verdicts.total)
         penalty = self._collector.episode_penalty
-        self._task.progress(TrainProgress(steps, verdicts.total, verdicts.latest, rollout.penalty_share, penalty))
+        most = max(verdicts.total, self._most)
+        self._task.progress(TrainProgress(steps, most, verdicts.latest, rollout.penalty_share, penalty))
 
     def _update(self, learner: Learner, rows: Batch, rate: float) -> None:
         size = len(rows.returns)
