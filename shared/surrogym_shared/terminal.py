@@ -14,19 +14,13 @@ from typing import Any
 
 import typer
 
+from surrogym_shared.words import visible
+
 PLAIN_SECONDS = 5.0  # time between lines of progress if no bar can be drawn
 FIRST_SECONDS = 2.0  # time before the first line, so that short or refused work shows none
 WATCH_SECONDS = 1.0  # time between two updates of a watched output
 
 Update = Callable[[float | None, str], None]  # arguments: share done in [0, 1], None if unchanged; a few words
-
-
-_CONTROLS = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"}
-
-
-def visible(text: str) -> str:
-    """Replace control characters by escapes, so that names and errors from others can't control the terminal."""
-    return text.translate(_CONTROLS)
 
 
 def say(text: str, *, quiet: bool = False) -> None:

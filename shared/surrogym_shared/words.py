@@ -7,6 +7,20 @@ from collections.abc import Iterable
 SHOWN = 10  # names of a list
 
 
+_HIDDEN = (
+    *range(32),
+    *range(127, 160),
+    *range(0x202A, 0x202F),
+    *range(0x2066, 0x206A),
+)  # the last two turn a line around
+_CONTROLS = {code: f"\\x{code:02x}" for code in _HIDDEN if chr(code) not in "\n\t"}
+
+
+def visible(text: str) -> str:
+    """Replace control characters by escapes, so that names and errors from others can't control the terminal."""
+    return text.translate(_CONTROLS)
+
+
 def counted(count: int, noun: str) -> str:
     """Return a number with its noun, such as 1 row and 2,000 rows."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"

@@ -17,6 +17,8 @@ from surrogym_client.logs import ReadLog, UnusableLog, read_log
 from surrogym_client.logs.importing import Options, keep_rejected
 from surrogym_client.logs.reading import format_of
 from surrogym_shared.logs.columns import roles_by_name
+from surrogym_shared.logs.table import stamps
+from surrogym_shared.spec import BoxAction, DiscreteAction
 
 
 def read(path: Path, **changes) -> ReadLog:
@@ -88,7 +90,49 @@ def test_a_minari_data_set_gives_its_steps(tmp_path: Path, monkeypatch: pytest.M
     )
     same = read_log(tmp_path / "same.npz")
     assert same.steps.digest == log.steps.digest, "so the model is the same"
-    assert same.spec.model_copy(update={"environment": log.spec.environment}) == log.spec
+    assert log.spec.action == BoxAction(low=(-1,), high=(1,)), "the declared space, and not the values in the log"
+    assert same.spec.model_copy(update={"environment": log.spec.environment, "action": log.spec.action}) == log.spec
+
+
+@pytest.mark.parametrize(
+    ("spaces", "says"),
+    [
+        ({}, ""),
+        ({"observation_space": gymnasium.spaces.Discrete(5)}, "expected observations that are vectors"),
+        ({"action_space": gymnasium.spaces.Discrete(4, start=1)}, "expected actions of a Box"),
+        ({"action_space": gymnasium.spaces.MultiDiscrete([2, 2])}, "expected actions of a Box"),
+    ],
+)
+def test_declared_spaces_of_a_minari_data_set_decide(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spaces: dict[str, gymnasium.Space], says: str
+):
+    """A discrete action whose values have a gap was continuous, and a label was a number."""
+    minari = pytest.importorskip("minari")
+    pytest.importorskip("h5py")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    declared = {
+        "observation_space": gymnasium.spaces.Box(-9, 9, (2, 1), dtype=np.float64),
+        "action_space": gymnasium.spaces.Discrete(4),
+    } | spaces
+    for space in declared.values():
+        space.seed(0)
+    episode = minari.data_collector.EpisodeBuffer(
+        id=0,
+        observations=np.array([declared["observation_space"].sample() for _ in range(7)]),
+        actions=np.array([2, 0, 2, 0, 0, 2]) if not says else [declared["action_space"].sample() for _ in range(6)],
+        rewards=[0.0, 1.0, 2.0, 3.0, 4.0, 5.0],
+        terminations=[False] * 6,
+        truncations=[False] * 5 + [True],
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        minari.create_dataset_from_buffers("reactor/declared-v0", [episode], **declared)
+    if says:
+        with pytest.raises(UnusableLog, match=says):
+            read_log("reactor/declared-v0")
+        return
+    log = read_log("reactor/declared-v0")
+    assert (log.spec.action, log.spec.coordinate_names) == (DiscreteAction(n=4), ("s0", "s1"))
 
 
 def test_exactly_the_broken_rows_are_set_aside(tmp_path: Path):
@@ -160,6 +204,47 @@ def test_times_may_be_dates(tmp_path: Path):
         whole = whole.at(row, "time", f"2026-03-01T12:{row:02d}:00Z")
     log = read(whole.write(tmp_path / "log.csv"))
     assert (log.steps.interval, log.rejected) == (60.0, [])
+
+
+@pytest.mark.parametrize(
+    ("form", "minutes"), [("2024033123{:02d}00", 1), ("2024033123{:02d}", 1), ("20240331T23{:02d}00", 1)]
+)
+def test_time_stamps_of_digits_are_times(tmp_path: Path, form: str, minutes: int):
+    """Their numbers jumped by 7,640 at midnight, and by 40 at each full minute."""
+    whole = reactor.log(runs=1, length=10)
+    for row in range(10):
+        stamp = form.format(53 + row) if row < 7 else form.replace("033123", "040100").replace("0331T23", "0401T00")
+        whole = whole.at(row, "time", stamp if row < 7 else stamp.format(row - 7))
+    log = read(whole.write(tmp_path / "log.csv"))
+    assert (log.steps.interval, log.rejected, len(log.steps)) == (60.0 * minutes, [], 10)
+
+
+@pytest.mark.parametrize("values", [[2.0, 3.0, 4.0, 5.0], [20240399.0, 20240400, 20240401, 20250000]])
+def test_other_numbers_are_no_time_stamps(values: list[float]):
+    assert stamps(np.array(values)) is None
+
+
+def test_days_of_digits_are_dates():
+    found = stamps(np.array([20240228.0, 20240229, 20240301, 20240302, np.nan] + [20240303.0] * 9))
+    assert found is not None
+    assert np.diff(found[:4]).tolist() == [86_400.0] * 3
+    assert np.isnan(found[4])
+
+
+def test_a_file_of_rejected_rows_has_no_formulas_and_no_control_characters(tmp_path: Path):
+    cells = ["=1+1", " @cmd", "+oops", "-1e3x", "\x1b[2Jred", "＝1", "-5.5"]
+    whole = reactor.log()
+    for row, cell in enumerate(cells, 3):
+        whole = whole.at(row, "reward" if cell != "-5.5" else "temperature", cell)
+    whole = reactor.Log(tuple("=cmd" if name == "time" else name for name in whole.heading), whole.rows)
+    log = read(whole.write(tmp_path / "log.csv"), time=None)
+    file = keep_rejected(tmp_path / "log.csv", log)
+    assert file is not None
+    [heading, *rows] = list(csv.reader(file.read_text(encoding="utf-8").splitlines()))
+    assert "'=cmd" in heading
+    found = [row[heading.index("reward")] for row in rows[:-1]]
+    assert found == ["'=1+1", "' @cmd", "'+oops", "'-1e3x", "\\x1b[2Jred", "'＝1"]
+    assert rows[-1][heading.index("temperature")] == "-5.5", "a number stays a number"
 
 
 def test_columns_are_known_by_their_names():

@@ -242,3 +242,12 @@ def test_an_id_of_a_module_in_the_working_directory_is_opened(tmp_path, monkeypa
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     open_simulator("plant_here:Here-v0").close()
     gymnasium.registry.pop("Here-v0")
+
+
+def test_a_column_of_numbers_is_no_image():
+    """An observation of shape (n, 1) was refused as an image."""
+    from surrogym_client.original.adapters.parts import flat
+
+    assert flat("own", {"b": np.ones((3, 1)), "a": np.zeros((1, 1))}).tolist() == [0, 1, 1, 1]
+    with pytest.raises(UnknownEnvironment, match="observes images"):
+        flat("own", np.ones((3, 2)))

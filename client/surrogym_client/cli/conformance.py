@@ -63,7 +63,7 @@ def _of_program(program: str, step_limit: float) -> Iterable[Outcome]:
 
 def _show(checked: Iterable[Outcome], output: Output) -> None:
     """Show each outcome as soon as it is there, then the sum."""
-    from surrogym_shared.terminal import visible
+    from surrogym_shared.words import visible
 
     outcomes = []
     for outcome in checked:

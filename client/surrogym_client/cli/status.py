@@ -51,7 +51,8 @@ def command(
 
     Example: surrogym status pendulum --watch
     """
-    from surrogym_shared.terminal import visible, watch
+    from surrogym_shared.terminal import watch
+    from surrogym_shared.words import visible
 
     form: Form = "json" if as_json else "short" if quiet else "words"
     with service.connect(context) as api:

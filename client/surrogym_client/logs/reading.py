@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from math import prod
 from pathlib import Path
 from typing import Any, Literal
 from zipfile import is_zipfile
 
 import numpy as np
+from gymnasium.spaces import Box, Discrete
 
 from surrogym_client.logs.arrays import require_shapes, table_of_arrays
 from surrogym_shared.archives import Header, read_arrays
 from surrogym_shared.logs.decoding import decoded
 from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.sizes import LONGEST_CELL, MOST_COLUMNS, require_sizes
 from surrogym_shared.logs.table import Cells, Table
 from surrogym_shared.logs.text import table_of_text
 from surrogym_shared.logs.writing import EVALUATED
@@ -139,23 +142,74 @@ def _cells(array: Any) -> Cells:
 def read_parquet(path: Path) -> Table:
     """The columns of a Parquet file; lists of one length become columns of their own."""
     try:
-        from pyarrow import ArrowException, parquet
+        from pyarrow import ArrowException, parquet, types
     except ModuleNotFoundError as error:
         raise UnusableLog("a log in Parquet needs the package pyarrow: pip install 'surrogym[logs]'") from error
     try:
-        read_table = parquet.read_table(path)
-        columns = [(name, read_table.column(i).to_numpy()) for i, name in enumerate(read_table.column_names)]
+        file = parquet.ParquetFile(path)
+        _require_parquet(path, file.metadata)
+        kinds = {field.name: field.type for field in file.schema_arrow}
+        ignored = {
+            name: f"its type {kind} is not one value a step" for name, kind in kinds.items() if not _is_plain(kind)
+        }
+        texts = [name for name, kind in kinds.items() if types.is_string(kind) or types.is_large_string(kind)]
+        columns = parquet.ParquetFile(path, read_dictionary=texts).read([name for name in kinds if name not in ignored])
+        arrays = {name: _of_column(path, name, columns.column(name)) for name in columns.column_names}
+    except UnusableLog:
+        raise
     except (ArrowException, OSError, ValueError) as error:
         raise UnusableLog(f"expected a Parquet file in {path}, got one that can't be read: {_line(error)}") from error
-    arrays = {name: _of_objects(path, name, cells) if cells.dtype == object else cells for name, cells in columns}
-    return table_of_arrays(path, arrays)
+    table = table_of_arrays(path, arrays)
+    return replace(table, ignored={**table.ignored, **ignored})
+
+
+def _require_parquet(path: Path, metadata: Any) -> None:
+    """Raise ``UnusableLog`` if a Parquet file is too large, before anything of it is decompressed."""
+    if len(metadata.schema) > MOST_COLUMNS:
+        raise UnusableLog(f"expected at most {MOST_COLUMNS:,} columns in {path}, got {len(metadata.schema):,}")
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    chunks = [group.column(i) for group in groups for i in range(group.num_columns)]
+    require_sizes(path, metadata.num_rows, sum(chunk.num_values for chunk in chunks))
+    if (size := sum(chunk.total_uncompressed_size for chunk in chunks)) > MOST_BYTES:
+        raise UnusableLog(f"expected at most {MOST_BYTES:,} bytes inside {path}, got {size:,}")
+
+
+def _is_plain(kind: Any) -> bool:
+    """Whether a type of Parquet is one value, or a list of numbers."""
+    from pyarrow import types
+
+    inner = (
+        kind.value_type if types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind) else None
+    )
+    if inner is not None:
+        return bool(types.is_floating(inner) or types.is_integer(inner) or types.is_boolean(inner))
+    return not (types.is_nested(kind) or types.is_binary(kind) or types.is_large_binary(kind))
+
+
+def _of_column(path: Path, name: str, column: Any) -> Cells:
+    """Return a column of Parquet (n,) or (n, k). A long text is refused; equal texts share their memory."""
+    from pyarrow import compute, types
+
+    if not types.is_dictionary(column.type):
+        cells = column.to_numpy()
+        return _of_objects(path, name, cells) if cells.dtype == object else cells
+    parts = []
+    for chunk in column.chunks:
+        longest = compute.max(compute.binary_length(chunk.dictionary)).as_py() if len(chunk.dictionary) else 0
+        if types.is_string(chunk.dictionary.type) and longest > LONGEST_CELL:
+            raise UnusableLog(
+                f"expected cells of at most {LONGEST_CELL:,} letters in the column {name!r} of {path}, got {longest:,}"
+            )
+        words = np.array([*map(str, chunk.dictionary.to_pylist()), ""], dtype=object)
+        parts.append(words[chunk.indices.fill_null(len(words) - 1).to_numpy()])
+    return np.concatenate([np.zeros(0, dtype=object), *parts])
 
 
 def _of_objects(path: Path, name: str, cells: Cells) -> Cells:
     """Return lists of one length as an array (n, k), and other cells as text (n,)."""
     lists = [isinstance(cell, np.ndarray) for cell in cells]
     if not any(lists):
-        return np.array(["" if cell is None else str(cell) for cell in cells])
+        return np.array(["" if cell is None else str(cell) for cell in cells], dtype=object)
     shapes = {cell.shape if one else None for cell, one in zip(cells, lists, strict=True)}
     if len(shapes) > 1:
         raise UnusableLog(
@@ -176,21 +230,40 @@ def read_minari(path: Path) -> Table:
         data = minari.MinariDataset(path / "data") if path.is_dir() else minari.load_dataset(str(path))
     except (ValueError, KeyError, AssertionError) as error:
         raise UnusableLog(f"expected a Minari data set in {path}, got one that can't be read: {error}") from error
+    width = _width(path, data.observation_space)
+    spaces = _declared(path, data.action_space)
+    require_sizes(path, data.total_steps, data.total_steps * (2 * width + 1))
     episodes = list(data.iterate_episodes())
-    if not all(isinstance(e.observations, np.ndarray) and isinstance(e.actions, np.ndarray) for e in episodes):
-        raise UnusableLog(f"expected observations and actions that are vectors in {path}, got dictionaries or tuples")
-    return table_of_arrays(
+    table = table_of_arrays(
         path,
         {
-            "observations": np.concatenate([_rows(e.observations[:-1]) for e in episodes]),
+            "observations": np.concatenate([e.observations[:-1].reshape(-1, width) for e in episodes]),
             "actions": np.concatenate([_rows(e.actions) for e in episodes]),
-            "next_observations": np.concatenate([_rows(e.observations[1:]) for e in episodes]),
+            "next_observations": np.concatenate([e.observations[1:].reshape(-1, width) for e in episodes]),
             "reward": np.concatenate([e.rewards for e in episodes]),
             "terminated": np.concatenate([e.terminations for e in episodes]),
             "truncated": np.concatenate([e.truncations for e in episodes]),
             "episode": np.concatenate([np.full(len(e.rewards), e.id) for e in episodes]),
         },
     )
+    return replace(table, **spaces)
+
+
+def _width(path: Path, space: Any) -> int:
+    """Return the length of an observation. A column, (n, 1), is a vector too; a label of Discrete is none."""
+    if not isinstance(space, Box) or sum(size > 1 for size in space.shape) > 1:
+        raise UnusableLog(f"expected observations that are vectors (a Box) in {path}, got the space {space}")
+    return prod(space.shape)
+
+
+def _declared(path: Path, space: Any) -> dict[str, Any]:
+    """Return what a declared space says of the actions: whether they are discrete, and their limits."""
+    if isinstance(space, Discrete) and space.start == 0:
+        return {"discrete": True, "limits": {"0": (0.0, float(space.n - 1))}}
+    if not isinstance(space, Box) or len(space.shape) > 1:
+        raise UnusableLog(f"expected actions of a Box (n,), or of a Discrete from 0, in {path}, got the space {space}")
+    ends = zip(space.low.reshape(-1).tolist(), space.high.reshape(-1).tolist(), strict=True)
+    return {"discrete": False, "limits": {str(i): pair for i, pair in enumerate(ends) if np.isfinite(pair).all()}}
 
 
 def _rows(array: Cells) -> Cells:

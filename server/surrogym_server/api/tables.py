@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from surrogym_server.storage.records import SampleRecord
-from surrogym_shared.logs.writing import npz_of_steps
+from surrogym_shared.logs.writing import npz_of_steps, spreadsheet_cell
 
 CSV = "text/csv"
 NPZ = "application/x-npz"
@@ -26,9 +26,9 @@ def as_csv(coordinate_names: Sequence[str], records: Sequence[SampleRecord]) -> 
     writer = csv.writer(text)
     actions = [f"u.{i}" for i in range(len(records[0].action))] if records else []
     q, q_next = [f"q.{name}" for name in coordinate_names], [f"next.{name}" for name in coordinate_names]
-    writer.writerow([*PLAIN, *q, *actions, *q_next])
+    writer.writerow(map(spreadsheet_cell, [*PLAIN, *q, *actions, *q_next]))
     for record in records:
-        plain = [_cell(getattr(record, name)) for name in PLAIN]
+        plain = [spreadsheet_cell(getattr(record, name)) for name in PLAIN]
         writer.writerow([*plain, *record.coordinates, *record.action, *record.next_coordinates])
     return text.getvalue().encode()
 
@@ -38,8 +38,3 @@ def as_npz(coordinate_names: Sequence[str], records: Sequence[SampleRecord]) -> 
     termination, purpose and the like (n,)."""
     arrays: dict[str, Any] = {name: np.array([getattr(record, name) for record in records]) for name in ARRAYS}
     return npz_of_steps(coordinate_names, arrays)
-
-
-def _cell(value: Any) -> Any:
-    """Text that a spreadsheet does not read as a formula, because a sampler's name comes from outside."""
-    return f"'{value}" if isinstance(value, str) and value[:1] in "=+-@\t\r" else value

@@ -18,7 +18,7 @@ const mappingText = (mapping) => JSON.stringify(Object.fromEntries(Object.entrie
 
 function rejectedParts({ rejected, rejected_rows: rows }) {
   if (!rejected) return [];
-  const cell = (text) => `"${String(text).replaceAll('"', '""')}"`;
+  const cell = (text) => `"${String(text).replace(/^(?=\s*[=+\-@＝＋－＠])/, "'").replaceAll('"', '""')}"`; // no formula of a spreadsheet
   const csv = () => ["line,reason", ...rows.map(({ line, reason }) => `${line},${cell(reason)}`), ""].join("\n");
   return [
     h("p", { class: "bad" }, `${plural(rejected, "row")} can't be used${rejected > SHOWN ? `; the first ${SHOWN} are shown` : ""}.`),

@@ -21,6 +21,7 @@ from surrogym_shared.logs.table import Bools, Floats, Table
 from surrogym_shared.logs.too_few import require_steps
 from surrogym_shared.logs.transitions import Transitions, transitions_of
 from surrogym_shared.logs.units import require_units
+from surrogym_shared.logs.writing import spreadsheet_cell
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.terms import terminates
 
@@ -115,9 +116,9 @@ def write_rejected(path: Path, table: Table, steps: Transitions) -> None:
     """Write the rows that were set aside as CSV: line, reason, and the cells as in the log."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow([*HEADING, *(table.heading or table.names)])
+        writer.writerow([*HEADING, *map(spreadsheet_cell, table.heading or table.names)])
         for row, reason in steps.rejected.items():
-            writer.writerow([table.lines[row], reason, *table.row(row)])
+            writer.writerow([table.lines[row], *map(spreadsheet_cell, [reason, *table.row(row)])])
 
 
 def is_of_rejected(path: Path) -> bool:

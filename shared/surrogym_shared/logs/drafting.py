@@ -238,7 +238,8 @@ def _observed(coordinate: Coordinate) -> Iterator[ObservationEntry]:
 
 def _action(roles: Roles, steps: Transitions, notes: list[str]) -> BoxAction | DiscreteAction:
     values = steps.u
-    highest = int(values.max()) if values.size else 0
+    declared = [end for name in roles.action if (end := roles.limits.get(name, (None, None))[1]) is not None]
+    highest = int(max([values.max(), *declared])) if values.size else 0
     whole = bool((values == np.floor(values)).all() and values.min() >= 0 and 1 <= highest < MOST_DISCRETE)
     named = len(np.unique(values)) == highest + 1
     if values.shape[1] == 1 and (roles.discrete or (roles.discrete is None and whole and named)):

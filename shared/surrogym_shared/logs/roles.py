@@ -75,6 +75,8 @@ def read_roles(table: Table, mapping: Path | Mapping[str, Any] | LogMapping | No
         if mapped.episode is not None and mapped.episode.removeprefix(BY) in table.columns:
             table = _with_episodes(table, mapped.episode.removeprefix(BY))
         roles = roles_by_mapping(mapped, (*table.names, *table.unnamed), where)
+    if roles.discrete is None:
+        roles = replace(roles, discrete=table.discrete, limits={**table.limits, **roles.limits})
     if twice := [name for name in roles.used if name in table.repeated]:
         count = table.repeated[twice[0]]
         raise UnusableLog(f"expected each column that is used once in the heading, got {twice[0]!r} {count} times")

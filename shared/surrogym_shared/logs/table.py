@@ -24,6 +24,8 @@ NO_FINITE = ("nan", "+nan", "-nan", "inf", "+inf", "-inf", "infinity", "+infinit
 BOOLEANS = {"True": 1.0, "False": 0.0, "true": 1.0, "false": 0.0, "TRUE": 1.0, "FALSE": 0.0}
 DATES, DURATIONS = "M", "m"  # kinds of NumPy types
 NO_NUMBERS = {DATES: "dates", DURATIONS: "durations", "c": "complex numbers", "V": "records"}
+FEWEST_STAMPS = 3  # numbers that show that a column has time stamps
+MOST_STAMPS = 0.9  # share of them that are dates
 MAX_MEASURED = 1e30  # the server takes no larger number
 
 
@@ -41,6 +43,8 @@ class Table:
         unnamed: columns without a name in the file, by the words that stand for it.
         repeated: how often a name stands in the heading, if more than once. Such columns are not in ``columns``.
         ignored: reason for each array of the file that is not a column, by its name.
+        discrete: whether the file declares the action as discrete; None if it does not say.
+        limits: limits of action entries that the file declares, by the entry's name.
         remarks: what the report on the log says about the form of the file.
         evaluated: whether the steps come from an evaluation in the surrogate's own environment, so that their units and
             ends are not in doubt.
@@ -55,6 +59,8 @@ class Table:
     unnamed: tuple[str, ...] = ()
     repeated: Mapping[str, int] = field(default_factory=dict)
     ignored: Mapping[str, str] = field(default_factory=dict)
+    discrete: bool | None = None
+    limits: Mapping[str, tuple[float | None, float | None]] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     evaluated: bool = False
 
@@ -97,6 +103,9 @@ def times(name: str, cells: Cells) -> tuple[Floats, dict[int, str]]:
         values = np.where(np.isnat(cells), np.nan, seconds)
         return values, {int(row): f"{name}: missing" for row in np.flatnonzero(np.isnat(cells))}
     values, faults = numbers(name, cells)
+    if (dates := stamps(values)) is not None:
+        odd = np.flatnonzero(np.isnan(dates) & np.isfinite(values))
+        return dates, {**{int(row): f"{name}: expected a date, got {values[row]:.0f}" for row in odd}, **faults}
     if cells.dtype.kind not in "biuf":
         for row in list(faults):
             try:
@@ -106,6 +115,28 @@ def times(name: str, cells: Cells) -> tuple[Floats, dict[int, str]]:
             values[row] = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
             del faults[row]
     return values, faults
+
+
+def stamps(values: Floats) -> Floats | None:
+    """Return the seconds (n,) of time stamps such as 20240331001500, NaN where one is no date.
+
+    Numbers are time stamps if most of them are dates from 1900 to 2199, with or without a time of day. Otherwise None.
+    """
+    finite = np.where(np.isfinite(values), values, 0)
+    for below in (1, 100, 10_000, 1_000_000):  # to the day, hour, minute or second
+        day = np.floor(finite / below)
+        if len(values) < FEWEST_STAMPS or not ((day >= 1900_01_01) & (day < 2200_00_00)).mean() > MOST_STAMPS:
+            continue
+        left = (finite - day * below) * (1_000_000 // below)
+        hour, minute, second = left // 10_000, left // 100 % 100, left % 100
+        months = ((day // 10_000 - 1970) * 12 + day // 100 % 100 - 1).astype(np.int64).astype("datetime64[M]")
+        dates = months.astype("datetime64[D]") + (day % 100 - 1).astype(np.int64)
+        same = (dates.astype("datetime64[M]") == months) & (day // 100 % 100 >= 1) & (day // 100 % 100 <= 12)
+        valid = same & (hour < 24) & (minute < 60) & (second < 60)
+        if valid.mean() > MOST_STAMPS:
+            seconds = dates.astype(np.int64) * 86_400.0 + hour * 3_600 + minute * 60 + second
+            return np.where(valid, seconds, np.nan)
+    return None
 
 
 def flags(name: str, cells: Cells) -> tuple[Bools, dict[int, str]]:

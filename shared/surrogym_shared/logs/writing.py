@@ -8,7 +8,19 @@ from typing import Any
 
 import numpy as np
 
+from surrogym_shared.logs.table import is_number
+from surrogym_shared.words import visible
+
+FORMULA = "=+-@\uff1d\uff0b\uff0d\uff20"  # what begins a formula, also in full width
 EVALUATED = "evaluated"  # array that marks steps of an evaluation in the surrogate's own environment
+
+
+def spreadsheet_cell(value: Any) -> Any:
+    """Return a cell of CSV that no spreadsheet reads as a formula and no terminal as an order. Numbers stay numbers."""
+    if not isinstance(value, str):
+        return value
+    shown = visible(value)
+    return f"'{shown}" if shown.strip()[:1] in (*FORMULA,) and not is_number(shown) else shown
 
 
 def npz_of_steps(coordinate_names: Sequence[str], arrays: Mapping[str, Any]) -> bytes:

@@ -86,7 +86,7 @@ def flat(name: str, observation: Any) -> Array:
     """
     entries = [observation[key] for key in sorted(observation)] if isinstance(observation, dict) else [observation]
     arrays = [np.asarray(entry) for entry in entries]
-    if any(a.ndim > 1 or a.dtype.kind not in "fiub" for a in arrays):
+    if any(sum(size > 1 for size in a.shape) > 1 or a.dtype.kind not in "fiub" for a in arrays):
         raise UnknownEnvironment(
             f"{name} observes images, or values that are not numbers: expected a row of numbers, or a dictionary of "
             "rows"

@@ -1,0 +1,109 @@
+"""Small files that are large inside are refused by their sizes, before anything of them is converted."""
+
+from __future__ import annotations
+
+import io
+import resource
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from surrogym_client.logs import UnusableLog, read_log
+
+MIB = 1024**2
+
+
+def refused(path: Path, says: str) -> None:
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(UnusableLog, match=says) as error:
+        read_log(path)
+    assert len(str(error.value)) < 1_000
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 * 1024, "KiB"
+
+
+def zeros(file: zipfile.ZipFile, name: str, rows: int) -> None:
+    """An array of zeros, written in pieces."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": (rows,)})
+    with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
+        entry.write(header.getvalue())
+        for _ in range(rows // MIB):
+            entry.write(bytes(MIB))
+        entry.write(bytes(rows % MIB))
+
+
+def test_rows_of_an_npz_are_counted_in_its_headers(tmp_path: Path):
+    with zipfile.ZipFile(tmp_path / "log.npz", "w", zipfile.ZIP_DEFLATED) as file:
+        for name in ("x", "action"):
+            zeros(file, name, 60 * MIB)
+    refused(tmp_path / "log.npz", "expected at most 2,000,000 rows in .*, got 62,914,560")
+
+
+def test_bytes_of_an_npz_are_counted_in_its_directory(tmp_path: Path):
+    with zipfile.ZipFile(tmp_path / "log.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
+        zeros(file, "x", 1025 * MIB)
+    refused(tmp_path / "log.npz", "expected at most 1073741824 bytes inside, got 1074790")
+
+
+def test_arrays_of_an_npz_are_counted_and_not_listed(tmp_path: Path):
+    with zipfile.ZipFile(tmp_path / "log.npz", "w") as file:
+        for number in range(2_000):
+            zeros(file, f"x{number}", 1)
+    refused(tmp_path / "log.npz", "expected at most 1,000 arrays in .*, got 2,000")
+
+
+def test_rows_of_parquet_are_counted_in_its_metadata(tmp_path: Path):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    part = pyarrow.table({"x": np.zeros(1_000_000, np.int8), "action": np.zeros(1_000_000, np.int8)})
+    with parquet.ParquetWriter(tmp_path / "log.parquet", part.schema) as file:
+        for _ in range(4):
+            file.write_table(part)
+    assert (tmp_path / "log.parquet").stat().st_size < MIB
+    refused(tmp_path / "log.parquet", "expected at most 2,000,000 rows in .*, got 4,000,000")
+
+
+def test_cells_of_lists_in_parquet_are_counted(tmp_path: Path):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    one = pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(np.zeros(52_000_000, np.int8)), 26_000_000)
+    parquet.write_table(pyarrow.table({"obs": one, "action": [0.0, 1.0]}), tmp_path / "log.parquet")
+    refused(tmp_path / "log.parquet", "expected at most 50,000,000 cells in .*, got 52,000,002")
+
+
+def test_a_long_text_in_parquet_is_not_repeated_in_each_row(tmp_path: Path):
+    """A file of 12 kB asked for 373 GiB."""
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    long = pyarrow.DictionaryArray.from_arrays(np.zeros(100_000, np.int32), ["x" * 4 * MIB])
+    table = pyarrow.table({"run": long, "x": np.arange(100_000) % 7, "action": np.arange(100_000) % 3})
+    parquet.write_table(table, tmp_path / "log.parquet", compression="zstd")
+    assert (tmp_path / "log.parquet").stat().st_size < MIB
+    refused(
+        tmp_path / "log.parquet", "expected cells of at most 10,000 letters in the column 'run' of .*, got 4,194,304"
+    )
+
+
+def test_text_and_nested_columns_of_parquet(tmp_path: Path):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    rng = np.random.default_rng(0)
+    columns = {"x": rng.normal(size=6), "action": rng.normal(size=6), "run": ["a", "a", "a", None, "b", "b"]}
+    columns |= {"info": [{"k": 1}] * 6, "tags": [["s"]] * 6, "raw": [b"\xff"] * 6}
+    parquet.write_table(pyarrow.table(columns), tmp_path / "log.parquet")
+    log = read_log(tmp_path / "log.parquet")
+    assert {"info", "tags", "raw"} == set(log.ignored)
+    assert log.steps.episodes[0] == 3
+
+
+def test_a_message_lists_few_of_many_columns(tmp_path: Path):
+    (tmp_path / "log.csv").write_text(",".join(f"x{k}" for k in range(900)) + "\n" + ",".join("1" * 900))
+    with pytest.raises(UnusableLog, match=r"'x9' and 890 more\]") as error:
+        read_log(tmp_path / "log.csv")
+    assert len(str(error.value)) < 500
