@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from surrogym_client.cli import train
+from surrogym_client.original.classic import pendulum
 from surrogym_client.original.loading import env_option
-from surrogym_client.training import TrainProgress, TrainResult
+from surrogym_client.training import TrainProgress, TrainResult, TrainSettings
 from surrogym_client.training.words import words_of, words_of_interruption, words_of_result
 
 RESULT = TrainResult(Path("p.zip"), "PPO", 512, 1.0, -150.0, 0, {})
@@ -75,3 +79,13 @@ def test_replaced_networks_are_reported():
 def test_the_advice_after_an_interruption_keeps_the_closed_loop():
     words = words_of_interruption(RESULT, "cart --improve 5 --rounds 3")
     assert words.endswith("to continue: surrogym train cart --improve 5 --rounds 3 --start-from p.zip --out p.zip")
+
+
+@pytest.mark.parametrize("sessions", [0, 1, 2])
+def test_another_open_session_gives_a_warning_of_two_trainings(sessions: int, monkeypatch, capsys) -> None:
+    known = {"name": "rig", "model_version": 1, "phase": "ready", "paused": False, "spec": pendulum()}
+    view = SimpleNamespace(**known, sessions=sessions)
+    monkeypatch.setattr(train, "awaited_surrogate", lambda *_, **__: view)
+    monkeypatch.setattr(train, "connect", lambda *_, **__: nullcontext(SimpleNamespace(url="here")))
+    assert train._trainable("rig", None, None, 0.0, TrainSettings(), quiet=False) == (pendulum(), "here")
+    assert ("warning" in capsys.readouterr().err) is (sessions > 0)

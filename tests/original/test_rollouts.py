@@ -131,3 +131,19 @@ def test_a_choice_can_take_teleport_away_from_ones_own_class_that_has_both():
     assert isinstance(answering(Both()), OriginalEnvironment)
     assert isinstance(answering(Both()), Both)
     assert isinstance(answering(Rail()), FromReset)
+
+
+@pytest.mark.parametrize(
+    ("methods", "lacking"),
+    [
+        (("spec", "step_from"), "close"),
+        (("spec", "reset", "step", "close"), "coordinates"),
+        (("step_from",), "spec and close"),
+    ],
+)
+def test_a_class_that_lacks_methods_is_refused_with_their_names(methods: tuple[str, ...], lacking: str) -> None:
+    made = type("Plant", (), {name: lambda *_: None for name in methods})()
+    if "spec" in methods:
+        made.spec = Rail().spec
+    with pytest.raises(UnknownEnvironment, match=rf"got a Plant without {lacking}$"):
+        answering(made)

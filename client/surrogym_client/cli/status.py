@@ -124,7 +124,8 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
 
     ledger = view.ledger
     lines = [
-        f"{view.name}: {view.environment or 'own environment'}, {'paused, ' if view.paused else ''}{view.phase}",
+        f"{view.name}: {view.environment or 'own environment'}{_period(view)}, "
+        f"{'paused, ' if view.paused else ''}{view.phase}",
         f"real steps: {ledger.initial} initial, {ledger.adaptive} adaptive, {ledger.manual} manual, "
         f"{ledger.total} of {view.budget} in all; {ledger.audit} of audits, {ledger.logged} logged, "
         f"{ledger.evaluation} in evaluation, "
@@ -152,6 +153,12 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
     if following := advice(view, models):
         lines.append(f"next: {following}")
     return "\n".join(lines)
+
+
+def _period(view: SurrogateView) -> str:
+    """The declared sampling period, with a comma before it; empty without one."""
+    period = view.spec.sampling_period
+    return "" if period is None else f", a step every {period:g} s"
 
 
 def _steps(seen: SurrogateSummary) -> str:

@@ -157,6 +157,17 @@ def _keeping(write_card: Callable[[TrainResult], object], asked: str) -> Iterato
         raise
 
 
+def _words_of_sessions(view: SurrogateView) -> str:
+    """Warn of another training of the surrogate, which may be running."""
+    from surrogym_shared.words import counted
+
+    are = "is" if view.sessions == 1 else "are"
+    return (
+        f"warning: {counted(view.sessions, 'session')} of {view.name!r} {are} open, perhaps of another training. "
+        "Trainings at the same time share the budget of real steps, and each one's steps change the model of the others"
+    )
+
+
 def _trainable(
     surrogate: str, server: str | None, token: str | None, wait: float, settings: TrainSettings, *, quiet: bool
 ) -> tuple[EnvironmentSpec, str]:
@@ -186,6 +197,8 @@ def _trainable(
                 )
         if view.model_version is None:
             raise CommandError(_words_without_model(view))
+        if view.sessions:
+            say(_words_of_sessions(view), quiet=quiet)
         if view.phase in ("over_budget", "unsure"):
             say(words_of_uncertainty(view), quiet=quiet)
         if view.phase not in COMPLETED and not view.paused:

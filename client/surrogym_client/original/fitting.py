@@ -7,6 +7,7 @@ from typing import TypeAlias
 
 from surrogym_client.original.errors import PolicyMisfit
 from surrogym_client.original.executables import is_executable
+from surrogym_client.original.periods import is_other
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 
 ROUNDING = 1e-6  # share of the larger limit; float32 rounds by less
@@ -31,7 +32,8 @@ def check_shape(trained: EnvironmentSpec, own: EnvironmentSpec, called: str) -> 
 
 
 def check_policy(trained: EnvironmentSpec, own: EnvironmentSpec) -> None:
-    """Check that an environment has what a policy was trained for: coordinates, action and observation.
+    """Check that an environment has what a policy was trained for: coordinates, action, observation and
+    sampling period.
 
     Limits of continuous actions must lie within the environment's, because every action beyond them would be cut off.
     Bins must be equal, because a policy gives their numbers. How queries begin, ranges and starts may differ.
@@ -49,6 +51,11 @@ def check_policy(trained: EnvironmentSpec, own: EnvironmentSpec) -> None:
     both = zip(asked, allowed, strict=True)
     if not all(is_within(a, b) and (_bins(own) is None or is_within(b, a)) for a, b in both):
         raise PolicyMisfit(f"{misfit}: expected actions from {range_in_words(asked)}, got {range_in_words(allowed)}")
+    if is_other(trained.sampling_period, own.sampling_period):
+        raise PolicyMisfit(
+            f"{misfit}: expected a step every {trained.sampling_period:g} s (sampling_period), got "
+            f"{own.sampling_period:g} s"
+        )
     expected, got = _observation_in_words(trained), _observation_in_words(own)
     if len(trained.observation) != len(own.observation):
         raise PolicyMisfit(f"{misfit}: expected observation ({expected}), got ({got})")

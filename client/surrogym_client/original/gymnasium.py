@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from surrogym_client.original.classic import PAPER_TASKS, TASKS, Task
 from surrogym_client.original.errors import StepFailed
+from surrogym_client.original.periods import period_of
 from surrogym_client.original.protocol import Array, RealStep
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.spec.actions import Action
@@ -49,6 +50,7 @@ class GymnasiumEnvironment:
         self._task = task_for(spec.environment, spec.design.preset)
         self._env: Any = gymnasium.make(spec.environment).unwrapped
         self._env.reset(seed=0)
+        self.period = period_of(self._env)
         self._shows_own = shows_the_same(spec)
 
     def spec(self) -> EnvironmentSpec:

@@ -18,6 +18,7 @@ from surrogym_client.original.executables import Executable, is_executable, open
 from surrogym_client.original.gymnasium import GymnasiumEnvironment, opens_task, task_for
 from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
+from surrogym_client.original.periods import period_of, require_period
 from surrogym_client.original.protocol import LONGEST_EPISODE, Environment
 from surrogym_client.original.rollouts import answering
 from surrogym_client.original.simulator import Simulated
@@ -81,7 +82,7 @@ def make(
     if is_executable(name):
         return open_executable(name, spec, choose, step_limit)
     if is_own(name):
-        return _own(_made(name), spec, choose)
+        return _own(name, _made(name), spec, choose)
     return _known(name, spec, choose, preset or "default", step_limit)
 
 
@@ -226,12 +227,15 @@ def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str,
         base = spec or task_for(name, preset).spec()
         made = choose(base)
         require_same_action(name, made.action, TASKS[name].spec().action)
-        return GymnasiumEnvironment(made)
+        environment = GymnasiumEnvironment(made)
+        require_period(name, made, environment.period)
+        return environment
     base = choose(spec or specification(name))
     own = name in SPECIFICATIONS and SPECIFICATIONS[name]().observation == base.observation
     simulator = open_simulator(name)
     try:
         require_same_action(name, base.action, simulator.action)
+        require_period(name, base, simulator.period)
         return simulator.with_specification(base, shows_own=own, step_limit=step_limit)
     except UnknownEnvironment as error:
         simulator.close()
@@ -267,9 +271,10 @@ def _made(name: str) -> Any:
         raise UnknownEnvironment(f"{name} ended while it was made: {sentence(error)}") from error
 
 
-def _own(made: Any, spec: EnvironmentSpec | None, choose: Choose) -> Environment:
+def _own(name: str, made: Any, spec: EnvironmentSpec | None, choose: Choose) -> Environment:
     if not callable(getattr(made, "spec", None)):
         return answering(made)  # its error says what is missing
     own = made.spec()
     given = choose(spec or own)
+    require_period(name, given, period_of(made))
     return answering(made if given == own else _Respecified(made, given))

@@ -21,6 +21,8 @@ from surrogym_client.original.protocol import (
 )
 from surrogym_shared.spec import EnvironmentSpec
 
+KINDS = (("spec", "step_from", "close"), ("spec", "reset", "step", "coordinates", "close"))  # methods that each needs
+
 
 class FromReset:
     """A ``ResettableEnvironment`` as a ``RolloutEnvironment``: each step begins where the one before ended.
@@ -137,7 +139,7 @@ def answering(environment: object) -> Environment:
     if not isinstance(environment, (OriginalEnvironment, RolloutEnvironment)):
         raise UnknownEnvironment(
             "expected an object with spec, step_from and close, or with spec, reset, step, coordinates and close, "
-            f"got a {type(environment).__name__}"
+            f"got a {type(environment).__name__} without {_missing(environment)}"
         )
     query = environment.spec().query
     needed, methods = (
@@ -150,6 +152,12 @@ def answering(environment: object) -> Environment:
             f"its specification declares query={query!r}, which needs {methods}: some of them are missing"
         )
     return environment
+
+
+def _missing(environment: object) -> str:
+    """Name the methods that an object lacks of the kind of environment to which it is nearest."""
+    lacking = [[name for name in names if not callable(getattr(environment, name, None))] for names in KINDS]
+    return " and ".join(min(lacking, key=len))
 
 
 def _check_snapshots(environment: object) -> None:

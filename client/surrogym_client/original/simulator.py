@@ -66,6 +66,7 @@ class Simulator(ABC):
         variables: the state's numbers, (V,).
         rest: the state (V,) that a variable has where no coordinate says otherwise.
         time_limit: steps of an episode; None without a limit.
+        period: seconds from one step to the next; None if it does not tell.
         scheduled: variables that a schedule sets, such as setpoints, with their lowest and highest value in it. They
             are coordinates, also where a few steps show one value alone.
         shown_limits: declared limits (D, 2) of the entries of its observation, infinite where it has none.
@@ -82,6 +83,7 @@ class Simulator(ABC):
     variables: tuple[Variable, ...]
     rest: Array
     time_limit: int | None = None
+    period: float | None = None
     scheduled: Mapping[str, tuple[float, float]] = MappingProxyType({})
     notes: tuple[str, ...] = ()
     questions: tuple[str, ...] = ()

@@ -11,6 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.policies.card import DEFAULT_ALGORITHM, PolicyCard, UnusablePolicy, read_card
+from surrogym_client.policies.normalisation import (
+    Normalisation,
+    is_normalised,
+    missing_statistics,
+    statistics_path,
+)
 from surrogym_client.policies.onnx_files import load_onnx
 from surrogym_client.policies.predict import Predict
 from surrogym_shared.network import Network
@@ -55,17 +61,20 @@ def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM, *, trust: bool =
         trust: unpickle a policy's objects, which runs any code that is in them.
 
     Raises:
-        UnusablePolicy: the algorithm is unknown, the file is not one of its policies, or it needs ``trust``.
+        UnusablePolicy: the algorithm is unknown, the file is not one of its policies, it needs ``trust``, or it learned
+            in a ``VecNormalize`` whose statistics are not beside it.
         UnusableOnnx: the file is not a policy in ONNX, or it could need more memory than a policy should.
     """
     if Network.is_at(path):
         return load_network(path)
     if path.suffix.lower() == ONNX:
         return load_onnx(path)
-    model = load_learner(path, algorithm, trust=trust)
+    model = _learner(path, algorithm, trust, {})
+    normalise = _normalisation(path, model)
 
     def predict(observations: NDArray[np.float32]) -> NDArray[Any]:
-        actions: NDArray[Any] = model.predict(observations, deterministic=True)[0]
+        shown = observations if normalise is None else normalise(observations)
+        actions: NDArray[Any] = model.predict(shown, deterministic=True)[0]
         return actions
 
     return predict
@@ -92,8 +101,29 @@ def load_learner(
             environment.
 
     Raises:
-        UnusablePolicy: the algorithm is unknown, the file is not one of its policies, or it needs ``trust``.
+        UnusablePolicy: the algorithm is unknown, the file is not one of its policies, it needs ``trust``, or it learned
+            in a ``VecNormalize``.
     """
+    model = _learner(path, algorithm, trust, changes)
+    if is_normalised(model):
+        raise UnusablePolicy(
+            f"expected a policy that sees observations as they are, got {path}, which learned in a VecNormalize: "
+            "surrogym evaluate can run it, with the statistics beside it"
+        )
+    return model
+
+
+def _normalisation(path: Path, model: BaseAlgorithm) -> Normalisation | None:
+    """How the policy's observations are normalised; None if they are not."""
+    if not is_normalised(model):
+        return None
+    if not statistics_path(path).is_file():
+        raise missing_statistics(path)
+    return Normalisation(statistics_path(path))
+
+
+def _learner(path: Path, algorithm: str, trust: bool, changes: dict[str, Any]) -> BaseAlgorithm:
+    """Load an algorithm from its file. Arguments and errors as of ``load_learner``."""
     import stable_baselines3
 
     kind = getattr(stable_baselines3, algorithm.upper(), None)
@@ -107,7 +137,7 @@ def load_learner(
         raise UnusablePolicy(f"{path}: expected weights that are numbers, got other pickled objects") from error
     except Exception as error:  # a malformed file can raise anything
         if changes:
-            load_learner(path, algorithm, trust=trust)
+            _learner(path, algorithm, trust, {})
             given = [f"{name}={value!r}" for name, value in changes.items() if name not in ("env", "seed")]
             raise UnusablePolicy(f"{path} does not fit {', '.join([*given, 'this surrogate'])}: {error}") from error
         raise UnusablePolicy(f"{path} is not a policy of {algorithm}: {error}") from error

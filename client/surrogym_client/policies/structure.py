@@ -116,7 +116,7 @@ class Structure(BaseModel):
 def save(learner: BaseAlgorithm, path: Path) -> None:
     """Save a policy as ``learner.save`` does, and add the description if the policy can be described."""
     file = io.BytesIO()
-    learner.save(file)
+    learner.save(file, exclude=["_last_original_obs"])  # by which ``normalisation`` tells policies of other programs
     if (structure := describe(learner)) is not None:
         with zipfile.ZipFile(file, "a") as archive:
             archive.writestr(ENTRY, structure.model_dump_json())

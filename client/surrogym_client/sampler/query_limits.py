@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from surrogym_client.original.errors import QueryRefused, UnknownEnvironment
 from surrogym_client.original.fitting import Range, action_ranges, is_within, range_in_words
+from surrogym_client.original.periods import is_other
 from surrogym_shared.spec import MAX_ROLLOUT_QUERY, Access, BoxAction, EnvironmentSpec
 from surrogym_shared.spec import limits as sampled
 from surrogym_shared.wire import Query, StepQuery
@@ -23,6 +24,11 @@ def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSp
     if expected != got:
         raise UnknownEnvironment(
             f"the environment does not fit surrogate {surrogate!r}: expected {expected}, got {got}"
+        )
+    if is_other(asked.sampling_period, own.sampling_period):
+        raise UnknownEnvironment(
+            f"the environment does not fit surrogate {surrogate!r}: expected a step every {asked.sampling_period:g} s "
+            f"(sampling_period), got {own.sampling_period:g} s"
         )
     _check_ranges("actions", action_ranges(asked), action_ranges(own))
     _check_ranges("coordinates", [sampled(c.sampling) for c in asked.coordinates], _coordinate_ranges(own))

@@ -100,6 +100,9 @@ class EnvironmentSpec(Frozen):
     )
     termination: Termination = ()
     time_limit: Annotated[int, Field(ge=1, le=10_000_000, strict=True)] | None = None
+    sampling_period: Positive | None = Field(
+        default=None, description="seconds from one step to the next; None: nobody declared it"
+    )
     outside_reward: Number | None = Field(
         default=None,
         description="ends a virtual episode that leaves the sampling ranges, or what a session trusts, and pays this "

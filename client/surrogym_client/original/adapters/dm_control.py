@@ -57,6 +57,7 @@ class ControlSuite(OfParts):
         self._physics, self._task = env.physics, env.task
         model, data = self._physics.model.ptr, self._physics.data.ptr
         super().__init__(mujoco_parts(model, data, self.reset), model, data)
+        self.period = float(env.control_timestep())
         self._substeps = round(env.control_timestep() / self._physics.timestep())
         bounds = env.action_spec()
         self.action = BoxAction(low=tuple(map(float, bounds.minimum)), high=tuple(map(float, bounds.maximum)))

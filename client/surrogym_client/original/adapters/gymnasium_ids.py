@@ -16,6 +16,7 @@ import numpy as np
 from surrogym_client.original.adapters.parts import OfParts, action_of, flat
 from surrogym_client.original.errors import StepFailed, UnknownEnvironment
 from surrogym_client.original.gymnasium import native_action
+from surrogym_client.original.periods import period_of
 from surrogym_client.original.protocol import Array
 from surrogym_client.original.simulator import Simulator, Taken, Variable
 from surrogym_client.original.state_parts import (
@@ -95,6 +96,7 @@ class _Gymnasium(Simulator):
         self.action = action_of(name, env.action_space)
         self.shown_limits = _limits_of(env.observation_space)
         self.time_limit = limit
+        self.period = period_of(env.unwrapped)
 
     def reset(self, seed: int | None) -> Array:
         observation, _ = _entries(self._env.reset(seed=seed), "its reset", ("observation", "info"))

@@ -141,6 +141,7 @@ class _Draft:
             action=self._simulator.action,
             start={c.name: ranges.start(i, c) for i, c in zip(self._kept, coordinates, strict=True)},
             termination="learned" if self._seen.terminated.any() else (),
+            sampling_period=self._simulator.period,
             time_limit=self._seen.limit or self._simulator.time_limit or UNKNOWN_LIMIT,
             query="step" if self._probed.settable else "rollout",
             snapshots=self._simulator.saves and not self._simulator.settable,
