@@ -21,7 +21,6 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
 }
 REST = "More"  # heading of the commands of no group, such as those of other packages
 ADVANCED: Mapping[str, frozenset[str]] = {  # options that a first reader does not need, by command
-    "demo": frozenset({"--arm"}),
     "evaluate": frozenset(
         {"--wide", "--start-scale", "--perturb", "--explore", "--parallel", "--algorithm", "--where", "--learn"}
         | {"--learn-all", "--compare", "--reference", "--video"}
