@@ -15,7 +15,7 @@ from surrogym_server.engine.requests import Array, Opening, Reply, SessionInfo
 from surrogym_server.engine.tallies import SessionActivity
 from surrogym_server.environment import definition as core
 from surrogym_server.errors import InvalidInput
-from surrogym_server.virtual import VirtualSettings
+from surrogym_server.virtual import Residual, VirtualSettings
 from surrogym_shared import frames
 from surrogym_shared import wire as replies
 from surrogym_shared.acting import ActingPolicy, NoiseKey, PolicyRun
@@ -41,6 +41,7 @@ def opening(request: replies.OpenSession) -> Opening:
         weighting=request.weighting,
         spread=request.spread,
         functions=request.functions,
+        residual=None if request.residual is None else residual(request.residual),
     )
     return Opening(
         settings=settings,
@@ -50,6 +51,11 @@ def opening(request: replies.OpenSession) -> Opening:
         occupancy=request.occupancy,
         key=request.idempotency_key,
     )
+
+
+def residual(given: replies.Residual) -> Residual:
+    weights = tuple(tuple(map(tuple, rows)) for rows in given.weights)
+    return Residual(tuple(given.centre), tuple(given.scale), weights)
 
 
 def session_view(session: SessionInfo, idle_seconds: float, replay: int = 0) -> replies.SessionView:

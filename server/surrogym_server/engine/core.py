@@ -94,8 +94,10 @@ def opened(
 
 def resolved(opening: Opening, definition: EnvironmentDefinition) -> VirtualSettings:
     """Settings in which the surrogate's values replace those that the trainer left open. Raises ``InvalidInput`` for
-    sensor noise of an unknown coordinate."""
+    sensor noise of an unknown coordinate, and for a residual that does not fit."""
     check_sensors(definition, opening.settings.sensor_noise)
+    if opening.settings.residual is not None:
+        opening.settings.residual.check(definition)
     return replace(
         opening.settings,
         time_limit=opening.settings.time_limit or definition.time_limit,

@@ -18,7 +18,7 @@ from surrogym_server.engine.session import Answer, Fingerprint, Outcome, Session
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import Damaged, InvalidInput, UnknownSession
 from surrogym_server.tensors import to_device
-from surrogym_server.virtual import LaneState, VirtualSettings
+from surrogym_server.virtual import LaneState, Residual, VirtualSettings
 from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
 
 FORMAT = 2
@@ -100,10 +100,11 @@ def _read(definition: EnvironmentDefinition, data: bytes, surrogate_id: int) -> 
 
 
 def _settings(saved: dict[str, Any], starts: NDArray[Any] | None, device: torch.device) -> VirtualSettings:
-    limits, noise = saved["reward_limits"], saved["sensor_noise"]
+    limits, noise, residual = saved["reward_limits"], saved["sensor_noise"], saved.get("residual")
     tuples = {
         "reward_limits": None if limits is None else (limits[0], limits[1]),
         "sensor_noise": tuple((name, deviation) for name, deviation in noise),
+        "residual": None if residual is None else Residual.from_saved(residual),
     }
     visited = None if starts is None else torch.from_numpy(starts).to(device)
     return VirtualSettings(**{**saved, **tuples, "visited": visited})

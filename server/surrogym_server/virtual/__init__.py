@@ -3,11 +3,13 @@
 from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, create, expected_bytes, reset
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.limits import reward_limits, within
+from surrogym_server.virtual.residual import Residual
 from surrogym_server.virtual.step import in_fastest_form, step
 
 __all__ = [
     "LaneState",
     "LaneTransition",
+    "Residual",
     "VirtualSettings",
     "create",
     "expected_bytes",

@@ -19,6 +19,7 @@ from surrogym_server.virtual.dynamics import Moved, Weighting, move_mean, move_p
 from surrogym_server.virtual.lanes import ENDED, EVERY, NEW, RUNNING, Chosen, LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 from surrogym_server.virtual.paths import with_paths
+from surrogym_server.virtual.residual import Residual, with_residual
 from surrogym_server.virtual.sensors import SensorNoise, driving, sensed
 from surrogym_server.virtual.start import start_coordinates, start_particles
 
@@ -43,6 +44,7 @@ class VirtualSettings:
     weighting: Weighting = "inverse_variance"
     spread: float = 0.01  # first deviation of particles, as a share of each coordinate's range
     functions: int | None = None  # number of functions that lanes of variant pathwise share; None: one for each lane
+    residual: Residual | None = None  # systematic errors that are added to each prediction
     process_noise: bool = False  # the learned noise moves the state, w of eq. 2
     sensor_noise: SensorNoise = ()  # errors of observed coordinates, which don't move the state
     reward_limits: tuple[float, float] | None = None  # of mean rewards; None: none
@@ -143,7 +145,10 @@ def step(
         active = with_paths(model, active, settings.functions)
     action = torch.from_numpy(u).to(definition.device)
     action = action if isinstance(moving, slice) else action[moving]
-    moved = _doubted(model, settings, _move(model, settings, active, action, deviations, particle_steps))
+    moved = _move(model, settings, active, action, deviations, particle_steps)
+    if settings.residual is not None:
+        moved = with_residual(model, settings.residual, active, action, moved)
+    moved = _doubted(model, settings, moved)
     untrusted = _untrusted(model, settings, moved)
     left = _left(definition, moved, untrusted)
     if left is not None:

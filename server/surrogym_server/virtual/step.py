@@ -16,9 +16,12 @@ logger = logging.getLogger(__name__)
 
 
 def in_fastest_form(settings: VirtualSettings, model: DynamicsModel) -> VirtualSettings:
-    """Settings of a new session, with compiled steps if they work here and are faster."""
+    """Settings of a new session, with compiled steps if they work here and are faster.
+
+    Compiled steps know no residual.
+    """
     deviations = settings.variant == "probabilistic" or settings.penalty > 0 or settings.doubts
-    able = offers(model, CompiledSteps)
+    able = None if settings.residual is not None else offers(model, CompiledSteps)
     if able is None or not able.compiled_pays(deviations=deviations):
         return settings
     try:

@@ -49,8 +49,9 @@ _NAMES = {
     "service": "Access Event Health Ready",
     "sessions": (
         "OF_PARTICLES ActionNoise ActionRow Actions ActionSpace BoxSpace DiscreteSpace MultiDiscreteSpace "
-        "OpenSession PolicyArrays PolicyLayer ResetReply ResetSession RolloutReply RolloutSession SessionActivity "
-        "SessionCoordinates SessionList SessionView StepReply StepSession SubmitOccupancy SubmittedOccupancy"
+        "OpenSession PolicyArrays PolicyLayer Residual ResetReply ResetSession RolloutReply RolloutSession "
+        "SessionActivity SessionCoordinates SessionList SessionView StepReply StepSession SubmitOccupancy "
+        "SubmittedOccupancy"
     ),
     "surrogates": (
         "CheckedSurrogate CreatedSurrogate CreateSurrogate DoubtfulRegion Fidelity ImprovedSurrogate Ledger "

@@ -11,6 +11,7 @@ from surrogym_shared.checks import LARGEST
 from surrogym_shared.network import MAX_LAYERS, Activation
 from surrogym_shared.spec import MAX_DIMENSIONS
 from surrogym_shared.wire.base import (
+    MAX_DRAWS,
     MAX_LANES,
     MAX_PARTICLES,
     MAX_ROLLOUT,
@@ -25,6 +26,27 @@ from surrogym_shared.wire.base import (
 )
 
 OF_PARTICLES = ("particles", "propagation", "weighting", "spread")
+
+
+Residuals = Annotated[list[FiniteFloat], Field(min_length=1, max_length=4 * MAX_DIMENSIONS)]
+
+
+class Residual(Request):
+    """Systematic errors of a model, which a session adds to its predictions: affine functions of state and action.
+
+    The P inputs are the coordinates, in their order, with cosine and sine in place of an angle, and then the entries of
+    the action. Each is standardised by ``centre`` and ``scale``, and limited to three deviations.
+    """
+
+    centre: Residuals = Field(description="(P,) value of each input that counts as 0")
+    scale: Residuals = Field(description="(P,) by which the difference is divided")
+    weights: Annotated[
+        list[Annotated[list[Residuals], Field(min_length=1, max_length=MAX_DIMENSIONS)]],
+        Field(min_length=1, max_length=MAX_DRAWS),
+    ] = Field(
+        description="(K, O, 1 + P) constant and weights of each output, in the order of the session's ``outputs``; "
+        "lane i has those of row i modulo K"
+    )
 
 
 class OpenSession(Request):
@@ -98,6 +120,10 @@ class OpenSession(Request):
         description="variant pathwise: number of drawn functions; lane i follows function i modulo this number, so "
         "that lanes share functions from different starts; null: one function for each lane",
     )
+    residual: Residual | None = Field(
+        default=None,
+        description="systematic errors to add to each prediction, such as those that real steps have shown; null: none",
+    )
     occupancy: bool = Field(
         default=False,
         description="whether to collect the visited states, which can then be submitted under the name of a checkpoint",
@@ -118,6 +144,8 @@ class OpenSession(Request):
         for name in () if self.variant == "probabilistic" else OF_PARTICLES:
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise ValueError(f"{name}: expected with variant probabilistic alone, got with {self.variant}")
+        if self.residual is not None and self.variant == "probabilistic":
+            raise ValueError("residual: expected with variant deterministic or pathwise, got with probabilistic")
         if self.functions is not None and self.variant != "pathwise":
             raise ValueError(f"functions: expected with variant pathwise alone, got with {self.variant}")
         return self

@@ -1,0 +1,82 @@
+"""Systematic errors of a model that a session adds to its predictions.
+
+Shapes: N lanes, C coordinates, F action entries, O outputs, P inputs: see ``inputs``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.step_rules import paid, placed, settle, with_lags
+from surrogym_server.errors import InvalidInput
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.virtual.dynamics import Moved
+from surrogym_server.virtual.lanes import LaneState
+
+FARTHEST = 3.0  # deviations to which a standardised input is limited
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Affine functions of standardised inputs, one for each output; lane i has those of row i modulo K."""
+
+    centre: tuple[float, ...]  # (P,)
+    scale: tuple[float, ...]  # (P,)
+    weights: tuple[tuple[tuple[float, ...], ...], ...]  # (K, O, 1 + P)
+
+    @classmethod
+    def from_saved(cls, saved: Mapping[str, Any]) -> Self:
+        """Restore what JSON made of a residual."""
+        weights = tuple(tuple(map(tuple, rows)) for rows in saved["weights"])
+        return cls(tuple(saved["centre"]), tuple(saved["scale"]), weights)
+
+    def check(self, definition: EnvironmentDefinition) -> None:
+        """Raise ``InvalidInput`` if the residual does not fit the environment."""
+        if definition.moves_observation:
+            raise InvalidInput("residual: expected a model of coordinates, got one of observations")
+        outputs = len(definition.outputs)
+        size = len(definition.coordinates) + len(definition.angles) + definition.action.size
+        shapes = {len(self.centre), len(self.scale), *(len(row) - 1 for rows in self.weights for row in rows)}
+        if shapes != {size} or {len(rows) for rows in self.weights} != {outputs}:
+            raise InvalidInput(
+                f"residual: expected centre and scale of {size} inputs, and weights of {outputs} outputs by {size + 1}"
+            )
+        if min(self.scale) <= 0:
+            raise InvalidInput(f"residual: expected scales above 0, got {min(self.scale)}")
+
+    def of(self, definition: EnvironmentDefinition, lanes: LaneState, u: Tensor) -> Tensor:
+        """Errors (N, O) of the step of lanes under u (N, F)."""
+        x = inputs(definition, lanes.q, u)
+        x = ((x - x.new_tensor(self.centre)) / x.new_tensor(self.scale)).clamp(-FARTHEST, FARTHEST)
+        x = torch.cat([torch.ones_like(x[:, :1]), x], 1)
+        weights = x.new_tensor(self.weights)
+        return torch.einsum("nop,np->no", weights[lanes.lane % len(weights)], x)
+
+
+def inputs(definition: EnvironmentDefinition, q: Tensor, u: Tensor) -> Tensor:
+    """Coordinates q (N, C), with cosine and sine in place of an angle, and actions u (N, F): (N, P)."""
+    columns: list[Tensor] = []
+    for index in range(q.shape[1]):
+        value = q[:, index]
+        columns += [value.cos(), value.sin()] if index in definition.angles else [value]
+    return torch.cat([torch.stack(columns, 1), u.to(q.dtype)], 1)
+
+
+def with_residual(model: DynamicsModel, residual: Residual, lanes: LaneState, u: Tensor, moved: Moved) -> Moved:
+    """The move of lanes under u (N, F) with the errors of ``residual`` added, and the environment's rules applied."""
+    definition = model.definition
+    errors = residual.of(definition, lanes, u)
+    q = settle(definition, moved.q + placed(definition, errors[:, :-1]))
+    q = with_lags(definition, lanes.q, u, q)
+    over = model.terminated(q)
+    more = errors[:, -1] + paid(model.terminal_reward, torch.zeros_like(errors[:, -1]), over)
+    more = more - paid(model.terminal_reward, torch.zeros_like(errors[:, -1]), moved.terminated)
+    mean = moved.reward_mean + more
+    reward = mean if moved.reward is moved.reward_mean else moved.reward + more
+    return replace(moved, q=q, terminated=over, reward_mean=mean, reward=reward)
