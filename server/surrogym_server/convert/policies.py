@@ -83,20 +83,37 @@ def _card(record: PolicyRecord) -> wire.PushedCard:
 
 
 def _fields(record: PolicyRecord, card: wire.PushedCard) -> dict[str, Any]:
-    names = ("algorithm", "virtual_steps", "imagined_return", "promise", "audit", "trusted", "reason")
+    names = ("algorithm", "virtual_steps", "imagined_return", "promise", "audit")
+    evaluations = [_evaluation(evaluation, card) for evaluation in record.evaluations]
+    trusted, reason = _trust(card, evaluations)
     return {
         "version": record.version,
         "created_at": record.created_at,
         "aliases": list(record.aliases),
         **{name: getattr(card, name) for name in names},
+        "trusted": trusted,
+        "reason": reason,
         "differs": record.card.get("differs"),
         "pushed_by": record.card.get(PUSHED_BY),
         "files": [
             {"form": file.form, "bytes": file.bytes, "digest": file.digest, "stored": file.blob is not None}
             for file in record.files
         ],
-        "evaluations": [_evaluation(evaluation, card) for evaluation in record.evaluations],
+        "evaluations": evaluations,
     }
+
+
+def _trust(card: wire.PushedCard, evaluations: list[dict[str, Any]]) -> tuple[bool | None, str]:
+    """The verdict on a promise with its reason: that of the card, unless the latest evaluation that judges the promise
+    broke it."""
+    judged = [one for one in evaluations if one["promise_kept"] is not None]
+    latest = max(judged, key=lambda one: int(one["id"]), default=None)
+    if latest is None or latest["promise_kept"] or card.promise is None:
+        return card.trusted, card.reason
+    return False, (
+        f"the latest evaluation broke the promise: a mean return of {latest['mean']:.4g}, where at least "
+        f"{card.promise.low:.4g} was promised"
+    )
 
 
 def _evaluation(record: EvaluationRecord, card: wire.PushedCard) -> dict[str, Any]:

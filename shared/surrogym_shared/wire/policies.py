@@ -301,7 +301,10 @@ class PolicyView(Reply):
     imagined_return: float | None = Field(description="imagined return of the policy")
     promise: PolicyPromise | None = Field(description="promise of the policy")
     audit: PolicyAudit | None = Field(description="audit of the policy")
-    trusted: bool | None = Field(description="verdict on the promise; null: none was made")
+    trusted: bool | None = Field(
+        description="verdict on the promise; false if the latest evaluation that judges the promise broke it; null: "
+        "none was made"
+    )
     reason: str = Field(description="reason of the verdict")
     differs: str | None = Field(
         description="difference between the specification that the policy was trained for and the surrogate's; "

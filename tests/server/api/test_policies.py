@@ -146,6 +146,21 @@ def test_an_evaluation_has_intervals_and_says_whether_the_promise_was_kept(api: 
     assert [one.id for one in policy.evaluations] == [said.id, worse.id, kept.id, wide.id]
 
 
+def test_a_policy_whose_latest_evaluation_broke_its_promise_is_not_trusted(api: Api, surrogate: str, tmp_path: Path):
+    """Episodes elsewhere judge nothing, and a later evaluation that keeps the promise gives the trust back."""
+    api.policies.push(surrogate, card(reason="an audit passed"), [], "zip", network_file(tmp_path))
+    said = []
+    for number, (mean, name) in enumerate([(-180.0, "plants:Heavy"), (-180.0, ""), (-150.0, "")]):
+        returns: dict[str, Any] = {"returns": [mean] * 30, "lengths": [200] * 30}
+        api.policies.evaluate(surrogate, 1, episodes(str(number), environment=name, **returns))
+        said.append(api.policies.list(surrogate)[0])
+    assert [one.trusted for one in said] == [True, False, True]
+    assert said[1].reason == (
+        "the latest evaluation broke the promise: a mean return of -180, where at least -170 was promised"
+    )
+    assert said[2].reason == "an audit passed"
+
+
 def test_only_episodes_in_the_own_environment_judge_a_promise(api: Api, surrogate: str, tmp_path: Path):
     api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
     many: dict[str, Any] = {"returns": [-180.0] * 30, "lengths": [200] * 30}
