@@ -128,18 +128,33 @@ def _row(handover: Handover, *known: str | int | float) -> Row:
 
 
 @contextmanager
-def placed(url: str, spec: EnvironmentSpec, environment: Changing) -> Iterator[tuple[Api, HttpSurrogate]]:
-    """A surrogate, with a sampler beside the environment in a thread."""
+def placed(
+    url: str, spec: EnvironmentSpec, environment: Changing, *, keep: bool = False
+) -> Iterator[tuple[Api, HttpSurrogate]]:
+    """A surrogate, with a sampler beside the environment in a thread. It is deleted at the end, or kept."""
     name = f"audited-{uuid4().hex[:8]}"
-    with Api(url) as api, Api(url) as own, HttpSurrogate(url, name) as port:
+    with Api(url) as api, HttpSurrogate(url, name) as port:
         api.create_surrogate(name, spec)
-        settings = SamplerSettings(name="beside", wait_seconds=1.0, time_limit=2 * PATIENCE_SECONDS)
-        thread = threading.Thread(target=_until_deleted, args=(Sampler(own, name, environment, settings),))
+        with sampling(url, name, environment):
+            try:
+                yield api, port
+            finally:
+                if not keep:
+                    api.delete_surrogate(name)
+
+
+@contextmanager
+def sampling(url: str, name: str, environment: Changing) -> Iterator[None]:
+    """A sampler beside the environment in a thread, until the context ends or the surrogate is deleted."""
+    settings = SamplerSettings(name="beside", wait_seconds=0.5, time_limit=2 * PATIENCE_SECONDS)
+    with Api(url) as own:
+        sampler = Sampler(own, name, environment, settings)
+        thread = threading.Thread(target=_until_deleted, args=(sampler,))
         thread.start()
         try:
-            yield api, port
+            yield
         finally:
-            api.delete_surrogate(name)
+            sampler.stop()
             thread.join()
 
 
