@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from surrogym_client.cli.audit import _require_fit, _session
+from surrogym_client.cli.audit import _require_fit, session_of
 from surrogym_client.cli.errors import CommandError
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.policies.card import PolicyCard
@@ -28,12 +28,12 @@ def view(noise: float, sensor: float = 0.0) -> SurrogateView:
     ids=["no noise", "confirmed after the training", "the user chose none", "compared along functions"],
 )
 def test_session_of_an_audit_has_the_noise_known_now(settings, noise, expected):
-    assert _session(PolicyCard(settings=settings), view(noise)) == expected
+    assert session_of(PolicyCard(settings=settings), view(noise)) == expected
 
 
 def test_errors_of_a_sensor_are_observed():
     expected = {"process_noise": True, "sensor_noise": {"x": 0.07}}
-    assert _session(PolicyCard(settings={"session": {}}), view(0.1, sensor=0.07)) == expected
+    assert session_of(PolicyCard(settings={"session": {}}), view(0.1, sensor=0.07)) == expected
 
 
 def test_a_policy_of_another_surrogate_is_refused_before_a_real_step():

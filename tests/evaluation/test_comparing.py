@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from support.moody import SPEC
 from surrogym_client.cli.disagreement import Differing
 from surrogym_client.evaluation.audit import Compared
 from surrogym_client.evaluation.comparing import MOST, Disagreements, disagreements, samples_of, steady, steps_of
+from surrogym_client.evaluation.consequences import effects_of
 from surrogym_client.evaluation.evaluator import Trace
 
 NAMES = ("x", "reward")
@@ -101,3 +104,39 @@ def test_steps_within_which_a_constant_changed_are_not_compared() -> None:
     said = Differing(none, 0, changed=("wanted",), left_out=3).in_words(spec)
     assert said[1].startswith("not compared: 3 real steps, in each of which wanted changed")
     assert Differing(none, 0, left_out=3).as_json()["left_out"] == 3
+
+
+def shared(error: float) -> Compared:
+    """Steps of two episodes with a noise of 0.1 and a tolerance of 0.5. Errors of x share ``error`` where u > 0."""
+    rng, steps = np.random.default_rng(0), steps_of(episodes(2, 60))
+    q, u = (np.array([getattr(step, name) for step in steps]) for name in ("coordinates", "action"))
+    errors = 0.1 * rng.normal(size=(len(steps), 2))
+    errors[:, 0] += np.where(u[:, 0] > 0, error, 0.0)
+    return Compared(
+        NAMES, errors, np.zeros((len(steps), 2)), np.full(2, 0.5), claimed_alone=np.full(2, 0.3), states=q, actions=u
+    )
+
+
+def test_an_error_of_one_sign_is_found_with_its_region_and_cost_where_no_step_differs_alone() -> None:
+    beside, steps = shared(0.3), steps_of(episodes(2, 60))
+    (effect,), share = effects_of(SPEC, beside, lambda _, weights: 1e3 * weights[:, 0, 0])
+    assert (effect.output, effect.region and effect.region.name) == ("x", "action 0")
+    assert effect.error == pytest.approx(0.15, abs=0.05)
+    assert effect.change == pytest.approx(150, abs=60)
+    found = disagreements(steps, beside)
+    assert not found.found
+    first, *_, last = Differing(found, 0, effects=(effect,), broken=True).in_words(SPEC)
+    assert first == "no single step shows why the promise was broken"
+    assert "x is +0.1" in last
+    assert "where action 0 is between" in last
+    explaining = [steps[i] for i in np.argsort(-share)]
+    learned = samples_of(replace(found, shared=tuple(explaining)), 8)
+    assert np.mean([sample.action[0] > 0 for sample in learned]) > 0.8, "the steps that show the error"
+
+
+def test_a_right_model_has_no_effects_and_a_broken_promise_is_never_no_difference() -> None:
+    effects, share = effects_of(SPEC, shared(0.0), None)
+    assert not effects
+    assert not share.any()
+    (said,) = Differing(Disagreements(120, (), {}), 0, broken=True).in_words(SPEC)
+    assert said.startswith("the compared steps do not explain why the promise was broken")

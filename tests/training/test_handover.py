@@ -19,14 +19,16 @@ from support.moody import SPEC, Line
 from support.server import ServerProcess
 from surrogym_client.cli import main
 from surrogym_client.errors import UnknownSurrogate
+from surrogym_client.evaluation.evaluator import EvaluationSettings, evaluate
 from surrogym_client.original import RealStep
+from surrogym_client.original.episodes import open_episode
 from surrogym_client.policies.card import PolicyCard, read_card, write_card
 from surrogym_client.sampler import Sampler, SamplerSettings
 from surrogym_client.surrogates import waiting
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.training import TrainSettings
 from surrogym_client.training.audited import AuditedTraining
-from surrogym_client.training.handover import NO_SAMPLER, AuditSettings, Subject, hand_over, way_of
+from surrogym_client.training.handover import NO_SAMPLER, AuditSettings, Subject, hand_over, judge_episodes, way_of
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_shared.network import Network
 from surrogym_shared.spec import Design, EnvironmentSpec, ModelChoice
@@ -189,14 +191,46 @@ def test_without_a_sampler_an_audit_is_given_up(
     assert handover.reason.endswith(NO_SAMPLER)
 
 
-def test_where_no_state_can_be_set_an_audit_is_one_rollout(server_process: ServerProcess) -> None:
+def test_where_no_state_can_be_set_an_audit_is_a_whole_episode(server_process: ServerProcess) -> None:
     with placed(server_process.url, rail.SPEC, rail.Rail()) as place:
         handover = hand_over(place.subject(), AUDIT)
         assert handover.audit is not None
-        assert 1 <= handover.audit.steps <= 8
+        assert handover.audit.steps == rail.SPEC.time_limit
         audited = [query for query in place.api.queries(place.name) if query.purpose == "audit"]
         assert [query.kind for query in audited] == ["rollout"]
         assert place.api.surrogate(place.name).ledger.audit == handover.audit.steps
+
+
+class Paying(rail.Rail):
+    """The rail, with a reward of 1 - |x|. Once it is changed, every episode ends at its third step."""
+
+    changed = False
+    steps = 0
+
+    def reset(self, *, seed: int | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        self.steps = 0
+        return super().reset(seed=seed)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        observation, reward, over, truncated, said = super().step(action)
+        self.steps += 1
+        return observation, 1 + reward, over or (self.changed and self.steps == 3), truncated, said
+
+
+@pytest.mark.parametrize("changed", [False, True])
+def test_whole_episodes_judge_the_way_and_the_return(server_process: ServerProcess, changed: bool) -> None:
+    with placed(server_process.url, rail.SPEC, Paying()) as place:
+        real = Paying()
+        real.changed = changed
+        result = evaluate(
+            place.subject().predict, lambda: open_episode("rail", None, lambda: real), EvaluationSettings(3)
+        )
+        handover = judge_episodes(place.subject(), result)
+        assert handover.audit is not None
+        assert (handover.audit.episodes, handover.audit.steps) == (3, 9 if changed else 60)
+        assert handover.trusted is not changed, handover.reason
+        if changed:
+            assert handover.reason.startswith("the audit failed: 3 whole episodes earned 2.")
 
 
 class Broken(Changed):

@@ -11,8 +11,10 @@ from surrogym_client.cli.groups import Output, PolicyReading, Service, add
 from surrogym_client.cli.pushing import push_or_say
 
 if TYPE_CHECKING:
+    from surrogym_client.evaluation.evaluator import EvaluationSettings
     from surrogym_client.policies.card import PolicyCard
     from surrogym_client.policies.predict import Predict
+    from surrogym_client.training.handover import Handover, Subject
     from surrogym_shared.port import SurrogatePort
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import SurrogateView
@@ -30,8 +32,22 @@ def command(
         str | None, typer.Option(help="Surrogate that the policy was trained on. [default: as noted beside the policy]")
     ] = None,
     steps: Annotated[
-        int, typer.Option(min=2, max=256, help="Number of real steps. They don't count towards the budget.")
+        int,
+        typer.Option(
+            min=2,
+            max=256,
+            help="Number of real steps to begin with; as many again follow, up to 40 in all, while they leave the "
+            "promise undecided. They don't count towards the budget.",
+        ),
     ] = 8,
+    env: Annotated[
+        str | None,
+        typer.Option(
+            help="Original environment in which to take whole episodes of the policy, in place of a sampler's single "
+            "steps. This tests all that the policy does where the environment can only be reset."
+        ),
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=1, max=100, help="Number of whole episodes, with --env.")] = 3,
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of starts, of drawn functions, and of the places to audit.")
     ] = 0,
@@ -42,13 +58,17 @@ def command(
 ) -> None:
     """Test a policy's promise with a few real steps.
 
-    The real steps are taken on the policy's way and compared with the model. This needs a running sampler. The promise,
+    The real steps are taken on the policy's way and compared with the model. This needs a running sampler. With --env
+    they are whole episodes, whose returns are compared too; the command says how many steps they may take. The promise,
     the audit and the verdict (trusted or not) go into the card beside the policy. With --surrogate, the card names
     that surrogate from then on.
 
     Example: surrogym audit policy.zip --steps 16
+
+    Example: surrogym audit policy.zip --env rig:Rig --episodes 3
     """
     from surrogym_client.cli.errors import CommandError
+    from surrogym_client.evaluation.evaluator import EvaluationSettings
     from surrogym_client.policies.card import read_card, write_card
     from surrogym_client.surrogates.waiting import words_of_audit
     from surrogym_client.training.handover import AuditSettings, Subject, hand_over
@@ -70,11 +90,14 @@ def command(
         _require_fit(predict, view.spec, f"{policy} does not fit {name!r}")
         if card.surrogate not in (None, name):
             card = _of_another(card)
-        session = _session(card, view)
+        session = session_of(card, view)
         floor = _floor(port, seed, session) if card.untrained is None else card.untrained
         subject = Subject(api, name, port, predict, session, floor, seed)
         update(None, "computing the promise")
-        found = hand_over(subject, asked, lambda view: update(None, words_of_audit(view)))
+        if env is None:
+            found = hand_over(subject, asked, lambda view: update(None, words_of_audit(view)))
+        else:
+            found = _by_episodes(subject, env, card, EvaluationSettings(episodes, seed), quiet=output.quiet)
     if found.audit is None:
         raise CommandError(_not_made(view, found.reason))
     noted = card.model_copy(update={"surrogate": name, "spec": card.spec or view.spec, **vars(found)})
@@ -82,6 +105,38 @@ def command(
     version = push_or_say(service.server, service.token_for(context), policy, name, quiet=output.quiet)
     result = {"policy": str(policy), **noted.model_dump(mode="json", include=set(vars(found))), "version": version}
     output.give(result, lambda: words_of_handover(found))
+
+
+def _by_episodes(
+    subject: Subject, env: str, card: PolicyCard, settings: EvaluationSettings, *, quiet: bool
+) -> Handover:
+    """Audit by whole episodes in an environment. Their steps are announced, and counted in the ledger in any case."""
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.cli.opening import opener_for_policy
+    from surrogym_client.evaluation.evaluator import EvaluationInterrupted, evaluate
+    from surrogym_client.original.errors import EvaluationFailed
+    from surrogym_client.original.protocol import LONGEST_EPISODE
+    from surrogym_client.training.handover import judge_episodes
+    from surrogym_shared.terminal import say
+    from surrogym_shared.words import counted
+
+    spec = subject.port.spec()
+    if subject.api.surrogate(subject.name).fidelity is None:
+        raise CommandError(f"{subject.name!r} has no model yet, so there is nothing to compare with")
+    most = settings.episodes * (spec.time_limit or LONGEST_EPISODE)
+    count = counted(settings.episodes, "whole episode")
+    say(f"the audit takes {count} in {env}: at most {most} real steps", quiet=quiet)
+    note, taken = f"audit, {count} from seed {settings.first_seed}", 0
+    try:
+        result = evaluate(subject.predict, opener_for_policy(env, None, card, quiet=quiet), settings, trained_for=spec)
+        taken = result.steps
+    except (EvaluationFailed, EvaluationInterrupted) as error:
+        taken = error.steps
+        raise
+    finally:
+        if taken:
+            subject.api.report_steps(subject.name, taken, episodes=settings.episodes, note=note)
+    return judge_episodes(subject, result)
 
 
 def _not_made(view: SurrogateView, reason: str) -> str:
@@ -127,7 +182,7 @@ def _floor(port: SurrogatePort, seed: int, session: dict[str, object]) -> float:
     return float(imagined_returns(port, predict, CHECK_EPISODES, seed, **session).mean())
 
 
-def _session(card: PolicyCard, view: SurrogateView) -> dict[str, object]:
+def session_of(card: PolicyCard, view: SurrogateView) -> dict[str, object]:
     """Return the session options that the policy was compared in, from its card. Noise that was confirmed since then is
     added."""
     from surrogym_client.training.settings import noise_of

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -11,10 +12,15 @@ import typer
 if TYPE_CHECKING:
     from surrogym_client.cli.learning import Learning, Steps
     from surrogym_client.evaluation.comparing import Disagreement, Disagreements
+    from surrogym_client.evaluation.consequences import Effect
     from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings
+    from surrogym_client.evaluation.systematic import Systematic
+    from surrogym_client.policies.card import PolicyCard
     from surrogym_client.policies.evidence import Promise
+    from surrogym_client.policies.predict import Predict
     from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.wire import SurrogateView
 
 
 @dataclass(frozen=True)
@@ -95,6 +101,7 @@ class Differences:
         settings: EvaluationSettings,
         promise: Promise | None,
         steps: Steps | None,
+        imagining: Imagining,
         *,
         quiet: bool,
     ) -> Differing | None:
@@ -116,7 +123,9 @@ class Differences:
             with connect(server, token) as api:
                 if steps is not None and self.learn_all:
                     steps.send(api)
-                found = _compare(api, surrogate, result, settings.first_seed)
+                found = _compare(api, surrogate, result, settings.first_seed, imagining)
+                if found is not None and missed(promise, result):
+                    found = replace(found, broken=True)
                 if steps is not None and self.learn and found is not None:
                     steps.choose(samples_of(found.found, self.learn))
                     steps.send(api)
@@ -139,17 +148,54 @@ def left(promise: Promise | None, result: Evaluation) -> bool:
     return promise is not None and not promise.low <= result.returns.mean() <= promise.high
 
 
-def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int) -> Differing | None:
+def missed(promise: Promise | None, result: Evaluation) -> bool:
+    """Whether the mean return is below the promise's interval."""
+    return promise is not None and bool(result.returns.mean() < promise.low)
+
+
+@dataclass(frozen=True)
+class Imagining:
+    """How to imagine episodes of the policy that was evaluated."""
+
+    load: Callable[[], Predict]
+    card: PolicyCard
+    token: str | None
+    seed: int = 0
+
+    def changes(self, api: Api, view: SurrogateView, shifted: Systematic, weights: Any) -> Any:
+        """Compute by how much errors of the model of ``view`` change the imagined return, see ``changes_of``."""
+        from surrogym_client.cli.audit import session_of
+        from surrogym_client.evaluation.consequences import EFFECT_STARTS, changes_of
+        from surrogym_client.transport import HttpSurrogate
+
+        assert view.model_version is not None
+        session = session_of(self.card, view)
+        with HttpSurrogate(api.url, view.name, self.token) as port:
+            return changes_of(
+                port, self.load(), self.seed, session, view.model_version, shifted, weights, EFFECT_STARTS
+            )
+
+
+def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, imagining: Imagining) -> Differing | None:
     """Compare steps with the model. Returns None without a model, or if the model has other coordinates."""
+    import numpy as np
+
     from surrogym_client.evaluation.comparing import Disagreements, compared, disagreements, steady, steps_of
+    from surrogym_client.evaluation.consequences import effects_of
 
     view = api.surrogate(surrogate)
     if view.fidelity is None or result.trace.coordinates.shape[1] != len(view.spec.coordinates):
         return None
     known = [step for step in steps_of(result.traces) if view.spec.known(step.coordinates)]
     steps = steady(view.spec, known)
-    found = disagreements(steps, compared(api, view.spec, view, steps)) if steps else Disagreements(0, (), {})
-    return Differing(found, first_seed, changed=result.varied, left_out=len(known) - len(steps))
+    about = {"changed": result.varied, "left_out": len(known) - len(steps)}
+    if not steps:
+        return Differing(Disagreements(0, (), {}), first_seed, **about)
+    beside = compared(api, view.spec, view, steps)
+    effects, share = effects_of(view.spec, beside, partial(imagining.changes, api, view))
+    explaining = tuple(steps[i] for i in np.argsort(-share).tolist() if share[i] > 0)
+    found = replace(disagreements(steps, beside), shared=explaining)
+    return Differing(found, first_seed, effects=tuple(effects), **about)
 
 
 def _not_compared(first_seed: int, why: str) -> Differing:
@@ -193,6 +239,8 @@ class Differing:
         left_out: number of steps within which one of them changed. They are not compared, because a model keeps
             constants.
         without: why no step was compared; empty if steps were.
+        effects: outputs that are wrong in all steps together.
+        broken: whether the return is below the promise.
     """
 
     found: Disagreements
@@ -202,6 +250,8 @@ class Differing:
     left_out: int = 0
     all_steps: bool = False
     without: str = ""
+    effects: tuple[Effect, ...] = ()
+    broken: bool = False
 
     def in_words(self, spec: EnvironmentSpec | None) -> list[str]:
         """Return one line about all steps, one for each of the worst episodes, and one for each of the worst steps."""
@@ -211,8 +261,7 @@ class Differing:
         if self.without:
             return [f"not compared with a model: {self.without}", *self._learned()]
         if not found.found:
-            none = f"none of {found.compared} real steps differs from the model by more than the model's uncertainty"
-            return [none, *self._left_out(), *self._learned()]
+            return [*self._none(), *self._together(), *self._left_out(), *self._learned()]
         count = len(found.found)
         lines = [
             f"{count} of {found.compared} real steps differ{'s' * (count == 1)} from the model by more than the "
@@ -226,7 +275,25 @@ class Differing:
             )
         names = () if spec is None else spec.coordinate_names
         lines += [f"  {self._at(one, names)}" for one in found.found[:SHOWN]]
-        return [*lines, *self._left_out(), *self._learned()]
+        return [*lines, *self._together(), *self._left_out(), *self._learned()]
+
+    def _none(self) -> list[str]:
+        """Say that no single step differs. That alone is no answer where the promise was broken."""
+        none = f"none of {self.found.compared} real steps differs from the model by more than the model's uncertainty"
+        if not self.broken:
+            return [] if self.effects else [none]
+        if self.effects:
+            return ["no single step shows why the promise was broken"]
+        return [
+            f"the compared steps do not explain why the promise was broken: {none}, and together they show no error "
+            "either; a hidden state or other starts would"
+        ]
+
+    def _together(self) -> list[str]:
+        """Describe the outputs that are wrong in all steps together. Nothing if there are none."""
+        if not self.effects:
+            return []
+        return [f"{self.found.compared} real steps together:", *(f"  {one.words()}" for one in self.effects)]
 
     def as_json(self) -> dict[str, Any]:
         """Return all disagreements as JSON."""
@@ -235,6 +302,7 @@ class Differing:
             "compared": self.found.compared,
             "left_out": self.left_out,
             "learned": self.learned,
+            "together": [asdict(one) | {"region": one.region and one.region._asdict()} for one in self.effects],
             "episodes": [
                 {"seed": self.first_seed + episode, "steps": counts.get(episode, 0), "missing_reward": missing}
                 for episode, missing in self.found.missing.items()

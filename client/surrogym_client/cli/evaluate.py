@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from surrogym_client.cli.beside import Beside
-from surrogym_client.cli.disagreement import Differences
+from surrogym_client.cli.disagreement import Differences, Imagining
 from surrogym_client.cli.filming import film
 from surrogym_client.cli.groups import Output, PolicyReading, Service, add
 from surrogym_client.cli.learning import kept
@@ -167,7 +167,10 @@ def command(
             _keep(policy, reports, settings, _named(env, card), card.spec, quiet=output.quiet)
         filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if keeping.video else None
         version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
-        found = differences.between(ledger, service.server, token, result, settings, judged, steps, quiet=output.quiet)
+        imagining = Imagining(partial(reading.load, policy, card), card, token)
+        found = differences.between(
+            ledger, service.server, token, result, settings, judged, steps, imagining, quiet=output.quiet
+        )
     summary = {
         "policy": str(policy),
         "environment": _named(env, card),

@@ -10,14 +10,20 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_client.evaluation.systematic import Inputs, Systematic, columns, systematic
 from surrogym_client.policies.evidence import Audit, Promise
 from surrogym_shared.spec import EnvironmentSpec
 
 AUDIT_STEPS = 8
+MOST_STEPS = 40  # of an audit that is undecided
 ALARM = 0.01  # probability that the test of output errors fails for a right model
+SHIFT_ALARM = 0.05  # probability that the errors of a right model ever count as shifted, at any number of steps
+UNDECIDED = 0.05  # probability of a lost promise from which on an audit takes more steps, and the promise widens
 MISPLACED_ENDS = 2  # an audit fails if the model predicted the termination of this many steps wrongly
 SLACK = 0.1  # share of the gain over an untrained policy by which a promise may leave its former interval
-BIAS = 0.2  # share of the same gain that reward errors may add up to in an episode
+FAR = 1.0  # standard deviations of a coordinate on the policy's way
+MOST_UNTESTED = 0.2  # share of a policy's states that may be far from every step of an audit
+QUANTILES = 200  # of a promise's distribution
 UNSURE = 0.2  # share of the same gain: real steps may narrow a promise whose lower half is wider
 
 Array = NDArray[np.float64]
@@ -38,8 +44,9 @@ class Compared:
         cut_short: whether the steps are one rollout that an end has cut short which the model did not predict.
         unanswered: number of steps on the policy's way that the original environment failed to take.
         elsewhere: number of steps off the policy's way; they come last.
-        length: mean number of steps of an episode; 0 if unknown.
-        noise: standard deviation of the noise of a single step (O,), included in ``expected``; empty without noise.
+        claimed_alone: error (O,) of the model on left-out samples, without any tolerance.
+        states: states (n, C) at which the steps began.
+        actions: actions (n, F) of the steps.
     """
 
     names: Sequence[str]
@@ -50,8 +57,9 @@ class Compared:
     cut_short: bool = False
     unanswered: int = 0
     elsewhere: int = 0
-    length: float = 0.0
-    noise: Array = field(default_factory=lambda: np.zeros(0))
+    claimed_alone: Array = field(default_factory=lambda: np.zeros(0))
+    states: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    actions: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def claimed(self) -> Array:
@@ -59,28 +67,95 @@ class Compared:
         scale: Array = np.sqrt(self.deviations**2 + self.expected**2)
         return scale
 
-    def biased(self) -> Bools:
-        """Whether the mean error of an output, (O,), exceeds what noise, deviations and tolerance explain.
+    def together(self, spec: EnvironmentSpec, inputs: Inputs) -> Systematic:
+        """Test the errors on the policy's way together."""
+        on_way = slice(len(self.errors) - self.elsewhere)
+        return systematic(
+            self.names,
+            self.errors[on_way],
+            self.deviations[on_way],
+            self.claimed_alone,
+            inputs,
+            inputs.at(spec, self.states[on_way], self.actions[on_way]),
+        )
 
-        Noise can hide an error in each single step, but not in their mean. Predicted deviations of neighbouring states
-        belong to one function, so they don't average out.
+
+@dataclass(frozen=True)
+class Consequence:
+    """What the errors that all steps share would change in a policy's return.
+
+    Attributes:
+        shifted: the joint test of the errors.
+        changes: changes (K,) of the mean return, under errors that the steps support.
+        before: promise without them.
+        slack: by how much a return may leave the promise.
+    """
+
+    shifted: Systematic
+    changes: Array
+    before: Promise
+    slack: float
+
+    @property
+    def beyond(self) -> Bools:
+        """Under which of the errors (K,) the return leaves the promise."""
+        returns = self.before.median + self.changes
+        outside: Bools = (returns < self.before.low - self.slack) | (returns > self.before.high + self.slack)
+        return outside
+
+    @property
+    def undecided(self) -> bool:
+        """Whether more steps are needed to tell whether the promise stands."""
+        return float(self.beyond.mean()) > UNDECIDED and not self.proven
+
+    @property
+    def proven(self) -> bool:
+        """Whether the model is shifted for certain, and the promise more likely lost than not."""
+        moved = self.changes[self.changes != 0]
+        return self.shifted.evidence >= 1 / SHIFT_ALARM and len(moved) > 0 and self.beyond.sum() > len(moved) / 2
+
+    def fault(self, compared: Compared) -> str | None:
+        """Describe what is wrong in a sentence; None if nothing is proven."""
+        if not self.proven:
+            return None
+        worst = int(np.argmax(self.shifted.chances))
+        error = float(compared.errors[: len(compared.errors) - compared.elsewhere, worst].mean())
+        moved = self.before.median + float(np.median(self.changes[self.changes != 0]))
+        return (
+            f"{compared.names[worst]}: errors that all steps share, {error:+.3g} on average; with them the policy "
+            f"would earn {moved:.4g} instead of {self.before.median:.4g}"
+        )
+
+    def widened(self, promise: Promise) -> Promise:
+        """The promise of a model that has learned from the steps, with the returns that the errors make likely.
+
+        Unchanged if it is hardly possible that they matter.
         """
-        n, count = self.errors.shape
-        if not len(self.noise):
-            return np.zeros(count, dtype=bool)
-        z = NormalDist().inv_cdf(1 - ALARM / (2 * count))
-        own = np.sqrt(np.maximum(self.expected**2 - self.noise**2, 0))
-        spread = np.sqrt(self.noise**2 / n + (self.deviations**2).mean(0))
-        found: Bools = (self.noise > 0) & (np.abs(self.errors.mean(0)) > own + z * spread)
-        return found
+        if float(self.beyond.mean()) <= UNDECIDED:
+            return promise
+        quantiles = (np.arange(QUANTILES) + 0.5) / QUANTILES
+        own = np.interp(quantiles, [0.05, 0.5, 0.95], [promise.low, promise.median, promise.high])
+        moves = np.where(self.beyond, self.before.median + self.changes - promise.median, 0.0)
+        low, median, high = np.quantile(own[:, None] + moves, [0.05, 0.5, 0.95]).tolist()
+        return promise.model_copy(update={"low": low, "median": median, "high": high})
 
 
-def judge(compared: Compared, before: Promise, after: Promise, floor: float | None) -> Audit:
+def judge(
+    compared: Compared,
+    before: Promise,
+    after: Promise,
+    floor: float | None,
+    consequence: Consequence | None = None,
+) -> Audit:
     """Judge the model by an audit's real steps, and compare the promises before and after them.
 
-    An output is at fault if the sum of squared errors, each divided by its claimed deviation, is larger than chance
-    explains: beyond the 1 % quantile of the chi-squared distribution, shared between the outputs. A noisy output is
-    also at fault if its mean error is. Errors within the tolerance are never a fault.
+    An output is at fault in either of two cases:
+
+    - The sum of its squared errors, each divided by its claimed deviation, is larger than chance explains: beyond the
+      1 % quantile of the chi-squared distribution, shared between the outputs. Single errors within the tolerance are
+      never a fault.
+    - The errors have a part that all steps share, beyond chance, and with it in the model the policy's return leaves
+      the promise, see ``Consequence``. A shared part that costs nothing is no fault.
 
     A rollout has one end at most, so a single one that was not predicted is a fault. A step that the original
     environment fails to take is a fault, because the policy would need it.
@@ -90,6 +165,7 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
         before: promise before the audit.
         after: promise of the model that has learned from the audit.
         floor: return of an untrained policy; None if it was not measured.
+        consequence: what the errors together mean for the return; None if that was not computed.
     """
     n, count = compared.errors.shape
     sums = ((compared.errors / compared.claimed) ** 2).sum(0)
@@ -100,10 +176,8 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
         for i, name in enumerate(compared.names)
         if sums[i] > limit
     ]
-    faults += [
-        f"{compared.names[i]}: errors of {compared.errors[:, i].mean():.3g} on average, more than noise explains"
-        for i in np.flatnonzero(compared.biased() & (sums <= limit)).tolist()
-    ]
+    if consequence is not None and (shared := consequence.fault(compared)) is not None:
+        faults.append(shared)
     if compared.unanswered:
         faults.insert(0, unanswered(compared.unanswered, n + compared.unanswered))
     if compared.cut_short:
@@ -116,11 +190,6 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
             f"the promise moved from {before.median:.4g} to {after.median:.4g} after the model learned the audit's "
             "steps"
         )
-    if "reward" in compared.names and compared.length:
-        on_way = compared.errors[: n - compared.elsewhere, list(compared.names).index("reward")]
-        missing = float(on_way.mean()) * compared.length if len(on_way) else 0.0
-        if abs(missing) > BIAS * earned(before, floor):
-            faults.append(f"rewards would differ from the prediction by {missing:.4g} over a whole episode")
     return Audit(
         steps=n,
         elsewhere=compared.elsewhere,
@@ -129,8 +198,39 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
         errors=dict(zip(compared.names, actual.tolist(), strict=True)),
         expected=dict(zip(compared.names, claimed.tolist(), strict=True)),
         before=before,
-        after=after,
+        after=after if consequence is None else consequence.widened(after),
     )
+
+
+def missed(audit: Audit, returns: Array, floor: float | None) -> Audit:
+    """Compare the returns (k,) of whole real episodes with the promise, in addition to their steps.
+
+    Their mean may leave the promise by ``SLACK`` of the gain, and by two of its standard errors.
+    """
+    mean, before = float(returns.mean()), audit.before
+    chance = 2 * float(returns.std(ddof=1)) / sqrt(len(returns)) if len(returns) > 1 else 0.0
+    slack = SLACK * earned(before, floor) + chance
+    if before.low - slack <= mean <= before.high + slack:
+        return audit
+    fault = (
+        f"{len(returns)} whole episode{'s' * (len(returns) > 1)} earned {mean:.4g} on average, where "
+        f"{before.low:.4g} to {before.high:.4g} was promised"
+    )
+    return audit.model_copy(update={"passed": False, "faults": (fault, *audit.faults)})
+
+
+def untested(spec: EnvironmentSpec, q: Array, audited: Array) -> float:
+    """Share of the states q (m, C) of a policy's way from which every audited state (n, C) is far.
+
+    A state is far from another one if a coordinate differs by more than ``FAR`` standard deviations over the way.
+    """
+    none = np.zeros((len(q) + len(audited), 0))
+    at = on_one_scale(spec, np.concatenate([q, audited]), none, len(q))
+    way, known = at[: len(q)], at[len(q) :]
+    nearest = np.full(len(way), np.inf)
+    for one in known:
+        nearest = np.minimum(nearest, np.abs(way - one).max(1))
+    return float((nearest > FAR).mean())
 
 
 def unanswered(count: int, of: int) -> str:
@@ -231,13 +331,9 @@ def differences(spec: EnvironmentSpec, real: Array, predicted: Array) -> Array:
 def on_one_scale(spec: EnvironmentSpec, q: Array, u: Array, first: int | None = None) -> Array:
     """Scale states q (m, C) and actions u (m, F) to points whose distances are meaningful.
 
-    Angles become cosine and sine. Each column is divided by its standard deviation, or by that of the ``first`` rows.
+    Each column is divided by its standard deviation, or by that of the ``first`` rows.
     """
-    columns = [u]
-    for index, coordinate in enumerate(spec.coordinates):
-        column = q[:, index : index + 1]
-        columns += [np.cos(column), np.sin(column)] if coordinate.kind == "angle" else [column]
-    at = np.concatenate(columns, 1)
+    at = columns(spec, q, u)
     spread = at[:first].std(0)
     scaled: Array = at / np.where(spread > 0, spread, 1.0)
     return scaled

@@ -14,11 +14,13 @@ import numpy as np
 
 from surrogym_client.evaluation.audit import ALARM, Compared, chi_squared, differences
 from surrogym_client.evaluation.evaluator import ROUNDING, Trace, span
+from surrogym_client.evaluation.systematic import LEAST
 from surrogym_client.transport.api import Api
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import NewSample, OutputFidelity, SurrogateView
 
 MOST = 400  # most real steps to compare
+LEAST_ERROR = 1e-12  # in an output's unit, so that an exact output can be tested
 SHOWN = 3  # number of worst steps, and of worst episodes, to show
 
 
@@ -61,7 +63,9 @@ def compared(
         errors=np.stack([columns[claim.name] for claim in claims], 1),
         deviations=deviations,
         expected=np.array([_expected(claim, matters if claim.name == "reward" else 0.0) for claim in claims]),
-        noise=np.array([claim.noise for claim in claims]),
+        claimed_alone=np.array([_alone(claim) for claim in claims]),
+        states=np.array(q),
+        actions=np.array(u),
         misplaced=int((ended != foreseen).sum()),
         cut_short=spec.query == "rollout" and bool((ended & ~foreseen).any()),
     )
@@ -70,6 +74,12 @@ def compared(
 def _expected(claim: OutputFidelity, matters: float) -> float:
     """Error of an output that the model allows: its tolerance, its error on left-out samples, or one without effect."""
     return max(claim.tolerance, claim.leave_one_out_error or 0.0, matters)
+
+
+def _alone(claim: OutputFidelity) -> float:
+    """Error of an output on left-out samples, noise included; its tolerance if the family of models knows none."""
+    known = claim.tolerance if claim.leave_one_out_error is None else claim.leave_one_out_error
+    return max(known, claim.noise, LEAST * claim.tolerance, LEAST_ERROR)
 
 
 @dataclass(frozen=True)
@@ -130,11 +140,13 @@ class Disagreements:
         compared: number of real steps that were compared.
         found: steps whose error exceeds the model's claim, the worst first.
         missing: real minus predicted reward over the compared steps of each episode, by its number.
+        shared: further steps that have much of an error that all steps share, the most first.
     """
 
     compared: int
     found: tuple[Disagreement, ...]
     missing: dict[int, float]
+    shared: tuple[StepOfEpisode, ...] = ()
 
     def by_episode(self) -> dict[int, int]:
         """Number of excluded steps of each episode, the largest first."""
@@ -166,15 +178,26 @@ def disagreements(steps: Sequence[StepOfEpisode], beside: Compared) -> Disagreem
 
 
 def samples_of(found: Disagreements, most: int) -> list[NewSample]:
-    """Return at most ``most`` of the steps as samples: the worst step of each episode, then the second worst, and so
-    on. Neighbours in one episode often err for the same reason, so the episodes take turns.
+    """Return at most ``most`` of the steps as samples: those that differ each by itself, then those that explain an
+    error that all steps share.
+
+    Of either kind the worst step of each episode comes first, then the second worst, and so on. Neighbours in one
+    episode often err for the same reason, so the episodes take turns.
     """
+    alone = [one.step for one in found.found]
+    known = {(step.episode, step.number) for step in alone}
+    shared = [step for step in found.shared if (step.episode, step.number) not in known]
+    return as_samples([*_in_turns(alone), *_in_turns(shared)][:most])
+
+
+def _in_turns(steps: Sequence[StepOfEpisode]) -> list[StepOfEpisode]:
+    """Order steps, so that their episodes take turns."""
     rank: dict[int, int] = {}
     turns: list[tuple[int, StepOfEpisode]] = []
-    for one in found.found:
-        turn = rank[one.step.episode] = rank.get(one.step.episode, 0) + 1
-        turns.append((turn, one.step))
-    return as_samples([step for _, step in sorted(turns, key=lambda item: item[0])[:most]])
+    for step in steps:
+        turn = rank[step.episode] = rank.get(step.episode, 0) + 1
+        turns.append((turn, step))
+    return [step for _, step in sorted(turns, key=lambda item: item[0])]
 
 
 def as_samples(steps: Sequence[StepOfEpisode]) -> list[NewSample]:

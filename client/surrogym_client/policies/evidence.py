@@ -55,6 +55,8 @@ class Audit(BaseModel):
     Attributes:
         steps: number of real steps.
         elsewhere: how many of them were taken in gaps of the samples, off the policy's way.
+        episodes: number of whole episodes that the steps are of; 0 if they are single steps or a part of an episode.
+        untested: share of the policy's states that are far from every step of the audit, if states can't be set.
         unanswered: number of further queries, at which the original environment failed.
         untestable: a coordinate that many of the policy's states have beyond what the original environment can be set
             to, and the share of these states; None if they are few.
@@ -71,6 +73,8 @@ class Audit(BaseModel):
 
     steps: int
     elsewhere: int = 0
+    episodes: int = 0
+    untested: float = 0.0
     unanswered: int = 0
     untestable: tuple[str, float] | None = None
     passed: bool

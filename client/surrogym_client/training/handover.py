@@ -10,12 +10,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import Lanes, session_request
-from surrogym_client.evaluation.audit import AUDIT_STEPS, earned, gaps, judge, places, unanswered, wider
-from surrogym_client.evaluation.comparing import compared
+from surrogym_client.errors import BeyondBudget
+from surrogym_client.evaluation.audit import (
+    AUDIT_STEPS,
+    MOST_STEPS,
+    MOST_UNTESTED,
+    SLACK,
+    Compared,
+    Consequence,
+    earned,
+    gaps,
+    judge,
+    missed,
+    places,
+    unanswered,
+    untested,
+    wider,
+)
+from surrogym_client.evaluation.comparing import compared, steady, steps_of
+from surrogym_client.evaluation.consequences import DRAWS, changes_of
+from surrogym_client.evaluation.evaluator import Evaluation
 from surrogym_client.evaluation.imagined import WHOLE
 from surrogym_client.evaluation.outside import Outside, outside_of
 from surrogym_client.evaluation.promise import UNNOTICED, promise_of
 from surrogym_client.evaluation.ranges import range_left, untestable
+from surrogym_client.evaluation.systematic import Inputs
 from surrogym_client.evaluation.uncontrolled import baseline
 from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.protocol import LONGEST_EPISODE
@@ -25,8 +44,9 @@ from surrogym_client.surrogates.phases import COMPLETED
 from surrogym_client.surrogates.waiting import NobodyAnswers, wait_for_answers, wait_for_design
 from surrogym_client.transport.api import Api
 from surrogym_shared.port import SurrogatePort
-from surrogym_shared.wire import SurrogateView
+from surrogym_shared.wire import QueryView, SampleView, SurrogateView
 
+LEAST_AUDITED = 64  # real steps of audits that every surrogate may take
 WAY_LANES = 16  # virtual episodes whose states an audit chooses from
 MOST_OF_A_WAY = 200  # steps of an episode that are compared with a log
 ELSEWHERE = 4  # an audit of a ready design takes one of every four steps in a gap of the samples
@@ -123,38 +143,103 @@ def take(
 ) -> Audit | None:
     """Take the real steps of an audit, fit the model to them, and judge.
 
-    Returns None if there was no step to take. An audit whose steps the original environment all failed to take has
-    failed.
+    It takes more steps, up to ``MOST_STEPS``, as long as the errors so far may be shared by all steps and cost the
+    promise, but don't prove it. Returns None if there was no step to take. An audit whose steps the original
+    environment all failed to take has failed.
     """
     api, name, spec = subject.api, subject.name, subject.port.spec()
     view = api.surrogate(name)
     q, u = way_of(subject, WAY_LANES, spec.time_limit or LONGEST_EPISODE)
+    matters = UNNOTICED * earned(before, subject.floor) * WAY_LANES / len(q)
     wanted, elsewhere = _asked(subject, settings, q, u, claims=view.phase == "ready")
+    while True:
+        answers, failed = _answers(subject, settings, wanted, progress)
+        samples = [sample for sample in answers if spec.known(sample.coordinates)]
+        if not samples:
+            faults = (unanswered(len(failed), len(wanted)),)
+            none = Audit(steps=0, unanswered=len(failed), passed=False, faults=faults, before=before, after=before)
+            return none if failed else None
+        samples.sort(key=lambda sample: sample.query_id in elsewhere)
+        off_way = sum(sample.query_id in elsewhere for sample in samples)
+        beside = replace(compared(api, spec, view, samples, matters), elsewhere=off_way)
+        found = _consequence(subject, beside, before, view, Inputs.over(spec, q, u))
+        more = min(settings.steps, MOST_STEPS - len(samples)) if found is not None and found.undecided else 0
+        if not (added := _asked_more(subject, replace(settings, steps=more, seed=len(wanted)), q, u)):
+            break
+        wanted |= added
+    wait_for_design(api, name, settings.patience_seconds, progress, after_round=view.round)
+    far = untested(spec, q, beside.states) if spec.query == "rollout" else 0.0
+    beside = replace(beside, unanswered=sum(query.id not in elsewhere for query in failed))
+    about: dict[str, Any] = {"unanswered": len(failed), "untestable": untestable(spec, q)}
+    about |= {"range_left": range_left(spec, q), "untested": far}
+    return judge(beside, before, subject.promise(), subject.floor, found).model_copy(update=about)
+
+
+def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
+    """Judge a policy's promise by whole real episodes: by their steps, and by their returns.
+
+    This tests what single steps can't reach where no state can be set: the goal, and what happens on the way to it. The
+    model does not learn from the steps.
+
+    Raises:
+        SurrogymClientError: the server refused, or has no model yet.
+    """
+    api, spec = subject.api, subject.port.spec()
+    view, before = api.surrogate(subject.name), subject.promise()
+    steps = steady(spec, [step for step in steps_of(result.traces) if spec.known(step.coordinates)])
+    q, u = np.array([step.coordinates for step in steps]), np.array([step.action for step in steps])
+    beside = compared(api, spec, view, steps, UNNOTICED * earned(before, subject.floor) / float(result.lengths.mean()))
+    found = _consequence(subject, beside, before, view, Inputs.over(spec, q, u))
+    audit = missed(judge(beside, before, before, subject.floor, found), result.returns, subject.floor)
+    about = {"steps": result.steps, "episodes": len(result.returns), "range_left": range_left(spec, q)}
+    audit = audit.model_copy(update=about)
+    trusted, reason = _verdict(audit, subject.floor)
+    return Handover(audit.after, audit, trusted, reason)
+
+
+def _answers(
+    subject: Subject,
+    settings: AuditSettings,
+    wanted: set[int],
+    progress: Callable[[SurrogateView], None] | None,
+) -> tuple[list[SampleView], list[QueryView]]:
+    """Wait for the answers to queries. Returns their samples, and the queries that have none."""
+    api, name = subject.api, subject.name
     try:
         wait_for_answers(api, name, wanted, settings.patience_seconds, progress)
     except BaseException:
         api.withdraw_audit(name, sorted(wanted))
         raise
     failed = [query for query in api.queries(name) if query.id in wanted and query.status in ("set_aside", "refused")]
-    answers = [sample for sample in api.samples(name) if sample.query_id in wanted]
-    samples = [sample for sample in answers if spec.known(sample.coordinates)]
-    if not samples:
-        faults = (unanswered(len(failed), len(wanted)),)
-        none = Audit(steps=0, unanswered=len(failed), passed=False, faults=faults, before=before, after=before)
-        return none if failed else None
-    samples.sort(key=lambda sample: sample.query_id in elsewhere)
-    wait_for_design(api, name, settings.patience_seconds, progress, after_round=view.round)
-    after, length = subject.promise(), len(q) / WAY_LANES
-    matters = UNNOTICED * earned(before, subject.floor) / length
-    off_way = sum(sample.query_id in elsewhere for sample in samples)
-    beside = replace(
-        compared(api, spec, view, samples, matters),
-        length=length,
-        elsewhere=off_way,
-        unanswered=sum(query.id not in elsewhere for query in failed),
+    return [sample for sample in api.samples(name) if sample.query_id in wanted], failed
+
+
+def _consequence(
+    subject: Subject, beside: Compared, before: Promise, view: SurrogateView, inputs: Inputs
+) -> Consequence | None:
+    """Test the errors on the policy's way together, and compute what they would change in the return.
+
+    Returns None without a step on the way.
+    """
+    if len(beside.errors) == beside.elsewhere or view.model_version is None:
+        return None
+    shifted = beside.together(subject.port.spec(), inputs)
+    weights = shifted.draws(DRAWS, np.random.default_rng(subject.seed))
+    changes = changes_of(
+        subject.port, subject.predict, subject.seed, subject.session, view.model_version, shifted, weights
     )
-    more = {"unanswered": len(failed), "untestable": untestable(spec, q), "range_left": range_left(spec, q)}
-    return judge(beside, before, after, subject.floor).model_copy(update=more)
+    return Consequence(shifted, changes, before, SLACK * earned(before, subject.floor))
+
+
+def _asked_more(subject: Subject, settings: AuditSettings, q: Array, u: Array) -> set[int]:
+    """Add further queries of an audit on the policy's way. Returns their numbers; none if the surrogate's audits have
+    taken as many steps as they may, or if states can't be set."""
+    if settings.steps < 1 or subject.port.spec().query == "rollout":
+        return set()
+    try:
+        return _asked(subject, settings, q, u, claims=False)[0]
+    except BeyondBudget:
+        return set()
 
 
 def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, claims: bool) -> tuple[set[int], set[int]]:
@@ -162,12 +247,13 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, cla
 
     If the design ``claims`` to know the whole sampling range, one query in ``ELSEWHERE`` is in a gap of its samples
     instead: what the model got wrong there may have kept the policy away. If the environment can't be set to a state,
-    the query is one episode's sequence of actions. Returns the queries' numbers, and those off the policy's way.
+    the query is the sequence of actions of one imagined episode, whole if the surrogate's audits may take that many
+    steps. Returns the queries' numbers, and those off the policy's way.
     """
     spec, rng = subject.port.spec(), np.random.default_rng(settings.seed)
     if spec.query == "rollout":
-        steps = settings.steps + spec.unknown_steps
-        _, actions = way_of(subject, 1, min(steps, spec.max_rollout or steps))
+        steps = length_of_rollout(subject.api.surrogate(subject.name), settings.steps)
+        _, actions = way_of(subject, 1, steps)
         queries = subject.api.add_queries(subject.name, rollouts=[actions.tolist()], audit=True)
         return {query.id for query in queries}, set()
     elsewhere = settings.steps // ELSEWHERE if claims else 0
@@ -181,6 +267,15 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, cla
     queries = subject.api.add_queries(subject.name, states.tolist(), actions.tolist(), audit=True)
     numbers = [query.id for query in queries]
     return set(numbers), set(numbers[len(chosen) :])
+
+
+def length_of_rollout(view: SurrogateView, steps: int) -> int:
+    """Number of real steps of an audit from a reset: a whole episode if the surrogate may take that many, at least
+    ``steps``."""
+    spec = view.spec
+    left = max(view.budget, LEAST_AUDITED) - view.ledger.audit
+    longest = min(spec.time_limit or LONGEST_EPISODE, spec.max_rollout or LONGEST_EPISODE)
+    return max(min(longest, max(left, steps + spec.unknown_steps)), 1)
 
 
 def _in_gaps(subject: Subject, count: int) -> tuple[Array, Array]:
@@ -243,6 +338,16 @@ def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
         return False, (
             f"{100 * share:.0f} % of the policy's states have a {name!r} beyond what the original environment can be "
             "set to, so no audit tests them: register under a new name with a wider range or bounds"
+        )
+    if audit.untested > MOST_UNTESTED:
+        return False, (
+            f"the audit's {audit.steps} real steps from a reset reached {100 * (1 - audit.untested):.0f} % of the "
+            "policy's states, and the others are untested: surrogym audit POLICY --env ENVIRONMENT takes whole episodes"
+        )
+    if audit.episodes:
+        return (
+            True,
+            f"the return and the {audit.steps} real steps of {audit.episodes} whole episodes agree with the model",
         )
     where = f"{audit.steps - audit.elsewhere} real steps on the policy's way"
     if audit.elsewhere:

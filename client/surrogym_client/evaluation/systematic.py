@@ -1,0 +1,215 @@
+"""Test the errors of real steps together: do they have a part that all of them share? Pure.
+
+A model can be right in each single step, within its tolerance, and wrong in all of them by the same amount. A return
+sums such errors up. So the signed errors e (n,) of an output are compared under two hypotheses:
+
+- ``right``: e ~ N(0, s^2 V), V = I + D (I + F F') / 2 D / c^2, where c is the model's error on left-out samples, D has
+  the predicted deviations of its function on the diagonal, and F (n, 1 + P) the standardised inputs with a constant,
+  divided by sqrt(1 + P);
+- ``shifted``: e ~ N(0, s^2 (V + t^2 A)), where A is 1 1' (the same error everywhere) or F F' (an error that depends on
+  where the step is), and t has one of the sizes ``SIZES``, all as likely.
+
+The scale s is that of the errors on the policy's way, where they may be much smaller than over the whole range. It is
+unknown, with the conjugate prior of ``DEGREES`` degrees of freedom at c, and integrated out.
+
+The evidence is the mean over outputs, forms and sizes of the likelihood ratio. For a right model its expectation is 1,
+also if steps are added one after the other. So it exceeds 1 / a at any time with probability a at most (Ville's
+inequality: Ville 1939; Robbins 1970, "Statistical methods related to the law of the iterated logarithm"; with an
+unknown scale: Perez-Ortiz, Lardy, de Heide and Grunwald 2022, "E-statistics, group invariance and anytime-valid
+testing").
+
+Shapes: n steps, O outputs, C coordinates, F action entries, P inputs, K draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from math import sqrt
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import Residual
+
+SIZES = tuple(2.0**i for i in range(-1, 6))  # of a shared error, in standard deviations of the others
+DEGREES = 0.1  # of freedom, of the prior of the errors' scale: it hardly says more than that the scale is unknown
+FARTHEST = 3.0  # deviations to which a standardised input is limited, as in a session
+LEAST = 1e-3  # of the tolerance: least error that a model may claim on left-out samples
+PARTS = 3  # ranges of one input, of equal numbers of steps, in which the mean error is looked at
+
+Array = NDArray[np.float64]
+
+
+def columns(spec: EnvironmentSpec, q: Array, u: Array) -> Array:
+    """States q (m, C), with cosine and sine in place of angles, and actions u (m, F), as columns (m, P)."""
+    found: list[Array] = []
+    for index, coordinate in enumerate(spec.coordinates):
+        column = q[:, index : index + 1]
+        found += [np.cos(column), np.sin(column)] if coordinate.kind == "angle" else [column]
+    joined: Array = np.concatenate([*found, u], 1)
+    return joined
+
+
+class Inputs(NamedTuple):
+    """How inputs are standardised: by their mean and standard deviation over a policy's way."""
+
+    centre: Array  # (P,)
+    scale: Array  # (P,)
+
+    @classmethod
+    def over(cls, spec: EnvironmentSpec, q: Array, u: Array) -> Self:
+        """Take mean and deviation of states q (m, C) and actions u (m, F)."""
+        at = columns(spec, q, u)
+        spread = at.std(0)
+        return cls(at.mean(0), np.where(spread > 1e-9 * (1 + np.abs(at).max(0)), spread, 1.0))
+
+    def at(self, spec: EnvironmentSpec, q: Array, u: Array) -> Array:
+        """Standardised inputs with a constant, (n, 1 + P)."""
+        x = ((columns(spec, q, u) - self.centre) / self.scale).clip(-FARTHEST, FARTHEST)
+        joined: Array = np.concatenate([np.ones((len(x), 1)), x], 1)
+        return joined
+
+    def residual(self, weights: Array) -> Residual:
+        """The option of a session for weights (K, O, 1 + P)."""
+        return Residual(centre=self.centre.tolist(), scale=self.scale.tolist(), weights=weights.tolist())
+
+
+class _Form(NamedTuple):
+    """One way in which an output may be wrong: prior variances of its weights (1 + P,), and how well it explains the
+    errors."""
+
+    variances: Array
+    evidence: float  # likelihood ratio to ``right``
+    mean: Array  # (1 + P,) of the weights, given the errors
+    root: Array  # (1 + P, 1 + P) square root of their covariance
+
+    @classmethod
+    def of(cls, errors: Array, right: Array, x: Array, variances: Array) -> Self:
+        """Explain errors (n,), in units of what the model claims, at inputs x (n, 1 + P). Their covariance without a
+        shared part is ``right`` (n, n), times an unknown factor."""
+        spread = x * variances
+        wrong = right + spread @ x.T
+        log_density, scale = _density(errors, wrong)
+        ratio = np.exp(min(log_density - _density(errors, right)[0], 600.0))
+        gain = np.linalg.solve(wrong, spread).T  # (1 + P, n)
+        values, vectors = np.linalg.eigh(np.diag(variances) - gain @ spread)
+        return cls(variances, float(ratio), gain @ errors, scale * vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _density(errors: Array, covariance: Array) -> tuple[float, float]:
+    """Logarithm of the density of errors (n,) whose scale is integrated out, without its constant, and the scale that
+    they suggest."""
+    factor, n = np.linalg.cholesky(covariance), len(errors)
+    squares = DEGREES + float(np.sum(np.linalg.solve(factor, errors) ** 2))
+    return float(-0.5 * (DEGREES + n) * np.log(squares) - np.log(np.diag(factor)).sum()), sqrt(squares / (DEGREES + n))
+
+
+@dataclass(frozen=True)
+class Systematic:
+    """What all errors of real steps share.
+
+    Attributes:
+        names: names of the outputs, (O,).
+        inputs: how inputs are standardised.
+        forms: of each output, the ways in which it may be wrong.
+    """
+
+    names: tuple[str, ...]
+    inputs: Inputs
+    forms: tuple[tuple[_Form, ...], ...]
+
+    @property
+    def evidence(self) -> float:
+        """Evidence against a right model; at most 1 / a of right models ever exceed a."""
+        return float(np.mean(self._by_output))
+
+    @cached_property
+    def _by_output(self) -> Array:
+        return np.array([np.mean([form.evidence for form in forms]) for forms in self.forms])
+
+    @cached_property
+    def chances(self) -> Array:
+        """Probability (O,) that each output is shifted, if one in two models has a single one that is."""
+        odds: Array = self._by_output / len(self.names)
+        return odds / (1 + odds)
+
+    def draws(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw weights (count, O, 1 + P) that the errors support; those of an output that is right are 0."""
+        size = len(self.inputs.centre) + 1
+        weights = np.zeros((count, len(self.names), size))
+        for o, (forms, chance) in enumerate(zip(self.forms, self.chances, strict=True)):
+            share = np.array([form.evidence for form in forms])
+            which = rng.choice(len(forms), size=count, p=share / share.sum())
+            drawn = [forms[i].mean + forms[i].root @ rng.standard_normal(size) for i in which]
+            weights[:, o] = np.where(rng.random((count, 1)) < chance, drawn, 0.0)
+        return weights
+
+    def expected(self) -> Array:
+        """Mean weights (O, 1 + P) of the outputs that are shifted more likely than not; the others' are 0."""
+        size = len(self.inputs.centre) + 1
+        weights = np.zeros((len(self.names), size))
+        for o in np.flatnonzero(self.chances > 0.5).tolist():
+            share = np.array([form.evidence for form in self.forms[o]])
+            weights[o] = (share[:, None] * [form.mean for form in self.forms[o]]).sum(0) / share.sum()
+        return weights
+
+
+def systematic(
+    names: Sequence[str], errors: Array, deviations: Array, claimed: Array, inputs: Inputs, x: Array
+) -> Systematic:
+    """Test errors (n, O) together.
+
+    Args:
+        names: names of the outputs, (O,).
+        errors: real minus predicted values (n, O).
+        deviations: predicted standard deviations of the function (n, O).
+        claimed: error (O,) of the model on left-out samples, which includes the noise.
+        inputs: how inputs are standardised.
+        x: standardised inputs of the steps with a constant, (n, 1 + P).
+    """
+    constant = np.eye(x.shape[1])[0]
+    tilted = np.full(x.shape[1], 1 / x.shape[1])
+    smooth = (np.eye(len(x)) + x @ x.T / x.shape[1]) / 2
+    forms = []
+    for e, deviation, own in zip(errors.T, deviations.T, claimed, strict=True):
+        right = np.eye(len(x)) + smooth * deviation[:, None] * deviation / own**2
+        found = [_Form.of(e / own, right, x, size**2 * part) for part in (constant, tilted) for size in SIZES]
+        forms.append(tuple(one._replace(mean=own * one.mean, root=own * one.root) for one in found))
+    return Systematic(tuple(names), inputs, tuple(forms))
+
+
+class Region(NamedTuple):
+    """Range of one input in which an output errs most, with the mean error there."""
+
+    name: str
+    low: float
+    high: float
+    error: float
+
+
+def region(names: Sequence[str], values: Array, errors: Array) -> Region | None:
+    """Return where the mean of errors (n,) differs most from that of the other steps, beyond four standard errors.
+
+    Args:
+        names: names of the columns, (P,).
+        values: value of each column at the steps, (n, P).
+        errors: real minus predicted values (n,).
+    """
+    best, found = 4.0, None
+    for name, column in zip(names, values.T, strict=True):
+        ends = np.quantile(column, np.linspace(0, 1, PARTS + 1))
+        for low, high in pairwise(ends):
+            inside = (column >= low) & (column <= high)
+            count, rest = int(inside.sum()), int((~inside).sum())
+            if min(count, rest) < PARTS or abs(errors[inside].mean()) <= abs(errors[~inside].mean()):
+                continue
+            spread = np.hypot(errors[inside].std() / np.sqrt(count), errors[~inside].std() / np.sqrt(rest))
+            apart = abs(errors[inside].mean() - errors[~inside].mean()) / max(spread, 1e-300)
+            if apart > best:
+                best, found = apart, Region(name, float(low), float(high), float(errors[inside].mean()))
+    return found
