@@ -192,7 +192,8 @@ def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, imag
     if not steps:
         return Differing(Disagreements(0, (), {}), first_seed, **about)
     beside = compared(api, view.spec, view, steps)
-    effects, share = effects_of(view.spec, beside, partial(imagining.changes, api, view))
+    changes = None if view.spec.design.preset == "paper" else partial(imagining.changes, api, view)
+    effects, share = effects_of(view.spec, beside, changes)  # preset paper moves observations, which take no residual
     explaining = tuple(steps[i] for i in np.argsort(-share).tolist() if share[i] > 0)
     found = replace(disagreements(steps, beside), shared=explaining)
     return Differing(found, first_seed, effects=tuple(effects), **about)

@@ -13,7 +13,7 @@ from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.training.candidates import Candidates
 from surrogym_client.training.closed_loop import ClosedLoop, LoopSettings, visit
 from surrogym_client.training.course import after
-from surrogym_client.training.handover import AuditSettings, Handover, Subject, hand_over
+from surrogym_client.training.handover import MOST_AUDITS, AuditSettings, Handover, Subject, hand_over
 from surrogym_client.training.search import search_for, with_algorithm
 from surrogym_client.training.settings import (
     TrainingInterrupted,
@@ -27,8 +27,6 @@ from surrogym_client.training.trainer import train
 from surrogym_client.transport.api import Api
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import SurrogateView
-
-MOST_AUDITS = 3  # audits of one training at most; each takes its own real steps
 
 
 @dataclass

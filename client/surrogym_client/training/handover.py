@@ -46,7 +46,8 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import QueryView, SampleView, SurrogateView
 
-LEAST_AUDITED = 64  # real steps of audits that every surrogate may take
+LEAST_AUDITED = 128  # real steps of audits that every surrogate may take
+MOST_AUDITS = 3  # audits of one training at most, which share these steps
 WAY_LANES = 16  # virtual episodes whose states an audit chooses from
 MOST_OF_A_WAY = 200  # steps of an episode that are compared with a log
 ELSEWHERE = 4  # an audit of a ready design takes one of every four steps in a gap of the samples
@@ -270,12 +271,17 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, cla
 
 
 def length_of_rollout(view: SurrogateView, steps: int) -> int:
-    """Number of real steps of an audit from a reset: a whole episode if the surrogate may take that many, at least
-    ``steps``."""
+    """Number of real steps of an audit from a reset: those of a whole episode, or its share of what audits may take, at
+    least ``steps``."""
     spec = view.spec
-    left = max(view.budget, LEAST_AUDITED) - view.ledger.audit
     longest = min(spec.time_limit or LONGEST_EPISODE, spec.max_rollout or LONGEST_EPISODE)
-    return max(min(longest, max(left, steps + spec.unknown_steps)), 1)
+    share = max(view.budget, LEAST_AUDITED) // MOST_AUDITS
+    return min(longest, max(min(share, _left_for_audits(view)), steps + spec.unknown_steps))
+
+
+def _left_for_audits(view: SurrogateView) -> int:
+    """Number of real steps that the surrogate's audits may still take."""
+    return max(view.budget, LEAST_AUDITED) - view.ledger.audit
 
 
 def _in_gaps(subject: Subject, count: int) -> tuple[Array, Array]:

@@ -164,7 +164,7 @@ class AuditModel(AddQueries):
     goes.
 
     They don't count towards the design's budget. All audits of a surrogate together have at most as many steps as
-    this budget, or 64 if the budget is smaller.
+    this budget, or 128 if the budget is smaller.
     """
 
 

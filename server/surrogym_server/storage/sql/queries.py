@@ -49,7 +49,7 @@ OLDEST_FREE: sa.Select[Any] = (
     .limit(sa.bindparam("most", type_=sa.Integer()))
     .with_for_update(skip_locked=True)
 )
-LEAST_AUDITED = 64  # real steps of audits that every surrogate may take
+LEAST_AUDITED = 128  # real steps of audits that every surrogate may take: three undecided ones take 120
 
 
 class SqlQueries(port.Queries):
