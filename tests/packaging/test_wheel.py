@@ -36,7 +36,7 @@ def test_it_holds_every_source_file_and_nothing_else(wheel: ZipFile) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        "surrogym_server/storage/sql/migrations/versions/r0001_first_tables.py",
+        "surrogym_server/storage/sql/migrations/versions/r0100_first_schema.py",
         "surrogym_server/dashboard/index.html",
         "surrogym_server/dashboard/uplot/LICENSE",
         *(f"{package}/py.typed" for package in PACKAGES.values()),

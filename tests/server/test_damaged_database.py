@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import gzip
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -18,16 +18,19 @@ import pytest
 from support import pendulum
 from support.server import ServerProcess, running_server
 
-STORED = Path(__file__).with_name("stored")
 NAME = "pendulum"
 SECONDS = 60.0
+LONG = 10 * SECONDS  # a machine that compiles the steps for the first time
 
 
-def stored(folder: Path) -> Path:
-    """A database with a surrogate, its models and an open session."""
-    file = folder / "surrogym.db"
-    file.write_bytes(gzip.decompress((STORED / "r0001.db.gz").read_bytes()))
-    return file
+@pytest.fixture(scope="module")
+def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database that a stopped server has left: with a surrogate, its models and an open session."""
+    folder = tmp_path_factory.mktemp("whole")
+    with running_server(folder) as running, httpx.Client(base_url=running.url, timeout=LONG) as client:
+        pendulum.teach(client, NAME, seconds=LONG)
+        client.post(f"/v1/surrogates/{NAME}/sessions", json={"num_envs": 1, "seed": 0}).raise_for_status()
+    return folder / "surrogym.db"
 
 
 def execute(file: Path, statement: str, *parameters: Any) -> None:
@@ -60,9 +63,9 @@ def changed(file: Path, column: str, value: str) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
+def server(database: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
     folder = tmp_path_factory.mktemp("damaged")
-    file = stored(folder)
+    file = Path(shutil.copy(database, folder))
     flip(file, "sessions", "data")
     with running_server(folder) as running:
         yield running
@@ -129,8 +132,8 @@ def test_the_version_before_replaces_a_model_with_a_flipped_bit(server: ServerPr
     assert f"ERROR surrogym_server.services.models: model {newest} of {NAME} is set aside" in server.log
 
 
-def test_broken_pages_end_the_start_with_one_sentence_and_the_way_out(tmp_path: Path):
-    file = stored(tmp_path)
+def test_broken_pages_end_the_start_with_one_sentence_and_the_way_out(database: Path, tmp_path: Path):
+    file = Path(shutil.copy(database, tmp_path))
     content = bytearray(file.read_bytes())
     content[4096:8192] = bytes(4096)
     file.write_bytes(content)

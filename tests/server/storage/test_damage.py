@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 import sqlalchemy as sa
-from alembic import command
-from alembic.config import Config
 
 from surrogym_server.errors import Damaged, NoModel, SurrogymError
 from surrogym_server.storage.port import Storage
@@ -23,7 +21,6 @@ from surrogym_server.storage.sql import open_storage
 from surrogym_server.storage.sql.blobs import RowBlobs
 from surrogym_server.storage.sql.checks import check_pages
 from surrogym_server.storage.sql.database import connect
-from surrogym_server.storage.sql.migrate import SCRIPTS
 from surrogym_server.storage.sql.storage import SqlStorage
 from surrogym_server.storage.sql.tables import Checked, metadata, models
 
@@ -41,14 +38,6 @@ READS: dict[str, Callable[[Storage], Any]] = {
     "occupancy": lambda storage: storage.occupancy.latest(NAME),
     "events": lambda storage: storage.events.list(NAME),
 }
-
-
-def downgrade(connection: sa.Connection, revision: str) -> None:
-    config = Config()
-    config.set_main_option("script_location", str(SCRIPTS))
-    config.set_main_option("path_separator", "os")
-    config.attributes["connection"] = connection
-    command.downgrade(config, revision)
 
 
 def execute(url: str, statement: str) -> None:
@@ -243,18 +232,6 @@ def test_a_fit_is_due_when_a_model_is_set_aside(
     assert (storage.designs.due(), storage.models.newest()) == ([name], {})
     with pytest.raises(NoModel):
         storage.models.get(name)
-
-
-def test_older_models_get_the_checksum_of_their_present_content(url: str, full: Storage) -> None:
-    full.close()
-    with closing(connect(url)) as database, database.write() as connection:
-        downgrade(connection, "0004")
-    again = open_storage(url)
-    assert again.models.blob(NAME, 1) == b"\0model"
-    flip(url, 1)
-    with pytest.raises(Damaged):
-        again.models.blob(NAME, 1)
-    again.close()
 
 
 @pytest.mark.parametrize("url", ["sqlite"], indirect=True)

@@ -78,6 +78,16 @@ def test_a_database_of_a_newer_program_is_refused_and_left_alone(url: str) -> No
         assert connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalar() == "9999"
 
 
+def test_a_database_of_an_unreleased_program_is_refused_and_left_alone(url: str) -> None:
+    open_storage(url).close()
+    with engine(url).begin() as connection:
+        connection.execute(sa.text("UPDATE alembic_version SET version_num = '0011'"))
+    with pytest.raises(Unavailable, match=r"unreleased Surrogym.*0011.*export its samples .* or begin anew"):
+        open_storage(url)
+    with engine(url).connect() as connection:
+        assert connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalar() == "0011"
+
+
 def test_the_names_of_the_migrations_are_their_revisions_in_order() -> None:
     """Opening compares the names with the database, so that Alembic is loaded only where something is missing."""
     scripts = ScriptDirectory(str(SCRIPTS)).walk_revisions()

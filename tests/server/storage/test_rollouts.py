@@ -6,16 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import sqlalchemy as sa
-from alembic import command
-from alembic.config import Config
 
 from surrogym_server.errors import IdempotencyConflict, InvalidInput
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, LedgerRecord, NewDesign, NewSample, QueryCounts
-from surrogym_server.storage.sql import open_storage
-from surrogym_server.storage.sql.database import connect
-from surrogym_server.storage.sql.migrate import SCRIPTS
 
 LONG = 60.0
 SHORT = 0.02
@@ -136,34 +130,3 @@ def test_a_design_asks_for_rollouts(
     storage.designs.commit(lease, design(query_rollouts=ACTIONS[:1]))
     [query] = storage.queries.claim(name, "a", 5, LONG)
     assert (query.purpose, query.actions.tolist()) == ("adaptive", ACTIONS[0].tolist())
-
-
-def test_a_database_from_before_rollouts_keeps_its_queries_samples_and_ids(
-    url: str, make: Callable[..., str], storage: Storage, answer: Answer
-) -> None:
-    gone = make(queries=2, name="gone")
-    kept = make(queries=3, name="kept")
-    for name in (kept, gone):  # the highest id is one of a surrogate that is deleted
-        for query in storage.queries.claim(name, "a", 2, LONG):
-            [last] = storage.samples.add(name, "a", [answer(query)]).ids
-    storage.surrogates.delete(gone)
-    before = (storage.samples.page(kept, 0, 10), storage.queries.list(kept))
-    storage.close()
-    _to(url, "0001")
-    again = open_storage(url)
-    assert (again.samples.page(kept, 0, 10), again.queries.list(kept)) == before
-    [query] = again.queries.claim(kept, "a", 1, LONG)
-    assert again.samples.add(kept, "a", [answer(query)]).ids > (last,), "ids are never used twice"
-    again.close()
-
-
-def _to(url: str, revision: str) -> None:
-    """Take a database back to an older schema."""
-    config = Config()
-    config.set_main_option("script_location", str(SCRIPTS))
-    database = connect(url)
-    with database.write() as connection:
-        config.attributes["connection"] = connection
-        command.downgrade(config, revision)
-        assert sa.inspect(connection).has_table("samples")
-    database.close()

@@ -20,14 +20,14 @@ def migrate(database: Database) -> None:
     """Run the missing migrations.
 
     Raises:
-        Unavailable: the database was written by a newer program.
+        Unavailable: the database was written by a newer program, or by an unreleased one.
         Damaged: no program has ever made its schema.
     """
     known = [script.name[1:5] for script in sorted(SCRIPTS.glob("versions/r*.py"))]
     with database.write() as connection:
         _take_turn(connection)
         present = _present(connection)
-        _refuse_newer(present, known)
+        _refuse_others(present, known)
         if present != known[-1:]:
             _upgrade(connection)
 
@@ -60,8 +60,14 @@ def _take_turn(connection: Connection) -> None:
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(MIGRATION_LOCK)))
 
 
-def _refuse_newer(present: list[str], known: list[str]) -> None:
+def _refuse_others(present: list[str], known: list[str]) -> None:
     unknown = sorted(map(str, set(present) - set(known)))
+    if unknown and max(unknown) < known[0]:
+        raise Unavailable(
+            f"the database was written by an unreleased Surrogym: its schema is {', '.join(unknown)}, "
+            f"the first released one is {known[0]}; export its samples with that version, or begin anew with another "
+            "--database"
+        )
     if unknown:
         raise Unavailable(
             f"the database was written by a newer Surrogym: its schema is {', '.join(unknown)}, this program knows "
