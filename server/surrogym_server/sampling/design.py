@@ -26,15 +26,16 @@ from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.excursions import excursion
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.sampling.noise import SLACK, established_noise, to_repeat, widened
-from surrogym_server.sampling.past import owed_to_past
+from surrogym_server.sampling.past import owed_to_past, pairs_lacking
 from surrogym_server.sampling.peaks import highest
 from surrogym_server.sampling.prequential import Predictions, from_pairs, pairs_of, scores_of
-from surrogym_server.sampling.rollouts import Aim, Rollout, first_rollouts, plan_round
+from surrogym_server.sampling.rollouts import Aim, Rollout, first_rollouts, plan_round, random_sequences
 from surrogym_server.sampling.serial import noise_of_sensors, sensor_noise
 from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
 
 Verdict = Literal["continue", "ready", "over_budget", "unsure", "from_log"]
 SHORTEST_ROUND = 4  # real steps
+LONGER = 8  # steps of a rollout that shows what the steps before explain
 FEW_POINTS = 500  # more points leave no large gap, and comparing all pairs takes memory in the square of their number
 
 
@@ -173,7 +174,7 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         rng = _rng(definition, f"rollouts {state.round}")
         if testing:
             rollouts = _excursion(learned.model, samples, request, rng)
-        else:
+        elif not (rollouts := _longer(definition, samples, confidences, tolerances, verdict, request, rng)):
             ends = reserved is not None
             rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, ends)
     asks = bool(len(chosen) or rollouts)
@@ -333,6 +334,31 @@ def _repeated(
         again = to_repeat(model, samples, model.definition.tolerances_over(usual))
     room = max(0, request.budget - spent - len(request.pending))
     return none if again is None else again[:room]
+
+
+def _longer(
+    definition: EnvironmentDefinition,
+    samples: Samples,
+    confidences: tuple[OutputConfidence, ...],
+    tolerances: tuple[float, ...],
+    verdict: Verdict,
+    request: Request,
+    rng: np.random.Generator,
+) -> tuple[Rollout, ...]:
+    """Random rollouts that give enough consecutive steps to tell noise from what the steps before explain: in the
+    second half of a budget, if an error exceeds its tolerance. Snapshots need none, because they keep the past."""
+    spent, design = len(samples) - request.free, definition.design
+    if verdict != "continue" or design.stopping != "tested_confidence" or definition.snapshots:
+        return ()
+    if spent < max(request.budget / 2, 1.5 * design.initial) or request.pending_rollouts:
+        return ()
+    if all(_agrees(c, t) for c, t in zip(confidences[:-1], tolerances, strict=False)):
+        return ()
+    length = min(LONGER, definition.max_rollout or 1)
+    lacking = pairs_lacking(definition, samples)
+    count = min(-(-lacking // max(length - 1, 1)), _room(samples, request) // length) if length > 1 else 0
+    sequences = random_sequences(definition, count, length, rng) if count else ()
+    return tuple(Rollout(torch.from_numpy(sequence)) for sequence in sequences)
 
 
 def _choose(

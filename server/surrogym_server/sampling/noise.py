@@ -15,8 +15,9 @@ import scipy  # its parts are loaded on first use
 import torch
 from torch import Tensor
 
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
-from surrogym_server.environment.samples import Samples, increments, saturated
+from surrogym_server.environment.samples import Samples, increments, preceding, saturated
 from surrogym_server.models.abilities import LearnedNoise, LeaveOneOut, offers
 from surrogym_server.models.port import DynamicsModel
 
@@ -37,14 +38,25 @@ class Repeats:
 
 
 def repeats(model: DynamicsModel, samples: Samples) -> Repeats:
-    """Pool the deviations of repeated steps in the samples."""
+    """Pool the deviations of repeated steps in the samples: of equal state, action and, in an episode, step before.
+    Otherwise, what an environment remembers of the step before would count as noise."""
     targets = torch.cat([increments(model.definition, samples), samples.reward[:, None]], -1)
-    groups, member = torch.unique(torch.cat([samples.q, samples.u], -1), dim=0, return_inverse=True)
+    groups, member = torch.unique(_conditions(model.definition, samples), dim=0, return_inverse=True)
     counts = torch.bincount(member, minlength=len(groups)).to(targets.dtype)
     means = torch.zeros(len(groups), targets.shape[1], dtype=targets.dtype).index_add(0, member, targets)
     within = (targets - (means / counts[:, None])[member]).square().sum(0)
     degrees = len(samples) - len(groups)
     return Repeats(degrees, (within / max(degrees, 1)).sqrt())
+
+
+def _conditions(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
+    """State and action of each step (n, d), and those of the step before it in an episode, zeros for its first step."""
+    now = torch.cat([samples.q, samples.u], -1)
+    if definition.max_rollout is None:
+        return now
+    follows = preceding(definition, samples)
+    began = (follows < 0)[:, None]
+    return torch.cat([now, torch.where(began, 0.0, now[follows]), began.to(now.dtype)], -1)
 
 
 def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Tensor:

@@ -1,13 +1,16 @@
 """Tell what a step owes to the steps before it from noise, by consecutive steps of one episode.
 
-A dead time, or a state that is not measured, makes equal steps differ, as noise does. But then the residual r_t of a
-step depends on the steps before: on their actions u_{t-1}, u_{t-2}, ..., or on the change d_{t-1} = q_t - q_{t-1} that
-led to this one. A linear regression on them predicts each residual from all others.
+A dead time, or a state that is not measured, makes equal steps differ, as noise does. But then the steps before tell
+what follows: their actions u_{t-1}, u_{t-2}, ..., or the change d_{t-1} = q_t - q_{t-1} that led to this step. Linear
+regressions predict each step from all others, with and without them:
 
-Noise of the process is independent of them. A sensor's error e falsifies the end of one step and the start of the next:
-r_t = e_{t+1} - a e_t and d_{t-1} = e_t - e_{t-1} + (a change without error). From such a sum nothing can predict more
-than half of the variance of e_t; earlier changes would tell more of it, so they are left out. So a past that explains
-more than ``EXPLAINED`` is no noise.
+    increments and residuals r_t of the model, over (q_t, u_t) and over (q_t, u_t, d_{t-1}, u_{t-1}, ...).
+
+The share is that of the smallest squared error without the past, the model's own included, that vanishes with it.
+
+Noise of the process is independent of the past. A sensor's error e falsifies the end of one step and the start of the
+next: r_t = e_{t+1} - a e_t. The past tells e_t - a e_{t-1} at best, which explains at most a quarter of
+r_t. Earlier changes would tell more, so they are left out. A past that explains more than ``EXPLAINED`` is no noise.
 """
 
 from __future__ import annotations
@@ -17,34 +20,49 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples, increments, preceding
 from surrogym_server.models.abilities import AtSamples, LeaveOneOut, SampledFunctions, offers
 from surrogym_server.models.port import DynamicsModel
 
-EXPLAINED = 0.5  # of the squared residuals
-PAIRS = 4  # consecutive steps for each coefficient of the regression, at least
+EXPLAINED = 0.5  # of the squared error
+PAIRS = 3  # consecutive steps for each coefficient of a regression, at least
 DEPTHS = (1, 3)  # earlier actions; a longer dead time needs more, and more steps to show it
 MOST = 400  # samples in a test, because its time grows with their third power
 RIDGE = 1e-6  # of the inputs' variance
 
 
 def owed_to_past(model: DynamicsModel, samples: Samples, limits: Sequence[float]) -> tuple[float, ...]:
-    """Share of each output's squared residuals (O,) that the steps before explain. It is 0 if that share is below
-    ``EXPLAINED``, if the residuals are within the limit (O,), or if there are too few consecutive steps."""
+    """Share of each output's squared error (O,) that the steps before explain. It is 0 if that share is below
+    ``EXPLAINED``, if the error is within the limit (O,), or if there are too few consecutive steps."""
     definition, able, errors = model.definition, offers(model, SampledFunctions), offers(model, LeaveOneOut)
     nothing = (0.0,) * len(definition.outputs)
     newest = samples.at(torch.arange(max(0, len(samples) - MOST), len(samples)))
     follows = preceding(definition, newest)
     if able is None or errors is None or not bool((follows >= 0).any()):
         return nothing
+    now = torch.cat([_state(definition, newest.q), newest.u], -1)
     pasts = [_past(newest.u, increments(definition, newest), follows, depth) for depth in DEPTHS]
     shares = [
-        max(_explained(at, *past) for past in pasts)
+        max(_explained(at, now, *past) for past in pasts)
         if one.error > limit and (at := able.at_samples(newest, column)) is not None
         else 0.0
         for column, (one, limit) in enumerate(zip(errors.leave_one_out()[:-1], limits, strict=False))
     ]
     return (*shares, 0.0)
+
+
+def pairs_lacking(definition: EnvironmentDefinition, samples: Samples) -> int:
+    """How many more consecutive steps ``owed_to_past`` needs."""
+    state, size, changes = _state(definition, samples.q[:1]).shape[1], samples.u.shape[1], len(definition.moving)
+    needed = PAIRS * (state + size + changes + DEPTHS[0] * size + 1)
+    return max(0, needed - int((preceding(definition, samples) >= 0).sum()))
+
+
+def _state(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
+    """Coordinates (n, C), of angles cosine and sine."""
+    turning = torch.tensor([c.kind == "angle" for c in definition.coordinates])
+    return torch.cat([q[:, ~turning], q[:, turning].cos(), q[:, turning].sin()], -1)
 
 
 def _past(u: Tensor, change: Tensor, follows: Tensor, depth: int) -> tuple[Tensor, Tensor]:
@@ -57,18 +75,25 @@ def _past(u: Tensor, change: Tensor, follows: Tensor, depth: int) -> tuple[Tenso
     return torch.cat(columns, -1), known
 
 
-def _explained(at: AtSamples, past: Tensor, known: Tensor) -> float:
-    """Share of the squared residuals at n samples that their ``past`` (n, d) explains, where it is ``known`` (n,)."""
+def _explained(at: AtSamples, now: Tensor, past: Tensor, known: Tensor) -> float:
+    """Share of the squared error of an output at n samples that their ``past`` (n, d) explains, where it is ``known``
+    (n,), beside state and action ``now`` (n, e)."""
     some = known[at.rows]
-    x, r = past[at.rows][some], _residuals(at)[some]
-    if len(r) < PAIRS * (x.shape[1] + 1):
+    x, y, r = now[at.rows][some], at.targets[some], _residuals(at)[some]
+    whole = torch.cat([x, past[at.rows][some]], -1)
+    if len(y) < PAIRS * (whole.shape[1] + 1):
         return 0.0
-    spread = x.std(0)
-    z = torch.cat([torch.ones_like(r)[:, None], (x - x.mean(0)) / torch.where(spread > 0, spread, 1.0)], -1)
-    hat = z @ torch.linalg.solve(z.T @ z + RIDGE * len(z) * torch.eye(z.shape[1], dtype=z.dtype), z.T)
-    left = (r - hat @ r) / (1 - hat.diagonal()).clamp_min(1e-6)  # errors of residuals that were left out
-    share = 1 - float(left.square().sum() / r.square().sum().clamp_min(1e-300))
+    without = min(float(r.square().sum()), _left_out(x, y), _left_out(x, r))
+    share = 1 - min(_left_out(whole, y), _left_out(whole, r)) / max(without, 1e-300)
     return share if share >= EXPLAINED else 0.0
+
+
+def _left_out(x: Tensor, y: Tensor) -> float:
+    """Sum of the squared errors of y (n,) by a linear regression on x (n, d) with each row left out in turn."""
+    spread = x.std(0)
+    z = torch.cat([torch.ones_like(y)[:, None], (x - x.mean(0)) / torch.where(spread > 0, spread, 1.0)], -1)
+    hat = z @ torch.linalg.solve(z.T @ z + RIDGE * len(z) * torch.eye(z.shape[1], dtype=z.dtype), z.T)
+    return float(((y - hat @ y) / (1 - hat.diagonal()).clamp_min(1e-6)).square().sum())
 
 
 def _residuals(at: AtSamples) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.guard import learn
-from surrogym_server.sampling.design import Judged, Request, judge_model
-from surrogym_server.sampling.past import EXPLAINED
+from surrogym_server.sampling.design import LONGER, DesignState, Judged, Request, advance, judge_model
+from surrogym_server.sampling.noise import repeats
+from surrogym_server.sampling.past import EXPLAINED, pairs_lacking
 from surrogym_server.sampling.tolerances import usual_tolerances
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
@@ -92,3 +94,34 @@ def test_noise_and_plain_steps_owe_nothing_to_the_past(follow: Next) -> None:
     position, _ = judged(follow).confidences
     assert position.past == 0
     assert (position.noise > 0) is (follow is of_sensor)
+
+
+def single_steps() -> Samples:
+    """Steps of a hidden speed, each from a reset: they show nothing of a past."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for _ in range(20):
+        state, u = rng.uniform(-1, 1, 2), rng.uniform(-1, 1)
+        rows.append((state[0], u, hidden_speed(state, u, 0.0, rng)[1]))
+    q, u, q_next = (torch.tensor(column, dtype=torch.float64)[:, None] for column in np.array(rows).T)
+    return Samples(q, u, q_next, torch.zeros(20, dtype=torch.float64), torch.zeros(20, dtype=torch.bool))
+
+
+@pytest.mark.parametrize(("budget", "longer"), [(60, False), (40, True)])
+def test_a_design_of_single_steps_takes_longer_rollouts_in_its_second_half(budget: int, longer: bool) -> None:
+    taken = single_steps()
+    lacking = pairs_lacking(DEFINITION, taken)
+    assert lacking > 0
+    request = Request(budget, 0.999, Points(taken.q[:0], taken.u[:0]))
+    planned = advance(DEFINITION, taken, DesignState(), request).rollouts
+    gained = sum(len(rollout) - 1 for rollout in planned)
+    assert (gained >= min(lacking, (budget - len(taken)) // LONGER * (LONGER - 1))) is longer
+
+
+def test_equal_steps_after_different_ones_are_no_repeats() -> None:
+    rows = torch.tensor([[0.0, 1.0, 0.5], [0.5, 1.0, 0.7], [0.2, -1.0, 0.5], [0.5, 1.0, 0.3]], dtype=torch.float64)
+    nothing = torch.zeros(4, dtype=torch.float64)
+    taken = Samples(rows[:, :1], rows[:, 1:2], rows[:, 2:], nothing, nothing.bool())
+    model = SimpleNamespace(definition=DEFINITION)
+    assert repeats(model, taken).degrees == 0
+    assert repeats(model, taken.at(torch.tensor([0, 1, 0, 1]))).degrees == 2
