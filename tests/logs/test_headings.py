@@ -158,7 +158,11 @@ def test_a_counter_that_starts_again_numbers_episodes(tmp_path: Path, seed: int)
     lengths.append(ROWS - sum(lengths))
     columns = plant(seed)
     first = rng.choice([0, 1])
-    named = {rng.choice(["", "step", "index", "t_step"[2:]]): [first + k for n in lengths for k in range(n)]}
+    named = {
+        rng.choice(["", "step", "index", "episode_step", "Unnamed: 0", "time step"]): [
+            first + k for n in lengths for k in range(n)
+        ]
+    }
     named |= {"T": columns["T"], "u": columns["heat"], "reward": columns["reward"]}
     log = read_log(write(tmp_path / "log.csv", named))
     assert (log.steps.episodes, log.spec.coordinate_names) == (tuple(lengths), ("T",))
@@ -179,6 +183,31 @@ def test_rows_that_are_missing_from_an_index_leave_a_gap(tmp_path: Path):
     log = read_log(write(tmp_path / "log.csv", named))
     assert not {4, 12} & set(log.steps.row.tolist()), "the rows before the gaps"
     assert (len(log.steps), log.rejected) == (len(kept) - 3, [])
+
+
+@pytest.mark.parametrize("name", ["", "index", "Unnamed: 0", "step"])
+@pytest.mark.parametrize("order", [range(ROWS)[::-1], random.Random(0).sample(range(ROWS), ROWS)])
+def test_rows_in_another_order_than_their_numbers_are_refused(tmp_path: Path, name: str, order: list[int]):
+    columns = plant(0)
+    named = {name: list(order), "T": columns["T"], "u": columns["heat"], "reward": columns["reward"]}
+    with pytest.raises(UnusableLog, match=r"expected rows in the order of .*, got another order"):
+        read_log(write(tmp_path / "log.csv", named))
+
+
+def test_a_state_that_always_grows_is_pointed_out(tmp_path: Path):
+    columns = plant(0)
+    named = {"tijd": [k + 0.1 * (k % 3) for k in range(ROWS)], "T": columns["T"], "u": columns["heat"]}
+    log = read_log(write(tmp_path / "log.csv", {**named, "reward": columns["reward"]}))
+    assert any(note.startswith("tijd: grows in each row") for note in log.notes)
+
+
+def test_a_counter_that_starts_again_may_have_gaps_too(tmp_path: Path):
+    columns = plant(0)
+    steps = [0, 1, 3, 4, 5, 6, 7, 8, 0, 1, 2, 4, 5, 6, 7, 8, 0, 1, 2, 3, 4, 5, 6, 7]
+    named = {"step": steps, "T": columns["T"], "u": columns["heat"], "reward": columns["reward"]}
+    log = read_log(write(tmp_path / "log.csv", named))
+    assert (log.spec.coordinate_names, log.steps.episodes) == (("T",), (8, 8, 8))
+    assert not {1, 7, 10, 15} & set(log.steps.row.tolist()), "rows before a gap or a new start"
 
 
 def test_an_age_that_an_action_resets_is_a_state(tmp_path: Path):

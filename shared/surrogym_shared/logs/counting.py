@@ -26,7 +26,7 @@ def measured(cells: Cells) -> Floats | None:
 
 
 def numbering(cells: Cells) -> Numbering | None:
-    """Whether whole numbers count the rows, the rows of each episode, or rows of which some are missing."""
+    """Whether whole numbers count the rows, the rows of each episode, or either with some missing."""
     values = measured(cells)
     if values is None or (values != np.floor(values)).any():
         return None
@@ -37,7 +37,20 @@ def numbering(cells: Cells) -> Numbering | None:
     again = values[1:][restarts]
     if restarts.mean() <= MOST_TURNS and (change[restarts] <= 0).all() and (again == values[0]).all():
         return "episodes"
-    return "gaps" if (change > 0).all() else None
+    return "gaps" if grows(cells) and (change != 0).all() and not is_unordered(cells) else None
+
+
+def is_unordered(cells: Cells) -> bool:
+    """Whether whole numbers are different in each row and fall somewhere: an index of rows in another order."""
+    values = measured(cells)
+    whole = values is not None and bool((values == np.floor(values)).all())
+    return values is not None and whole and len(np.unique(values)) == len(values) and bool((np.diff(values) < 0).any())
+
+
+def grows_always(cells: Cells) -> bool:
+    """Whether a column is larger in each row than in the one before."""
+    values = measured(cells)
+    return values is not None and bool((np.diff(values) > 0).all())
 
 
 def grows(cells: Cells) -> bool:

@@ -16,7 +16,17 @@ from surrogym_shared.logs.columns import (
     roles_by_mapping,
     roles_by_name,
 )
-from surrogym_shared.logs.counting import Numbering, episodes_by, grows, is_in_blocks, is_mark, is_steady, numbering
+from surrogym_shared.logs.counting import (
+    Numbering,
+    episodes_by,
+    grows,
+    grows_always,
+    is_in_blocks,
+    is_mark,
+    is_steady,
+    is_unordered,
+    numbering,
+)
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.headings import heading, timed
 from surrogym_shared.logs.rlds import from_rlds
@@ -25,8 +35,8 @@ from surrogym_shared.words import listed
 
 BY = "episodes by "  # beginning of the name of a column that is made of marks of starts, or of a counter
 STARTS = ("is_first", "episode_start", "episode_starts")  # the names of RLDS and Stable-Baselines3
-COUNTERS = {"index", "step", "steps", "step_index", "time_step", "timestep", "row", "line", "sample", "frame", "tick"}
-COUNTERS |= {"counter", "count", "number", "no", "nr", "id", "i", "k", "n", "index_level_0"}
+INDEX = {"index", "step", "steps", "timestep", "row", "line"}  # words of columns that number rows
+COUNTERS = {"sample", "frame", "tick", "counter", "count", "number", "no", "nr", "id", "i", "k", "n"}  # whole names
 COUNTED = "it grows by one in each row, as the number of a row does"
 WITHIN = "it numbers the rows of each episode"
 LONGEST_HINT = 600  # letters of a mapping that a message proposes
@@ -103,7 +113,11 @@ def _by_name(table: Table) -> tuple[Table, Roles]:
     if roles.time is None and (gaps := [name for name, kind in kinds.items() if kind == "gaps"]):
         roles = replace(roles, time=gaps[0])
         del ignored[gaps[0]]
-    return replace(table, ignored={**table.ignored, **ignored}), roles
+    remarks = (
+        [] if roles.time is not None else [name for name in _plain(table, roles) if grows_always(table.columns[name])]
+    )
+    words = (f"{name}: grows in each row; if it is the time, say so in a mapping file (--map)" for name in remarks)
+    return replace(table, ignored={**table.ignored, **ignored}, remarks=(*table.remarks, *words)), roles
 
 
 def _with_episodes(table: Table, name: str) -> Table:
@@ -118,10 +132,19 @@ def _plain(table: Table, roles: Roles) -> list[str]:
 
 
 def _numbering(name: str, table: Table) -> Numbering | None:
-    """What a column counts. That it restarts or has gaps only counts if its name is that of a counter."""
-    kind = numbering(table.columns[name])
-    known = name in table.unnamed or timed(heading(name)).plain in COUNTERS or heading(name).plain in COUNTERS
-    return kind if kind == "rows" or known else None
+    """What a column counts. That it restarts or has gaps only counts if its name is that of a counter.
+
+    Raises:
+        UnusableLog: the rows are in another order than their numbers.
+    """
+    kind, one = numbering(table.columns[name]), heading(name)
+    is_index = name in table.unnamed or bool(INDEX.intersection(one.words))
+    if is_index and kind is None and is_unordered(table.columns[name]):
+        raise UnusableLog(
+            f"expected rows in the order of {name!r}, which numbers them, got another order: sort the log by it, or "
+            "say what the columns are in a mapping file (--map)"
+        )
+    return kind if kind == "rows" or is_index or one.plain in COUNTERS else None
 
 
 def _ask(table: Table, roles: Roles, plain: Sequence[str]) -> None:

@@ -19,7 +19,7 @@ from surrogym_shared.words import counted
 
 DELIMITERS = ",;\t|"
 BLANKS = " "
-COMMENTS = ("#", "%", "//")
+COMMENTS = ("#", "%", "//", "sep=")  # Excel has sep=; as the first line
 LONGEST_NAME = 200  # letters
 JSON = re.compile(r"[{\[]\s*[{\[\"]")
 UNIT_APART = re.compile(r"\s+(?=[\[(])")  # time [s] is one name, also where blanks separate the columns
@@ -153,7 +153,7 @@ def _heading(head: _Head, delimiter: str, where: str, remarks: list[str]) -> tup
             cells = joined if len(joined) == len(row) else cells
         return cells, head.before + 1, remarks
     if head.comments:
-        line = head.comments[-1].strip('"').lstrip("".join(COMMENTS) + " ")
+        line = head.comments[-1].strip('"').lstrip("#%/ ")
         named = [name.strip() for name in _cells(line, delimiter)]
         if delimiter == BLANKS and len(named) != len(cells):
             named = _cells(UNIT_APART.sub("", line), delimiter)

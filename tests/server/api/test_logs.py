@@ -77,7 +77,7 @@ def test_a_draft_equals_that_of_the_command(client: httpx.Client, tmp_path):
         ({"text": log(3), "mapping": {"state": {"theta": "x"}, "action": ["y"]}}, 422, "names the column 'x'"),
         ({"text": log(3), "mapping": {"state": {}, "run": "os.system"}}, 422, "mapping"),
         ({"text": log(3), "file": "/etc/passwd"}, 422, "file"),
-        ({"text": HEADING + "\n" + "0,0,0,0,0\n" * 50_001}, 422, "at most 50000 rows"),
+        ({"text": HEADING + "\n" + "0,0,0,0,0\n" * 50_001}, 422, "at most 50,000 rows"),
         ({"text": "x" * 6 * 1024 * 1024}, 413, "at most 5242880 bytes"),
     ],
 )
