@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 from surrogym_server.cluster.leases import Leases
 from surrogym_server.engine.local import LocalEngine
+from surrogym_server.engine.opening import OpeningLocks
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance, Array, Open, Reply, Restore, Saved, SessionInfo, Visited
 from surrogym_server.engine.tallies import Counts, SessionActivity
@@ -60,13 +61,13 @@ class RecordedEngine(SessionEngine):
         self._store = store
         self._leases = leases
         self._surroundings = surroundings
-        self._opening = asyncio.Lock()
+        self._opening = OpeningLocks()
         self._taking = asyncio.Lock()
         self._behind: dict[str, int] = {}  # sessions that were taken over, and the seq that they have to reach
         self._tasks: list[asyncio.Task[None]] = []
 
     async def open(self, request: Open) -> SessionInfo:
-        async with self._opening:
+        async with self._opening.of(request.surrogate_id):
             info = await self._inner.open(request)
             if not self._leases.holds(info.id):
                 await self._add(info.id, request.surrogate_id)

@@ -21,6 +21,7 @@ from surrogym_server.engine.core import (
     visited_states,
 )
 from surrogym_server.engine.models import ModelCache
+from surrogym_server.engine.opening import OpeningLocks
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import (
     Advance,
@@ -87,7 +88,7 @@ class LocalEngine(SessionEngine):
             Threads(steps, STEP_THREADS), Threads(rollouts, ROLLOUT_THREADS), limits=limits, idle_seconds=idle_seconds
         )
         self._compiling = Compiling()
-        self._opening = asyncio.Lock()
+        self._opening = OpeningLocks()
         self._tallies = Tallies()
         self._steps, self._lane_steps, self._expired = Durations(), 0, 0
 
@@ -95,7 +96,7 @@ class LocalEngine(SessionEngine):
         opening = request.opening
         check_size(opening.settings, self._max_lanes)
         digest = digest_of("open", opening)
-        async with self._opening:
+        async with self._opening.of(request.surrogate_id):
             if opening.key and (known := self._live.opened_by(request.surrogate, opening.key, digest)):
                 return info_of(known)
             needed = await asyncio.to_thread(self._expected_bytes, request)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import Callable
 
 import pytest
@@ -38,3 +39,33 @@ def test_the_engine_of_this_process_keeps_the_laws(
             await engine.stop()
 
     asyncio.run(kept())
+
+
+def test_an_opening_waits_for_no_model_of_another_surrogate(
+    definition: EnvironmentDefinition, fitted: Callable[[int], DynamicsModel]
+):
+    """The model of a long log takes long to load."""
+    loading, loaded, large = threading.Event(), threading.Event(), SURROGATE + 1
+
+    def load(surrogate: int, version: int) -> DynamicsModel:
+        del version
+        if surrogate == large:
+            loading.set()
+            assert loaded.wait(60)
+        return fitted(12)
+
+    async def opens() -> None:
+        models = ModelCache(load, lambda: {SURROGATE: 1, large: 1})
+        engine = LocalEngine(models, lambda *_: (), limits=Limits(), max_lanes=64, idle_seconds=60)
+        try:
+            slow = asyncio.create_task(engine.open(EngineCase(engine, "log", large, definition).asked()))
+            await asyncio.to_thread(loading.wait, 60)
+            await asyncio.wait_for(engine.open(EngineCase(engine, "pendulum", SURROGATE, definition).asked()), 30)
+            assert not slow.done()
+            loaded.set()
+            await slow
+        finally:
+            loaded.set()
+            await engine.stop()
+
+    asyncio.run(opens())
