@@ -182,14 +182,14 @@ def test_steps_with_numbers_that_no_server_stores_do_not_lose_the_others(tmp_pat
 
 
 def test_angles_are_sent_as_an_import_sends_them():
-    """The server knows a logged step by its numbers, so one with another last bit would be stored twice."""
+    """The server knows a log by its numbers, so one with another last bit would be stored twice."""
     spec = original.make("Pendulum-v1").spec()
     angles = np.random.default_rng(0).uniform(-20, 20, size=(500, 2))
     steps = [
         NewSample(coordinates=[a, 0.5], action=[0.1], next_coordinates=[b, 0.5], reward=-1.0, terminated=False)
         for a, b in angles.tolist()
     ]
-    once = as_logged(spec, [*steps, *steps])
-    assert len(once) == len(steps)
-    assert as_logged(spec, once) == once
-    assert all(-np.pi <= one.coordinates[0] < np.pi for one in once)
+    sent = as_logged(spec, [*steps, *steps])
+    assert len(sent) == 2 * len(steps), "equal steps all count"
+    assert as_logged(spec, sent) == sent
+    assert all(-np.pi <= one.coordinates[0] < np.pi for one in sent)

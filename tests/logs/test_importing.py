@@ -49,6 +49,25 @@ def test_the_same_log_twice_changes_nothing(server_process: ServerProcess, log: 
     assert (second.round, second.samples, second.phase) == (first.round, first.samples, "from_log")
 
 
+def test_equal_steps_all_count_and_a_log_that_begins_alike_is_another_log(
+    server_process: ServerProcess, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+):
+    """A gauge of whole metres: 1,864 of 1,999 steps were dropped, because others had their numbers."""
+    monkeypatch.setattr(importing, "BATCH", 25)
+    for day, turns in (("monday", 40), ("tuesday", 45)):
+        levels = [min(k // 10, turns // 10) for k in range(60)]
+        lines = [f"{level},{1.5 if k < turns else -0.5},{-level}" for k, level in enumerate(levels)]
+        (tmp_path / day).write_text("\n".join(["level,action_flow,reward", *lines]))
+    spec = import_log(tmp_path / "tuesday").log.spec
+    taken = [
+        import_log(tmp_path / day, register=name, spec=spec, url=server_process.url).taken
+        for day in ("monday", "tuesday", "monday", "tuesday")
+    ]
+    assert taken == [59, 59, 0, 0]
+    with Api(server_process.url) as api:
+        assert api.surrogate(name).samples == 2 * 59
+
+
 def test_steps_that_were_there_are_sent_and_not_stored(server_process: ServerProcess, log: Path, name: str):
     """The progress said that 60 of 60 steps were stored, and the result that none of them was new."""
     said: list[str] = []

@@ -151,8 +151,8 @@ class Steps:
         return f"{said}; all are in {self.file}; to store the others, without storing any twice: {shlex.join(command)}"
 
     def _count(self, added: AddedSamples) -> None:
-        self.stored += len(added.sample_ids)
-        self.new += len(added.sample_ids) - added.duplicates
+        self.stored = len(added.sample_ids)
+        self.new = len(added.sample_ids) - added.duplicates
 
 
 @contextmanager

@@ -24,14 +24,13 @@ def is_storable(step: StepOfEpisode) -> bool:
 
 
 def as_logged(spec: EnvironmentSpec, samples: Sequence[NewSample]) -> list[NewSample]:
-    """Return steps in the form in which an import would send them: with wrapped angles, and each one once.
+    """Return steps in the form in which an import would send them: with wrapped angles.
 
-    The server knows a logged step by its numbers. So a step that it has stored is a duplicate in an import, to the last
-    bit.
+    The server knows a log by the numbers of its steps. So steps that it has stored are duplicates in an import, to the
+    last bit. Equal steps all stay, because each was taken.
     """
     angles = [i for i, coordinate in enumerate(spec.coordinates) if coordinate.kind == "angle"]
-    once = {one.model_dump_json(): one for one in (_with_wrapped(angles, sample) for sample in samples)}
-    return list(once.values())
+    return [_with_wrapped(angles, sample) for sample in samples]
 
 
 def write_steps(policy: Path, spec: EnvironmentSpec, samples: Sequence[NewSample]) -> Path:

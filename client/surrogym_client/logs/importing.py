@@ -87,15 +87,20 @@ def _with_budget(spec: EnvironmentSpec, budget: int | None) -> EnvironmentSpec:
 def send(api: Api, name: str, log: ReadLog, progress: Progress = lambda _share, _words: None) -> tuple[int, int]:
     """Send the usable steps of a log to a surrogate; returns how many, and how many were there before.
 
-    It may be interrupted, and sent again: a step that is there is not stored twice.
+    It may be interrupted, and sent again: the server knows the log by its beginning, and adds only what is missing.
     """
-    steps, duplicates = log.steps, 0
-    reward = log.reward
-    for first in range(0, len(steps), BATCH):
+    steps, reward = log.steps, log.reward
+    after = log.steps.origin
+    first = duplicates = 0
+    while first < len(steps):
         rows = range(first, min(first + BATCH, len(steps)))
         batch = [_sample(steps, reward, row) for row in rows]
-        added = api.add_samples(name, SAMPLER, batch, purpose="logged", complete=rows.stop == len(steps))
-        duplicates += added.duplicates
+        complete = rows.stop == len(steps)
+        added = api.add_samples(name, SAMPLER, batch, purpose="logged", complete=complete, after=after)
+        if added.restart is not None:
+            first, duplicates, after = 0, 0, added.restart
+            continue
+        first, duplicates, after = rows.stop, duplicates + added.duplicates, added.digest
         progress(rows.stop / len(steps), f"{rows.stop} of {len(steps)} steps sent")
     return len(steps), duplicates
 

@@ -281,17 +281,20 @@ class Api:
         *,
         purpose: Literal["manual", "logged"] = "manual",
         complete: bool = True,
+        after: str | None = None,
         idempotency_key: str | None = None,
         stored: Callable[[wire.AddedSamples], None] = lambda _: None,
     ) -> wire.AddedSamples:
         """Send real steps, and return once the server has stored them.
 
-        ``logged`` steps were recorded before: they don't count towards the budget, and those that are stored already
-        change nothing. The call with ``complete`` makes a fit of the log due.
+        ``logged`` steps were recorded before: they don't count towards the budget, and a log that is stored already
+        changes nothing. The call with ``complete`` makes a fit of the log due. A further part of a log comes ``after``
+        the ``digest`` of the reply to the part before. If the reply has a ``restart``, nothing of the log was stored,
+        and it has to be sent from its beginning with this as ``after``; a call without ``after`` does so by itself.
 
         A batch of up to about 300 samples is stored whole or not at all. A larger one is sent in several requests, so
         an error may leave its first part stored; the same call with the same key then adds the rest. ``stored`` is
-        called after each request that the server has answered.
+        called after each request that the server has answered, with a reply for all requests so far.
         """
         batches = _batches(samples)
         keys: list[str | None] = [None] * len(batches)
@@ -299,21 +302,23 @@ class Api:
             key = idempotency_key or new_key()
             keys = [key] if len(batches) == 1 else [f"{key}/{number}" for number in range(len(batches))]
         added: list[wire.AddedSamples] = []
-        for one, batch in zip(keys, batches, strict=True):
+        begins, place = after is None, after
+        while len(added) < len(batches):
+            batch = batches[len(added)]
             body = wire.AddSamples(
                 sampler=sampler,
                 samples=batch,
                 purpose=purpose,
                 complete=complete and batch is batches[-1],
-                idempotency_key=one,
+                after=place,
+                idempotency_key=keys[len(added)],
             )
-            added.append(self._post(wire.AddedSamples, f"{routes.surrogate(name)}/add_sample", body))
-            stored(added[-1])
-        return wire.AddedSamples(
-            sample_ids=[id for one in added for id in one.sample_ids],
-            duplicates=sum(one.duplicates for one in added),
-            ledger=added[-1].ledger,
-        )
+            reply = self._post(wire.AddedSamples, f"{routes.surrogate(name)}/add_sample", body)
+            if reply.restart is not None and not begins:
+                return reply
+            added, place = ([*added, reply], reply.digest) if reply.restart is None else ([], reply.restart)
+            stored(_joined(added or [reply]))
+        return _joined(added)
 
     def samples(self, name: str) -> Iterator[wire.SampleView]:
         """Iterate over all samples in order of arrival, page by page."""
@@ -494,6 +499,12 @@ class Api:
 
     def _send(self, path: str, body: BaseModel, *, method: str = "POST", **options: Any) -> bytes:
         return self.connection.send(method, path, body.model_dump_json().encode(), **options)
+
+
+def _joined(added: Sequence[wire.AddedSamples]) -> wire.AddedSamples:
+    """Return one reply for all requests so far."""
+    ids = [id for one in added for id in one.sample_ids]
+    return added[-1].model_copy(update={"sample_ids": ids, "duplicates": sum(one.duplicates for one in added)})
 
 
 def _batches(samples: Sequence[wire.NewSample]) -> list[list[wire.NewSample]]:

@@ -45,12 +45,12 @@ async def draft(body: Annotated[DraftLog, example(examples.DRAFT_LOG)], request:
 )
 async def add(name: str, body: Annotated[AddLog, example(examples.ADD_LOG)], request: Request, use: Use) -> AddedLog:
     """Check each row of a log against the surrogate's specification. The usable ones are stored as ``logged`` samples,
-    unless ``check_only``. A step that equals a stored one in every number is a duplicate, so a repeat is harmless."""
+    unless ``check_only``. The same log again changes nothing, and one that has grown adds its new steps."""
     turns: Turns = request.app.state.log_turns
     return await turns.take(request, lambda: _added(name, body, use))
 
 
 def _added(name: str, body: AddLog, use: Services) -> AddedLog:
     log = convert.checked_log(body, use.surrogates.spec(name))
-    added = NOTHING if body.check_only else use.samples.add_log(name, convert.logged_samples(log))
+    added = NOTHING if body.check_only else use.samples.add_log(name, convert.logged_samples(log), log.steps.origin)
     return convert.added_report(log, added)

@@ -47,11 +47,11 @@ MAX_PAGE = 10_000
 )
 def add_sample(name: str, body: Annotated[AddSamples, example(examples.ADD_SAMPLE)], use: Use) -> AddedSamples:
     """Store one or many samples, all or none, with or without a query. They are stored durably when the reply comes. A
-    repeat is harmless: a sample of a query is identified by its lease token, a logged one by its numbers, others by the
-    idempotency key."""
+    repeat is harmless: a sample of a query is identified by its lease token, a logged one by its place in its log,
+    others by the idempotency key."""
     samples = [convert.new_sample(sample) for sample in body.samples]
     logged, key = body.purpose == "logged", body.idempotency_key
-    added = use.samples.add(name, body.sampler, samples, key, logged=logged, complete=body.complete)
+    added = use.samples.add(name, body.sampler, samples, key, logged=logged, complete=body.complete, after=body.after)
     return convert.added_samples(added)
 
 

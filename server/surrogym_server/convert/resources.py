@@ -152,7 +152,13 @@ def new_sample(sample: replies.NewSample) -> NewSample:
 
 
 def added_samples(added: Added) -> replies.AddedSamples:
-    return replies.AddedSamples(sample_ids=list(added.ids), duplicates=added.duplicates, ledger=ledger(added.ledger))
+    return replies.AddedSamples(
+        sample_ids=list(added.ids),
+        duplicates=added.duplicates,
+        ledger=ledger(added.ledger),
+        digest=added.digest,
+        restart=added.restart,
+    )
 
 
 def snapshot_list(known: Mapping[str, Sequence[float]]) -> replies.SnapshotList:

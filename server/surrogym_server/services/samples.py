@@ -27,6 +27,8 @@ class Added:
     ids: tuple[int, ...]
     duplicates: int
     ledger: LedgerRecord
+    digest: str | None = None  # of a log, see ``storage.records.AddedSamples``
+    restart: str | None = None
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ class SampleService:
         *,
         logged: bool = False,
         complete: bool = True,
+        after: str | None = None,
     ) -> Added:
         """Store real steps, all or nothing. They are committed when it returns.
 
@@ -72,20 +75,29 @@ class SampleService:
         check_trajectories(checked)
         if key is None and not logged and any(sample.query_id is None for sample in checked):
             raise InvalidInput("samples without a query_id: expected an idempotency_key, got none")
-        added = self._storage.samples.add(name, sampler, checked, key=key, logged=logged, complete=complete)
-        if logged and complete:
+        added = self._storage.samples.add(
+            name, sampler, checked, key=key, logged=logged, complete=complete, after=after
+        )
+        if logged and complete and added.restart is None:
             self._withdraw_covered(name, definition)
         self._samplers.heard(name, sampler)
         self._notices.post(name)
-        return Added(added.ids, added.duplicates, self._storage.ledger.read(name))
+        return Added(added.ids, added.duplicates, self._storage.ledger.read(name), added.digest, added.restart)
 
-    def add_log(self, name: str, samples: Sequence[NewSample]) -> AddedLog:
-        """Store a whole log, batch by batch; a repeat stores what an earlier call did not. Raises as ``add``."""
-        duplicates = 0
-        for first in range(0, len(samples), BATCH):
+    def add_log(self, name: str, samples: Sequence[NewSample], origin: str | None = None) -> AddedLog:
+        """Store a whole log, batch by batch; a repeat stores what an earlier call did not. Raises as ``add``.
+
+        ``origin`` distinguishes the log from others with the same numbers; None: nothing does.
+        """
+        first, duplicates, after = 0, 0, origin
+        while first < len(samples):
             batch = samples[first : first + BATCH]
             complete = first + BATCH >= len(samples)
-            duplicates += self.add(name, LOG, batch, None, logged=True, complete=complete).duplicates
+            added = self.add(name, LOG, batch, None, logged=True, complete=complete, after=after)
+            if added.restart is not None:
+                first, duplicates, after = 0, 0, added.restart
+            else:
+                first, duplicates, after = first + BATCH, duplicates + added.duplicates, added.digest
         return AddedLog(len(samples) - duplicates, duplicates)
 
     def _withdraw_covered(self, name: str, definition: EnvironmentDefinition) -> None:

@@ -316,6 +316,7 @@ class Samples(ABC):
         key: str | None = None,
         logged: bool = False,
         complete: bool = True,
+        after: str | None = None,
     ) -> AddedSamples:
         """Store a batch of samples, all or nothing, and answer the queries that it names. It is committed when this
         returns.
@@ -325,9 +326,11 @@ class Samples(ABC):
         has one answer: a sample, or the first samples of a rollout, with ``step`` 0, 1, ... up to the query's
         ``steps``. Sending it again is a duplicate and gets the same id.
 
-        ``logged`` samples answer no query, and don't count towards the budget. One that equals a logged sample of the
-        surrogate in every number is a duplicate, even from another batch. Until a log is ``complete``, its samples make
-        no fit due.
+        ``logged`` samples answer no query, and don't count towards the budget. Each is identified by its numbers and by
+        all samples of its log before it. So a log that comes again, or has grown, adds only what is new. Equal steps of
+        one log all count, and those of two logs too. A part of a log comes ``after`` the digest in the reply to the
+        part before; None if the log begins with it. A log that differs from a stored one in a later part has to
+        restart, see ``AddedSamples``. Until a log is ``complete``, its samples make no fit due.
 
         Raises:
             UnknownQuery: there is no such query.

@@ -214,10 +214,16 @@ class NewSample:
 
 @dataclass(frozen=True)
 class AddedSamples:
-    """``ids`` are in the order of the batch; ``duplicates`` of them existed already."""
+    """``ids`` are in the order of the batch; ``duplicates`` of them existed already.
+
+    Of logged samples, ``digest`` identifies the log up to the end of the batch. With a ``restart`` nothing was stored:
+    the log differs here from a stored one that begins in the same way, and has to come again after ``restart``.
+    """
 
     ids: tuple[int, ...]
     duplicates: int
+    digest: str | None = None
+    restart: str | None = None
 
 
 @dataclass(frozen=True)

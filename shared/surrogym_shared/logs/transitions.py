@@ -30,6 +30,9 @@ class Transitions:
         rejected: reason for each row that was set aside, by the row's index.
         ends: number of rows without a next state, because an episode ends there or a gap in time follows.
         interval: median time between two rows, in the unit of the time column; None without such a column.
+        lost_ends: number of rows that end their episode in a terminal state, and give no step, because their next state
+            is not known.
+        began: time of the first step; None without a column of times.
         notes: what was concluded about the order of the rows, from the clock and the names of episodes.
     """
 
@@ -46,9 +49,17 @@ class Transitions:
     ends: int
     interval: float | None
     notes: tuple[str, ...] = ()
+    lost_ends: int = 0
+    began: float | None = None
 
     def __len__(self) -> int:
         return len(self.row)
+
+    @property
+    def origin(self) -> str | None:
+        """Text that distinguishes the log from others with the same numbers: the time of its first step; None without
+        a column of times."""
+        return None if self.began is None else f"begins at {self.began!r}"
 
     @property
     def digest(self) -> str:
@@ -95,6 +106,8 @@ def transitions_of(rows: Rows) -> Transitions:
         rejected=dict(sorted(rejected.items())),
         ends=len(rows) - len(usable) - len(rejected),
         interval=interval,
+        lost_ends=int(rows.terminated.sum() - rows.terminated[usable].sum() - rows.terminated[list(rejected)].sum()),
+        began=None if rows.time is None or not len(usable) else float(rows.time[usable[0]]),
         notes=(*episodes.notes, *([] if ticks is None else [f"{rows.roles.time}: {ticks.note}"])),
     )
 

@@ -220,8 +220,13 @@ class AddSamples(Request):
     purpose: Literal["manual", "logged"] = Field(
         default="manual",
         description="purpose of the samples that answer no query. ``manual``: they count towards the budget. "
-        "``logged``: they were recorded before and don't; one that equals a stored sample in every "
-        "number is a duplicate",
+        "``logged``: they were recorded before and don't. Each is identified by its numbers and by all samples "
+        "of its log before it, so the same log again changes nothing",
+    )
+    after: Key | None = Field(
+        default=None,
+        description="for logged samples: ``digest`` of the reply to the part of the log before; null: the log begins "
+        "here. Another text begins a log that differs from logs with the same numbers",
     )
     complete: bool = Field(
         default=True, description="false: more of the same log follows, so no fit becomes due for this part"
@@ -238,6 +243,14 @@ class AddedSamples(Reply):
     sample_ids: list[int] = Field(description="id of each sample, in the order of the request")
     duplicates: int = Field(description="number of samples that were stored before")
     ledger: Ledger = Field(description="real steps so far")
+    digest: str | None = Field(
+        default=None, description="identifies the log up to here; give it as ``after`` with the next part"
+    )
+    restart: str | None = Field(
+        default=None,
+        description="not null: nothing was stored, because the log differs here from a stored one that begins in the "
+        "same way; send it again from its beginning, with this as ``after``",
+    )
 
 
 class SnapshotView(Reply):

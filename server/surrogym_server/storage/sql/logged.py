@@ -1,4 +1,8 @@
-"""Logged samples: identified by their content, and used by the design when their log is complete.
+"""Logged samples: identified by their place in their log, and used by the design when the log is complete.
+
+The digest of a log up to a sample is a hash of the digest before it and of the sample's numbers. The fingerprint of a
+logged sample holds both digests, so a sample is found by everything that came before it. A log that equals a stored one
+up to some place, and then differs from what follows there, is another log. It is stored whole, under other digests.
 
 ``logged_revision`` is the revision of the surrogate that has all of the last log. While a log is incomplete it is one
 ahead of ``revision``, so that the call that completes it makes a fit due even if it brings no new sample.
@@ -7,20 +11,23 @@ ahead of ``revision``, so that the call that completes it makes a fit due even i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate, pairwise
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import InvalidInput
-from surrogym_server.storage.records import AddedSamples, NewSample
+from surrogym_server.storage.records import AddedSamples, NewSample, fingerprint
 from surrogym_server.storage.sql.rows import touch
 from surrogym_server.storage.sql.sample_rows import insert_samples, row_of
 from surrogym_server.storage.sql.tables import samples, surrogates
 
 
-def store_logged(connection: Connection, held: Row[Any], sampler: str, batch: Sequence[NewSample]) -> AddedSamples:
-    """Insert the new samples of the batch: those that no logged sample of the surrogate equals in every number.
+def store_logged(
+    connection: Connection, held: Row[Any], sampler: str, batch: Sequence[NewSample], after: str | None
+) -> AddedSamples:
+    """Insert the new samples of a part of a log, which comes ``after`` another part, or begins the log.
 
     Raises:
         InvalidInput: a sample that names a query.
@@ -29,12 +36,22 @@ def store_logged(connection: Connection, held: Row[Any], sampler: str, batch: Se
         if sample.query_id is not None:
             raise InvalidInput(f"samples.{index}: expected a logged sample without a query_id, got {sample.query_id}")
     rows = [row_of(held, sampler, sample, logged=True) for sample in batch]
-    known = _known(connection, held, [row["fingerprint"] for row in rows])
-    new = {row["fingerprint"]: row for row in rows if row["fingerprint"] not in known}
-    known |= dict(zip(new, insert_samples(connection, held, sampler, list(new.values())), strict=True))
+    before = after or ""
+    while True:
+        chain = list(accumulate((row["fingerprint"] for row in rows), fingerprint, initial=before))
+        links = [f"{one}:{other}" for one, other in pairwise(chain)]
+        known = _known(connection, held, links)
+        old = next((place for place, link in enumerate(links) if link not in known), len(links))
+        if old == len(links) or not _continued(connection, held, chain[old]):
+            break
+        before = chain[old + 1]  # shared by all logs that differ here in the same way, as one that grows does
+        if after is not None:
+            return AddedSamples((), 0, restart=before)
+    new = [row | {"fingerprint": link} for row, link in zip(rows[old:], links[old:], strict=True)]
+    ids = [known[link] for link in links[:old]] + insert_samples(connection, held, sampler, new)
     if new:
         _update(connection, held, logged_revision=surrogates.c.revision + 1)
-    return AddedSamples(tuple(known[row["fingerprint"]] for row in rows), len(batch) - len(new))
+    return AddedSamples(tuple(ids), old, digest=chain[-1])
 
 
 def complete_log(connection: Connection, held: Row[Any]) -> None:
@@ -49,6 +66,13 @@ def _known(connection: Connection, held: Row[Any], fingerprints: Sequence[str]) 
     same = samples.c.fingerprint.in_(set(fingerprints))
     wanted = sa.select(samples.c.fingerprint, samples.c.id).where(samples.c.surrogate_id == held.id, same)
     return {row.fingerprint: row.id for row in connection.execute(wanted.where(samples.c.purpose == "logged"))}
+
+
+def _continued(connection: Connection, held: Row[Any], digest: str) -> bool:
+    """Whether a sample is stored that follows the log with this digest."""
+    follows = samples.c.fingerprint.startswith(f"{digest}:")
+    wanted = sa.select(samples.c.id).where(samples.c.surrogate_id == held.id, follows).limit(1)
+    return connection.execute(wanted).first() is not None
 
 
 def _update(connection: Connection, held: Row[Any], **changes: Any) -> None:

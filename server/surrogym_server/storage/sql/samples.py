@@ -52,21 +52,22 @@ class SqlSamples(port.Samples):
         key: str | None = None,
         logged: bool = False,
         complete: bool = True,
+        after: str | None = None,
     ) -> AddedSamples:
         told = [asdict(sample) for sample in samples] if key else []
-        body = fingerprint(sampler, told, logged)  # compared only if there is a key
+        body = fingerprint(sampler, told)  # compared only if there is a key
         with self._database.write() as connection:
             held = hold(connection, name)
+            if logged:  # their log identifies them
+                added = store_logged(connection, held, sampler, samples, after)
+                if complete and added.restart is None:
+                    complete_log(connection, held)
+                return added
             before: list[int] | None = recall(connection, held, "add_samples", key, body)
             if before is not None:
                 return AddedSamples(tuple(before), len(before))
-            if logged:
-                added = store_logged(connection, held, sampler, samples)
-                if complete:
-                    complete_log(connection, held)
-            else:
-                answered = read_answered(connection, held, samples)
-                added = _store(connection, held, sampler, samples, answered)
+            answered = read_answered(connection, held, samples)
+            added = _store(connection, held, sampler, samples, answered)
             remember(connection, held, "add_samples", key, body, added.ids)
             return added
 
