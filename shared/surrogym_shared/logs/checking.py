@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from surrogym_shared.checks import first_fault
 from surrogym_shared.logs.columns import Roles
-from surrogym_shared.logs.drafting import Draft, draft, wrapped
+from surrogym_shared.logs.drafting import Draft, draft, lost_ends, wrapped
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.rewards import declared_reward
 from surrogym_shared.logs.rows import rows_of
@@ -86,7 +86,8 @@ def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
             require_units(rows.following, spec, "next ")
         steps = _consistent(spec, steps)
     require_steps(table, steps, 1)
-    return ReadLog(table, roles, steps, spec, (*table.remarks, *steps.notes))
+    lost = lost_ends(steps) if spec.termination == "learned" else []
+    return ReadLog(table, roles, steps, spec, (*table.remarks, *steps.notes, *lost))
 
 
 def draft_log(table: Table, roles: Roles, name: str, budget: int = 0) -> ReadLog:

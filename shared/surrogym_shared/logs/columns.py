@@ -46,12 +46,13 @@ EXPECTED = {
     "limits": "a table of names and their two ends, such as level = [0, 2.5]",
     "angles": NAMES,
     "constants": NAMES,
-    "discrete": "true or false",
+    "discrete": "true, false, or a table of actions and the values of their choices, such as switch = [1, 2, 3]",
 }
 SHOWN = 60  # letters of a wrong value that a message shows
 LONGEST = 64  # letters of a coordinate's name
 MOST = 1_000  # columns that a mapping may name for one role
 
+Choices = Annotated[list[float], Field(min_length=2, max_length=MOST)]
 Limits = Annotated[list[float | None], Field(min_length=2, max_length=2)]
 
 
@@ -68,6 +69,8 @@ class Roles:
         angles: names of the coordinates that are angles; None lets the data decide.
         constants: names of coordinates that are declared as constants of an episode.
         discrete: whether the action is declared as discrete; None lets the data decide.
+        choices: declared values of the choices of each action entry, by its name; empty without such a declaration. The
+            surrogate numbers them from 0.
         ignored: columns without a role.
         units: unit of each used column whose heading has one, by the column's name.
     """
@@ -84,6 +87,7 @@ class Roles:
     angles: frozenset[str] | None = None
     constants: frozenset[str] = frozenset()
     discrete: bool | None = None
+    choices: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     ignored: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
 
@@ -109,7 +113,7 @@ class Roles:
             limits={name: list(ends) for name, ends in self.limits.items()},
             angles=None if self.angles is None else sorted(self.angles),
             constants=sorted(self.constants),
-            discrete=self.discrete,
+            discrete={name: list(values) for name, values in self.choices.items()} or self.discrete,
             **single,
         )
 
@@ -145,8 +149,10 @@ class LogMapping(FailFast):
     constants: list[str] = Field(
         default_factory=list, max_length=MOST, description="names of coordinates that don't change within an episode"
     )
-    discrete: bool | None = Field(
-        default=None, description="whether the action is the number of a discrete one; null: the data decide"
+    discrete: bool | dict[str, Choices] | None = Field(
+        default=None,
+        description="whether the action is the number of a choice, from 0; or the values of the choices of each action "
+        "entry, by its name, which the surrogate numbers from 0; null: the data decide",
     )
 
 
@@ -252,11 +258,26 @@ def roles_by_mapping(mapped: LogMapping, names: Sequence[str], where: str = "the
             limits={name: (ends[0], ends[1]) for name, ends in mapped.limits.items()},
             angles=None if mapped.angles is None else frozenset(mapped.angles),
             constants=frozenset(mapped.constants),
-            discrete=mapped.discrete,
+            discrete=mapped.discrete if not isinstance(mapped.discrete, dict) else True,
+            choices=_choices(mapped, action, where),
             ignored=tuple(name for name in names if name not in wanted),
             units=_units(names, wanted),
         )
     )
+
+
+def _choices(mapped: LogMapping, action: Mapping[str, str], where: str) -> dict[str, tuple[float, ...]]:
+    """Return the declared choices by action entry. Raises ``UnusableLog`` if they are not those of all entries."""
+    if not isinstance(mapped.discrete, dict):
+        return {}
+    if set(mapped.discrete) != set(action):
+        raise UnusableLog(
+            f"{where}: expected the choices of all of {list(action)} in discrete, got those of {list(mapped.discrete)}"
+        )
+    for name, values in mapped.discrete.items():
+        if len(set(values)) < len(values):
+            raise UnusableLog(f"{where}: expected different choices of {name!r} in discrete, got {values}")
+    return {name: tuple(mapped.discrete[name]) for name in action}
 
 
 def _single(role: str, found: Iterable[tuple[str, str]]) -> dict[str, str]:

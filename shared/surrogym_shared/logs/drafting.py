@@ -23,6 +23,7 @@ from surrogym_shared.spec import (
     DiscreteAction,
     EnvironmentSpec,
     Fixed,
+    MultiDiscreteAction,
     ObservationEntry,
     Reward,
     RewardTerm,
@@ -86,7 +87,7 @@ def draft(roles: Roles, steps: Transitions, name: str, budget: int = 0) -> Draft
         reward=_reward(steps, notes),
         design=Design(budget=budget),
     )
-    notes += _about(roles, steps)
+    notes += [*_about(roles, steps), *lost_ends(steps)]
     return Draft(spec, tuple(notes))
 
 
@@ -236,19 +237,48 @@ def _observed(coordinate: Coordinate) -> Iterator[ObservationEntry]:
         yield ObservationEntry(name=f"sin({name})", term=Term.sin(**{name: 1}), low=-1, high=1)
 
 
-def _action(roles: Roles, steps: Transitions, notes: list[str]) -> BoxAction | DiscreteAction:
-    values = steps.u
-    declared = [end for name in roles.action if (end := roles.limits.get(name, (None, None))[1]) is not None]
-    highest = int(max([values.max(), *declared])) if values.size else 0
-    whole = bool((values == np.floor(values)).all() and values.min() >= 0 and 1 <= highest < MOST_DISCRETE)
-    named = len(np.unique(values)) == highest + 1
-    if values.shape[1] == 1 and (roles.discrete or (roles.discrete is None and whole and named)):
-        if not whole:
+def _action(roles: Roles, steps: Transitions, notes: list[str]) -> BoxAction | DiscreteAction | MultiDiscreteAction:
+    """Draft the action: choices that are declared, or numbered from 0 in every column; otherwise amounts. Whole numbers
+    that may be choices are asked about.
+
+    Raises:
+        UnusableLog: a discrete action is declared, and its values are not numbered from 0; or an action never varies.
+    """
+    names = list(roles.action)
+    codes = [np.unique(column) for column in steps.u.T]
+    whole = [_are_codes(one) for one in codes]
+    counts = [_count(one, roles.limits.get(name, (None, None))[1]) for name, one in zip(names, codes, strict=True)]
+    numbered = [few and one[0] == 0 and len(one) == n for one, few, n in zip(codes, whole, counts, strict=True)]
+    if roles.choices:
+        for name in names:
+            values = ", ".join(f"{number} is {value:g}" for number, value in enumerate(roles.choices[name]))
+            notes.append(f"action {name}: numbered from 0, as its choices are declared: {values}")
+        return _discrete([len(roles.choices[name]) for name in names])
+    one_hot = steps.u.shape[1] > 1 and all(numbered) and bool((steps.u.sum(1) == 1).all() and steps.u.max() == 1)
+    if one_hot and roles.discrete is None:
+        notes.append(
+            f"action {', '.join(names)}: one of them is 1 in each row, and the others 0, drafted as amounts: if these "
+            "are choices, write the number of the choice from 0 into one column; if they are amounts, declare "
+            "discrete = false in a mapping file (--map)"
+        )
+    elif roles.discrete is not False and all(numbered):
+        for name, count in zip(names, counts, strict=True):
+            notes.append(f"action {name}: one of {count}, as all values are whole numbers from 0 to {count - 1}")
+        return _discrete(counts)
+    if roles.discrete:
+        if not all((one >= 0).all() and (one == np.floor(one)).all() for one in codes):
             raise UnusableLog(
-                f"expected whole numbers from 0 for a discrete action, got {np.unique(values)[:5].tolist()}"
+                f"expected whole numbers from 0 for a discrete action, got {codes[0][:5].tolist()}: name the choices, "
+                f"such as {_declared_choices(names, codes)}"
             )
-        notes.append(f"action: one of {highest + 1}, as all values are whole numbers from 0 to {highest}")
-        return DiscreteAction(n=highest + 1)
+        return _discrete(counts)
+    if roles.discrete is None and not one_hot:
+        notes += _asked(names, codes, whole)
+    return _amounts(roles, steps.u)
+
+
+def _amounts(roles: Roles, values: Floats) -> BoxAction:
+    """Draft an action of amounts from its values (m, F). Raises ``UnusableLog`` if one never varies."""
     low, high = [], []
     for index, name in enumerate(roles.action):
         ends = roles.limits.get(name, (None, None))
@@ -263,6 +293,48 @@ def _action(roles: Roles, steps: Transitions, notes: list[str]) -> BoxAction | D
         low.append(least)
         high.append(most)
     return BoxAction(low=tuple(low), high=tuple(high))
+
+
+def _are_codes(values: Floats) -> bool:
+    """Whether different values of an action are few whole numbers, so that they may be the codes of choices."""
+    return bool(2 <= len(values) <= MOST_DISCRETE and (values == np.floor(values)).all())
+
+
+def _count(values: Floats, most: float | None) -> int:
+    """Return the number of choices that are numbered from 0 up to the largest value, or to a declared limit."""
+    return int(max(values.max(), values.max() if most is None else most)) + 1
+
+
+def _discrete(counts: list[int]) -> DiscreteAction | MultiDiscreteAction:
+    return DiscreteAction(n=counts[0]) if len(counts) == 1 else MultiDiscreteAction(nvec=tuple(counts))
+
+
+def _asked(names: list[str], codes: list[Floats], whole: list[bool]) -> Iterator[str]:
+    """Ask about actions of few whole numbers, which are drafted as amounts."""
+    shown = ", ".join(
+        f"{name} of {', '.join(f'{value:g}' for value in one)}"
+        for name, one, few in zip(names, codes, whole, strict=True)
+        if few
+    )
+    if not shown:
+        return
+    yield f"action {shown}: few whole numbers, drafted as amounts, which a policy may choose between"
+    if all(whole):
+        yield (
+            f"action: for choices, declare {_declared_choices(names, codes)} in a mapping file (--map); for amounts, "
+            "discrete = false"
+        )
+    else:
+        yield "action: it has choices or amounts, not both; if these are amounts, declare discrete = false (--map)"
+
+
+def _declared_choices(names: list[str], codes: list[Floats]) -> str:
+    """Return the line of a mapping that declares these values as choices."""
+    values = ", ".join(
+        f"{name} = [{', '.join(f'{value:g}' for value in one[:MOST_DISCRETE])}]"
+        for name, one in zip(names, codes, strict=True)
+    )
+    return f"discrete = {{ {values} }}"
 
 
 def _time_limit(steps: Transitions, notes: list[str]) -> int:
@@ -290,6 +362,18 @@ def _about(roles: Roles, steps: Transitions) -> list[str]:
         length = f"{steps.interval:g} {unit}" if unit else f"{steps.interval:g}, in the unit of {roles.time}"
         notes.append(f"sampling interval: {length}; a virtual step covers the same time")
     return notes
+
+
+def lost_ends(steps: Transitions) -> list[str]:
+    """Return a note if the ends of episodes are lost, because the log has no states after them."""
+    if not steps.lost_ends:
+        return []
+    count = "1 episode ends" if steps.lost_ends == 1 else f"{steps.lost_ends} episodes end"
+    return [
+        f"terminated: {count} in a terminal state that the log does not have, as it has no columns of next states. So "
+        "no step shows an end, a virtual episode never ends before its time limit, and a promise may be far too high: "
+        "declare the termination in the drafted file (--draft) before training, or add columns of next states"
+    ]
 
 
 def _remarks(values: Floats) -> list[str]:

@@ -55,7 +55,7 @@ def rows_of(table: Table, roles: Roles, spec: EnvironmentSpec | None = None) -> 
     whole = np.ones(len(table), dtype=np.bool_)
     whole[list(table.faults)] = False
     q, state_faults = _matrix(table, roles.state, _state_limits(roles, spec))
-    u, action_faults = _matrix(table, roles.action, _action_limits(roles, spec))
+    u, action_faults = _matrix(table, roles.action, _action_limits(roles, spec), roles.choices)
     sound = whole.copy()
     sound[list(state_faults)] = False
     found = [state_faults, action_faults]
@@ -90,15 +90,30 @@ def rows_of(table: Table, roles: Roles, spec: EnvironmentSpec | None = None) -> 
     )  # fmt: skip
 
 
-def _matrix(table: Table, columns: Mapping[str, str], ends: Ends) -> tuple[Floats, dict[int, str]]:
-    """Convert columns to numbers (n, k). Also returns the first fault of each row, by the row's index."""
+def _matrix(
+    table: Table, columns: Mapping[str, str], ends: Ends, choices: Mapping[str, tuple[float, ...]] | None = None
+) -> tuple[Floats, dict[int, str]]:
+    """Convert columns to numbers (n, k), and values of declared ``choices`` to their numbers from 0. Also returns the
+    first fault of each row, by the row's index."""
     values, faults = [], dict[int, str]()
     for name, column in columns.items():
         cells, faulty = numbers(column, table.columns[column])
+        if choices and name in choices:
+            cells, unknown = _numbered(column, cells, choices[name])
+            faulty = unknown | faulty
         values.append(cells)
         for row, reason in (_beyond(column, cells, *ends.get(name, (None, None))) | faulty).items():
             faults.setdefault(row, reason)
     return np.stack(values, 1), faults
+
+
+def _numbered(column: str, cells: Floats, choices: tuple[float, ...]) -> tuple[Floats, dict[int, str]]:
+    """Return the number of each cell's choice, (n,), and a reason for each cell that is none, by the row's index."""
+    known = np.array(choices)
+    same = cells[:, None] == known
+    numbered = np.where(same.any(1), same.argmax(1), np.nan)
+    words = f"{column}: expected one of {known.tolist()}"
+    return numbered, {int(row): f"{words}, got {cells[row]:g}" for row in np.flatnonzero(~same.any(1))}
 
 
 def _beyond(column: str, cells: Floats, low: float | None, high: float | None) -> dict[int, str]:
