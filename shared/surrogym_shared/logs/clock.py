@@ -86,7 +86,7 @@ def _names(rows: Rows, named: Ints, notes: list[str]) -> Ints:
         f"{rows.roles.episode}: {counted(returned, 'name')} returned after other episodes, first in line "
         f"{rows.lines[back]}; what follows is another episode"
     )
-    return stretch
+    return stretch.astype(np.int64)
 
 
 def _restarts(time: Floats) -> Bools:
