@@ -201,6 +201,14 @@ def test_a_state_that_always_grows_is_pointed_out(tmp_path: Path):
     assert any(note.startswith("tijd: grows in each row") for note in log.notes)
 
 
+@pytest.mark.parametrize("form", ["2024-03-31T00:00:{:02d}", "202403310000{:02d}"])
+def test_dates_that_grow_by_one_second_are_a_time_and_no_numbers_of_rows(tmp_path: Path, form: str):
+    columns = plant(0)
+    named = {"stamp": [form.format(k) for k in range(ROWS)], "T": columns["T"], "u": columns["heat"]}
+    with pytest.raises(UnusableLog, match="'stamp' is likely the time"):
+        read_log(write(tmp_path / "log.csv", {**named, "reward": columns["reward"]}))
+
+
 def test_a_counter_that_starts_again_may_have_gaps_too(tmp_path: Path):
     columns = plant(0)
     steps = [0, 1, 3, 4, 5, 6, 7, 8, 0, 1, 2, 4, 5, 6, 7, 8, 0, 1, 2, 3, 4, 5, 6, 7]

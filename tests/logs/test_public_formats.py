@@ -117,6 +117,12 @@ def test_imitation_and_marks_of_starts(tmp_path: Path):
     np.testing.assert_array_equal(log.reward, arrays["rews"][log.steps.row])
 
 
+def test_an_episode_of_rlds_without_a_step_is_refused(tmp_path: Path):
+    np.savez(tmp_path / "log.npz", **{name: cells[:1] for name, cells in rlds(episodes()).items()})
+    with pytest.raises(UnusableLog, match="expected steps of RLDS, got none"):
+        read_log(tmp_path / "log.npz")
+
+
 @pytest.mark.parametrize("name", ["is_last", "is_terminal"])
 def test_a_single_mark_of_rlds_is_asked_for(tmp_path: Path, name: str):
     """Whether the row's own step ended, or the one before, can't be known."""

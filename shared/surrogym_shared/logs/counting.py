@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from surrogym_shared.logs.errors import UnusableLog
-from surrogym_shared.logs.table import Cells, Floats, flags, groups, times
+from surrogym_shared.logs.table import DATES, DURATIONS, Cells, Floats, flags, groups, numbers, stamps, times
 
 Numbering = Literal["rows", "episodes", "gaps"]
 
@@ -28,7 +28,10 @@ def measured(cells: Cells) -> Floats | None:
 def numbering(cells: Cells) -> Numbering | None:
     """Whether whole numbers count the rows, the rows of each episode, or either with some missing."""
     values = measured(cells)
-    if values is None or (values != np.floor(values)).any():
+    if values is None or cells.dtype.kind in (DATES, DURATIONS) or (values != np.floor(values)).any():
+        return None
+    plain, faults = numbers("", cells)
+    if faults or stamps(plain) is not None:  # a date is no number of a row
         return None
     change = np.diff(values)
     if (change == 1).all():
