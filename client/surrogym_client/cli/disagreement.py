@@ -188,15 +188,15 @@ def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, imag
         return None
     known = [step for step in steps_of(result.traces) if view.spec.known(step.coordinates)]
     steps = steady(view.spec, known)
-    about = {"changed": result.varied, "left_out": len(known) - len(steps)}
+    left_out = len(known) - len(steps)
     if not steps:
-        return Differing(Disagreements(0, (), {}), first_seed, **about)
+        return Differing(Disagreements(0, (), {}), first_seed, changed=result.varied, left_out=left_out)
     beside = compared(api, view.spec, view, steps)
     changes = None if view.spec.design.preset == "paper" else partial(imagining.changes, api, view)
     effects, share = effects_of(view.spec, beside, changes)  # preset paper moves observations, which take no residual
     explaining = tuple(steps[i] for i in np.argsort(-share).tolist() if share[i] > 0)
     found = replace(disagreements(steps, beside), shared=explaining)
-    return Differing(found, first_seed, effects=tuple(effects), **about)
+    return Differing(found, first_seed, effects=tuple(effects), changed=result.varied, left_out=left_out)
 
 
 def _not_compared(first_seed: int, why: str) -> Differing:

@@ -157,7 +157,8 @@ def answering(environment: object) -> Environment:
 def _missing(environment: object) -> str:
     """Name the methods that an object lacks of the kind of environment to which it is nearest."""
     lacking = [[name for name in names if not callable(getattr(environment, name, None))] for names in KINDS]
-    return " and ".join(min(lacking, key=len))
+    fewest: list[str] = min(lacking, key=lambda names: len(names))
+    return " and ".join(fewest)
 
 
 def _check_snapshots(environment: object) -> None:
