@@ -145,7 +145,7 @@ def take(
     """Take the real steps of an audit, fit the model to them, and judge.
 
     It takes more steps, up to ``MOST_STEPS``, as long as the errors so far may be shared by all steps and cost the
-    promise, but don't prove it. Returns None if there was no step to take. An audit whose steps the original
+    promise, while no test has failed. Returns None if there was no step to take. An audit whose steps the original
     environment all failed to take has failed.
     """
     api, name, spec = subject.api, subject.name, subject.port.spec()
@@ -164,7 +164,8 @@ def take(
         off_way = sum(sample.query_id in elsewhere for sample in samples)
         beside = replace(compared(api, spec, view, samples, matters), elsewhere=off_way)
         found = _consequence(subject, beside, before, view, Inputs.over(spec, q, u))
-        more = min(settings.steps, MOST_STEPS - len(samples)) if found is not None and found.undecided else 0
+        doubt = found is not None and found.undecided and judge(beside, before, before, subject.floor, found).passed
+        more = min(settings.steps, MOST_STEPS - len(samples)) if doubt else 0
         if not (added := _asked_more(subject, replace(settings, steps=more, seed=len(wanted)), q, u)):
             break
         wanted |= added
