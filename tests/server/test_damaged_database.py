@@ -20,15 +20,15 @@ from support.server import ServerProcess, running_server
 
 NAME = "pendulum"
 SECONDS = 60.0
-LONG = 10 * SECONDS  # a machine that compiles the steps for the first time
+PLAIN = {"SURROGYM_COMPILED": "0"}  # what is damaged is found as soon without compiling steps first
 
 
 @pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A database that a stopped server has left: with a surrogate, its models and an open session."""
     folder = tmp_path_factory.mktemp("whole")
-    with running_server(folder) as running, httpx.Client(base_url=running.url, timeout=LONG) as client:
-        pendulum.teach(client, NAME, seconds=LONG)
+    with running_server(folder, **PLAIN) as running, httpx.Client(base_url=running.url, timeout=SECONDS) as client:
+        pendulum.teach(client, NAME, seconds=10 * SECONDS)
         client.post(f"/v1/surrogates/{NAME}/sessions", json={"num_envs": 1, "seed": 0}).raise_for_status()
     return folder / "surrogym.db"
 
@@ -67,7 +67,7 @@ def server(database: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     folder = tmp_path_factory.mktemp("damaged")
     file = Path(shutil.copy(database, folder))
     flip(file, "sessions", "data")
-    with running_server(folder) as running:
+    with running_server(folder, **PLAIN) as running:
         yield running
 
 
