@@ -87,7 +87,7 @@ def create(api: Api, name: str, budget: int) -> None:
 
 def finished(api: Api, name: str) -> bool:
     view = api.surrogate(name)
-    return view.phase in ("ready", "over_budget") and not view.queries.pending + view.queries.leased
+    return view.phase in ("ready", "over_budget", "unsure") and not view.queries.pending + view.queries.leased
 
 
 def until(holds: Callable[[], object], seconds: float = PATIENCE_SECONDS) -> bool:

@@ -82,6 +82,6 @@ def finish(client: httpx.Client, name: str, seconds: float = 120.0) -> dict[str,
         open_queries = view["queries"]["pending"] + view["queries"]["leased"]
         if view["phase"] == "failed":
             raise AssertionError(view["error"])
-        if view["phase"] in ("ready", "over_budget") and not open_queries:
+        if view["phase"] in ("ready", "over_budget", "unsure") and not open_queries:
             return view
     raise AssertionError(f"the design of {name} was not finished after {seconds} s")

@@ -27,7 +27,7 @@ from surrogym_shared.spec import EnvironmentSpec
 STEP_SECONDS = 0.05
 LEASE_SECONDS = 2.0
 SPAWN = multiprocessing.get_context("spawn")
-ENDED = ("ready", "over_budget")
+ENDED = ("ready", "over_budget", "unsure")
 
 Step = tuple[float, ...]
 

@@ -247,5 +247,5 @@ def test_a_fit_is_told_because_that_of_a_log_takes_minutes() -> None:
 
 def test_an_uncertain_end_names_index_and_target() -> None:
     assert words_of_uncertainty(view(output("x", 0.7))) == (
-        "the design has ended without being certain of its model: confidence index 0.7000, target 0.999"
+        "the design has spent its budget without being certain of its model: confidence index 0.7000, target 0.999"
     )

@@ -179,7 +179,8 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
             rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, ends)
     asks = bool(len(chosen) or rollouts)
     if verdict == "continue" and not asks and not request.open:
-        verdict = "unsure"  # no distinct query is left, or those that were set aside hold the rest of the budget
+        # no distinct query is left, or those that were set aside hold the rest of the budget, or there is no rest
+        verdict = "unsure" if now[0] < request.budget else "over_budget"
     ended, ended_as = (now, verdict) if verdict != "continue" and not asks else ((), "")
     tested_at = (len(samples) if testing else state.tested_at) if sure else 0
     new_state = DesignState(

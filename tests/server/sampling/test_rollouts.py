@@ -321,7 +321,7 @@ def test_steps_with_unknown_lags_count_and_are_not_learned_from():
     job = DesignJob(definition, q, *others, state=DesignState().to_json(), budget=10, target=0.999)
     result = run_design_job(job)
     assert result.fidelity["samples"] == 6
-    assert 0 < sum(map(len, result.query_rollouts)) <= 2 or result.phase == "over_budget"
+    assert 0 < sum(map(len, result.query_rollouts)) <= 2 or result.phase in ("over_budget", "unsure")
 
 
 @pytest.mark.parametrize("seed", range(3))
