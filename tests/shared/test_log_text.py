@@ -7,6 +7,7 @@ import pytest
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.table import numbers
 from surrogym_shared.logs.text import LONGEST_NAME, MOST_COLUMNS, table_of_text
+from surrogym_shared.logs.writing import spreadsheet_cell
 
 
 def test_one_long_cell_does_not_widen_its_column() -> None:
@@ -27,3 +28,20 @@ def test_one_long_cell_does_not_widen_its_column() -> None:
 def test_a_log_beyond_its_bounds_is_refused(text: str, expected: str) -> None:
     with pytest.raises(UnusableLog, match=expected):
         table_of_text(text, "the log", most_rows=2)
+
+
+@pytest.mark.parametrize(
+    ("cell", "written"),
+    [
+        ("=1+1", "'=1+1"),
+        ("\t@x", "'\t@x"),
+        ("＋1", "'＋1"),
+        ("\x1b[2J=", "\\x1b[2J="),
+        ("-5.5", "-5.5"),
+        ("+1e3", "+1e3"),
+        (-5.5, -5.5),
+        ("rig-7", "rig-7"),
+    ],
+)
+def test_a_cell_of_an_exported_table_is_no_formula(cell: object, written: object) -> None:
+    assert spreadsheet_cell(cell) == written
