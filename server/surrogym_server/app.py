@@ -137,7 +137,8 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     app.state.parsing = asyncio.Lock()
     app.state.turns = Turns("predictions", at_work=2, waiting=32)
     app.state.streams = Waiting("open streams of events")
-    app.state.claims = Waiting("waiting claims")
+    app.state.query_claims = Waiting("waiting claims of queries")
+    app.state.job_claims = Waiting("waiting claims of jobs")
     app.state.log_turns = Turns("logs", at_work=1, waiting=8)
     if settings.tokens:
         known = ", ".join(f"{role} {fingerprint(token)}" for token, role in settings.tokens.items())

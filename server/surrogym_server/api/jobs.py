@@ -97,8 +97,8 @@ async def claim(
     ``wait_seconds``."""
     offer = Offer(body.most_episodes, body.reference)
     present = partial(require_present, request)
-    request.app.state.claims.require_room(request)
-    with request.app.state.claims.count(request):
+    request.app.state.job_claims.require_room(request)
+    with request.app.state.job_claims.count(request):
         job = await use.jobs.claim(name, body.worker, offer, body.lease_seconds, body.wait_seconds, present)
     return convert.claimed_job(job, body.lease_seconds)
 

@@ -58,8 +58,8 @@ async def claim(
     """Claim up to ``max_queries`` queries, each for one sampler only. If there are none, the reply waits at most
     ``wait_seconds``, or until the design is finished."""
     present = partial(require_present, request)
-    request.app.state.claims.require_room(request)
-    with request.app.state.claims.count(request):
+    request.app.state.query_claims.require_room(request)
+    with request.app.state.query_claims.count(request):
         claimed = await use.queries.claim(
             name, body.sampler, body.max_queries, body.lease_seconds, body.wait_seconds, present
         )
