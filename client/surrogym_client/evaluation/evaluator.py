@@ -297,12 +297,13 @@ class _Run:
     def _begin(self, free: Sequence[Episode]) -> list[_Tally]:
         """Begin the next episodes, one in each free instance, until all have begun."""
         first = len(self._tallies)
-        if first == 0:
-            self._seeded = _repeats_start(free[0], self.settings)
+        before = _reset(free[0], self.settings) if first == 0 else None
         begun = [
             _Tally(first + i, episode, _start(episode, self.settings, first + i), self._noise(first + i))
             for i, episode in enumerate(free[: self.settings.episodes - first])
         ]
+        if before is not None:
+            self._seeded = _same_start(free[0].spec, before, begun[0].moment.coordinates)
         self._tallies += begun
         return begun
 
@@ -358,12 +359,17 @@ def _start(episode: Episode, settings: EvaluationSettings, index: int) -> Moment
     return episode.reset(seed)
 
 
-def _repeats_start(episode: Episode, settings: EvaluationSettings) -> bool:
-    """Whether two resets with the first seed begin in the same state. True where no reset chooses the start."""
+def _reset(episode: Episode, settings: EvaluationSettings) -> Array | None:
+    """Reset with the first seed, once more than there are episodes, and return the coordinates (C,). None where no
+    reset chooses the start."""
     if settings.wide or settings.start_scale != 1:
-        return True
-    one, other = (episode.reset(settings.first_seed).coordinates for _ in range(2))
-    return all(abs(b - a) <= ROUNDING * span(c) for c, a, b in zip(episode.spec.coordinates, one, other, strict=True))
+        return None
+    return episode.reset(settings.first_seed).coordinates
+
+
+def _same_start(spec: EnvironmentSpec, one: Array, other: Array) -> bool:
+    """Whether two starts are equal but for rounding."""
+    return all(abs(b - a) <= ROUNDING * span(c) for c, a, b in zip(spec.coordinates, one, other, strict=True))
 
 
 def _limit(tallies: Sequence[_Tally]) -> int | None:

@@ -135,7 +135,7 @@ def serve(host: Host, source: TextIO, answers: TextIO) -> None:
             answer["result"] = host.requests[asked["method"]](asked)
         except (Refused, Broken) as error:
             ended = isinstance(error, Broken)
-            answer |= {"error": str(error), "code": "broken" if ended else "refused"}
+            answer |= {"error": str(error), "code": "broken" if ended else "failed"}
         else:
             ended = asked["method"] == "close"
         print(json.dumps(answer, allow_nan=False), file=answers, flush=True)
