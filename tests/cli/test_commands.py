@@ -283,8 +283,8 @@ def _look_at(on_server, pendulum, tmp_path):
     assert f"{pendulum}@1" in listed
     assert "production" in listed
     shown = on_server("policy", f"{pendulum}@production").out
-    assert re.search(r"zero +declared starts, from seed 10000 +3 ", shown)
-    assert re.search(r"reference +declared starts, from seed 10000 +3 ", shown)
+    assert re.search(r"zero +its own +declared starts, from seed 10000 +3 ", shown)
+    assert re.search(r"reference +its own +declared starts, from seed 10000 +3 ", shown)
     taken = on_server("policy", "get", f"{pendulum}@production", "--out", "taken.zip")
     assert taken.code == 0, taken.err
     assert (tmp_path / "taken.zip").read_bytes() == (tmp_path / "policy.zip").read_bytes()

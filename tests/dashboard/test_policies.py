@@ -110,8 +110,9 @@ def test_differences_on_other_starts_are_wider_and_one_surrogate_has_its_own_bes
     expect(page.locator(".big")).to_contain_text(re.compile("^better@2.* is better than better@1 by"))
     found = page.evaluate("""async () => {
       const { difference, tail } = await import("/page/differences.js");
-      const entry = (mean, seed) => ({ returns: [mean - 1, mean + 1], policy: { evaluations: [{ controller: "policy", declared: true,
-        seeded: true, first_seed: seed, note: "", mean, mean_interval: { low: mean - 3, high: mean + 3 } }] } });
+      const entry = (mean, seed) => ({ returns: [mean - 1, mean + 1], policy: { evaluations: [{ controller: "policy",
+        declared: true, own: true, seeded: true, first_seed: seed, note: "", mean,
+        mean_interval: { low: mean - 3, high: mean + 3 } }] } });
       return { same: difference(entry(5, 1), entry(2, 1)), other: difference(entry(5, 1), entry(2, 7)),
         z: [0.025, 0.025 / 9].map(tail) };
     }""")

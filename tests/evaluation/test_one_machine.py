@@ -45,7 +45,7 @@ def test_episodes_come_one_after_the_other_each_after_its_reset(diary):
     moved = [what for what in diary() if what.startswith(("reset", "step"))]
     resets = [i for i, what in enumerate(moved) if what.startswith("reset")]
     assert [moved[i] for i in resets] == ["reset 10000", "reset 10000", "reset 10001", "reset 10002"]
-    assert resets == [0, STEPS + 1, 2 * (STEPS + 1)]
+    assert resets == [0, 1, STEPS + 2, 2 * (STEPS + 1) + 1]
 
 
 def test_a_simulator_says_that_it_runs_side_by_side(diary):

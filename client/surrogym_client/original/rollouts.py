@@ -155,8 +155,8 @@ def answering(environment: object) -> Environment:
 
 
 def _missing(environment: object) -> str:
-    """Name the methods that an object lacks of the kind of environment to which it is nearest: the one of which it lacks
-    fewest, and of two such the one of which it has more."""
+    """Name the methods that an object lacks of the kind of environment to which it is nearest: the one of which it
+    lacks fewest, and of two such the one of which it has more."""
     lacking = [[name for name in names if not callable(getattr(environment, name, None))] for names in KINDS]
     nearest = min(range(len(KINDS)), key=lambda kind: (len(lacking[kind]), -len(KINDS[kind])))
     return " and ".join(lacking[nearest])
