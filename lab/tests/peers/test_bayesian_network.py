@@ -122,7 +122,7 @@ def test_the_policy_stays_within_its_limits():
 
 def test_a_round_is_an_episode_and_its_policy_stays_as_it_was():
     spec = make(SWING_UP).spec()
-    real = Real(spec, lambda: open_episode(SWING_UP, spec, lambda: make(SWING_UP)), 0, 90, Clock(60.0))
+    real = Real(spec, lambda: open_episode(SWING_UP, spec, lambda: make(SWING_UP)), 0, 90, Clock(600.0))
     found = []
 
     def learn():
@@ -140,6 +140,6 @@ def test_a_round_is_an_episode_and_its_policy_stays_as_it_was():
 
 def test_a_task_without_a_cost_is_refused():
     spec = make("MountainCar-v0").spec()
-    real = Real(spec, lambda: open_episode("MountainCar-v0", spec, lambda: make("MountainCar-v0")), 0, 9, Clock(60.0))
+    real = Real(spec, lambda: open_episode("MountainCar-v0", spec, lambda: make("MountainCar-v0")), 0, 9, Clock(600.0))
     with pytest.raises(NotApplicable):
         next(BayesianNetwork(SMALL).learn(real, 0))

@@ -122,7 +122,7 @@ def test_a_batch_has_its_share_of_real_transitions():
 @pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1"])
 def test_a_policy_comes_every_fifty_real_steps_after_the_random_ones(name):
     spec = make(name).spec()
-    real = Real(spec, lambda: open_episode(name, spec, lambda: make(name)), 0, 140, Clock(60.0))
+    real = Real(spec, lambda: open_episode(name, spec, lambda: make(name)), 0, 140, Clock(600.0))
     found = []
 
     def learn():

@@ -118,7 +118,7 @@ def test_a_controller_remembers_each_episode_by_itself():
 @pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1"])
 def test_a_round_has_whole_real_episodes(name):
     spec = make(name).spec()
-    real = Real(spec, lambda: open_episode(name, spec, lambda: make(name)), 0, 450, Clock(60.0))
+    real = Real(spec, lambda: open_episode(name, spec, lambda: make(name)), 0, 450, Clock(600.0))
     found = []
 
     def learn():

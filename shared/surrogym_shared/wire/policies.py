@@ -326,6 +326,7 @@ class PolicyDetail(PolicyView):
 
     seed: int | None = Field(description="seed of the training")
     seconds: float | None = Field(description="duration of the training")
+    untrained: float | None = Field(default=None, description="imagined return of an untrained network")
     settings: dict[str, Any] = Field(description="settings of the training, by name")
     versions: dict[str, str] = Field(description="versions of the packages of the training, by name")
     curve: list[CurvePoint] = Field(description="curve of the training")

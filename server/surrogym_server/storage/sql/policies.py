@@ -152,13 +152,13 @@ def _of_file(file: PolicyFile) -> dict[str, Any]:
 
 
 def _known(connection: Connection, surrogate: int, card: JSON, curve: list[JSON], digest: str) -> int | None:
-    """The newest version with this file, card and curve."""
+    """The newest version with this file, card and curve. A downloaded policy is pushed again without its curve."""
     files = policy_files.c
     same = sa.select(files.version).where(files.surrogate_id == surrogate, files.digest == digest, files.main)
     own = (policies.c.surrogate_id == surrogate) & policies.c.version.in_(same)
     wanted = sa.select(policies.c.version, policies.c.card, policies.c.curve).where(own)
     for row in connection.execute(wanted.order_by(policies.c.version.desc())):
-        if (_without_owner(row.card), row.curve) == (_without_owner(card), curve):
+        if _without_owner(row.card) == _without_owner(card) and curve in ([], row.curve):
             return int(row.version)
     return None
 
