@@ -7,11 +7,11 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from surrogym_client.demo.settings import DemoSettings
-from surrogym_client.demo.tasks import ROUNDS, DemoTask, design_budget, queries_a_round
+from surrogym_client.demo.tasks import DemoTask, design_budget
 from surrogym_client.original import make
 from surrogym_client.original.loading import has_specification, with_choices
-from surrogym_client.training.search import FAST, REFERENCE, SEARCHES
-from surrogym_client.training.settings import SUGGESTED_STEPS, TrainSettings, prolongs
+from surrogym_client.training.search import REFERENCE
+from surrogym_client.training.settings import SUGGESTED_STEPS
 from surrogym_lab.arms import ARMS, Arm
 from surrogym_lab.tasks import EVERY_TASK
 from surrogym_shared.spec import EnvironmentSpec
@@ -45,37 +45,30 @@ class StudySettings(DemoSettings):
     @property
     def virtual_steps(self) -> int | None:
         """Where the default has rounds before its last training, those that have none learn for as long as it may."""
-        alone = not self.way.closed_loop and not self.way.original and queries_a_round(self.real_steps) > 0
-        return self.steps or self.demo_task.steps or (SUGGESTED_STEPS if alone else None)
+        alone = not self.way.closed_loop and not self.way.original and super().queries_a_round > 0
+        return super().virtual_steps or (SUGGESTED_STEPS if alone else None)
 
     @property
     def search(self) -> str:
         """Name of the policy search. By default, the reference where the paper or the original environment is one side
         of a comparison."""
-        if self.algorithm is not None:
-            return SEARCHES.name_of(self.algorithm)
-        return REFERENCE if self.way.original or self.way.preset == "paper" else FAST
+        if self.algorithm is None and (self.way.original or self.way.preset == "paper"):
+            return REFERENCE
+        return super().search
 
     @property
     def prolong(self) -> bool:
-        """Whether a training that still gains takes as many virtual steps again: as ``prolongs`` where a task or an arm
-        chose their number, and not where each is a real one or the search can't be prolonged."""
-        if not SEARCHES.get(self.search).prolongable:
-            return False
-        return not self.way.original and prolongs(TrainSettings(total_steps=self.steps), self.spec())
+        """As in the demo, and not where each step of the training is a real one."""
+        return not self.way.original and super().prolong
+
+    @property
+    def queries_a_round(self) -> int:
+        return super().queries_a_round if self.way.closed_loop else 0
 
     @property
     def training_options(self) -> list[str]:
-        options = [] if self.virtual_steps is None else ["--steps", str(self.virtual_steps)]
-        if self.algorithm is not None:
-            options += ["--algorithm", self.algorithm]
-        if self.way.start_box is not None:
-            options += ["--start-box", str(self.way.start_box)]
-        options.append("--prolong" if self.prolong else "--no-prolong")
-        queries = queries_a_round(self.real_steps)
-        if self.way.closed_loop and queries:
-            options += ["--improve", str(queries), "--rounds", str(ROUNDS)]
-        return options
+        starts = [] if self.way.start_box is None else ["--start-box", str(self.way.start_box)]
+        return [*super().training_options, *starts]
 
     @property
     def description_steps(self) -> int:

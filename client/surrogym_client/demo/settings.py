@@ -64,14 +64,19 @@ class DemoSettings:
         return SEARCHES.get(self.search).prolongable and prolongs(TrainSettings(total_steps=self.steps), self.spec())
 
     @property
+    def queries_a_round(self) -> int:
+        """Real steps of each round of the closed loop; 0 if there are no rounds."""
+        return queries_a_round(self.real_steps)
+
+    @property
     def training_options(self) -> list[str]:
         """Options of ``surrogym train``."""
         options = [] if self.virtual_steps is None else ["--steps", str(self.virtual_steps)]
         if self.algorithm is not None:
             options += ["--algorithm", self.algorithm]
         options.append("--prolong" if self.prolong else "--no-prolong")
-        if queries := queries_a_round(self.real_steps):
-            options += ["--improve", str(queries), "--rounds", str(ROUNDS)]
+        if self.queries_a_round:
+            options += ["--improve", str(self.queries_a_round), "--rounds", str(ROUNDS)]
         return options
 
     @property
