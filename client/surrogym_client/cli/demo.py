@@ -13,6 +13,8 @@ from surrogym_client.cli.options import ExitWithParent, Quiet, require_known
 from surrogym_client.demo.tasks import TASKS
 
 if TYPE_CHECKING:
+    from surrogym_client.demo.run import Begin, S
+
     Task = str
 else:
     Task = Literal[tuple(TASKS)]
@@ -60,20 +62,9 @@ def command(
 
     Example: surrogym demo pendulum --seed 0 --json metrics.json
     """
-    from surrogym_client.cli.errors import CommandError
-    from surrogym_client.demo.report import table
-    from surrogym_client.demo.run import run_demo
+    from surrogym_client.demo.learning import SurrogateRun
     from surrogym_client.demo.settings import DemoSettings
-    from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
-    from surrogym_shared.terminal import give
 
-    if exit_with_parent:
-        watch_parent()
-
-    if algorithm is not None:
-        require_known(algorithm)
-    if json_file is not None and not json_file.resolve().parent.is_dir():
-        raise CommandError(f"expected an existing folder for --json, got {json_file.parent}")
     settings = DemoSettings(
         task=task,
         seed=seed,
@@ -84,6 +75,29 @@ def command(
         pictures=pictures,
         keep=keep,
     )
+    perform(settings, SurrogateRun, out, json_file, exit_with_parent=exit_with_parent, quiet=quiet)
+
+
+def perform(
+    settings: S, begin: Begin[S], out: Path | None, json_file: Path | None, *, exit_with_parent: bool, quiet: bool
+) -> None:
+    """Run a demo, and show its metrics as a table, or write them to ``json_file``.
+
+    Raises:
+        CommandError: the folder of ``json_file`` does not exist; nothing was run.
+    """
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.demo.report import table
+    from surrogym_client.demo.run import run_demo
+    from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
+    from surrogym_shared.terminal import give
+
+    if exit_with_parent:
+        watch_parent()
+    if settings.algorithm is not None:
+        require_known(settings.algorithm)
+    if json_file is not None and not json_file.resolve().parent.is_dir():
+        raise CommandError(f"expected an existing folder for --json, got {json_file.parent}")
     as_json = json_file == Path("-")
 
     def tell(metrics: dict[str, Any], folder: Path) -> None:
@@ -91,4 +105,4 @@ def command(
             json_file.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
         give(metrics, lambda: table(metrics, folder), as_json=as_json, quiet=quiet)
 
-    run_demo(settings, out, tell, quiet=quiet)
+    run_demo(settings, out, tell, begin, quiet=quiet)
