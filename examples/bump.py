@@ -11,7 +11,7 @@ of the training finds that out. Declared in the specification, the reward would 
 
 import numpy as np
 
-from surrogym_client.original import RealStep
+from surrogym_sampler.original import RealStep
 from surrogym_shared.spec import Bounds, BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 RANGES = {"x": Uniform(low=-3, high=3), "y": Uniform(low=-3, high=3)}

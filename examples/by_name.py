@@ -11,8 +11,8 @@ import argparse
 import numpy as np
 
 import surrogym
-from surrogym_client import original
-from surrogym_client.original.describing import describe
+from surrogym_sampler import original
+from surrogym_sampler.original.describing import describe
 
 parser = argparse.ArgumentParser()
 parser.add_argument("name")

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from surrogym_client.original import RealStep
+from surrogym_sampler.original import RealStep
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Success, Term, Uniform
 from surrogym_shared.spec import Inequality as Is
 

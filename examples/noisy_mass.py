@@ -10,7 +10,7 @@ The design asks for some steps twice, and so finds that what it can't predict is
 
 import numpy as np
 
-from surrogym_client.original import RealStep
+from surrogym_sampler.original import RealStep
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 RANGES = {"x": Uniform(low=-2, high=2), "speed": Uniform(low=-3, high=3)}

@@ -16,12 +16,12 @@ from dead_time import SmithPredictor, Vessel
 from hidden_speed import AngleAlone
 
 import surrogym
-from surrogym_client.evaluation.evaluator import EvaluationSettings, evaluate
-from surrogym_client.original.episodes import RolloutEpisode
-from surrogym_client.original.rollouts import answering
-from surrogym_client.policies import load_policy
-from surrogym_client.training import TrainSettings, train
-from surrogym_client.training.settings import DRAWS, FUNCTIONS
+from surrogym_sampler.original.episodes import RolloutEpisode
+from surrogym_sampler.original.rollouts import answering
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_trainer.policies import load_policy
+from surrogym_trainer.training import TrainSettings, train
+from surrogym_trainer.training.settings import DRAWS, FUNCTIONS
 
 ENVIRONMENTS = {"dead_time": Vessel, "hidden_speed": AngleAlone}
 TUNING_SEEDS = range(50)

@@ -13,7 +13,7 @@ import sys
 
 import numpy as np
 
-from surrogym_client.original import RealStep
+from surrogym_sampler.original import RealStep
 from surrogym_shared.spec import Bounds, BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 INTERVAL = 0.05  # minutes between two samples

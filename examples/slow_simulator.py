@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 
-from surrogym_client.original.loading import make
+from surrogym_sampler.original.loading import make
 
 SAMPLERS = 4
 SECONDS = float(os.environ.get("SIMULATOR_SECONDS", "2"))

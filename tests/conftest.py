@@ -17,8 +17,8 @@ import torch
 
 from support.server import ServerProcess, running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.engine.compiling import Compiling
 
 # The same examples in every run, on machines of any speed, and none kept in the checkout.

@@ -3,8 +3,6 @@ swing-up."""
 
 from __future__ import annotations
 
-import gymnasium
-
 ENVIRONMENT_ID = "surrogym/Remote-v0"
 FILE_ID = "surrogym/File-v0"
 SWING_UP = "surrogym/CartPoleSwingUp-v0"
@@ -14,6 +12,8 @@ SWING_UP_STEPS = 40  # of 0.1 s
 
 def register() -> None:
     """Register this package's environments with Gymnasium. Repeating it is harmless."""
+    import gymnasium  # whoever reads the names alone need not load it
+
     for environment_id, module in ((ENVIRONMENT_ID, "gym_factories"), (FILE_ID, "file_factories")):
         if environment_id not in gymnasium.registry:
             gymnasium.register(
@@ -25,7 +25,7 @@ def register() -> None:
         if environment_id not in gymnasium.registry:
             gymnasium.register(
                 environment_id,
-                entry_point="surrogym_client.original.swingup:CartPoleSwingUp",
+                entry_point="surrogym_sampler.original.swingup:CartPoleSwingUp",
                 max_episode_steps=SWING_UP_STEPS,
                 kwargs={"reward": reward},
             )

@@ -13,7 +13,7 @@ import typer
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from surrogym_client.cli import build
+from surrogym.cli import build
 
 PAGE = "reference/commands.md"
 

@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 
 import surrogym
-from surrogym_client import original
-from surrogym_client.evaluation.evaluator import EvaluationSettings, evaluate
-from surrogym_client.original.describing import describe
-from surrogym_client.original.episodes import open_episode
-from surrogym_client.original.port import OriginalPort
-from surrogym_client.policies import load_policy
-from surrogym_client.training import TrainSettings, train
+from surrogym_sampler import original
+from surrogym_sampler.original.describing import describe
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.port import OriginalPort
 from surrogym_shared.logs.rewards import declared_reward
 from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Quantity, RewardTerm, Term, Uniform
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_trainer.policies import load_policy
+from surrogym_trainer.training import TrainSettings, train
 
 FOLDER = Path(__file__).parent
 SCRIPTS = {"TwoTanks": "two_tanks", "InvertedPendulum": "inverted_pendulum"}

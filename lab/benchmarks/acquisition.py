@@ -30,16 +30,16 @@ from matplotlib.figure import Figure
 
 from support.models import learn
 from support.real_steps import answer, join, random_steps
-from surrogym_client.evaluation.evaluator import interquartile_mean
-from surrogym_client.original import make
 from surrogym_client.runtime.versions import commit
 from surrogym_lab.reproduce.statistics import bootstrap_interval, difference_interval
+from surrogym_sampler.original import make
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.sampling.design import DesignState, Request, advance, initial_design
 from surrogym_shared.spec import Design, EnvironmentSpec
+from surrogym_trainer.evaluation.evaluator import interquartile_mean
 
 TASKS = {"pendulum": "Pendulum-v1", "acrobot": "Acrobot-v1", "mountaincar": "MountainCarContinuous-v0"}
 DESIGNS = {  # by representation

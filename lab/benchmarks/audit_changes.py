@@ -30,14 +30,14 @@ from audit_power import PATIENCE_SECONDS, SEARCH, placed, sampling
 from support.changing import Machine
 from support.levitation import PLANTS, Plant, real_returns
 from support.server import running_server
-from surrogym_client.policies import load_policy
 from surrogym_client.surrogates.waiting import wait_for_design
-from surrogym_client.training import TrainSettings, train
-from surrogym_client.training.handover import AuditSettings, Subject, hand_over
-from surrogym_client.training.settings import chosen_for
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_lab.reproduce.statistics import exact_interval
 from surrogym_shared.spec import Design
+from surrogym_trainer.policies import load_policy
+from surrogym_trainer.training import TrainSettings, train
+from surrogym_trainer.training.handover import AuditSettings, Subject, hand_over
+from surrogym_trainer.training.settings import chosen_for
 
 HARMFUL = 0.2  # share of the policy's gain
 EPISODES = 100  # of a real return

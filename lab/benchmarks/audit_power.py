@@ -33,16 +33,16 @@ import torch
 from support.changing import FEW, MACHINES, RIGHT, Changing, Machine, parameters_of
 from support.server import running_server
 from surrogym_client.errors import UnknownSurrogate
-from surrogym_client.policies import load_policy
 from surrogym_client.runtime.versions import commit
-from surrogym_client.sampler import Sampler, SamplerSettings
 from surrogym_client.surrogates.waiting import wait_for_design
-from surrogym_client.training import TrainSettings, train
-from surrogym_client.training.handover import AuditSettings, Handover, Subject, hand_over
-from surrogym_client.training.settings import chosen_for
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_lab.reproduce.statistics import exact_interval
+from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_shared.spec import Design, EnvironmentSpec
+from surrogym_trainer.policies import load_policy
+from surrogym_trainer.training import TrainSettings, train
+from surrogym_trainer.training.handover import AuditSettings, Handover, Subject, hand_over
+from surrogym_trainer.training.settings import chosen_for
 
 OFF = 0.2  # of the range of returns
 PATIENCE_SECONDS = 600.0

@@ -20,7 +20,7 @@ from acquisition import designed
 from common import parser, started, write
 
 from support.calibration import Calibration, Trajectories, mean, one_step, ten_steps, trajectories
-from surrogym_client.original import make
+from surrogym_sampler.original import make
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.sampling.tolerances import usual_tolerances
 from surrogym_shared.spec import Design

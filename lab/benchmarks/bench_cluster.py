@@ -24,8 +24,8 @@ from support.haproxy import program, running_proxy
 from support.postgresql import running_postgresql
 from support.server import running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api, HttpSurrogate, Transport
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.wire import OpenSession
 
 TRANSPORTS: tuple[Transport, ...] = ("stream", "binary")
@@ -50,7 +50,7 @@ def raylets() -> Iterator[str]:
 
 def conforms(url: str) -> str:
     """The last line of ``surrogym conformance``."""
-    command = [sys.executable, "-m", "surrogym_client", "conformance", "--server", url]
+    command = [sys.executable, "-m", "surrogym", "conformance", "--server", url]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     lines = (ended.stdout.strip() or ended.stderr.strip()).splitlines()
     return f"exit code {ended.returncode}: {lines[-1] if lines else ''}"

@@ -30,13 +30,9 @@ import torch
 from common import parser, started, write
 
 from support.calibration import HORIZON, Array, Trajectories, outputs
-from surrogym_client.demo.judging import episodes_of
-from surrogym_client.evaluation.evaluator import EvaluationSettings, Trace, evaluate
-from surrogym_client.original.actions import decode_actions
-from surrogym_client.policies.card import read_card
-from surrogym_client.policies.files import load_policy
-from surrogym_client.policies.predict import Predict
+from surrogym.demo.judging import episodes_of
 from surrogym_lab.settings import StudySettings
+from surrogym_sampler.original.actions import decode_actions
 from surrogym_server.convert import stored_definition
 from surrogym_server.environment.actions import model_actions
 from surrogym_server.models.draws import function_draws
@@ -46,6 +42,10 @@ from surrogym_server.services.models import load_model
 from surrogym_server.storage.sql.storage import open_storage
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.terms import observe
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, Trace, evaluate
+from surrogym_trainer.policies.card import read_card
+from surrogym_trainer.policies.files import load_policy
+from surrogym_trainer.policies.predict import Predict
 
 DRAWS, EPISODES, FIRST_SEED = 256, 60, 30_000
 LEVEL = 0.9

@@ -25,7 +25,7 @@ from common import parser, started, write
 
 from support.models import learn
 from support.real_steps import random_steps
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.port import DynamicsModel

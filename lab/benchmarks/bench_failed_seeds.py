@@ -17,8 +17,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 from common import parser, started, write
 
-from surrogym_client.demo.run import run_demo
-from surrogym_client.demo.settings import DemoSettings
+from surrogym.demo.run import run_demo
+from surrogym.demo.settings import DemoSettings
 
 TASK, TARGET = "mountaincar", 93.0
 SEEDS = {  # and the return that each had

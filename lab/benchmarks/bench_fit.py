@@ -26,9 +26,9 @@ from common import figures, parser, ratio, started, write
 from support.models import learn
 from support.real_steps import random_steps
 from support.teaching import answer
-from surrogym_client.original.classic import cartpole, pendulum
-from surrogym_client.original.gymnasium import GymnasiumEnvironment
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.original.classic import cartpole, pendulum
+from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
 from surrogym_server.convert import definition_from_spec
 from surrogym_shared import wire
 from surrogym_shared.wire import OpenSession

@@ -24,8 +24,8 @@ from common import parser, started, timed, write
 from support.real_steps import random_steps
 from support.server import running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.environment.samples import Samples
 from surrogym_shared import wire
 from surrogym_shared.wire import OpenSession

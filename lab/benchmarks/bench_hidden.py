@@ -24,10 +24,10 @@ from common import parser, started, write
 
 import surrogym
 from support.hidden_bump import HiddenBump
-from surrogym_client.policies.files import load_policy
-from surrogym_client.training import TrainSettings, train
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import Design, EnvironmentSpec
+from surrogym_trainer.policies.files import load_policy
+from surrogym_trainer.training import TrainSettings, train
 
 BUDGETS = {2: 60, 4: 150}
 REACH = {2: None, 4: 0.5}  # where episodes start: with the reward declared, FASTPPO never meets it in four dimensions

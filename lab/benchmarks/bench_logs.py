@@ -26,18 +26,18 @@ import reactor
 from bench_start import serving
 from common import parser, started, write
 
-from surrogym_client.evaluation.evaluator import EvaluationSettings, evaluate
-from surrogym_client.logs import import_log
-from surrogym_client.original import make
-from surrogym_client.original.episodes import Episode, open_episode
-from surrogym_client.original.port import OriginalPort
-from surrogym_client.policies.files import load_policy
 from surrogym_client.surrogates.waiting import wait_for_model
-from surrogym_client.training import TrainSettings, train
-from surrogym_client.training.settings import chosen_for
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.logs import import_log
+from surrogym_sampler.original import make
+from surrogym_sampler.original.episodes import Episode, open_episode
+from surrogym_sampler.original.port import OriginalPort
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_trainer.policies.files import load_policy
+from surrogym_trainer.training import TrainSettings, train
+from surrogym_trainer.training.settings import chosen_for
 
 PLANT, PATIENCE = "reactor:Reactor", 300.0
 

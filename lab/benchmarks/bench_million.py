@@ -31,8 +31,8 @@ from support.million import APART, FIRST, fill
 from support.postgresql import running_postgresql
 from support.server import running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.storage.live_sessions import Checkpoint, SessionLease
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage

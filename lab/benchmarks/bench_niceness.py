@@ -23,8 +23,8 @@ from support.postgresql import Postgresql, running_postgresql
 from support.ray_cluster import RayCluster
 from support.server import running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.wire import OpenSession
 
 NICENESS = (0, 15)

@@ -24,8 +24,8 @@ from support.browser import launched
 from support.policies import store
 from support.server import running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared import wire
 
 SAMPLES, MODELS, POLICIES, LOADS = 10_000, 50, 20, 5

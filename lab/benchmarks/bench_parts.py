@@ -54,8 +54,8 @@ from structures import (
 from torch import Tensor
 
 from support.models import gaussian_processes
-from surrogym_client.demo.tasks import TASKS as DEMOS
-from surrogym_client.original import make
+from surrogym.demo.tasks import TASKS as DEMOS
+from surrogym_sampler.original import make
 from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
 from surrogym_server.environment.features import features
 from surrogym_server.environment.samples import Samples, increments

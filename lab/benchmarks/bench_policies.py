@@ -13,8 +13,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 from support.policies import network_file
 from support.server import ServerProcess, running_server
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared import wire
 
 POLICIES, VIDEOS, ROOM = 220, 64, 256  # videos of 16 MiB; MiB of a surrogate's files

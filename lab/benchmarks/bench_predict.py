@@ -27,7 +27,7 @@ from owned import Child, installed
 
 from support.models import learn
 from support.real_steps import random_steps
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.gp import Hyperparameters, Output, Posterior, Serving, condition
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel

@@ -28,8 +28,8 @@ from common import parser, started, write
 from scipy.stats import binom
 
 from support.real_steps import join, samples_of
-from surrogym_client.original import make
 from surrogym_lab.tasks import EVERY_TASK
+from surrogym_sampler.original import make
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples

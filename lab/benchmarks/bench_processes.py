@@ -23,8 +23,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 import numpy as np
 from common import parser, started, write
 
-from surrogym_client.demo.run import run_demo
-from surrogym_client.demo.tasks import DemoTask, Target
+from surrogym.demo.run import run_demo
+from surrogym.demo.tasks import DemoTask, Target
 from surrogym_lab.runs import begin
 from surrogym_lab.settings import StudySettings
 from surrogym_lab.tasks import EVERY_TASK

@@ -17,8 +17,8 @@ from common import parser, started, take_turns, timed, write
 from support.haproxy import Proxy, program
 from support.server import running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api, HttpSurrogate, Transport
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.wire import OpenSession
 
 TRANSPORTS: tuple[Transport, ...] = ("stream", "binary")

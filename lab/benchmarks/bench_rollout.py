@@ -21,11 +21,11 @@ from common import MICROSECONDS, Call, figures, parser, ratio, started, take_tur
 from threadpoolctl import threadpool_limits
 
 from support.acting import random_policy, stepped
-from surrogym_client.training import TrainSettings, train
 from surrogym_client.transport import HttpSurrogate
 from surrogym_shared.acting import Actor, NoiseKey
 from surrogym_shared.port import PolicyPort
 from surrogym_shared.wire import OpenSession
+from surrogym_trainer.training import TrainSettings, train
 
 LANES, STEPS = (16, 1024), 64
 POLICY = random_policy((3, 64, 64, 1))  # of the size that FASTPPO learns

@@ -26,11 +26,11 @@ from common import parser, started, write
 
 from support.postgresql import running_postgresql
 from support.server import ServerProcess, running_server
-from surrogym_client.original.classic import pendulum
-from surrogym_client.original.gymnasium import GymnasiumEnvironment
-from surrogym_client.original.protocol import Array, RealStep
-from surrogym_client.sampler import Sampler, SamplerSettings
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
+from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
+from surrogym_sampler.original.protocol import Array, RealStep
+from surrogym_sampler.queries import Sampler, SamplerSettings
 
 STEP_SECONDS = 0.05
 COUNTS, QUICK_COUNTS = (1, 2, 4, 8, 16, 32), (1, 4)

@@ -23,11 +23,11 @@ from threadpoolctl import threadpool_limits
 from support.models import learn
 from support.ppo import ROWS, batch_of, reference
 from support.real_steps import random_steps
-from surrogym_client.original.classic import pendulum
-from surrogym_client.training import TrainSettings, train
-from surrogym_client.training.fast_ppo.learner import Learner, Objective
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
+from surrogym_trainer.training import TrainSettings, train
+from surrogym_trainer.training.fast_ppo.learner import Learner, Objective
 
 SEARCHES = ("ppo", "fastppo")
 STEPS, SEEDS, SAMPLES = 600_000, 3, 24

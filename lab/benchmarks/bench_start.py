@@ -23,11 +23,11 @@ import httpx
 from common import parser, started, write
 
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.wire import OpenSession
 
-COMMAND = [sys.executable, "-m", "surrogym_client"]
+COMMAND = [sys.executable, "-m", "surrogym"]
 SAMPLES, LONGEST = 24, 60.0
 GOALS = {"help": 0.3, "page": 2.0, "first virtual step": 1.0, "demo's first real step": 3.0}
 

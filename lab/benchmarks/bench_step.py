@@ -25,11 +25,11 @@ from servers import TRIVIAL
 from websockets.sync.client import connect
 
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api, HttpSurrogate, Transport
 from surrogym_client.transport.connection import Connection, Retries
 from surrogym_client.transport.step_codecs import BinaryForm, Form, JsonForm
 from surrogym_client.transport.stream import Stream
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine import core
 from surrogym_server.local import LocalSurrogate

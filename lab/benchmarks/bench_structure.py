@@ -54,8 +54,8 @@ from torch import Tensor
 from support.fermenter import Fermenter
 from support.models import gaussian_processes
 from support.reactor import example
-from surrogym_client.demo.tasks import TASKS as DEMOS
-from surrogym_client.original import make
+from surrogym.demo.tasks import TASKS as DEMOS
+from surrogym_sampler.original import make
 from surrogym_server.errors import NumericalFailure
 from surrogym_server.gp import condition
 from surrogym_server.gp.posterior import Posterior

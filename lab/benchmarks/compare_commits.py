@@ -54,7 +54,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "pathwise": {"variant": "pathwise", "penalty": 1.0},
 }
 OF_A_SAMPLE = ("coordinates", "action", "next_coordinates", "reward", "terminated", "observation", "next_observation")
-PACKAGES = ("front", "server", "client", "shared")
+PACKAGES = ("front", "server", "client", "shared")  # older commits have a folder front
 OF_ONE_RUN = {
     "created_at",
     "fit_seconds",
@@ -81,13 +81,18 @@ class Commit:
     def path(self) -> str:
         return os.pathsep.join(str(self.folder / package) for package in PACKAGES)
 
+    @property
+    def program(self) -> str:
+        """Package that is the command: older commits have it in the client."""
+        return "surrogym" if (self.folder / "client/surrogym/__main__.py").exists() else "surrogym_client"
+
     def demo(self, task: str, seed: int, out: Path) -> None:
         """Run the demo of a task with a short training."""
         sizes = ["--steps", str(TRAINING_STEPS), "--episodes", str(EPISODES), "--no-pictures", "--quiet"]
         command = [
             sys.executable,
             "-m",
-            "surrogym_client",
+            self.program,
             "demo",
             task,
             "--seed",

@@ -49,7 +49,7 @@ def serve_echo(port: int) -> None:
 
 def serve_surrogym(options: list[str]) -> None:
     """The server as it is, but for the model of one surrogate: its steps give zeros at once."""
-    from surrogym_client.cli import main
+    from surrogym.cli import main
     from surrogym_server.engine import core
     from surrogym_shared.port import StepResult
 
@@ -74,7 +74,7 @@ def serve_surrogym(options: list[str]) -> None:
 
 def serve_collecting(threshold: int, arguments: list[str]) -> None:
     """Collect the youngest generation after ``threshold`` new objects; 0: never collect."""
-    from surrogym_client.cli import main
+    from surrogym.cli import main
     from surrogym_server.cli import runner
 
     runner.YOUNG_OBJECTS = threshold

@@ -11,10 +11,10 @@ import sys
 import numpy as np
 from cmaes import SepCMA
 
-from surrogym_client.original.loading import load_factory
 from surrogym_lab.tasks import UNSEEN
 from surrogym_lab.unseen.machine import Machine
 from surrogym_lab.unseen.tasks import ResetOnly
+from surrogym_sampler.original.loading import load_factory
 from surrogym_shared.network import Network
 from surrogym_shared.terms import observe
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from surrogym_client.cli import run
+from surrogym.cli import run
 from surrogym_lab.commands import build
 
 if __name__ == "__main__":

@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
-from surrogym_client.demo.judging import Judgement, episodes_of
-from surrogym_client.demo.learning import Learned, SurrogateRun
-from surrogym_client.demo.processes import Children
-from surrogym_client.demo.run import Run
-from surrogym_client.original.port import OriginalPort
-from surrogym_client.policies.card import PolicyCard, write_card
-from surrogym_client.training import TrainProgress, TrainSettings, train
-from surrogym_client.training.words import words_of
+from surrogym.demo.judging import Judgement, episodes_of
+from surrogym.demo.learning import Learned, SurrogateRun
+from surrogym.demo.processes import Children
+from surrogym.demo.run import Run
 from surrogym_lab.settings import StudySettings
+from surrogym_sampler.original.port import OriginalPort
 from surrogym_shared.terminal import progress
+from surrogym_trainer.policies.card import PolicyCard, write_card
+from surrogym_trainer.training import TrainProgress, TrainSettings, train
+from surrogym_trainer.training.words import words_of
 
 
 def begin(settings: StudySettings, folder: Path, children: Children, *, quiet: bool) -> Run:

@@ -6,18 +6,18 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from surrogym_client.demo.settings import DemoSettings
-from surrogym_client.demo.tasks import DemoTask, design_budget
-from surrogym_client.original import make
-from surrogym_client.original.loading import has_specification, with_choices
-from surrogym_client.training.search import REFERENCE
-from surrogym_client.training.settings import SUGGESTED_STEPS
+from surrogym.demo.settings import DemoSettings
+from surrogym.demo.tasks import DemoTask, design_budget
 from surrogym_lab.arms import ARMS, Arm
 from surrogym_lab.tasks import EVERY_TASK
+from surrogym_sampler.original import make
+from surrogym_sampler.original.loading import has_specification, with_choices
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.training.search import REFERENCE
+from surrogym_trainer.training.settings import SUGGESTED_STEPS
 
 if TYPE_CHECKING:
-    from surrogym_client.original.describing import Description
+    from surrogym_sampler.original.describing import Description
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,6 @@ class StudySettings(DemoSettings):
 
 @cache
 def _described(name: str, seed: int) -> Description:
-    from surrogym_client.original.describing import describe
+    from surrogym_sampler.original.describing import describe
 
     return describe(name, seed=seed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from surrogym_client.demo.tasks import TASKS, DemoTask, Target
+from surrogym.demo.tasks import TASKS, DemoTask, Target
 
 # Ten tasks of the study of trust. Nobody tunes the method on them. Targets: four fifths of the way from no action to a
 # policy that CMA-ES learned on the task itself (lab/benchmarks/unseen_targets.py).

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from support.saying import speaker
-from surrogym_client.cli import run
+from surrogym.cli import run
 from surrogym_lab.commands import build
 
 

@@ -9,7 +9,7 @@ import pytest
 from support.commands import parse
 from support.metrics import METRICS
 from support.studies import ignore, stand_in
-from surrogym_client.demo.tasks import TASKS
+from surrogym.demo.tasks import TASKS
 from surrogym_lab.arms import ARMS
 from surrogym_lab.commands import build
 from surrogym_lab.reproduce.cells import Cell, cells, demo_command, done_already, run_cells, study

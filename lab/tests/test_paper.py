@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surrogym_client.original import make
 from surrogym_lab.reproduce.paper_cases import QUICK, TASKS, WHOLE, Cell, Variation, cells
 from surrogym_lab.reproduce.paper_measures import BiasedEpisode, Unseen, run_variation, some
 from surrogym_lab.reproduce.paper_table import settling_time, table
 from surrogym_lab.reproduce.table import markdown
+from surrogym_sampler.original import make
 from surrogym_shared.spec import Fixed
 
 

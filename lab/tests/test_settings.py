@@ -3,8 +3,8 @@
 import pytest
 
 from support.simulators import installed
-from surrogym_client.demo.learning import later_imports
-from surrogym_client.demo.tasks import (
+from surrogym.demo.learning import later_imports
+from surrogym.demo.tasks import (
     ROUNDS,
     TASKS,
     DemoTask,
@@ -13,10 +13,10 @@ from surrogym_client.demo.tasks import (
     design_budget,
     queries_a_round,
 )
-from surrogym_client.original.loading import is_known
 from surrogym_lab.arms import ARMS
 from surrogym_lab.settings import StudySettings
 from surrogym_lab.tasks import BY_NAME, EVERY_TASK
+from surrogym_sampler.original.loading import is_known
 
 KNOWN = [name for name, task in TASKS.items() if is_known(task.environment)]
 

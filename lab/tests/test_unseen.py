@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from surrogym_client.demo.judging import episodes_of
-from surrogym_client.demo.tasks import TASKS
-from surrogym_client.evaluation.evaluator import EvaluationSettings, evaluate
-from surrogym_client.original import make
-from surrogym_client.original.protocol import OriginalEnvironment, RolloutEnvironment, runs_in_parallel
-from surrogym_client.original.rollouts import answering
+from surrogym.demo.judging import episodes_of
+from surrogym.demo.tasks import TASKS
 from surrogym_lab.settings import StudySettings
 from surrogym_lab.tasks import UNSEEN
 from surrogym_lab.unseen.machine import Machine
 from surrogym_lab.unseen.tasks import NoisySensors, ResetOnly
+from surrogym_sampler.original import make
+from surrogym_sampler.original.protocol import OriginalEnvironment, RolloutEnvironment, runs_in_parallel
+from surrogym_sampler.original.rollouts import answering
 from surrogym_server.convert import definition_from_spec
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 
 SETTABLE = [name for name in UNSEEN if name != "reset-only"]
 

@@ -22,10 +22,10 @@ from support.postgresql import running_postgresql
 from support.ray_cluster import RayCluster
 from support.server import RestartingServer
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
-from surrogym_client.training import TrainResult
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.wire import OpenSession
+from surrogym_trainer.training import TrainResult
 
 ray = pytest.importorskip("ray")
 

@@ -19,9 +19,9 @@ from support import crashing
 from support.chaos import SEED
 from support.programs import program
 from support.server import running_server
-from surrogym_client import original
-from surrogym_client.original.executables import name_of
 from surrogym_client.transport import Api
+from surrogym_sampler import original
+from surrogym_sampler.original.executables import name_of
 from surrogym_shared.spec import EnvironmentSpec
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "executables"
@@ -52,7 +52,7 @@ def specification(command: str) -> EnvironmentSpec:
 def sample(url: str, name: str, command: str) -> tuple[dict[str, int], int]:
     """Run samplers until the design has ended; what the last one reports, and how many ended by themselves before."""
     options = ["--exec", command, "--step-limit", str(STEP_LIMIT), "--until-done", "--batch", "16", "--json"]
-    call = [sys.executable, "-m", "surrogym_client", "sample", name, "--server", url, *options]
+    call = [sys.executable, "-m", "surrogym", "sample", name, "--server", url, *options]
     said, ends = "", 0
     while True:
         ended = subprocess.run(call, capture_output=True, text=True, check=False)

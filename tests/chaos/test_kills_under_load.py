@@ -16,8 +16,8 @@ from support.haproxy import program
 from support.load import load
 from support.stage import Stage, killing_fronts, running_stage
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 
 pytest.importorskip("ray")
 

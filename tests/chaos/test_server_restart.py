@@ -14,9 +14,9 @@ import pytest
 from support.server import RestartingServer
 from support.teaching import teach
 from surrogym_client.environments.env import LOST
-from surrogym_client.original.classic import pendulum
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.transport import Api, HttpSurrogate, Retries
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.wire import OpenSession
 
 LANES = 3

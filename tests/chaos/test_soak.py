@@ -17,12 +17,12 @@ from support.hostile import resident_mib
 from support.noting import until
 from support.server import running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
-from surrogym_client.original.gymnasium import GymnasiumEnvironment
-from surrogym_client.original.protocol import Array, RealStep
-from surrogym_client.sampler import Sampler, SamplerSettings
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
+from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
+from surrogym_sampler.original.protocol import Array, RealStep
+from surrogym_sampler.queries import Sampler, SamplerSettings
 
 SESSIONS, LANES, THREADS = times(short=8, full=64), 16, 4
 SECONDS, WARM_SECONDS = times(short=4, full=600), times(short=1, full=60)

@@ -25,8 +25,8 @@ from support.chaos import times
 from support.postgresql import running_postgresql
 from support.server import ServerProcess, running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api, HttpSurrogate, Retries
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.storage.sql.database import BUSY_SECONDS
 from surrogym_shared.wire import OpenSession
 

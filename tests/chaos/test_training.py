@@ -12,10 +12,10 @@ from support.chaos import times
 from support.disturbed import LANES, disturbed_training, require_same_policy
 from support.server import RestartingServer
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
-from surrogym_client.training import TrainResult
-from surrogym_client.training.words import words_of_result
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
+from surrogym_trainer.training import TrainResult
+from surrogym_trainer.training.words import words_of_result
 
 FAULTS = times(short=1, full=10)
 pytestmark = pytest.mark.timeout(3_600)

@@ -15,10 +15,10 @@ import pytest
 
 from support.server import RestartingServer
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api, Retries
-from surrogym_client.work.worker import Worker, WorkerReport, WorkerSettings
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared import wire
+from surrogym_trainer.work.worker import Worker, WorkerReport, WorkerSettings
 
 NAME = "pendulum"
 LEASE = 2.0
@@ -27,7 +27,7 @@ WORKER = """
 import sys
 from pathlib import Path
 from surrogym_client.transport import Api
-from surrogym_client.work.worker import Worker, WorkerSettings
+from surrogym_trainer.work.worker import Worker, WorkerSettings
 Worker(Api(sys.argv[1]), "pendulum", WorkerSettings("killed", Path(sys.argv[2]), lease_seconds=2)).run()
 """
 

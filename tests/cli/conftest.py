@@ -7,7 +7,7 @@ import uuid
 import pytest
 
 from support.saying import speaker
-from surrogym_client.cli import main
+from surrogym.cli import main
 
 
 @pytest.fixture

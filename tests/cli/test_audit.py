@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from surrogym_client.cli.audit import _require_fit, session_of
-from surrogym_client.cli.errors import CommandError
-from surrogym_client.original.classic import cartpole, pendulum
-from surrogym_client.policies.card import PolicyCard
+from surrogym.cli.audit import _require_fit, session_of
+from surrogym.cli.errors import CommandError
+from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_shared.network import Network
 from surrogym_shared.wire import SurrogateView
+from surrogym_trainer.policies.card import PolicyCard
 
 
 def view(noise: float, sensor: float = 0.0) -> SurrogateView:

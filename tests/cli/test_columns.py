@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from surrogym_client.cli.columns import ENDLESS, columns, fitted
+from surrogym.cli.columns import ENDLESS, columns, fitted
 
 ROWS = [("name", "a long heading"), ("pendulum", 0.123456), ("x", None)]
 MARKDOWN = """\

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from support.machine import Machine, diary_in
-from surrogym_client import original
-from surrogym_client.original.loading import with_choices
-from surrogym_client.policies import PolicyCard
 from surrogym_client.transport import Api
+from surrogym_sampler import original
+from surrogym_sampler.original.loading import with_choices
 from surrogym_shared.archives import stored
+from surrogym_trainer.policies import PolicyCard
 
 OWN = """
-from surrogym_client.original import RealStep
+from surrogym_sampler.original import RealStep
 from surrogym_shared.spec import *
 
 class Cart:
@@ -253,7 +253,7 @@ def test_a_policy_of_bins_pushes_ones_own_machine_as_its_surrogate_was_pushed(su
     spec = with_choices(Machine.spec(None), {}, bins=5)
     (tmp_path / "policy.zip").write_bytes(stored({}))
     (tmp_path / "policy.json").write_text(PolicyCard(spec=spec).model_dump_json())
-    monkeypatch.setattr("surrogym_client.policies.files.load_policy", lambda *_, **__: lambda o: np.ones(len(o)))
+    monkeypatch.setattr("surrogym_trainer.policies.files.load_policy", lambda *_, **__: lambda o: np.ones(len(o)))
     with diary_in(tmp_path, monkeypatch) as diary:
         said = surrogym("evaluate", "policy.zip", "--env", "support.machine:Machine", "--episodes", "1")
         assert said.code == 0, said.err
@@ -264,7 +264,7 @@ def test_equal_episodes_are_told_as_such(surrogym, monkeypatch, tmp_path):
     """A hundred equal episodes of a deterministic plant looked like a hundred that agree."""
     (tmp_path / "policy.zip").write_bytes(stored({}))
     (tmp_path / "policy.json").write_text(PolicyCard().model_dump_json())
-    monkeypatch.setattr("surrogym_client.policies.files.load_policy", lambda *_, **__: lambda o: np.ones((len(o), 1)))
+    monkeypatch.setattr("surrogym_trainer.policies.files.load_policy", lambda *_, **__: lambda o: np.ones((len(o), 1)))
     said = surrogym("evaluate", "policy.zip", "--env", "support.moody:Alike", "--episodes", "4")
     assert said.code == 0, said.err
     assert said.out.splitlines()[-1] == (

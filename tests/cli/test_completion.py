@@ -9,12 +9,12 @@ import time
 
 import pytest
 
-from surrogym_client.cli.options import QUICK
+from surrogym.cli.options import QUICK
 
 
 def run(*arguments: str, **environment: str) -> str:
     kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
-    command = [sys.executable, "-m", "surrogym_client", *arguments]
+    command = [sys.executable, "-m", "surrogym", *arguments]
     return subprocess.run(
         command, env=kept | environment, capture_output=True, text=True, check=False, timeout=60
     ).stdout

@@ -11,8 +11,8 @@ from surrogym_shared import wire
 from surrogym_shared.codes import Code
 
 BROKEN = """
-from surrogym_client.original.classic import pendulum
-from surrogym_client.original import RealStep
+from surrogym_sampler.original.classic import pendulum
+from surrogym_sampler.original import RealStep
 
 class Pendulum:
     def spec(self):
@@ -74,7 +74,7 @@ def test_a_server_of_another_protocol(surrogym):
     ],
 )
 def test_one_thing_out_of_place_does_not_hide_the_others(surrogym, monkeypatch, ready, access, broken, way_out):
-    monkeypatch.setattr("surrogym_client.cli.options.QUICK", 0.0)
+    monkeypatch.setattr("surrogym.cli.options.QUICK", 0.0)
     alive = reply(wire.Health(version="0.1.0").model_dump_json())
     with scripted_server(alive, ready, access, alive) as server:
         said = surrogym("doctor", "--server", server.url)

@@ -57,8 +57,8 @@ def test_an_environment_that_exits_while_it_is_closed_is_one_sentence(surrogym, 
 
 
 FACTORY = """
-from surrogym_client.original import RealStep
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original import RealStep
+from surrogym_sampler.original.classic import pendulum
 
 class Pendulum:
     def spec(self):
@@ -75,7 +75,7 @@ class Pendulum:
 
 def test_an_environment_in_a_process_of_its_own_prints_aside_too(tmp_path) -> None:
     (tmp_path / "chatty_plant.py").write_text(FACTORY)
-    command = [sys.executable, "-m", "surrogym_client", "doctor", "--server", "http://127.0.0.1:9"]
+    command = [sys.executable, "-m", "surrogym", "doctor", "--server", "http://127.0.0.1:9"]
     said = subprocess.run(
         [*command, "--env", "chatty_plant:Pendulum"], cwd=tmp_path, capture_output=True, text=True, timeout=60
     )

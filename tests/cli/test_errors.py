@@ -11,7 +11,7 @@ NOBODY = ("--server", "http://127.0.0.1:9")
 
 @pytest.fixture
 def quickly(monkeypatch):
-    monkeypatch.setattr("surrogym_client.cli.options.QUICK", 0.0)
+    monkeypatch.setattr("surrogym.cli.options.QUICK", 0.0)
 
 
 def refused(said, code=1):

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogym_client.cli.filming import film
-from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
-from surrogym_client.original.episodes import open_episode
-from surrogym_client.original.loading import make
-from surrogym_client.policies.card import PolicyCard
+from surrogym.cli.filming import film
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.loading import make
+from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
+from surrogym_trainer.policies.card import PolicyCard
 
 SHORT = Trace(np.zeros((4, 4)), np.zeros((3, 1)), np.ones(3))
 RESULT = Evaluation(np.ones(1), np.array([3]), None, (SHORT,))

@@ -11,7 +11,7 @@ import pytest
 
 from support.gifts import gift
 from support.scripted_server import problem, scripted_server
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.codes import Code
 from surrogym_shared.network import Network
 

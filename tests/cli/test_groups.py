@@ -9,9 +9,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from surrogym_client.cli import COMMANDS, build
-from surrogym_client.cli.groups import add
-from surrogym_client.cli.train_options import SessionOptions
+from surrogym.cli import COMMANDS, build
+from surrogym.cli.groups import add
+from surrogym.cli.train_options import SessionOptions
 from surrogym_shared.wire import OpenSession
 
 SHARED = {"server", "token", "token_file"}

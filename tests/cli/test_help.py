@@ -6,8 +6,8 @@ import sys
 import pytest
 
 from support.commands import command_line
-from surrogym_client.cli import COMMANDS
-from surrogym_client.cli.commands import ADVANCED, GROUPS
+from surrogym.cli import COMMANDS
+from surrogym.cli.commands import ADVANCED, GROUPS
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, "serve"])
@@ -44,7 +44,7 @@ def test_version(surrogym):
 
 def test_help_imports_nothing_heavy():
     script = (
-        "import sys, surrogym_client.cli as cli; cli.build();"
+        "import sys, surrogym.cli as cli; cli.build();"
         "print([m for m in ('torch', 'httpx', 'fastapi', 'stable_baselines3') if m in sys.modules])"
     )
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
@@ -52,7 +52,7 @@ def test_help_imports_nothing_heavy():
 
 
 def test_a_missing_extra_is_named():
-    script = "import sys; sys.modules['uvicorn'] = None; import surrogym_client.cli as cli; cli.main(['serve'])"
+    script = "import sys; sys.modules['uvicorn'] = None; import surrogym.cli as cli; cli.main(['serve'])"
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert ended.returncode == 1
     assert ended.stderr == ("error: this needs uvicorn, which is not installed: pip install 'surrogym[server]'\n")

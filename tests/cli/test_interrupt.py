@@ -10,12 +10,12 @@ import pytest
 
 from support.server import ServerProcess
 from support.terminal import Terminal, on_terminal
-from surrogym_client.cli.train import _keeping
-from surrogym_client.evaluation import EvaluationInterrupted
-from surrogym_client.original.errors import EvaluationFailed
-from surrogym_client.policies import load_policy
+from surrogym.cli.train import _keeping
 from surrogym_client.transport import Api
+from surrogym_sampler.original.errors import EvaluationFailed
 from surrogym_shared.archives import stored
+from surrogym_trainer.evaluation import EvaluationInterrupted
+from surrogym_trainer.policies import load_policy
 
 INTERRUPTED = 130
 
@@ -78,8 +78,8 @@ def test_an_evaluation_that_does_not_end_enters_its_real_steps(
     def ends(*_):
         raise ending
 
-    monkeypatch.setattr("surrogym_client.policies.files.load_policy", lambda *_, **__: None)
-    monkeypatch.setattr("surrogym_client.evaluation.evaluator.evaluate", ends)
+    monkeypatch.setattr("surrogym_trainer.policies.files.load_policy", lambda *_, **__: None)
+    monkeypatch.setattr("surrogym_trainer.evaluation.evaluator.evaluate", ends)
     ended = on_server("evaluate", "policy.zip", "--env", "Pendulum-v1")
     with Api(server_process.url) as api:
         assert api.surrogate(name).ledger.evaluation == 7
@@ -127,7 +127,7 @@ def test_an_interruption_before_the_first_real_step_says_so(surrogym, monkeypatc
     def interrupts(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("surrogym_client.original.loading.make", interrupts)
+    monkeypatch.setattr("surrogym_sampler.original.loading.make", interrupts)
     ended = surrogym("register", "Pendulum-v1")
     assert (ended.code, ended.out) == (INTERRUPTED, ""), ended.err
     assert ended.err == "interrupted before the first real step; nothing was registered\n"

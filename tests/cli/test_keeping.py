@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogym_client.cli.evaluate import _keep
-from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
-from surrogym_client.policies.pushing import waiting_path
+from surrogym.cli.evaluate import _keep
+from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
+from surrogym_trainer.policies.pushing import waiting_path
 
 
 def episodes(returns: list[float]) -> Evaluation:

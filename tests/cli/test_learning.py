@@ -10,18 +10,18 @@ import pytest
 
 from support.machine import Machine, diary_in
 from support.server import RestartingServer
-from surrogym_client import original
-from surrogym_client.cli.disagreement import Differences
-from surrogym_client.cli.errors import CommandError
-from surrogym_client.cli.learning import Learning, kept
-from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
-from surrogym_client.evaluation.keeping import as_logged, write_steps
-from surrogym_client.logs import read_log
-from surrogym_client.logs.importing import Options
-from surrogym_client.policies import PolicyCard
+from surrogym.cli.disagreement import Differences
+from surrogym.cli.errors import CommandError
+from surrogym.cli.learning import Learning, kept
 from surrogym_client.transport import Api
+from surrogym_sampler import original
+from surrogym_sampler.logs import read_log
+from surrogym_sampler.logs.importing import Options
 from surrogym_shared.archives import stored
 from surrogym_shared.wire import NewSample
+from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
+from surrogym_trainer.evaluation.keeping import as_logged, write_steps
+from surrogym_trainer.policies import PolicyCard
 
 MACHINE = ("--env", "support.machine:Machine")
 
@@ -31,7 +31,7 @@ def policy(tmp_path, monkeypatch, name):
     """A policy for the machine that always pushes, as trained for the surrogate ``name``."""
     (tmp_path / "policy.zip").write_bytes(stored({}))
     (tmp_path / "policy.json").write_text(PolicyCard(spec=Machine.spec(None), surrogate=name).model_dump_json())
-    monkeypatch.setattr("surrogym_client.policies.files.load_policy", lambda *_, **__: lambda o: np.ones((len(o), 1)))
+    monkeypatch.setattr("surrogym_trainer.policies.files.load_policy", lambda *_, **__: lambda o: np.ones((len(o), 1)))
     return "policy.zip"
 
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from support.machine import Machine, diary_in
-from surrogym_client.original.classic import cartpole, pendulum
-from surrogym_client.policies.card import PolicyCard
+from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_shared.archives import stored
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_trainer.policies.card import PolicyCard
 
 MACHINE = ("--env", "support.machine:Machine", "--episodes", "2")
 
@@ -21,7 +21,7 @@ MACHINE = ("--env", "support.machine:Machine", "--episodes", "2")
 def policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Writes ``policy.zip``, or another file, with a card of this specification. The policy pushes with all its force,
     whatever it observes."""
-    monkeypatch.setattr("surrogym_client.policies.files.load_policy", lambda *_, **__: lambda o: np.ones((len(o), 1)))
+    monkeypatch.setattr("surrogym_trainer.policies.files.load_policy", lambda *_, **__: lambda o: np.ones((len(o), 1)))
 
     def write(spec: EnvironmentSpec | None, name: str = "policy") -> None:
         (tmp_path / f"{name}.zip").write_bytes(stored({}))
@@ -99,7 +99,7 @@ def test_a_training_starts_from_no_policy_of_another_environment(on_server, poli
     """It failed after 17 s, with the shapes of arrays."""
     policy(pendulum())
     trainable = (Machine.spec(None), "http://127.0.0.1:9")
-    monkeypatch.setattr("surrogym_client.cli.train._trainable", lambda *_, **__: trainable)
+    monkeypatch.setattr("surrogym.cli.train._trainable", lambda *_, **__: trainable)
     said = on_server("train", name, "--start-from", "policy.zip", "--out", "next.zip")
     assert (said.code, said.out) == (1, "")
     assert said.err == (

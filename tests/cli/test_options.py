@@ -9,7 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from surrogym_client.cli.options import Quiet, Token, typed
+from surrogym.cli.options import Quiet, Token, typed
 
 
 @pytest.mark.parametrize(

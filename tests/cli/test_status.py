@@ -9,8 +9,8 @@ import pytest
 from support.scripted_server import lost_reply, reply, scripted_server
 from support.teaching import teach
 from support.terminal import on_terminal
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared import wire
 
 EMPTY = reply(wire.SurrogateList(surrogates=[]).model_dump_json())
@@ -77,7 +77,7 @@ def test_watching_shows_changes_alone_and_ends_cleanly(on_server, server_process
 
 
 def test_a_lost_server_is_reported_and_polled(surrogym, looks, monkeypatch):
-    monkeypatch.setattr("surrogym_client.cli.options.QUICK", 0.0)
+    monkeypatch.setattr("surrogym.cli.options.QUICK", 0.0)
     looks(3)
     with scripted_server(EMPTY, lost_reply, EMPTY) as server:
         said = surrogym("status", "--watch", "--server", server.url)

@@ -9,11 +9,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from surrogym_client.cli import train
-from surrogym_client.original.classic import pendulum
-from surrogym_client.original.loading import env_option
-from surrogym_client.training import TrainProgress, TrainResult, TrainSettings
-from surrogym_client.training.words import words_of, words_of_interruption, words_of_result
+from surrogym.cli import train
+from surrogym_sampler.original.classic import pendulum
+from surrogym_sampler.original.loading import env_option
+from surrogym_trainer.training import TrainProgress, TrainResult, TrainSettings
+from surrogym_trainer.training.words import words_of, words_of_interruption, words_of_result
 
 RESULT = TrainResult(Path("p.zip"), "PPO", 512, 1.0, -150.0, 0, {})
 

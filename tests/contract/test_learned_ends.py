@@ -8,8 +8,8 @@ import pytest
 
 from support.acting import assert_same_rollout, random_policy, stepped
 from support.teaching import teach
-from surrogym_client.original.classic import cartpole
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.original.classic import cartpole
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.models.files import from_bytes

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from support.acting import Stepwise, assert_same_rollout, random_policy, stepped
-from surrogym_client.evaluation.imagined import imagine
-from surrogym_client.training import TrainSettings, train
-from surrogym_client.training.fast_ppo.learner import restored
 from surrogym_shared.acting import ActingPolicy, Actor, NoiseKey
 from surrogym_shared.network import Layer, Network
 from surrogym_shared.port import PolicyPort
 from surrogym_shared.wire import OpenSession
+from surrogym_trainer.evaluation.imagined import imagine
+from surrogym_trainer.training import TrainSettings, train
+from surrogym_trainer.training.fast_ppo.learner import restored
 
 N, SIZES = 5, (3, 16, 8, 1)  # of Pendulum: 3 observation entries, 1 action entry
 Opened = Callable[..., str]

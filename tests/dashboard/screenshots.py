@@ -15,7 +15,7 @@ from playwright.sync_api import Browser, Page, expect  # noqa: E402
 
 from support.browser import launched  # noqa: E402
 from support.server import running_server  # noqa: E402
-from surrogym_client.original.classic import mountain_car_continuous as mountain_car  # noqa: E402
+from surrogym_sampler.original.classic import mountain_car_continuous as mountain_car  # noqa: E402
 
 IMAGES = ROOT / "docs" / "images"
 QUEUED = "CartPole-v1"
@@ -23,7 +23,7 @@ TRAININGS = {"short": "30000", "long": "150000"}  # virtual steps
 
 
 def surrogym(url: str, *words: str) -> None:
-    subprocess.run([sys.executable, "-m", "surrogym_client", *words, "--server", url, "--quiet"], check=True)
+    subprocess.run([sys.executable, "-m", "surrogym", *words, "--server", url, "--quiet"], check=True)
 
 
 def populate(url: str, folder: Path) -> None:
@@ -91,9 +91,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, running_server(Path(folder)) as server, launched() as browser:
         populate(server.url, Path(folder))
         command = ["train", "pendulum", "--steps", "1000000", "--penalty", "1", "--out", f"{folder}/policy.zip"]
-        training = subprocess.Popen(
-            [sys.executable, "-m", "surrogym_client", *command, "--server", server.url, "--quiet"]
-        )
+        training = subprocess.Popen([sys.executable, "-m", "surrogym", *command, "--server", server.url, "--quiet"])
         try:
             wait_for_episodes(browser, server.url)
             take(browser, server.url, "page-list", "#/", "light", 1100, 420)

@@ -13,10 +13,10 @@ from playwright.sync_api import Page, expect
 
 from support.browser import serious
 from support.server import RestartingServer
-from surrogym_client.original.classic import pendulum
-from surrogym_client.original.gymnasium import GymnasiumEnvironment
-from surrogym_client.sampler import Sampler, SamplerSettings
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
+from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
+from surrogym_sampler.queries import Sampler, SamplerSettings
 
 Open = Callable[..., Page]
 TOKEN = "the-token-of-an-admin"

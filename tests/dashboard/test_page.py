@@ -10,8 +10,8 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from support.server import ServerProcess
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 
 Open = Callable[..., Page]
 PARTS = (

@@ -14,11 +14,11 @@ from playwright.sync_api import Page, expect
 from support.browser import serious
 from support.policies import store
 from support.server import ServerProcess
-from surrogym_client.evaluation.evaluator import Evaluation, Trace
-from surrogym_client.evaluation.videos import record
-from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_shared import wire
+from surrogym_trainer.evaluation.evaluator import Evaluation, Trace
+from surrogym_trainer.evaluation.videos import record
 
 Open = Callable[..., Page]
 

@@ -13,8 +13,8 @@ from playwright.sync_api import Page, expect
 from support import reactor
 from support.browser import serious
 from support.server import ServerProcess
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 
 Open = Callable[..., Page]
 

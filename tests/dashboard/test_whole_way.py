@@ -25,7 +25,7 @@ TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial.md"
 def running(folder: Path, *words: str) -> Iterator[None]:
     """A command of the program for the time of the context, as a person would start it and end it by Ctrl-C."""
     with (folder / f"{words[0]}.log").open("wb") as log:
-        command = [sys.executable, "-m", "surrogym_client", *words]
+        command = [sys.executable, "-m", "surrogym", *words]
         environment = os.environ | {"OMP_NUM_THREADS": "1"}
         process = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log, env=environment)
     try:
@@ -43,7 +43,7 @@ def test_a_page_alone_leads_to_a_judged_policy_of_ones_own_environment(
 ):
     expect.set_options(timeout=600_000)
     (program,) = re.findall(
-        r"```python\n(from surrogym_client.original import RealStep.*?)```", TUTORIAL.read_text(), re.S
+        r"```python\n(from surrogym_sampler.original import RealStep.*?)```", TUTORIAL.read_text(), re.S
     )
     (tmp_path / "cart.py").write_text(program)
     said = [sys.executable, "-c", "import cart; print(cart.Cart().spec().model_dump_json())"]

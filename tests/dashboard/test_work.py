@@ -13,11 +13,11 @@ from playwright.sync_api import Locator, Page, Route, expect
 from support.browser import serious
 from support.policies import left_alone, network_file
 from support.server import ServerProcess
-from surrogym_client.original.classic import pendulum
-from surrogym_client.original.episodes import GymnasiumEpisode
 from surrogym_client.transport import Api
-from surrogym_client.work.worker import Environment, Worker, WorkerSettings
+from surrogym_sampler.original.classic import pendulum
+from surrogym_sampler.original.episodes import GymnasiumEpisode
 from surrogym_shared import wire
+from surrogym_trainer.work.worker import Environment, Worker, WorkerSettings
 
 Open = Callable[..., Page]
 NAME = "pendulum"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from surrogym_client.policies import load_policy
+from surrogym_trainer.policies import load_policy
 
 pytestmark = [pytest.mark.e2e, pytest.mark.slow]
 
@@ -28,7 +28,7 @@ class Demo:
         self.folder = folder
         self.mark = uuid.uuid4().hex
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "surrogym_client", "demo", "pendulum", "--out", str(folder), *options],
+            [sys.executable, "-m", "surrogym", "demo", "pendulum", "--out", str(folder), *options],
             env={**os.environ, MARK: self.mark},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

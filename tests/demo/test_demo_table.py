@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from surrogym_client.demo.report import table
+from surrogym.demo.report import table
 
 METRICS: dict[str, Any] = {
     "task": "cartpole",

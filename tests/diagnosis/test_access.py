@@ -11,17 +11,17 @@ import gymnasium
 import numpy as np
 import pytest
 
-import surrogym_client.cli
-from surrogym_client.diagnosis.access import Access, CheckFailed, examine
-from surrogym_client.diagnosis.doctor import environment
-from surrogym_client.original import RealStep
-from surrogym_client.original.adapters.gymnasium_ids import ResetOnly
-from surrogym_client.original.errors import StepFailed
-from surrogym_client.original.isolated import IsolatedEnvironment
-from surrogym_client.original.simulator import Simulated
+import surrogym.cli
+from surrogym_sampler.diagnosis.access import Access, CheckFailed, examine
+from surrogym_sampler.diagnosis.doctor import environment
+from surrogym_sampler.original import RealStep
+from surrogym_sampler.original.adapters.gymnasium_ids import ResetOnly
+from surrogym_sampler.original.errors import StepFailed
+from surrogym_sampler.original.isolated import IsolatedEnvironment
+from surrogym_sampler.original.simulator import Simulated
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
-CLI = Path(surrogym_client.cli.__file__).parent
+CLI = Path(surrogym.cli.__file__).parent
 PAGES = Path(__file__).parents[2] / "docs" / "how-to"
 RANGE = Uniform(low=-1, high=1)
 

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from support.forging_proxy import Forge, forging_proxy, leave
 from support.server import ServerProcess, running_server
-from surrogym_client.cli import build
-from surrogym_client.diagnosis.conformance import conformance, sessions
+from surrogym.cli import build
 from surrogym_client.transport import Api
+from surrogym_sampler.diagnosis.conformance import conformance, sessions
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_a_broken_promise_fails_its_check(
 
 
 def test_a_taken_name_is_left_alone(server: ServerProcess):
-    from surrogym_client.diagnosis.conformance.target import SPEC
+    from surrogym_sampler.diagnosis.conformance.target import SPEC
 
     with Api(server.url) as api:
         api.create_surrogate("taken", SPEC)

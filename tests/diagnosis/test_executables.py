@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from support.programs import program
-from surrogym_client.cli import build
-from surrogym_client.diagnosis.executables import FIRST, conformance
+from surrogym.cli import build
+from surrogym_sampler.diagnosis.executables import FIRST, conformance
 
 SHELL = Path(__file__).parents[2] / "examples" / "executables" / "rail.sh"
 SEEDED = 'random.Random(request["seed"]).uniform(-0.5, 0.5)'

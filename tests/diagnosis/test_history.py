@@ -8,11 +8,11 @@ from functools import partial
 import numpy as np
 import pytest
 
-from surrogym_client.diagnosis.doctor import environment
-from surrogym_client.diagnosis.history import declared, look_back
-from surrogym_client.original import make
-from surrogym_client.original.isolated import IsolatedEnvironment
-from surrogym_client.original.rollouts import answering
+from surrogym_sampler.diagnosis.doctor import environment
+from surrogym_sampler.diagnosis.history import declared, look_back
+from surrogym_sampler.original import make
+from surrogym_sampler.original.isolated import IsolatedEnvironment
+from surrogym_sampler.original.rollouts import answering
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform, with_history
 
 CIRCLE = Uniform(low=-math.pi, high=math.pi)

@@ -14,9 +14,9 @@ import yaml
 
 from support.server import running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 
 DOCKER = Path(__file__).parents[2] / "docker"
 BOARD: dict[str, Any] = json.loads((DOCKER / "grafana" / "boards" / "surrogym.json").read_text(encoding="utf-8"))

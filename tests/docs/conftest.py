@@ -8,8 +8,8 @@ import pytest
 
 from support.server import ServerProcess, running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 
 
 @pytest.fixture(scope="module")

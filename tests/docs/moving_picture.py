@@ -25,10 +25,10 @@ from matplotlib.colors import LogNorm
 from numpy.typing import NDArray
 
 import surrogym
-from surrogym_client import original
-from surrogym_client.policies import load_policy
-from surrogym_client.training import TrainSettings, train
+from surrogym_sampler import original
 from surrogym_server.sampling.uncertainty import query_uncertainty
+from surrogym_trainer.policies import load_policy
+from surrogym_trainer.training import TrainSettings, train
 
 OUT = Path(__file__).parents[2] / "docs" / "images" / "pendulum.gif"
 THETA, SPEED = np.linspace(-np.pi, np.pi, 81), np.linspace(-8, 8, 61)

@@ -46,15 +46,15 @@ def test_a_policy_of_another_algorithm_is_trained_and_its_states_are_known(
     run(tmp_path, "-c", program.replace(PRINTED_URL, server.url).replace("10_000", "500"))
     assert (tmp_path / "mine.zip").exists()
     improve = ["improve", "pendulum", "--queries", "1", "--checkpoint", "after-10k-steps", "--json"]
-    view = json.loads(run(tmp_path, "-m", "surrogym_client", *improve, "--server", server.url))
+    view = json.loads(run(tmp_path, "-m", "surrogym", *improve, "--server", server.url))
     assert view["budget"] == 7
 
 
 @pytest.mark.long
 def test_a_surrogate_leaves_as_a_file_and_is_stepped_without_a_server(server: ServerProcess, tmp_path: Path) -> None:
     on_server = ["--server", server.url]
-    run(tmp_path, "-m", "surrogym_client", "export", "pendulum", "--out", "pendulum.surrogate", *on_server)
-    run(tmp_path, "-m", "surrogym_client", "import", "pendulum.surrogate", "--name", "pendulum-2", *on_server)
+    run(tmp_path, "-m", "surrogym", "export", "pendulum", "--out", "pendulum.surrogate", *on_server)
+    run(tmp_path, "-m", "surrogym", "import", "pendulum.surrogate", "--name", "pendulum-2", *on_server)
     for program in programs("files.md")[:2]:
         run(tmp_path, "-c", program.replace("10_000", "512"))
 
@@ -75,7 +75,7 @@ def test_the_lines_of_the_terminal_page_work(
     assert len(lines) > 6
     for line in lines:
         if not {"--watch", "--install-completion"} & set(line.split()):  # tests/cli: test_status.py, test_completion.py
-            run(tmp_path, "-m", "surrogym_client", *line.split())
+            run(tmp_path, "-m", "surrogym", *line.split())
     assert (tmp_path / "report.html").exists()
 
 
@@ -83,22 +83,22 @@ def test_the_lines_of_the_terminal_page_work(
 @pytest.mark.long
 def test_a_policy_leaves_for_other_programs(server: ServerProcess, tmp_path: Path) -> None:
     train = ["train", "pendulum", "--steps", "512", "--num-envs", "16", "--quiet", "--server", server.url]
-    run(tmp_path, "-m", "surrogym_client", *train)
+    run(tmp_path, "-m", "surrogym", *train)
     for file in ("policy.onnx", "policy.pt2"):
-        run(tmp_path, "-m", "surrogym_client", "export-policy", "policy.zip", "--out", file)
+        run(tmp_path, "-m", "surrogym", "export-policy", "policy.zip", "--out", file)
     for program in programs("files.md")[2:]:
         run(tmp_path, "-c", READERS_FUNCTIONS + program)
     evaluate = ["evaluate", "policy.onnx", "--env", "Pendulum-v1", "--episodes", "2", "--json", "--server", server.url]
-    assert json.loads(run(tmp_path, "-m", "surrogym_client", *evaluate))["episodes"] == 2
+    assert json.loads(run(tmp_path, "-m", "surrogym", *evaluate))["episodes"] == 2
 
 
 def test_the_cart_that_can_only_be_reset_is_registered_and_sampled(server: ServerProcess, tmp_path: Path) -> None:
     (program,) = programs("no-teleport.md")
     (tmp_path / "cart.py").write_text(program, encoding="utf-8")
     common = ["--server", server.url, "--json", "--quiet"]
-    run(tmp_path, "-m", "surrogym_client", "register", "cart:Cart", "--name", "cart", "--budget", "14", *common)
+    run(tmp_path, "-m", "surrogym", "register", "cart:Cart", "--name", "cart", "--budget", "14", *common)
     sample = ["sample", "cart", "--env", "cart:Cart", "--until-done"]
-    report = json.loads(run(tmp_path, "-m", "surrogym_client", *sample, *common))
+    report = json.loads(run(tmp_path, "-m", "surrogym", *sample, *common))
     assert report["failed"] == 0
     assert 12 <= report["steps"] <= 14
 
@@ -113,9 +113,9 @@ def test_the_rail_is_registered_and_sampled(server: ServerProcess, tmp_path: Pat
     (program,) = programs("own-environment.md")
     (tmp_path / "rail.py").write_text(program, encoding="utf-8")
     common = ["--server", server.url, "--json", "--quiet"]
-    run(tmp_path, "-m", "surrogym_client", "register", "rail:Rail", "--name", "rail", "--budget", "5", *common)
+    run(tmp_path, "-m", "surrogym", "register", "rail:Rail", "--name", "rail", "--budget", "5", *common)
     sample = ["sample", "rail", "--env", "rail:Rail", "--until-done"]
-    report = json.loads(run(tmp_path, "-m", "surrogym_client", *sample, *common))
+    report = json.loads(run(tmp_path, "-m", "surrogym", *sample, *common))
     assert (report["answered"], report["failed"]) == (5, 0)
 
 
@@ -128,9 +128,9 @@ def test_a_log_is_drafted_and_imported(server: ServerProcess, tmp_path: Path) ->
 def test_a_reward_that_jumps_and_an_end_that_is_learned(server: ServerProcess, tmp_path: Path) -> None:
     (tmp_path / "track.py").write_text(programs("rewards-and-terminations.md")[0], encoding="utf-8")
     common = ["--server", server.url, "--json", "--quiet"]
-    run(tmp_path, "-m", "surrogym_client", "register", "track:Track", "--name", "track", "--budget", "6", *common)
+    run(tmp_path, "-m", "surrogym", "register", "track:Track", "--name", "track", "--budget", "6", *common)
     sample = ["sample", "track", "--env", "track:Track", "--until-done"]
-    report = json.loads(run(tmp_path, "-m", "surrogym_client", *sample, *common))
+    report = json.loads(run(tmp_path, "-m", "surrogym", *sample, *common))
     assert (report["answered"], report["failed"]) == (6, 0)
     for program in programs("rewards-and-terminations.md")[1:]:
         run(tmp_path, "-c", program)

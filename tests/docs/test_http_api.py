@@ -14,7 +14,7 @@ import httpx
 import numpy as np
 
 from support.server import ServerProcess
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.codes import STATUS
 from surrogym_shared.network import Network
 

@@ -19,8 +19,8 @@ import pytest
 from support.examples import EXAMPLES, ROOT, run
 from support.server import ServerProcess, running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 
 OWN_LINES = 30  # of an environment, blank ones left out
 PRINTED_URL = "http://127.0.0.1:8000"
@@ -158,7 +158,7 @@ def shortened(words: list[str]) -> list[str] | None:
         return [*words[1:], *(["--steps", "4096"] if words[1].startswith("train") else [])]
     assert words[0] == "surrogym", f"a page has people type {words[0]!r}, which nothing runs"
     more = SHORTER.get(words[1], []) if "--help" not in words else []
-    return ["-m", "surrogym_client", *words[1:], *more]
+    return ["-m", "surrogym", *words[1:], *more]
 
 
 def test_each_page_with_commands_is_followed_or_known_to_be_run_elsewhere() -> None:

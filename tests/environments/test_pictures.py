@@ -15,10 +15,10 @@ from gymnasium.wrappers import RecordVideo
 from support.exact_pendulum import ExactPendulum
 from surrogym_client.environments import RemoteEnv, RemoteVectorEnv
 from surrogym_client.environments.pictures import NotRenderable, Pictures, coordinates_from_observation, metadata_of
-from surrogym_client.original.classic import TASKS
-from surrogym_client.original.episodes import draw
-from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_client.registration import SWING_UP
+from surrogym_sampler.original.classic import TASKS
+from surrogym_sampler.original.episodes import draw
+from surrogym_sampler.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 from surrogym_shared.terms import observe
 

@@ -34,7 +34,7 @@ def test_gymnasium_may_be_imported_later():
 def test_help_loads_nothing_that_it_does_not_need():
     """Most of the time of a command that asks a server would be these."""
     code = (
-        "import sys\nfrom surrogym_client.cli import build\nbuild()\n"
+        "import sys\nfrom surrogym.cli import build\nbuild()\n"
         "print({name for name in ('gymnasium', 'numpy', 'torch', 'httpx', 'pydantic', 'scipy') if name in sys.modules})"
     )
     assert run(code).strip() == "set()"

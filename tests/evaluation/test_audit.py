@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from surrogym_client.evaluation.audit import Compared, chi_squared, differences, gaps, judge, places
-from surrogym_client.original.classic import pendulum
-from surrogym_client.policies.evidence import Promise
+from surrogym_sampler.original.classic import pendulum
+from surrogym_trainer.evaluation.audit import Compared, chi_squared, differences, gaps, judge, places
+from surrogym_trainer.policies.evidence import Promise
 
 PROMISE = Promise(median=-150.0, low=-160.0, high=-140.0, functions=32, episodes=256)
 UNTRAINED = -1_200.0

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from support.moody import SPEC
-from surrogym_client.cli.disagreement import Differing
-from surrogym_client.evaluation.audit import Compared
-from surrogym_client.evaluation.comparing import MOST, Disagreements, disagreements, samples_of, steady, steps_of
-from surrogym_client.evaluation.consequences import effects_of
-from surrogym_client.evaluation.evaluator import Trace
+from surrogym.cli.disagreement import Differing
+from surrogym_trainer.evaluation.audit import Compared
+from surrogym_trainer.evaluation.comparing import MOST, Disagreements, disagreements, samples_of, steady, steps_of
+from surrogym_trainer.evaluation.consequences import effects_of
+from surrogym_trainer.evaluation.evaluator import Trace
 
 NAMES = ("x", "reward")
 

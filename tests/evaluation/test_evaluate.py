@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from support.moody import Alike, Line
-from surrogym_client import original
-from surrogym_client.evaluation.evaluator import (
+from surrogym_sampler import original
+from surrogym_sampler.original.actions import decode_actions, explored
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.errors import NotPerturbable
+from surrogym_shared.spec import Success
+from surrogym_trainer.evaluation.evaluator import (
     EvaluationInterrupted,
     EvaluationSettings,
     evaluate,
     interquartile_mean,
 )
-from surrogym_client.evaluation.reporting import words_of
-from surrogym_client.original.actions import decode_actions, explored
-from surrogym_client.original.episodes import open_episode
-from surrogym_client.original.errors import NotPerturbable
-from surrogym_shared.spec import Success
+from surrogym_trainer.evaluation.reporting import words_of
 
 
 def pendulum_policy(observation):

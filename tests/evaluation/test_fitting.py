@@ -10,12 +10,12 @@ import pytest
 from support.moody import SPEC as LINE
 from support.moody import Line
 from support.rail import SPEC as RAIL
-from surrogym_client.evaluation.evaluator import EvaluationSettings, evaluate
-from surrogym_client.original.classic import pendulum
-from surrogym_client.original.episodes import open_episode
-from surrogym_client.original.errors import PolicyMisfit
-from surrogym_client.original.fitting import check_policy
+from surrogym_sampler.original.classic import pendulum
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.errors import PolicyMisfit
+from surrogym_sampler.original.fitting import check_policy
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, ObservationEntry, Term
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 
 
 def changed(**fields: object) -> EnvironmentSpec:

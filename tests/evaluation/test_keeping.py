@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from support.rail import SPEC
-from surrogym_client.evaluation.keeping import rewrite_steps, write_steps
-from surrogym_client.logs import UnusableLog, read_log
-from surrogym_client.logs.importing import Options
+from surrogym_sampler.logs import UnusableLog, read_log
+from surrogym_sampler.logs.importing import Options
 from surrogym_shared.logs.writing import npz_of_steps
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import NewSample
+from surrogym_trainer.evaluation.keeping import rewrite_steps, write_steps
 
 
 def steps_from(first: float, count: int = 50) -> list[NewSample]:

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from support.machine import Machine, SettableMachine, Simulator, diary_in, most_at_once, note
-from surrogym_client import original
-from surrogym_client.evaluation import EvaluationInterrupted, EvaluationSettings, evaluate
-from surrogym_client.original.episodes import open_episode
-from surrogym_client.original.errors import EvaluationFailed, NotParallel, PolicyMisfit
-from surrogym_client.original.port import OriginalPort
 from surrogym_client.runtime.lifetime import terminations_as_interrupts
+from surrogym_sampler import original
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.errors import EvaluationFailed, NotParallel, PolicyMisfit
+from surrogym_sampler.original.port import OriginalPort
 from surrogym_shared.wire import OpenSession
+from surrogym_trainer.evaluation import EvaluationInterrupted, EvaluationSettings, evaluate
 
 EPISODES = 3
 STEPS = 20  # of an episode of these machines

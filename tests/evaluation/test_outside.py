@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surrogym_client.evaluation.outside import LITTLE, outside_of
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
+from surrogym_trainer.evaluation.outside import LITTLE, outside_of
 
 
 def steps(speeds: tuple[float, float], rows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

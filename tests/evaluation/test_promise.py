@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from surrogym_client.evaluation.promise import EVALUATION_STARTS, FUNCTIONS, STARTS, UNNOTICED, interval, promise_of
 from surrogym_client.transport import HttpSurrogate
+from surrogym_trainer.evaluation.promise import EVALUATION_STARTS, FUNCTIONS, STARTS, UNNOTICED, interval, promise_of
 
 Z = 1.6449  # of a standard normal's 95 % quantile
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surrogym_client.evaluation.ranges import LITTLE, range_left
-from surrogym_client.original.classic import pendulum
-from surrogym_client.policies.evidence import Audit, Promise, RangeLeft
-from surrogym_client.training.handover import Handover
-from surrogym_client.training.words import words_of_handover
+from surrogym_sampler.original.classic import pendulum
+from surrogym_trainer.evaluation.ranges import LITTLE, range_left
+from surrogym_trainer.policies.evidence import Audit, Promise, RangeLeft
+from surrogym_trainer.training.handover import Handover
+from surrogym_trainer.training.words import words_of_handover
 
 SPEC = pendulum()  # an angle, and a speed that is sampled from -8 to 8
 

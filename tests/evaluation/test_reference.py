@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogym_client.cli.beside import Beside
-from surrogym_client.cli.errors import CommandError
-from surrogym_client.cli.groups import PolicyReading
-from surrogym_client.evaluation.evaluator import EvaluationSettings, evaluate
-from surrogym_client.evaluation.reference import load_reference
-from surrogym_client.original.episodes import open_episode
-from surrogym_client.original.errors import PolicyMisfit, UnknownEnvironment
-from surrogym_client.original.loading import make
-from surrogym_client.policies.card import PolicyCard
+from surrogym.cli.beside import Beside
+from surrogym.cli.errors import CommandError
+from surrogym.cli.groups import PolicyReading
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.errors import PolicyMisfit, UnknownEnvironment
+from surrogym_sampler.original.loading import make
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_trainer.evaluation.reference import load_reference
+from surrogym_trainer.policies.card import PolicyCard
 
 MODULE = """
 import numpy as np

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surrogym_client.evaluation.audit import Consequence
-from surrogym_client.evaluation.systematic import Inputs, Systematic, region, systematic
-from surrogym_client.original.classic import pendulum
-from surrogym_client.policies.evidence import Promise
+from surrogym_sampler.original.classic import pendulum
+from surrogym_trainer.evaluation.audit import Consequence
+from surrogym_trainer.evaluation.systematic import Inputs, Systematic, region, systematic
+from surrogym_trainer.policies.evidence import Promise
 
 PROMISE = Promise(median=180.0, low=170.0, high=190.0, functions=32, episodes=256)
 OUTPUTS, INPUTS = 3, 4

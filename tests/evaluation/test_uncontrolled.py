@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
-from surrogym_client.evaluation.reporting import as_reported, paired_start
-from surrogym_client.evaluation.uncontrolled import baseline, default_baseline
-from surrogym_client.original.actions import decode_actions
-from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_sampler.original.actions import decode_actions
+from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_shared.spec import BoxAction
+from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
+from surrogym_trainer.evaluation.reporting import as_reported, paired_start
+from surrogym_trainer.evaluation.uncontrolled import baseline, default_baseline
 
 
 def test_zero_where_zero_is_an_action_and_random_choices_elsewhere():

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
-from surrogym_client.evaluation.reporting import as_reported, is_promised
-from surrogym_client.original.episodes import open_episode
-from surrogym_client.original.protocol import RealStep
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.protocol import RealStep
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, Fixed, ObservationEntry, Term, Uniform
+from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
+from surrogym_trainer.evaluation.reporting import as_reported, is_promised
 
 SETTINGS = EvaluationSettings(episodes=3)
 SPEC = EnvironmentSpec(

@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 
 from surrogym_client.environments.pictures import NotRenderable
-from surrogym_client.evaluation import videos
-from surrogym_client.evaluation.evaluator import Evaluation, Trace
-from surrogym_client.original.classic import cartpole
-from surrogym_client.original.rendering import renderer_of
+from surrogym_sampler.original.classic import cartpole
+from surrogym_sampler.original.rendering import renderer_of
+from surrogym_trainer.evaluation import videos
+from surrogym_trainer.evaluation.evaluator import Evaluation, Trace
 
 SPEC = cartpole()
 

@@ -11,9 +11,9 @@ import pytest
 from support.examples import EXAMPLES, cells, run, surrogym
 from support.server import ServerProcess
 from surrogym import Design
-from surrogym_client.original import OriginalEnvironment, make
-from surrogym_client.original.protocol import RolloutEnvironment
 from surrogym_client.transport import Api
+from surrogym_sampler.original import OriginalEnvironment, make
+from surrogym_sampler.original.protocol import RolloutEnvironment
 
 ENVIRONMENT_LINES = 60  # of one's own environment, without blank ones
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from support.examples import ROOT
-from surrogym_client import original
-from surrogym_client.diagnosis.executables import conformance
-from surrogym_client.original.classic import cartpole
+from surrogym_sampler import original
+from surrogym_sampler.diagnosis.executables import conformance
+from surrogym_sampler.original.classic import cartpole
 from surrogym_shared.spec import EnvironmentSpec
 
 FOLDER = ROOT / "examples" / "executables"

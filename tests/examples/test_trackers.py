@@ -7,7 +7,7 @@ from pathlib import Path
 from support.examples import EXTRAS, needs_extras, run
 from support.server import ServerProcess
 
-TRAIN = ("-m", "surrogym_client", "train", "pendulum", "--steps", "1024", "--num-envs", "8", "--quiet")
+TRAIN = ("-m", "surrogym", "train", "pendulum", "--steps", "1024", "--num-envs", "8", "--quiet")
 
 
 @needs_extras

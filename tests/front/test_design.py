@@ -13,8 +13,8 @@ import pytest
 import surrogym
 from support import teaching
 from support.server import ServerProcess
-from surrogym_client.original.classic import cartpole, pendulum
-from surrogym_client.original.gymnasium import GymnasiumEnvironment
+from surrogym_sampler.original.classic import cartpole, pendulum
+from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
 from surrogym_server.errors import InvalidInput
 from surrogym_shared.surrogate_file import SurrogateFile
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import surrogym
-from surrogym_client import original
+from surrogym_sampler import original
 from surrogym_server.environment.points import Points
 from surrogym_server.sampling.design import monte_carlo
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogym_client.logs import ReadLog, UnusableLog, read_log
+from surrogym_sampler.logs import ReadLog, UnusableLog, read_log
 
 RNG = np.random.default_rng(0)
 STATES = RNG.normal(size=(21, 2))
@@ -48,7 +48,7 @@ def test_rewards_of_one_column_are_the_reward(tmp_path: Path):
 
 
 def test_the_command_says_the_role_of_each_column(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    from surrogym_client.cli import main
+    from surrogym.cli import main
 
     path = tmp_path / "log.npz"
     np.savez(path, **VECTORS, late=np.zeros(20), dt=0.05)

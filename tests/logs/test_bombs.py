@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogym_client.logs import UnusableLog, read_log
+from surrogym_sampler.logs import UnusableLog, read_log
 
 MIB = 1024**2
 

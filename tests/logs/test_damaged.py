@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogym_client.logs import UnusableLog, read_log
+from surrogym_sampler.logs import UnusableLog, read_log
 
 RNG = np.random.default_rng(0)
 COLUMNS = {"action": RNG.normal(size=60), "reward": RNG.normal(size=60)}

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from support import reactor
-from surrogym_client.logs import ReadLog, UnusableLog, read_log
-from surrogym_client.logs.importing import Options
-from surrogym_client.original import make
+from surrogym_sampler.logs import ReadLog, UnusableLog, read_log
+from surrogym_sampler.logs.importing import Options
+from surrogym_sampler.original import make
 from surrogym_shared.spec import Bounds, BoxAction, DeclaredReward, DiscreteAction, Fixed, Uniform
 
 RNG = np.random.default_rng(0)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogym_client.logs import ReadLog, UnusableLog, read_log
+from surrogym_sampler.logs import ReadLog, UnusableLog, read_log
 
 NAMES = ("state_Größe", "state_x", "action_u", "reward")
 ENCODINGS = {"utf-8": "", "utf-8-sig": "", "utf-16": "UTF-16", "utf-16-le": "UTF-16-LE", "utf-16-be": "UTF-16-BE"}
@@ -68,7 +68,7 @@ def test_a_text_without_a_heading_is_refused_with_the_cause(tmp_path: Path, seed
 
 def test_numbers_from_zero_may_name_columns(tmp_path: Path):
     (tmp_path / "log.csv").write_text("0,1,2\n" + "".join(f"{k % 5},{k % 3}.5,{-k}\n" for k in range(9)))
-    from surrogym_client.logs.importing import Options
+    from surrogym_sampler.logs.importing import Options
 
     mapping = {"state": {"x": "0"}, "action": {"u": "1"}, "reward": "2"}
     assert len(read_log(tmp_path / "log.csv", Options(mapping=mapping)).steps)
@@ -86,7 +86,7 @@ def test_comment_lines_between_rows_are_counted(tmp_path: Path):
     ("content", "says"),
     [
         (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(50), "Excel.*: save the table as CSV"),
-        (gzip.compress(b"a,b\n1,2\n"), "a file of gzip: decompress it first"),
+        (gzip.compress(b"a,b\n1,2\n", mtime=0), "a file of gzip: decompress it first"),
         (b"SQLite format 3\x00" + bytes(50), "a database of SQLite"),
         (b"\x93NUMPY\x01\x00", "a single array of NumPy"),
         (b"\x89HDF\r\n\x1a\n" + bytes(200), "expected an HDF5 file in .*, got one that can't be read"),

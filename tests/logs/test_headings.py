@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogym_client.logs import ReadLog, UnusableLog, read_log
-from surrogym_client.logs.importing import Options
+from surrogym_sampler.logs import ReadLog, UnusableLog, read_log
+from surrogym_sampler.logs.importing import Options
 from surrogym_shared.logs.columns import roles_by_name
 from surrogym_shared.logs.headings import heading
 

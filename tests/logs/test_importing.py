@@ -10,10 +10,10 @@ import pytest
 from support import reactor
 from support.server import ServerProcess
 from surrogym_client.errors import ServerUnreachable, UnknownSurrogate
-from surrogym_client.logs import UnusableLog, import_log, importing
 from surrogym_client.surrogates.transfer import export_surrogate, import_surrogate
 from surrogym_client.surrogates.waiting import wait_for_model
 from surrogym_client.transport import Api
+from surrogym_sampler.logs import UnusableLog, import_log, importing
 from surrogym_shared.surrogate_file import SurrogateFile
 
 ROWS = 60
@@ -172,7 +172,7 @@ def test_an_unknown_surrogate_and_a_server_that_is_away_are_named(server_process
 def test_the_command_drafts_registers_and_waits(
     server_process: ServerProcess, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
 ):
-    from surrogym_client.cli import main
+    from surrogym.cli import main
 
     path = reactor.log(runs=3, length=20).at(4, "temperature", "nan").write(tmp_path / "log.csv")
     common = ["import", str(path), "--register", name, "--draft", str(tmp_path / "spec.json"), "--wait", "120"]
@@ -209,7 +209,7 @@ def test_the_command_drafts_registers_and_waits(
 def test_wrong_options_of_a_log_are_refused(
     log: Path, capsys: pytest.CaptureFixture[str], options: list[str], says: str
 ):
-    from surrogym_client.cli import main
+    from surrogym.cli import main
 
     with pytest.raises(SystemExit) as ended:
         main(["import", str(log), *options])
@@ -220,7 +220,7 @@ def test_wrong_options_of_a_log_are_refused(
 def test_an_unreachable_server_is_reported_before_any_loss(log: Path, monkeypatch: pytest.MonkeyPatch):
     from surrogym_client.transport.connection import Retries
 
-    monkeypatch.setattr("surrogym_client.logs.importing.Api", lambda *given: Api(*given, retries=Retries(seconds=0)))
+    monkeypatch.setattr("surrogym_sampler.logs.importing.Api", lambda *given: Api(*given, retries=Retries(seconds=0)))
     with pytest.raises(ServerUnreachable):
         import_log(log, register="a", url="http://127.0.0.1:9")
 
@@ -228,7 +228,7 @@ def test_an_unreachable_server_is_reported_before_any_loss(log: Path, monkeypatc
 def test_the_next_command_has_the_options_of_this_one(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    from surrogym_client.cli import main
+    from surrogym.cli import main
 
     monkeypatch.chdir(tmp_path)
     Path("my map.json").write_text(json.dumps(reactor.MAPPING))
@@ -250,7 +250,7 @@ def test_a_log_without_a_reward_leads_to_its_declaration(
     monkeypatch: pytest.MonkeyPatch,
 ):
     """The last line led to a surrogate with a reward of 0, and to its training."""
-    from surrogym_client.cli import main
+    from surrogym.cli import main
 
     def last(*options: str) -> str:
         with pytest.raises(SystemExit) as ended:

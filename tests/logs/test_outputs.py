@@ -9,10 +9,10 @@ import pytest
 
 from support import reactor
 from support.server import ServerProcess
-from surrogym_client.cli import main
-from surrogym_client.logs import UnusableLog, import_log
-from surrogym_client.logs.importing import keep_rejected, read_log
+from surrogym.cli import main
 from surrogym_client.transport import Api
+from surrogym_sampler.logs import UnusableLog, import_log
+from surrogym_sampler.logs.importing import keep_rejected, read_log
 
 NOWHERE = "http://127.0.0.1:9"  # no server: a refusal comes before a request
 

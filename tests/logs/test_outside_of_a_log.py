@@ -9,13 +9,13 @@ import pytest
 
 from support import reactor
 from support.server import ServerProcess
-from surrogym_client.logs import import_log, read_log
-from surrogym_client.logs.importing import Options
 from surrogym_client.surrogates.waiting import wait_for_model
-from surrogym_client.training.handover import Handover, Subject, hand_over
-from surrogym_client.training.words import words_of_handover
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.logs import import_log, read_log
+from surrogym_sampler.logs.importing import Options
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.training.handover import Handover, Subject, hand_over
+from surrogym_trainer.training.words import words_of_handover
 
 
 def handed_over(url: str, log: Path, name: str, spec: EnvironmentSpec) -> Handover:

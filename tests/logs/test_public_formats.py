@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogym_client.logs import UnusableLog, read_log
+from surrogym_sampler.logs import UnusableLog, read_log
 
 LENGTHS = (6, 4, 5)  # observations of each episode
 TERMINAL = (True, False, True)

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from support import reactor
-from surrogym_client.logs import ReadLog, UnusableLog, read_log
-from surrogym_client.logs.importing import Options, keep_rejected
-from surrogym_client.logs.reading import format_of
+from surrogym_sampler.logs import ReadLog, UnusableLog, read_log
+from surrogym_sampler.logs.importing import Options, keep_rejected
+from surrogym_sampler.logs.reading import format_of
 from surrogym_shared.logs.columns import roles_by_name
 from surrogym_shared.logs.table import stamps
 from surrogym_shared.spec import BoxAction, DiscreteAction

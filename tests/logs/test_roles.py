@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from surrogym_client.logs import UnusableLog
+from surrogym_sampler.logs import UnusableLog
 from surrogym_shared.logs.columns import roles_by_file, roles_by_map, roles_by_name
 
 NAMES = ["x", "y", "v", "r"]

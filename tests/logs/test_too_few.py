@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from support import reactor
-from surrogym_client.logs import UnusableLog, import_log, read_log
-from surrogym_client.logs.importing import Options
+from surrogym_sampler.logs import UnusableLog, import_log, read_log
+from surrogym_sampler.logs.importing import Options
 from surrogym_shared.logs.too_few import TooFewSteps
 
 

@@ -9,9 +9,9 @@ import pytest
 
 from support import reactor
 from support.server import ServerProcess
-from surrogym_client.logs import importing
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.logs import importing
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.units import require_reward_unit, require_units
 

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from support.simulators import CASES, Register, installed
-from surrogym_client.original.adapters import open_simulator
-from surrogym_client.original.adapters.parts import action_of
-from surrogym_client.original.adapters.pcgym import parameters_of
-from surrogym_client.original.errors import UnknownEnvironment
-from surrogym_client.original.simulator import Simulator
+from surrogym_sampler.original.adapters import open_simulator
+from surrogym_sampler.original.adapters.parts import action_of
+from surrogym_sampler.original.adapters.pcgym import parameters_of
+from surrogym_sampler.original.errors import UnknownEnvironment
+from surrogym_sampler.original.simulator import Simulator
 
 
 def random_action(simulator: Simulator, rng: np.random.Generator) -> np.ndarray:
@@ -246,7 +246,7 @@ def test_an_id_of_a_module_in_the_working_directory_is_opened(tmp_path, monkeypa
 
 def test_a_column_of_numbers_is_no_image():
     """An observation of shape (n, 1) was refused as an image."""
-    from surrogym_client.original.adapters.parts import flat
+    from surrogym_sampler.original.adapters.parts import flat
 
     assert flat("own", {"b": np.ones((3, 1)), "a": np.zeros((1, 1))}).tolist() == [0, 1, 1, 1]
     with pytest.raises(UnknownEnvironment, match="observes images"):

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surrogym_client import original
-from surrogym_client.original.classic import TASKS
-from surrogym_client.original.gymnasium import native_action, wrapped
+from surrogym_sampler import original
+from surrogym_sampler.original.classic import TASKS
+from surrogym_sampler.original.gymnasium import native_action, wrapped
 from surrogym_shared import terms
 from surrogym_shared.spec import limits
 

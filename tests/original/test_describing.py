@@ -13,10 +13,10 @@ import pytest
 
 import surrogym
 from support.simulators import CASES, Register, Spiral, installed
-from surrogym_client import original
-from surrogym_client.original.describing import Description, describe
-from surrogym_client.original.simulator import Simulated
-from surrogym_client.original.state_parts import Attribute, holds_numbers
+from surrogym_sampler import original
+from surrogym_sampler.original.describing import Description, describe
+from surrogym_sampler.original.simulator import Simulated
+from surrogym_sampler.original.state_parts import Attribute, holds_numbers
 from surrogym_shared import terms
 from surrogym_shared.spec import EnvironmentSpec, limits
 

@@ -16,16 +16,16 @@ import pytest
 
 from support.noting import until
 from support.programs import HANGS, NOTES_ITSELF, UNTERMINABLE, left_behind, program
-from surrogym_client import original
-from surrogym_client.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
-from surrogym_client.original.executables.messages import decode
-from surrogym_client.original.executables.program import Program
-from surrogym_client.original.loading import is_known
+from surrogym_sampler import original
+from surrogym_sampler.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_sampler.original.executables.messages import decode
+from surrogym_sampler.original.executables.program import Program
+from surrogym_sampler.original.loading import is_known
 
 SHELL = Path(__file__).parents[2] / "examples" / "executables" / "rail.sh"
 MOODY = """
 import json, os, sys, time
-from surrogym_client.original.classic import cartpole
+from surrogym_sampler.original.classic import cartpole
 for line in sys.stdin:
     asked = json.loads(line)
     result = {"state": asked.get("state", [0, 0, 0, 0])}
@@ -142,7 +142,7 @@ def test_the_last_line_of_standard_error_is_in_the_error(capfd: pytest.CaptureFi
 def test_a_flood_on_standard_error_does_not_stop_the_program(monkeypatch: pytest.MonkeyPatch):
     """This process's own standard error is a pipe that nobody reads."""
     reading, writing = os.pipe()
-    monkeypatch.setattr("surrogym_client.original.executables.standard_error.OWN", writing)
+    monkeypatch.setattr("surrogym_sampler.original.executables.standard_error.OWN", writing)
     plant = moody("[print('x' * 10**6, file=sys.stderr) for _ in range(30)]")
     try:
         assert plant.step_from(np.zeros(4), np.ones(1)).reward > 0
@@ -193,7 +193,7 @@ def test_a_late_answer_is_never_taken_for_another_request(tmp_path):
 
 def test_a_program_ends_with_a_client_that_is_killed(tmp_path):
     name = f"exec:{program(tmp_path, NOTES_ITSELF)}"
-    client = f"import time; from surrogym_client import original; plant = original.make({name!r}); time.sleep(3600)"
+    client = f"import time; from surrogym_sampler import original; plant = original.make({name!r}); time.sleep(3600)"
     process = subprocess.Popen([sys.executable, "-c", client])
     try:
         assert until(lambda: (tmp_path / "pids").exists() and (tmp_path / "pids").read_text())
@@ -209,8 +209,8 @@ def test_a_program_that_hangs_is_ended_after_its_client_was_killed(tmp_path):
     command = program(tmp_path, NOTES_ITSELF, UNTERMINABLE, hangs)
     client = f"""
 import time
-from surrogym_client.original.executables.messages import decode
-from surrogym_client.original.executables.program import Program
+from surrogym_sampler.original.executables.messages import decode
+from surrogym_sampler.original.executables.program import Program
 plant = Program({command!r}, grace=0.0)
 plant.start()
 plant.ask("step", time.monotonic() + 3600, action=[1.0])

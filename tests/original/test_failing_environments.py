@@ -9,9 +9,9 @@ import pytest
 from gymnasium.spaces import Box, Discrete, Space
 
 from support.simulators import Register, Spiral
-from surrogym_client.original.adapters import open_simulator
-from surrogym_client.original.describing import describe
-from surrogym_client.original.errors import StepFailed, UnknownEnvironment, sentence
+from surrogym_sampler.original.adapters import open_simulator
+from surrogym_sampler.original.describing import describe
+from surrogym_sampler.original.errors import StepFailed, UnknownEnvironment, sentence
 
 STEPS = 60
 

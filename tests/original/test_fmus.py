@@ -22,13 +22,13 @@ from support.fmus import (
     rewarded,
     squared,
 )
-from surrogym_client import original
-from surrogym_client.original.adapters.fmu import Fmu, open_simulator
-from surrogym_client.original.describing import describe
-from surrogym_client.original.episodes import open_episode
-from surrogym_client.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
-from surrogym_client.original.fmus.environment import FmuEnvironment
-from surrogym_client.original.loading import fits, is_known, isolated
+from surrogym_sampler import original
+from surrogym_sampler.original.adapters.fmu import Fmu, open_simulator
+from surrogym_sampler.original.describing import describe
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_sampler.original.fmus.environment import FmuEnvironment
+from surrogym_sampler.original.loading import fits, is_known, isolated
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from support.fmus import EXAMPLES, STATES, build, changed, mapping
-from surrogym_client.original.adapters.fmu import open_simulator
-from surrogym_client.original.errors import UnknownEnvironment
-from surrogym_client.original.fmus import archive
+from surrogym_sampler.original.adapters.fmu import open_simulator
+from surrogym_sampler.original.errors import UnknownEnvironment
+from surrogym_sampler.original.fmus import archive
 
 pytest.importorskip("fmpy")
 pytest.importorskip("pythonfmu")

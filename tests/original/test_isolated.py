@@ -14,10 +14,10 @@ import pytest
 
 from support.machine import DIARY, STEP_SECONDS
 from support.noting import until
-from surrogym_client import original
-from surrogym_client.original import RealStep
-from surrogym_client.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
-from surrogym_client.original.isolated import IsolatedEnvironment
+from surrogym_sampler import original
+from surrogym_sampler.original import RealStep
+from surrogym_sampler.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_sampler.original.isolated import IsolatedEnvironment
 
 
 class Moody:
@@ -131,7 +131,7 @@ def _alive(pid):
 HELD = """
 import sys, time, os, signal
 import numpy as np
-from surrogym_client.original.isolated import IsolatedEnvironment
+from surrogym_sampler.original.isolated import IsolatedEnvironment
 from support.machine import Deliberate
 
 if __name__ == "__main__":
@@ -213,7 +213,7 @@ def test_the_answer_to_an_interrupted_step_reaches_no_other_request():
 
 
 def test_one_that_does_not_start_in_time_is_replaced(monkeypatch):
-    monkeypatch.setattr("surrogym_client.original.isolated.START_LIMIT", 0.0)
+    monkeypatch.setattr("surrogym_sampler.original.isolated.START_LIMIT", 0.0)
     with IsolatedEnvironment(Moody) as environment:
         with pytest.raises(StepTimedOut, match="to start"):
             environment.spec()

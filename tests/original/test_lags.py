@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from support.rail import SPEC, Rail
-from surrogym_client.original.errors import StepFailed
-from surrogym_client.original.protocol import RolloutEnvironment
-from surrogym_client.original.rollouts import FromReset, answering
+from surrogym_sampler.original.errors import StepFailed
+from surrogym_sampler.original.protocol import RolloutEnvironment
+from surrogym_sampler.original.rollouts import FromReset, answering
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,

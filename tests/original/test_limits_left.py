@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from surrogym_client.original.describing.counting import Counted
-from surrogym_client.original.describing.exploring import explore
-from surrogym_client.original.describing.probing import ANYWHERE, Probed, probe
-from surrogym_client.original.simulator import Simulator, Taken, Variable
+from surrogym_sampler.original.describing.counting import Counted
+from surrogym_sampler.original.describing.exploring import explore
+from surrogym_sampler.original.describing.probing import ANYWHERE, Probed, probe
+from surrogym_sampler.original.simulator import Simulator, Taken, Variable
 from surrogym_shared.spec import BoxAction
 
 

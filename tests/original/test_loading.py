@@ -6,16 +6,16 @@ import textwrap
 import numpy as np
 import pytest
 
-from surrogym_client import original
-from surrogym_client.original.describing import describe
-from surrogym_client.original.episodes import open_episode
-from surrogym_client.original.errors import UnknownEnvironment
-from surrogym_client.original.loading import is_known
+from surrogym_sampler import original
+from surrogym_sampler.original.describing import describe
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.errors import UnknownEnvironment
+from surrogym_sampler.original.loading import is_known
 from surrogym_shared.spec import BoxAction, DiscreteAction, Reward
 
 OWN = textwrap.dedent(
     """
-    from surrogym_client.original import RealStep
+    from surrogym_sampler.original import RealStep
     from surrogym_shared.spec import *
 
     class Cart:

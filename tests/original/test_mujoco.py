@@ -4,8 +4,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from surrogym_client import original
-from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
+from surrogym_sampler import original
+from surrogym_sampler.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_shared import terms
 from surrogym_shared.spec import limits
 

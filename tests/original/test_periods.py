@@ -9,12 +9,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from surrogym_client import original
-from surrogym_client.original.describing import describe
-from surrogym_client.original.errors import PolicyMisfit, UnknownEnvironment
-from surrogym_client.original.fitting import check_policy
-from surrogym_client.original.periods import period_of
-from surrogym_client.sampler.query_limits import check_environment
+from surrogym_sampler import original
+from surrogym_sampler.original.describing import describe
+from surrogym_sampler.original.errors import PolicyMisfit, UnknownEnvironment
+from surrogym_sampler.original.fitting import check_policy
+from surrogym_sampler.original.periods import period_of
+from surrogym_sampler.queries.query_limits import check_environment
 
 SPEC = original.make("Pendulum-v1").spec()  # its environment has the attribute dt, 0.05 s
 
@@ -58,7 +58,7 @@ def test_two_specifications_of_different_periods_do_not_fit() -> None:
 
 def test_a_class_of_ones_own_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = """
-        from surrogym_client import original
+        from surrogym_sampler import original
 
         class Fast:
             dt = 0.0025

@@ -6,13 +6,13 @@ import gymnasium
 import numpy as np
 import pytest
 
-from surrogym_client import original
-from surrogym_client.original.episodes import GymnasiumEpisode, open_episode
-from surrogym_client.original.port import OriginalPort
 from surrogym_client.sb3 import SurrogateVecEnv
-from surrogym_client.training import TrainSettings, train
+from surrogym_sampler import original
+from surrogym_sampler.original.episodes import GymnasiumEpisode, open_episode
+from surrogym_sampler.original.port import OriginalPort
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import OpenSession
+from surrogym_trainer.training import TrainSettings, train
 
 
 def port_of(name: str) -> OriginalPort:

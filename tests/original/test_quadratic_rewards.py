@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from support.simulators import Register, Spiral, installed
-from surrogym_client.original.describing import describe
-from surrogym_client.original.describing.rewarding import Paid, may_be_quadratic, quadratic_reward
+from surrogym_sampler.original.describing import describe
+from surrogym_sampler.original.describing.rewarding import Paid, may_be_quadratic, quadratic_reward
 from surrogym_shared.logs.rewards import declared_reward
 from surrogym_shared.spec import (
     BoxAction,

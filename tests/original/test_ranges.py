@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from support.toys import Toy
-from surrogym_client.original.describing.counting import Counted
-from surrogym_client.original.describing.exploring import EPISODES, STEPS, Seen, explore
-from surrogym_client.original.describing.ranges import FASTER
-from surrogym_client.original.simulator import Taken, Variable
+from surrogym_sampler.original.describing.counting import Counted
+from surrogym_sampler.original.describing.exploring import EPISODES, STEPS, Seen, explore
+from surrogym_sampler.original.describing.ranges import FASTER
+from surrogym_sampler.original.simulator import Taken, Variable
 from surrogym_shared.spec import BoxAction
 
 GRAVITY = 20.0  # rad/s^2, of a weightless rod with a mass at its end

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from support.rail import DiesRight, HangsRight, Rail, RaisesRight
-from surrogym_client import original
-from surrogym_client.original.episodes import RolloutEpisode, open_episode
-from surrogym_client.original.errors import EnvironmentDied, NotSettable, StepFailed, StepTimedOut, UnknownEnvironment
-from surrogym_client.original.isolated import IsolatedEnvironment
-from surrogym_client.original.protocol import OriginalEnvironment, RolloutEnvironment
-from surrogym_client.original.rollouts import FromReset, answering
+from surrogym_sampler import original
+from surrogym_sampler.original.episodes import RolloutEpisode, open_episode
+from surrogym_sampler.original.errors import EnvironmentDied, NotSettable, StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_sampler.original.isolated import IsolatedEnvironment
+from surrogym_sampler.original.protocol import OriginalEnvironment, RolloutEnvironment
+from surrogym_sampler.original.rollouts import FromReset, answering
 
 RIGHT, LEFT = np.array([1.0]), np.array([-1.0])
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from support.rail import SPEC, Rail
-from surrogym_client import original
-from surrogym_client.original.errors import StepFailed, UnknownEnvironment
-from surrogym_client.original.rollouts import FromReset, answering
+from surrogym_sampler import original
+from surrogym_sampler.original.errors import StepFailed, UnknownEnvironment
+from surrogym_sampler.original.rollouts import FromReset, answering
 from surrogym_shared.spec import with_history
 
 SHELL = Path(__file__).parents[2] / "examples" / "executables" / "rail.sh"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from support.toys import Toy
-from surrogym_client.original.describing import description
-from surrogym_client.original.simulator import Taken, Variable
+from surrogym_sampler.original.describing import description
+from surrogym_sampler.original.simulator import Taken, Variable
 from surrogym_shared.spec import BoxAction, limits
 
 STEP = 0.01  # s

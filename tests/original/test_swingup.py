@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from surrogym_client.original.swingup import GRAVITY, CartPoleSwingUp
+from surrogym_sampler.original.swingup import GRAVITY, CartPoleSwingUp
 
 HANGING, UPRIGHT = np.zeros(4), np.array([0, 0, np.pi, 0])
 

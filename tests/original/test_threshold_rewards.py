@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from support.simulators import Register, Spiral, installed
-from surrogym_client.original.describing import describe
-from surrogym_client.original.describing.rewarding import Paid
-from surrogym_client.original.describing.thresholds import (
+from surrogym_sampler.original.describing import describe
+from surrogym_sampler.original.describing.rewarding import Paid
+from surrogym_sampler.original.describing.thresholds import (
     BATCH,
     ENOUGH,
     HALVINGS,

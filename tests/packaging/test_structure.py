@@ -8,10 +8,13 @@ from pathlib import Path
 
 import surrogym
 import surrogym_client
+import surrogym_sampler
 import surrogym_server
 import surrogym_shared
+import surrogym_trainer
 
-PACKAGES = [Path(str(one.__file__)).parent for one in (surrogym, surrogym_client, surrogym_server, surrogym_shared)]
+OURS = (surrogym, surrogym_client, surrogym_sampler, surrogym_trainer, surrogym_server, surrogym_shared)
+PACKAGES = [Path(str(package.__file__)).parent for package in OURS]
 TESTS = Path(__file__).parents[1]
 UNFINISHED = re.compile(r"\b(TODO|FIXME|XXX)\b")
 

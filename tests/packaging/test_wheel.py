@@ -1,4 +1,4 @@
-"""The wheel holds all a user needs: four packages, migrations, the page, the marks of typed packages, the commands."""
+"""The wheel holds all a user needs: six packages, migrations, the page, the marks of typed packages, the commands."""
 
 from __future__ import annotations
 
@@ -10,7 +10,14 @@ from zipfile import ZipFile
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = {"front": "surrogym", "client": "surrogym_client", "server": "surrogym_server", "shared": "surrogym_shared"}
+PACKAGES = {
+    "surrogym": "client",
+    "surrogym_client": "client",
+    "surrogym_sampler": "client",
+    "surrogym_trainer": "client",
+    "surrogym_server": "server",
+    "surrogym_shared": "shared",
+}
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +32,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> ZipFile:
 def test_it_holds_every_source_file_and_nothing_else(wheel: ZipFile) -> None:
     expected = {
         path.relative_to(ROOT / folder).as_posix()
-        for folder, package in PACKAGES.items()
+        for package, folder in PACKAGES.items()
         for path in (ROOT / folder / package).rglob("*")
         if path.is_file() and path.suffix != ".pyc"
     }
@@ -39,7 +46,7 @@ def test_it_holds_every_source_file_and_nothing_else(wheel: ZipFile) -> None:
         "surrogym_server/storage/sql/migrations/versions/r0100_first_schema.py",
         "surrogym_server/dashboard/index.html",
         "surrogym_server/dashboard/uplot/LICENSE",
-        *(f"{package}/py.typed" for package in PACKAGES.values()),
+        *(f"{package}/py.typed" for package in PACKAGES),
     ],
 )
 def test_it_holds_what_is_easily_forgotten(wheel: ZipFile, name: str) -> None:
@@ -49,7 +56,7 @@ def test_it_holds_what_is_easily_forgotten(wheel: ZipFile, name: str) -> None:
 def test_it_brings_the_commands(wheel: ZipFile) -> None:
     (entry_points,) = (name for name in wheel.namelist() if name.endswith("entry_points.txt"))
     text = wheel.read(entry_points).decode()
-    assert "surrogym = surrogym_client.cli:main" in text
+    assert "surrogym = surrogym.cli:main" in text
     assert "gradients = surrogym_server.gradients" in text
     assert "serve = surrogym_server.cli.serve:register" in text
 

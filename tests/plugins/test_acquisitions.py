@@ -10,8 +10,8 @@ import pytest
 
 from support.server import ServerProcess
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.spec import AcquisitionChoice as Choice
 from surrogym_shared.spec import Design
 

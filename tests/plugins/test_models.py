@@ -12,7 +12,7 @@ import httpx
 import pytest
 
 from support.server import ServerProcess
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.models.registry import MODELS
 from surrogym_server.testing import LAWS_OF_MODELS, ModelCase, model_cases
 from surrogym_shared.spec import EnvironmentSpec, ModelChoice
@@ -29,7 +29,7 @@ def designed(model: str | ModelChoice, budget: int = 16) -> EnvironmentSpec:
 
 def surrogym(server: ServerProcess, folder: Path, *words: str) -> str:
     """What a command of a user's terminal prints."""
-    command = [sys.executable, "-m", "surrogym_client", *words]
+    command = [sys.executable, "-m", "surrogym", *words]
     with_server = command if words[0] == "evaluate" else [*command, "--server", server.url]
     made = subprocess.run(with_server, cwd=folder, capture_output=True, text=True, check=False, timeout=240)
     assert made.returncode == 0, made.stdout + made.stderr

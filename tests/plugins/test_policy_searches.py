@@ -13,16 +13,16 @@ import pytest
 from support.models import learn
 from support.real_steps import random_steps
 from support.server import ServerProcess, running_server
-from surrogym_client.diagnosis.doctor import installation
-from surrogym_client.original.classic import pendulum
-from surrogym_client.testing import POLICY_SEARCH_LAWS
-from surrogym_client.training import TrainSettings
-from surrogym_client.training.search import SEARCHES
+from surrogym_sampler.diagnosis.doctor import installation
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.models.registry import MODELS
 from surrogym_server.sampling.acquisition import ACQUISITIONS
 from surrogym_shared.port import SurrogatePort
+from surrogym_trainer.testing import POLICY_SEARCH_LAWS
+from surrogym_trainer.training import TrainSettings
+from surrogym_trainer.training.search import SEARCHES
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "plugins" / "policy_search"
@@ -86,7 +86,7 @@ def test_every_search_keeps_the_laws(
         ("nobody", "expected one of A2C, DDPG, DQN, PPO, SAC, TD3, FASTPPO, CMAES, GRADIENT, cross_entropy"),
         ("missing_module", "package 'package_of_missing_module', entry point missing_module = 'nowhere_to_be_found"),
         ("missing_module", "No module named 'nowhere_to_be_found'"),
-        ("no_search", "expected a subclass of surrogym_client.training.search.PolicySearch, got <class 'json"),
+        ("no_search", "expected a subclass of surrogym_trainer.training.search.PolicySearch, got <class 'json"),
     ],
 )
 @pytest.mark.usefixtures("installed")
@@ -139,7 +139,7 @@ def test_a_strangers_search_solves_pendulum_over_http(server: ServerProcess, sit
     def surrogym(*arguments: str) -> str:
         checkout = [str(ROOT / part) for part in ("server", "client", "shared")]
         done = subprocess.run(
-            [sys.executable, "-m", "surrogym_client", *arguments],
+            [sys.executable, "-m", "surrogym", *arguments],
             env={"PYTHONPATH": ":".join([str(site), *checkout]), "SURROGYM_URL": server.url, "PATH": ""},
             cwd=tmp_path,
             capture_output=True,

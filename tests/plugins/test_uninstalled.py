@@ -17,7 +17,7 @@ from typer.testing import CliRunner, Result
 from support import pendulum
 from support.searched import searching, with_path, write_package
 from support.server import ServerProcess, running_server
-from surrogym_client.cli import build
+from surrogym.cli import build
 from surrogym_client.transport import Api
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job

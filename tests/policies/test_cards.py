@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from surrogym_client.policies.card import PolicyCard, UnusablePolicy, require_card_or_none, write_card
+from surrogym_trainer.policies.card import PolicyCard, UnusablePolicy, require_card_or_none, write_card
 
 
 @pytest.mark.parametrize("content", ["{}", '{"model": "cstr"}', "[1, 2]", "3", "level, valve", ""])

@@ -13,13 +13,13 @@ import stable_baselines3
 import torch
 from gymnasium import spaces
 
-from surrogym_client.original.classic import acrobot, pendulum
-from surrogym_client.policies import UnusablePolicy, load_policy
-from surrogym_client.policies import export as policy_export
-from surrogym_client.policies.export import NotExportable, export_policy
-from surrogym_client.policies.networks import PaperPolicy
-from surrogym_client.policies.onnx_files import UnusableOnnx
+from surrogym_sampler.original.classic import acrobot, pendulum
 from surrogym_shared.network import Network
+from surrogym_trainer.policies import UnusablePolicy, load_policy
+from surrogym_trainer.policies import export as policy_export
+from surrogym_trainer.policies.export import NotExportable, export_policy
+from surrogym_trainer.policies.networks import PaperPolicy
+from surrogym_trainer.policies.onnx_files import UnusableOnnx
 
 OBSERVED = spaces.Box(-np.inf, np.inf, (3,), np.float32)
 TORQUES = spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 10.0], np.float32))

@@ -23,7 +23,9 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from support.exact_pendulum import ExactPendulum
 from support.gifts import LIMIT, Touches, changed, gift, pickled
-from surrogym_client.policies.card import (
+from surrogym_client.transport import Api
+from surrogym_shared.archives import read_entries, stored
+from surrogym_trainer.policies.card import (
     MAX_CARD_BYTES,
     NotedAddress,
     PolicyCard,
@@ -31,15 +33,13 @@ from surrogym_client.policies.card import (
     read_card,
     write_card,
 )
-from surrogym_client.policies.defaults import decaying
-from surrogym_client.policies.export import export_policy
-from surrogym_client.policies.files import load_learner, load_policy, save_policy
-from surrogym_client.policies.networks import PaperPolicy, Standardise
-from surrogym_client.policies.saved_settings import MAX_EXPERIENCE_BYTES
-from surrogym_client.policies.structure import ENTRY, Structure, describe
-from surrogym_client.training import TrainSettings, train
-from surrogym_client.transport import Api
-from surrogym_shared.archives import read_entries, stored
+from surrogym_trainer.policies.defaults import decaying
+from surrogym_trainer.policies.export import export_policy
+from surrogym_trainer.policies.files import load_learner, load_policy, save_policy
+from surrogym_trainer.policies.networks import PaperPolicy, Standardise
+from surrogym_trainer.policies.saved_settings import MAX_EXPERIENCE_BYTES
+from surrogym_trainer.policies.structure import ENTRY, Structure, describe
+from surrogym_trainer.training import TrainSettings, train
 
 OBSERVED = spaces.Box(-np.inf, np.inf, (3,), np.float32)
 TORQUES = spaces.Box(np.array([-2.0, 0.1], np.float32), np.array([2.0, 10.0], np.float32))
@@ -240,7 +240,7 @@ def test_weights_that_would_inflate_are_refused(tmp_path: Path):
 
 
 def test_a_policy_that_would_inflate_is_refused(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("surrogym_client.policies.structure.MAX_BYTES", 2**20)
+    monkeypatch.setattr("surrogym_trainer.policies.structure.MAX_BYTES", 2**20)
     (tmp_path / "policy.zip").write_bytes(bomb("policy.pth"))
     with pytest.raises(UnusablePolicy, match=f"expected at most {2**20} bytes inside, got {2**25}"):
         load_policy(tmp_path / "policy.zip")

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from torch import nn
 
-from surrogym_client.policies.networks import HIDDEN, Bounded, PaperPolicy, Standardise
+from surrogym_trainer.policies.networks import HIDDEN, Bounded, PaperPolicy, Standardise
 
 OBSERVED = spaces.Box(-np.inf, np.inf, (3,), np.float32)
 TORQUES = spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 10.0], np.float32))

@@ -10,9 +10,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from surrogym_client.policies.card import UnusablePolicy
-from surrogym_client.policies.files import load_learner, load_policy, save_policy
-from surrogym_client.policies.normalisation import statistics_path
+from surrogym_trainer.policies.card import UnusablePolicy
+from surrogym_trainer.policies.files import load_learner, load_policy, save_policy
+from surrogym_trainer.policies.normalisation import statistics_path
 
 SHOWN = np.array([[1.0, 0.0, 5.0], [-0.3, 0.9, -7.0]], dtype=np.float32)
 SETTINGS = {

@@ -10,8 +10,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from surrogym_client.policies import load_policy, onnx_files
-from surrogym_client.policies.onnx_files import LANES, UnusableOnnx, from_onnx
+from surrogym_trainer.policies import load_policy, onnx_files
+from surrogym_trainer.policies.onnx_files import LANES, UnusableOnnx, from_onnx
 
 FLOAT = TensorProto.FLOAT
 OBSERVED = helper.make_tensor_value_info("observation", FLOAT, ["lanes", 3])

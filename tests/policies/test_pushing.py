@@ -11,13 +11,13 @@ import pytest
 
 from support.server import ServerProcess
 from surrogym_client.errors import ServerUnreachable, SpecConflict
-from surrogym_client.original.classic import cartpole, pendulum
-from surrogym_client.policies import pushing
-from surrogym_client.policies.card import NotedAddress, PolicyCard, UnusablePolicy, write_card
 from surrogym_client.transport import Api, Retries
+from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_shared import wire
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.policies import pushing
+from surrogym_trainer.policies.card import NotedAddress, PolicyCard, UnusablePolicy, write_card
 
 NAME = "pushed"
 

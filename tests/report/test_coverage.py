@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surrogym_client.original.classic import cartpole, pendulum
-from surrogym_client.report.coverage import CELLS, columns_shown, coverage_of
-from surrogym_client.report.figures import draw_coverage
+from surrogym_sampler.original.classic import cartpole, pendulum
+from surrogym_trainer.report.coverage import CELLS, columns_shown, coverage_of
+from surrogym_trainer.report.figures import draw_coverage
 
 
 def steps(speeds: tuple[float, float], rows: int = 4_000) -> tuple[np.ndarray, np.ndarray]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surrogym_client.original.classic import pendulum
-from surrogym_client.report.episodes import Meet, draw_episodes
-from surrogym_client.report.known import with_whole_traces
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.wire import EpisodeTrace, EvaluationDetail
+from surrogym_trainer.report.episodes import Meet, draw_episodes
+from surrogym_trainer.report.known import with_whole_traces
 
 ONE = [[3.0, 0.0], [-3.0, 0.0], [3.1, 0.0], [-3.1, 0.0]]
 OTHER = [[-2.8, 0.0], [-3.1, 0.0], [3.0, 0.0], [2.9, 0.0]]

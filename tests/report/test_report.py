@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from support.server import ServerProcess
-from surrogym_client.report.figures import draw_fidelity, svg
-from surrogym_client.report.known import Known
-from surrogym_client.report.maps import Cut, cuts
-from surrogym_client.report.page import page
 from surrogym_client.transport import Api
 from surrogym_shared.wire import PrequentialScores
+from surrogym_trainer.report.figures import draw_fidelity, svg
+from surrogym_trainer.report.known import Known
+from surrogym_trainer.report.maps import Cut, cuts
+from surrogym_trainer.report.page import page
 
 SVG = "data:image/svg+xml;base64,"
 Both = tuple[Known, list[Cut]]
@@ -159,7 +159,7 @@ def test_a_surrogate_without_samples_or_models_has_a_page(known: Both) -> None:
 
 
 def test_the_command_writes_it(pendulum_server: ServerProcess, tmp_path, monkeypatch, capsys) -> None:
-    from surrogym_client.cli import main
+    from surrogym.cli import main
 
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:

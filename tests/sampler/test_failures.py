@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from support.moody import Line
-from surrogym_client.original.errors import MachineFails, StepRefused
-from surrogym_client.original.isolated import IsolatedEnvironment
-from surrogym_client.sampler import Sampler, SamplerSettings
-from surrogym_client.sampler import failures as limits
-from surrogym_client.sampler.failures import FIRST_FEW, LONGEST_DELAY, MANY, Failures
+from surrogym_sampler.original.errors import MachineFails, StepRefused
+from surrogym_sampler.original.isolated import IsolatedEnvironment
+from surrogym_sampler.queries import Sampler, SamplerSettings
+from surrogym_sampler.queries import failures as limits
+from surrogym_sampler.queries.failures import FIRST_FEW, LONGEST_DELAY, MANY, Failures
 
 UNTIL_DONE = SamplerSettings(name="worker", until_done=True, time_limit=60.0)
 

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from surrogym_client.errors import LeaseExpired, ServerUnreachable
-from surrogym_client.sampler.leases import LeaseEnded, Leases, seconds_awake_or_asleep
+from surrogym_sampler.queries.leases import LeaseEnded, Leases, seconds_awake_or_asleep
 from surrogym_shared.codes import Code, Problem
 from surrogym_shared.wire import StepQuery
 

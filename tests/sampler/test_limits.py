@@ -12,10 +12,10 @@ import pytest
 from support.moody import SPEC, Line
 from support.rail import SPEC as RAIL
 from surrogym_client.errors import ProtocolMismatch
-from surrogym_client.original.errors import QueryRefused, UnknownEnvironment
-from surrogym_client.sampler import Sampler, SamplerSettings
-from surrogym_client.sampler.query_limits import check_environment, check_query
 from surrogym_client.transport import Api
+from surrogym_sampler.original.errors import QueryRefused, UnknownEnvironment
+from surrogym_sampler.queries import Sampler, SamplerSettings
+from surrogym_sampler.queries.query_limits import check_environment, check_query
 from surrogym_shared.spec import Bounds, Coordinate, DiscreteAction, MultiDiscreteAction, Uniform
 from surrogym_shared.wire import RolloutQuery, StepQuery
 

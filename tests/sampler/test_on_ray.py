@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from support.moody import SPEC
-from surrogym_client.cli.sampling_on_ray import run_samplers
-from surrogym_client.sampler import SamplerSettings
-from surrogym_client.sampler.on_ray import RaySamplers, SamplerActor, SamplerPlan
+from surrogym.cli.sampling_on_ray import run_samplers
 from surrogym_client.transport import Api
+from surrogym_sampler.queries import SamplerSettings
+from surrogym_sampler.queries.on_ray import RaySamplers, SamplerActor, SamplerPlan
 from surrogym_shared.spec import Design
 
 ray = pytest.importorskip("ray")
@@ -110,7 +110,7 @@ def test_a_machine_with_another_version_takes_no_step(plan: SamplerPlan):
 def test_samplers_that_find_no_room_are_mentioned_and_the_time_limit_ends_them(
     cluster: None, plan: SamplerPlan, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setattr("surrogym_client.cli.sampling_on_ray.ROOM_SECONDS", 0.5)
+    monkeypatch.setattr("surrogym.cli.sampling_on_ray.ROOM_SECONDS", 0.5)
     samplers, said = RaySamplers(plan, 1, {"CPU": 1.0, "robot": 1.0}), []
     begun = time.monotonic()
     run_samplers(samplers, 1.5, said.append, said.append)
@@ -124,7 +124,7 @@ def test_without_a_free_cpu_a_way_out_is_named_and_ctrl_c_speaks_of_no_running_s
     cluster: None, plan: SamplerPlan, monkeypatch: pytest.MonkeyPatch
 ):
     """Session hosts may have taken all CPUs of a small machine."""
-    monkeypatch.setattr("surrogym_client.cli.sampling_on_ray.ROOM_SECONDS", 0.5)
+    monkeypatch.setattr("surrogym.cli.sampling_on_ray.ROOM_SECONDS", 0.5)
     samplers, said = RaySamplers(plan, 1, {"CPU": 3.0}), []
 
     def interrupt(text):

@@ -9,9 +9,9 @@ import pytest
 
 from support.moody import SPEC, Line
 from surrogym_client.errors import InvalidInput, ServerUnreachable
-from surrogym_client.sampler import Sampler, SamplerSettings, pipeline, worker
-from surrogym_client.sampler.pipeline import Pipeline
 from surrogym_client.transport import Api
+from surrogym_sampler.queries import Sampler, SamplerSettings, pipeline, worker
+from surrogym_sampler.queries.pipeline import Pipeline
 from surrogym_shared.codes import Code, Problem
 from surrogym_shared.wire import ClaimedQueries
 

@@ -13,12 +13,12 @@ from itertools import pairwise
 import pytest
 
 from support.rail import SPEC, HangsRight, Rail, RaisesRight
-from surrogym_client import original
 from surrogym_client.errors import InvalidInput
-from surrogym_client.original.errors import UnknownEnvironment
-from surrogym_client.original.isolated import IsolatedEnvironment
-from surrogym_client.sampler import Sampler, SamplerSettings
-from surrogym_client.sampler.sample_conversion import reset_seed
+from surrogym_sampler import original
+from surrogym_sampler.original.errors import UnknownEnvironment
+from surrogym_sampler.original.isolated import IsolatedEnvironment
+from surrogym_sampler.queries import Sampler, SamplerSettings
+from surrogym_sampler.queries.sample_conversion import reset_seed
 from surrogym_shared.wire import NewSample
 
 RIGHT, LEFT = [1.0], [-1.0]
@@ -27,7 +27,7 @@ KILLED = """
 import sys
 from support.rail import Slow
 from surrogym_client.transport import Api
-from surrogym_client.sampler import Sampler, SamplerSettings
+from surrogym_sampler.queries import Sampler, SamplerSettings
 
 with Api(sys.argv[1]) as api:
     Sampler(api, sys.argv[2], Slow(), SamplerSettings(name="killed", batch=1, lease_seconds=3.0, once=True)).run()

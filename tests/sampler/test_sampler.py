@@ -8,12 +8,12 @@ from functools import partial
 import pytest
 
 from support.moody import SPEC, GivesNonsense, HangsLeft, Line, RaisesLeft, Slow
-from surrogym_client import original
 from surrogym_client.errors import ServerUnreachable, Unavailable, UnknownSurrogate
-from surrogym_client.original.errors import UnknownEnvironment
-from surrogym_client.original.isolated import IsolatedEnvironment
-from surrogym_client.sampler import Sampler, SamplerReport, SamplerSettings
 from surrogym_client.transport import Api, Retries
+from surrogym_sampler import original
+from surrogym_sampler.original.errors import UnknownEnvironment
+from surrogym_sampler.original.isolated import IsolatedEnvironment
+from surrogym_sampler.queries import Sampler, SamplerReport, SamplerSettings
 from surrogym_shared.codes import Code, Problem
 from surrogym_shared.spec import BoxAction
 
@@ -103,7 +103,7 @@ def test_a_server_that_is_away_keeps_no_stopped_worker_waiting(server_process, l
 
 
 def test_a_real_step_that_can_not_be_submitted_is_reported(server_process, line, monkeypatch):
-    monkeypatch.setattr("surrogym_client.sampler.worker.LAST_SECONDS", 0.2)
+    monkeypatch.setattr("surrogym_sampler.queries.worker.LAST_SECONDS", 0.2)
     with Away(server_process.url, "add_samples") as api:
         reports, [error] = stopped(api, line)
     assert reports == []

@@ -10,11 +10,17 @@ import pytest
 
 from support.rail import SPEC, Rail
 from support.saving import SPAWN, fill
-from surrogym_client.original.errors import EnvironmentDied, SnapshotGone, SnapshotNotKept, StepTimedOut, UnusableFolder
-from surrogym_client.original.rollouts import answering
-from surrogym_client.sampler import Sampler, SamplerSettings
-from surrogym_client.sampler.returning import Returning
-from surrogym_client.sampler.snapshots import Bounds, SnapshotFolder, least_useful
+from surrogym_sampler.original.errors import (
+    EnvironmentDied,
+    SnapshotGone,
+    SnapshotNotKept,
+    StepTimedOut,
+    UnusableFolder,
+)
+from surrogym_sampler.original.rollouts import answering
+from surrogym_sampler.queries import Sampler, SamplerSettings
+from surrogym_sampler.queries.returning import Returning
+from surrogym_sampler.queries.snapshots import Bounds, SnapshotFolder, least_useful
 from surrogym_shared.spec import Design
 
 SAVED = SPEC.model_copy(update={"snapshots": True, "design": Design(initial=6, budget=16, target=0.9999)})

@@ -12,8 +12,8 @@ import pytest
 from support.chaos import FULL, SEED, times
 from support.server import running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 
 TOKEN = "the-token-of-an-admin"
 CONFIG = Path(__file__).with_name("schemathesis.toml")

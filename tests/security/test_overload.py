@@ -22,8 +22,8 @@ from support.chaos import times
 from support.hostile import KEY, connected, head, read_all, resident_mib, upgraded
 from support.server import ServerProcess, running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared import frames
 from surrogym_shared.codes import Code, Problem
 

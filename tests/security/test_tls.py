@@ -15,8 +15,8 @@ from websockets.sync.client import connect
 
 from support.server import ServerProcess, running_server
 from support.teaching import teach
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.errors import InvalidInput
 from surrogym_server.settings import read_settings
 from surrogym_shared import frames

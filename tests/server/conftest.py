@@ -12,7 +12,7 @@ import torch
 from support import pendulum
 from support.real_steps import answer, random_steps
 from support.server import ServerProcess
-from surrogym_client.original import classic
+from surrogym_sampler.original import classic
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples

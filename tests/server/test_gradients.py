@@ -10,14 +10,14 @@ import torch
 from support.exact_models import exact_pendulum
 from support.models import learn
 from support.real_steps import random_steps
-from surrogym_client.evaluation import imagined_returns
-from surrogym_client.original.classic import cartpole, pendulum
-from surrogym_client.policies import load_policy
+from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
 from surrogym_server.gradients import GradientSettings, Update, _evened, optimise
 from surrogym_server.local import LocalSurrogate
 from surrogym_shared.wire import OpenSession
+from surrogym_trainer.evaluation import imagined_returns
+from surrogym_trainer.policies import load_policy
 
 SMALL = GradientSettings(updates=12, lanes=16, horizon=20, units=8)
 

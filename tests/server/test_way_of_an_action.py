@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from support.way import Way
-from surrogym_client.original import classic
+from surrogym_sampler.original import classic
 from surrogym_server.app import create_app
 from surrogym_server.engine import sessions
 from surrogym_server.engine.design_job import DesignJob, run_design_job

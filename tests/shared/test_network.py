@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec, MultiDiscreteAction
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load, save
 
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared import surrogate_file
 from surrogym_shared.surrogate_file import NotASurrogateFile, RealSamples, SurrogateFile
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from surrogym_client.original.gymnasium import GymnasiumEnvironment
 from surrogym_lab.reproduce.statistics import interval_score
+from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.models.abilities import FunctionDraws
 from surrogym_server.models.port import DynamicsModel

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_client.original import RealStep
+from surrogym_sampler.original import RealStep
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,

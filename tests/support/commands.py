@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from surrogym_client.cli import build
+from surrogym.cli import build
 
 
 @cache

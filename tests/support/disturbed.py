@@ -12,8 +12,8 @@ import torch
 from stable_baselines3 import PPO
 
 from support.chaos import SEED
-from surrogym_client.training import TrainProgress, TrainResult, TrainSettings, train
 from surrogym_client.transport import HttpSurrogate, Retries
+from surrogym_trainer.training import TrainProgress, TrainResult, TrainSettings, train
 
 LANES, SMALL = 8, {"n_steps": 16, "batch_size": 64, "n_epochs": 2}
 STEPS_PER_FAULT = 4_096

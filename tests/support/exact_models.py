@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.step_rules import settle

@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 
 from surrogym_client.errors import refused_here
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.codes import Code
 from surrogym_shared.port import ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec

@@ -36,7 +36,7 @@ def run(server: ServerProcess, folder: Path, *arguments: str, python: str = sys.
 
 def surrogym(server: ServerProcess, folder: Path, *arguments: str, **environment: str) -> str:
     """What ``surrogym ARGUMENTS`` prints."""
-    return run(server, folder, "-m", "surrogym_client", *arguments, **environment)
+    return run(server, folder, "-m", "surrogym", *arguments, **environment)
 
 
 def cells(notebook: Path) -> str:

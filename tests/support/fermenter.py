@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from support.processes import process_spec
-from surrogym_client.original import RealStep
+from surrogym_sampler.original import RealStep
 from surrogym_shared.spec import EnvironmentSpec
 
 INTERVAL, SUBSTEPS = 0.5, 20  # hours between two samples

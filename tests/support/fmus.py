@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from surrogym_client.original.describing import describe
+from surrogym_sampler.original.describing import describe
 from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Quantity, RewardTerm, Term
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "fmus"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from surrogym_client.original import RealStep
+from surrogym_sampler.original import RealStep
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from support.changing import Array, Changing, Machine, Parameters
-from surrogym_client.original import RealStep
+from surrogym_sampler.original import RealStep
 
 DT, PARTS = 0.005, 5  # seconds of a step of the levitation, and Euler steps within it
 GRAVITY, MIDDLE = 9.81, 0.010  # m/s^2, and the gap in m that is wanted

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from support.disturbed import LANES, SMALL
 from support.noting import NotingSamplers, Tally, create, finished, noting_samplers, until
-from surrogym_client.training import TrainProgress, TrainResult, TrainSettings, train
 from surrogym_client.transport import Api, HttpSurrogate, Retries
+from surrogym_trainer.training import TrainProgress, TrainResult, TrainSettings, train
 
 SAMPLERS, TRAININGS = 4, 3  # that work at once
 STEPS = 4_096  # of one training

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from surrogym_client.original import RealStep
+from surrogym_sampler.original import RealStep
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surrogym_client.original.classic import pendulum
-from surrogym_client.original.gymnasium import GymnasiumEnvironment
-from surrogym_client.original.protocol import Array, RealStep
-from surrogym_client.sampler import Sampler, SamplerSettings
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
+from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
+from surrogym_sampler.original.protocol import Array, RealStep
+from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_shared import wire
 
 STEP_SECONDS = 0.1

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared import wire
 from surrogym_shared.network import Network
 

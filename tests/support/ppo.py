@@ -12,9 +12,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from surrogym_client.policies.networks import WIDER, PaperPolicy, Standardise
-from surrogym_client.training.fast_ppo.learner import Batch, Learner
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.policies.networks import WIDER, PaperPolicy, Standardise
+from surrogym_trainer.training.fast_ppo.learner import Batch, Learner
 
 ROWS, RATE = 1_024, 1e-3
 HYPERPARAMETERS = {"n_steps": ROWS, "batch_size": ROWS, "n_epochs": 1, "learning_rate": RATE, "device": "cpu"}

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogym_client.original import RealStep
-from surrogym_client.original.gymnasium import GymnasiumEnvironment
+from surrogym_sampler.original import RealStep
+from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples
 from surrogym_server.sampling.latin_hypercube import random_points

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_client import original
-from surrogym_client.original.gymnasium import GymnasiumEnvironment
-from surrogym_client.original.protocol import Array, RealStep
-from surrogym_client.sampler import Sampler, SamplerSettings
-from surrogym_client.sampler.snapshots import ENDING, Bounds, SnapshotFolder
 from surrogym_client.transport import Api
+from surrogym_sampler import original
+from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
+from surrogym_sampler.original.protocol import Array, RealStep
+from surrogym_sampler.queries import Sampler, SamplerSettings
+from surrogym_sampler.queries.snapshots import ENDING, Bounds, SnapshotFolder
 from surrogym_shared.spec import EnvironmentSpec
 
 STEP_SECONDS = 0.05

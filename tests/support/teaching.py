@@ -6,9 +6,9 @@ import time
 
 import numpy as np
 
-from surrogym_client.original.gymnasium import GymnasiumEnvironment
 from surrogym_client.surrogates.phases import COMPLETED
 from surrogym_client.transport import Api
+from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
 from surrogym_shared import wire
 from surrogym_shared.spec import EnvironmentSpec
 

@@ -67,7 +67,7 @@ def _heed_interrupts() -> None:
 
 @contextmanager
 def on_terminal(
-    *arguments: str, module: str = "surrogym_client", width: int = 80, folder: str | None = None
+    *arguments: str, module: str = "surrogym", width: int = 80, folder: str | None = None
 ) -> Iterator[Terminal]:
     """``python -m MODULE ARGUMENTS`` on a terminal of ``width`` characters; killed at the end if it still runs."""
     ours, theirs = pty.openpty()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from surrogym_client.original.simulator import Simulator
+from surrogym_sampler.original.simulator import Simulator
 
 
 class Toy(Simulator):

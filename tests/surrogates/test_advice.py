@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from surrogym_client.original.classic import pendulum
 from surrogym_client.surrogates.advice import advice, noise_in_words, verdict
 from surrogym_client.surrogates.waiting import (
     words_of_audit,
@@ -16,6 +15,7 @@ from surrogym_client.surrogates.waiting import (
     words_of_uncertainty,
     words_of_waiting,
 )
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.wire import (
     DoubtfulRegion,
     Fidelity,

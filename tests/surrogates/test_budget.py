@@ -9,11 +9,11 @@ from uuid import uuid4
 import pytest
 
 from support.server import ServerProcess, running_server
-from surrogym_client.cli import main
+from surrogym.cli import main
 from surrogym_client.errors import BeyondBudget
-from surrogym_client.original.classic import pendulum
 from surrogym_client.surrogates.budget import BudgetTooSmall, words_of_rounds
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.spec import Design
 
 TOKENS = {role: f"the-token-to-{role}" for role in ("train", "admin")}
@@ -84,7 +84,7 @@ def test_commands_say_it_in_one_sentence(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SURROGYM_TOKEN", TOKENS["train"])
-    monkeypatch.setattr("surrogym_client.cli.train._trainable", lambda *_, **__: (pendulum(), guarded.url))
+    monkeypatch.setattr("surrogym.cli.train._trainable", lambda *_, **__: (pendulum(), guarded.url))
     with pytest.raises(SystemExit) as ended:
         main([command[0], owned, *command[1:], "--server", guarded.url])
     said = capsys.readouterr().err

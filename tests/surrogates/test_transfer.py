@@ -12,10 +12,10 @@ import pytest
 from support.server import ServerProcess
 from surrogym_client.environments import open_file
 from surrogym_client.errors import InvalidInput, UnknownSurrogate
-from surrogym_client.original.classic import cartpole
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.surrogates.transfer import NotImportable, export_surrogate, import_surrogate
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.original.classic import cartpole
 from surrogym_shared.port import StepResult, SurrogatePort
 from surrogym_shared.surrogate_file import SurrogateFile
 from surrogym_shared.wire import OpenSession

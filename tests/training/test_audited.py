@@ -9,12 +9,12 @@ from unittest.mock import Mock
 
 import pytest
 
-from surrogym_client.policies.evidence import Audit, Promise
-from surrogym_client.training import audited
-from surrogym_client.training.audited import MOST_AUDITS, AuditedTraining
-from surrogym_client.training.closed_loop import LoopSettings
-from surrogym_client.training.handover import AuditSettings, Handover
-from surrogym_client.training.settings import TrainResult, TrainSettings
+from surrogym_trainer.policies.evidence import Audit, Promise
+from surrogym_trainer.training import audited
+from surrogym_trainer.training.audited import MOST_AUDITS, AuditedTraining
+from surrogym_trainer.training.closed_loop import LoopSettings
+from surrogym_trainer.training.handover import AuditSettings, Handover
+from surrogym_trainer.training.settings import TrainResult, TrainSettings
 
 
 def promise(median: float, low: float | None = None, high: float | None = None) -> Promise:

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from support.moody import SPEC, Line
-from surrogym_client.original.episodes import SteppedEpisode
-from surrogym_client.original.port import OriginalPort
-from surrogym_client.policies.predict import Predict
-from surrogym_client.training import audited
-from surrogym_client.training.audited import AuditedTraining
-from surrogym_client.training.candidates import Candidates
-from surrogym_client.training.settings import TrainResult, TrainSettings
+from surrogym_sampler.original.episodes import SteppedEpisode
+from surrogym_sampler.original.port import OriginalPort
+from surrogym_trainer.policies.predict import Predict
+from surrogym_trainer.training import audited
+from surrogym_trainer.training.audited import AuditedTraining
+from surrogym_trainer.training.candidates import Candidates
+from surrogym_trainer.training.settings import TrainResult, TrainSettings
 
 POLICIES = {
     b"to the middle": lambda o: -np.clip(10 * o[:, :1], -1, 1),

@@ -17,18 +17,18 @@ from support.models import learn
 from support.real_steps import random_steps
 from support.server import ServerProcess, running_server
 from support.teaching import answer
-from surrogym_client.original.classic import pendulum
-from surrogym_client.original.gymnasium import GymnasiumEnvironment
 from surrogym_client.surrogates.waiting import wait_for_design
-from surrogym_client.training import TrainProgress, TrainResult, TrainSettings, train
-from surrogym_client.training.closed_loop import VISIT_LANES, ClosedLoop, LoopSettings, shares
-from surrogym_client.training.search import search_for
-from surrogym_client.training.settings import DRAWS, chosen_for
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.original.classic import pendulum
+from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import Design, EnvironmentSpec
+from surrogym_trainer.training import TrainProgress, TrainResult, TrainSettings, train
+from surrogym_trainer.training.closed_loop import VISIT_LANES, ClosedLoop, LoopSettings, shares
+from surrogym_trainer.training.search import search_for
+from surrogym_trainer.training.settings import DRAWS, chosen_for
 
 SETTINGS = TrainSettings(
     "PPO", total_steps=400, num_envs=8, hyperparameters={"n_steps": 10, "batch_size": 40, "n_epochs": 1}
@@ -86,7 +86,7 @@ def test_rounds_end_when_the_visited_region_is_known_or_design_ready(
         asked.append((settings.anew, settings.prolong))
         return train(port, out, replace(settings, prolong=False), progress)
 
-    monkeypatch.setattr("surrogym_client.training.closed_loop.train", trained)
+    monkeypatch.setattr("surrogym_trainer.training.closed_loop.train", trained)
     settings = replace(SETTINGS, prolong=True)
     initial, unsure, ready = 4, tolerance < 1, budget > 4
     tolerances = dict.fromkeys(("theta", "speed", "reward"), tolerance)

@@ -7,14 +7,14 @@ import pytest
 
 from support.models import learn
 from support.real_steps import random_steps
-from surrogym_client.evaluation import imagined_returns
-from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
-from surrogym_client.policies import load_policy
-from surrogym_client.training import TrainingInterrupted, TrainSettings, train
-from surrogym_client.training.search import is_prolonged
+from surrogym_sampler.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_shared.network import Network
+from surrogym_trainer.evaluation import imagined_returns
+from surrogym_trainer.policies import load_policy
+from surrogym_trainer.training import TrainingInterrupted, TrainSettings, train
+from surrogym_trainer.training.search import is_prolonged
 
 SMALL = {"population": 8, "starts": 2, "units": 4}
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from surrogym_client.training import TrainProgress
-from surrogym_client.training.course import Course, after, words_of_time_left
+from surrogym_trainer.training import TrainProgress
+from surrogym_trainer.training.course import Course, after, words_of_time_left
 
 REPORTED = [  # of a demo, whose bar went back twice
     *((steps, 442_368) for steps in (8_192, 217_088, 434_176)),

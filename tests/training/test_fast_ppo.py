@@ -18,19 +18,19 @@ from support.models import learn
 from support.ppo import RATE, batch_of, layers, linear, reference
 from support.real_steps import random_steps
 from surrogym_client.environments.lanes import Lanes, session_request
-from surrogym_client.evaluation import imagined_returns
-from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
-from surrogym_client.policies import UnusablePolicy, load_policy
-from surrogym_client.training import TrainingInterrupted, TrainSettings, train
-from surrogym_client.training.fast_ppo import search as searches
-from surrogym_client.training.fast_ppo.actions import Bounded, Choices
-from surrogym_client.training.fast_ppo.learner import Learner, Objective, compiled_update, noisy, restored
-from surrogym_client.training.fast_ppo.rollouts import Collector, RewardScale, Rollout
-from surrogym_client.training.search import search_for
-from surrogym_client.training.verdicts import Verdicts
+from surrogym_sampler.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_shared.spec import EnvironmentSpec, MultiDiscreteAction
+from surrogym_trainer.evaluation import imagined_returns
+from surrogym_trainer.policies import UnusablePolicy, load_policy
+from surrogym_trainer.training import TrainingInterrupted, TrainSettings, train
+from surrogym_trainer.training.fast_ppo import search as searches
+from surrogym_trainer.training.fast_ppo.actions import Bounded, Choices
+from surrogym_trainer.training.fast_ppo.learner import Learner, Objective, compiled_update, noisy, restored
+from surrogym_trainer.training.fast_ppo.rollouts import Collector, RewardScale, Rollout
+from surrogym_trainer.training.search import search_for
+from surrogym_trainer.training.verdicts import Verdicts
 
 needs_numba = pytest.mark.skipif(compiled_update() is None, reason="numba is not installed, or switched off")
 

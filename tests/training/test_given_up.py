@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from surrogym_client.training.verdicts import PATIENT_ROLLOUTS, Imagined, Verdicts
+from surrogym_trainer.training.verdicts import PATIENT_ROLLOUTS, Imagined, Verdicts
 
 UNTRAINED = Imagined(mean=4.9, many=-0.1, most=97.0)  # three of 64 functions reach the goal by themselves
 BEST = 95.0  # that an episode of the training earned

@@ -10,14 +10,14 @@ import pytest
 from support.installed import metadata_into
 from support.server import ServerProcess
 from surrogym_client.environments import open_file
-from surrogym_client.original.classic import cartpole
-from surrogym_client.policies import load_policy
 from surrogym_client.surrogates.transfer import export_surrogate
-from surrogym_client.training import TrainSettings, train
-from surrogym_client.training.closed_loop import ClosedLoop, LoopSettings
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.original.classic import cartpole
 from surrogym_server.gradients import GradientSettings, optimise
 from surrogym_shared.network import Network
+from surrogym_trainer.policies import load_policy
+from surrogym_trainer.training import TrainSettings, train
+from surrogym_trainer.training.closed_loop import ClosedLoop, LoopSettings
 
 LANES, HORIZON, LIMIT, UPDATES = 8, 10, 200, 6
 STEPS = UPDATES * LANES * HORIZON + 12 * 64 * LIMIT

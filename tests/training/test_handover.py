@@ -17,21 +17,21 @@ import pytest
 from support import rail
 from support.moody import SPEC, Line
 from support.server import ServerProcess
-from surrogym_client.cli import main
+from surrogym.cli import main
 from surrogym_client.errors import UnknownSurrogate
-from surrogym_client.evaluation.evaluator import EvaluationSettings, evaluate
-from surrogym_client.original import RealStep
-from surrogym_client.original.episodes import open_episode
-from surrogym_client.policies.card import PolicyCard, read_card, write_card
-from surrogym_client.sampler import Sampler, SamplerSettings
 from surrogym_client.surrogates import waiting
 from surrogym_client.surrogates.waiting import wait_for_design
-from surrogym_client.training import TrainSettings
-from surrogym_client.training.audited import AuditedTraining
-from surrogym_client.training.handover import NO_SAMPLER, AuditSettings, Subject, hand_over, judge_episodes, way_of
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.original import RealStep
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_shared.network import Network
 from surrogym_shared.spec import Design, EnvironmentSpec, ModelChoice
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_trainer.policies.card import PolicyCard, read_card, write_card
+from surrogym_trainer.training import TrainSettings
+from surrogym_trainer.training.audited import AuditedTraining
+from surrogym_trainer.training.handover import NO_SAMPLER, AuditSettings, Subject, hand_over, judge_episodes, way_of
 
 AUDIT = AuditSettings(patience_seconds=60.0)
 

@@ -12,17 +12,17 @@ from torch import Tensor
 from support.models import learn
 from support.plane import Pay, drifting, plane
 from surrogym_client.environments.lanes import Lanes
-from surrogym_client.training import TrainSettings, train
-from surrogym_client.training.fast_ppo import search as searches
-from surrogym_client.training.fast_ppo.learner import Learner, restored
-from surrogym_client.training.fast_ppo.long_episodes import LONG, MORE, NOISE, SHORTER, SIGHT, with_short_episodes
-from surrogym_client.training.fast_ppo.rollouts import Collector
-from surrogym_client.training.fast_ppo.search import units_of
-from surrogym_client.training.proportions import suggested_gamma
-from surrogym_client.training.search import SearchTask
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, Inequality, Term
+from surrogym_trainer.training import TrainSettings, train
+from surrogym_trainer.training.fast_ppo import search as searches
+from surrogym_trainer.training.fast_ppo.learner import Learner, restored
+from surrogym_trainer.training.fast_ppo.long_episodes import LONG, MORE, NOISE, SHORTER, SIGHT, with_short_episodes
+from surrogym_trainer.training.fast_ppo.rollouts import Collector
+from surrogym_trainer.training.fast_ppo.search import units_of
+from surrogym_trainer.training.proportions import suggested_gamma
+from surrogym_trainer.training.search import SearchTask
 
 ROLLOUT, LIMIT, STEPS = 16, 200, 1_000
 FAR = Inequality(term=Term.linear(x=1), relation=">", value=0.9)

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from surrogym_client.original.classic import pendulum
-from surrogym_client.training import TrainSettings
-from surrogym_client.training.search import search_for, with_algorithm
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.spec import Design
+from surrogym_trainer.training import TrainSettings
+from surrogym_trainer.training.search import search_for, with_algorithm
 
 PAPER = pendulum().model_copy(update={"design": Design(preset="paper", budget=40)})
 

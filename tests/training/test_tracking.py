@@ -15,10 +15,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from support.models import learn
 from support.real_steps import random_steps
-from surrogym_client.original.classic import pendulum
-from surrogym_client.training import TrainSettings, train
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
+from surrogym_trainer.training import TrainSettings, train
 
 HYPERPARAMETERS = {"n_steps": 16, "batch_size": 32, "n_epochs": 1}
 

@@ -11,24 +11,24 @@ from stable_baselines3 import PPO
 
 from support.models import learn
 from support.real_steps import random_steps
-from surrogym_client.evaluation import imagined_returns
-from surrogym_client.evaluation.imagined import observation_statistics
-from surrogym_client.original.classic import cartpole, pendulum
-from surrogym_client.original.loading import make
-from surrogym_client.policies import UnusablePolicy, load_policy
-from surrogym_client.policies.networks import WIDER, PaperPolicy
 from surrogym_client.sb3 import SurrogateVecEnv
-from surrogym_client.training import TrainingInterrupted, TrainProgress, TrainSettings, train
-from surrogym_client.training.proportions import even_batch, suggested_gamma
-from surrogym_client.training.search import MAX_STEPS, SEARCHES
-from surrogym_client.training.settings import prolongs
-from surrogym_client.training.stable_baselines import search as training
-from surrogym_client.training.stable_baselines.algorithms import OffPolicySearch, OnPolicySearch
-from surrogym_client.training.stable_baselines.early_stopping import Checks
-from surrogym_client.training.stable_baselines.search import imagined_return
-from surrogym_client.training.verdicts import Imagined
+from surrogym_sampler.original.classic import cartpole, pendulum
+from surrogym_sampler.original.loading import make
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
+from surrogym_trainer.evaluation import imagined_returns
+from surrogym_trainer.evaluation.imagined import observation_statistics
+from surrogym_trainer.policies import UnusablePolicy, load_policy
+from surrogym_trainer.policies.networks import WIDER, PaperPolicy
+from surrogym_trainer.training import TrainingInterrupted, TrainProgress, TrainSettings, train
+from surrogym_trainer.training.proportions import even_batch, suggested_gamma
+from surrogym_trainer.training.search import MAX_STEPS, SEARCHES
+from surrogym_trainer.training.settings import prolongs
+from surrogym_trainer.training.stable_baselines import search as training
+from surrogym_trainer.training.stable_baselines.algorithms import OffPolicySearch, OnPolicySearch
+from surrogym_trainer.training.stable_baselines.early_stopping import Checks
+from surrogym_trainer.training.stable_baselines.search import imagined_return
+from surrogym_trainer.training.verdicts import Imagined
 
 SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 2}
 

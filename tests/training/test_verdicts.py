@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from surrogym_client.training.verdicts import Imagined, Verdicts
+from surrogym_trainer.training.verdicts import Imagined, Verdicts
 
 
 def after(untrained: float, earned: Sequence[float], checks: Sequence[float]) -> Verdicts:

@@ -13,13 +13,13 @@ import pytest
 from support.policies import left_alone
 from support.server import ServerProcess
 from surrogym_client.errors import ServerUnreachable
-from surrogym_client.original.classic import cartpole, pendulum
-from surrogym_client.policies.card import PolicyCard, write_card
 from surrogym_client.transport import Api, Retries
-from surrogym_client.work.outbox import Outbox, Waiting
+from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_shared import wire
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.policies.card import PolicyCard, write_card
+from surrogym_trainer.work.outbox import Outbox, Waiting
 
 NAME = "pendulum"
 TASK = wire.TrainTask(kind="train")

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from surrogym_client.errors import LeaseExpired, ServerUnreachable
-from surrogym_client.training import TrainProgress
-from surrogym_client.work.reporter import JobStopped, Reporter, Stand
 from surrogym_shared import wire
 from surrogym_shared.codes import Code, Problem
+from surrogym_trainer.training import TrainProgress
+from surrogym_trainer.work.reporter import JobStopped, Reporter, Stand
 
 JOB = wire.LeasedJob(id=1, attempt=1, lease_token="a", lease_seconds=0.03, task=wire.TrainTask(kind="train"))
 ENDED = LeaseExpired(Problem(title="ended", status=409, code=Code.LEASE_EXPIRED, detail="another worker has it"))

@@ -6,10 +6,10 @@ from typing import get_args
 
 import pytest
 
-from surrogym_client.original.classic import pendulum
-from surrogym_client.training.search import SEARCHES
-from surrogym_client.work.tasks import QUICK, settings_of
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared import wire
+from surrogym_trainer.training.search import SEARCHES
+from surrogym_trainer.work.tasks import QUICK, settings_of
 
 
 def test_a_task_without_choices_trains_as_the_command_does():

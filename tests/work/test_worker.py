@@ -18,15 +18,15 @@ import pytest
 from support.moody import SPEC, Line
 from support.policies import left_alone, network_file
 from support.server import ServerProcess
-from surrogym_client.evaluation.reference import Reference
-from surrogym_client.original.classic import pendulum
-from surrogym_client.original.episodes import GymnasiumEpisode, open_episode
-from surrogym_client.policies import load_policy
 from surrogym_client.transport import Api
-from surrogym_client.work.reporter import JobStopped, Stand
-from surrogym_client.work.tasks import Gathered, run_episodes
-from surrogym_client.work.worker import Environment, Worker, WorkerReport, WorkerSettings
+from surrogym_sampler.original.classic import pendulum
+from surrogym_sampler.original.episodes import GymnasiumEpisode, open_episode
 from surrogym_shared import wire
+from surrogym_trainer.evaluation.reference import Reference
+from surrogym_trainer.policies import load_policy
+from surrogym_trainer.work.reporter import JobStopped, Stand
+from surrogym_trainer.work.tasks import Gathered, run_episodes
+from surrogym_trainer.work.worker import Environment, Worker, WorkerReport, WorkerSettings
 
 NAME = "pendulum"
 SHORT = wire.TrainTask(kind="train", algorithm="fastppo", steps=1_000, audit=False)
@@ -203,7 +203,7 @@ def test_a_worker_that_is_stopped_keeps_the_best_policy(api: Api, tmp_path: Path
 @pytest.mark.long
 def test_ctrl_c_keeps_the_best_policy_and_says_so(api: Api, tmp_path: Path):
     id = api.jobs.add(NAME, LONG).id
-    command = [sys.executable, "-m", "surrogym_client", "work", NAME, "--folder", str(tmp_path), "--server", api.url]
+    command = [sys.executable, "-m", "surrogym", "work", NAME, "--folder", str(tmp_path), "--server", api.url]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
     until(lambda: len(api.jobs.get(NAME, id).curve) > 0)
     process.send_signal(signal.SIGINT)

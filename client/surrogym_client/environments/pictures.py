@@ -23,12 +23,12 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Read = Callable[[Array], float]  # computes a coordinate from an observation (D,)
 RENDER_MODES = ["rgb_array"]
-RENDERERS = "surrogym_client.original.rendering"  # the module that has renderer_of
+RENDERERS = "surrogym_sampler.original.rendering"  # the module that has renderer_of
 # What draws an environment of Gymnasium, and the extra that brings it, by the package of its class; None: numpy alone.
 DRAWN_WITH: dict[str, tuple[str, str] | None] = {
     "gymnasium.envs.classic_control.": ("pygame", "render"),
     "gymnasium.envs.mujoco.": ("mujoco", "mujoco"),
-    "surrogym_client.original.swingup:": None,
+    "surrogym_sampler.original.swingup:": None,
 }
 
 

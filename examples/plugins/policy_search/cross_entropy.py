@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_client.evaluation import imagined_returns, observation_statistics
-from surrogym_client.training import TrainProgress
-from surrogym_client.training.search import Found, PolicySearch, SearchTask
 from surrogym_shared.network import Network
+from surrogym_trainer.evaluation import imagined_returns, observation_statistics
+from surrogym_trainer.training import TrainProgress
+from surrogym_trainer.training.search import Found, PolicySearch, SearchTask
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from surrogym_client.cli.demo import Budget, RunFolder, Steps, perform
-from surrogym_client.cli.groups import add
-from surrogym_client.cli.options import ExitWithParent, Quiet
+from surrogym.cli.demo import Budget, RunFolder, Steps, perform
+from surrogym.cli.groups import add
+from surrogym.cli.options import ExitWithParent, Quiet
 from surrogym_lab.arms import ARMS
 from surrogym_lab.tasks import EVERY_TASK
 

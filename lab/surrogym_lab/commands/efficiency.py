@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from surrogym_client.cli.groups import add
-from surrogym_client.cli.options import AsJson, Quiet, require_known
+from surrogym.cli.groups import add
+from surrogym.cli.options import AsJson, Quiet, require_known
 
 if TYPE_CHECKING:
     from surrogym_lab.reproduce.cells import Begin, Cell, Progress
@@ -91,7 +91,7 @@ def run_study(
         CommandError: a run failed.
         NoCluster: there is no such cluster.
     """
-    from surrogym_client.cli.errors import CommandError
+    from surrogym.cli.errors import CommandError
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_lab.commands.table import present
     from surrogym_lab.reproduce.cells import done_already, run_cells
@@ -128,7 +128,7 @@ def _begin_on(address: str | None) -> Begin | None:
 
 def _wanted(tasks: str, arms: str, seeds: Sequence[int], chosen: dict[str, Any]) -> list[Cell]:
     """Return the runs of the chosen tasks and arms."""
-    from surrogym_client.demo.tasks import TASKS
+    from surrogym.demo.tasks import TASKS
     from surrogym_lab.arms import ARMS
     from surrogym_lab.reproduce.cells import cells, study
 
@@ -146,7 +146,7 @@ def names_of(what: str, given: str, known: Iterable[str], *words: str) -> list[s
     Raises:
         CommandError: a name is not known.
     """
-    from surrogym_client.cli.errors import CommandError
+    from surrogym.cli.errors import CommandError
     from surrogym_shared.removed import remark
 
     if given == "all":
@@ -161,7 +161,7 @@ def names_of(what: str, given: str, known: Iterable[str], *words: str) -> list[s
 
 
 def _shares(given: str) -> list[float]:
-    from surrogym_client.cli.errors import CommandError
+    from surrogym.cli.errors import CommandError
 
     try:
         shares = [float(share) for share in given.split(",")]

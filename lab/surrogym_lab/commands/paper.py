@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from surrogym_client.cli.groups import add
-from surrogym_client.cli.options import AsJson, Quiet
+from surrogym.cli.groups import add
+from surrogym.cli.options import AsJson, Quiet
 from surrogym_lab.commands.efficiency import OnRay
 
 if TYPE_CHECKING:
@@ -55,8 +55,8 @@ def command(
     """
     from dataclasses import replace
 
-    from surrogym_client.cli.columns import columns
-    from surrogym_client.cli.errors import CommandError
+    from surrogym.cli.columns import columns
+    from surrogym.cli.errors import CommandError
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_lab.reproduce.paper import tables
     from surrogym_lab.reproduce.paper_cases import QUICK, TASKS, WHOLE, cells

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym_client.cli.groups import add
-from surrogym_client.cli.options import AsJson, Quiet
+from surrogym.cli.groups import add
+from surrogym.cli.options import AsJson, Quiet
 from surrogym_lab.commands.efficiency import OnRay
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def command(
 
     Example: python -m surrogym_lab peers --rows docs/results/efficiency.csv --out runs/peers --only-table
     """
-    from surrogym_client.cli.errors import CommandError
+    from surrogym.cli.errors import CommandError
     from surrogym_lab.peers.study import PeerCell
     from surrogym_shared.terminal import say
 
@@ -85,7 +85,7 @@ def command(
 
 
 def _tasks(given: str) -> list[str]:
-    from surrogym_client.cli.errors import CommandError
+    from surrogym.cli.errors import CommandError
     from surrogym_lab.peers.registry import CORE, task_of
 
     names = list(CORE) if given == "core" else list(dict.fromkeys(given.split(",")))
@@ -102,9 +102,9 @@ def _tasks(given: str) -> list[str]:
 
 def _require_classes(tasks: Sequence[str]) -> None:
     """Refuse a class that this machine does not have. Machines of a cluster may have others."""
-    from surrogym_client.original.executables import is_executable
-    from surrogym_client.original.loading import is_own, load_factory
     from surrogym_lab.peers.registry import task_of
+    from surrogym_sampler.original.executables import is_executable
+    from surrogym_sampler.original.loading import is_own, load_factory
 
     for environment in (task_of(name).environment for name in tasks):
         if is_own(environment) and not is_executable(environment):
@@ -112,7 +112,7 @@ def _require_classes(tasks: Sequence[str]) -> None:
 
 
 def _methods(given: str) -> list[str]:
-    from surrogym_client.cli.errors import CommandError
+    from surrogym.cli.errors import CommandError
     from surrogym_lab.commands.efficiency import names_of
     from surrogym_lab.peers.registry import METHODS, OURS
 
@@ -126,7 +126,7 @@ def _methods(given: str) -> list[str]:
 
 def _keep_others(cells: Sequence[PeerCell], out: Path) -> None:
     """Refuse to overwrite runs with other settings."""
-    from surrogym_client.cli.errors import CommandError
+    from surrogym.cli.errors import CommandError
 
     if occupied := [cell.file(out) for cell in cells if cell.occupied(out)]:
         more = f" ({len(occupied)} such files)" if len(occupied) > 1 else ""
@@ -142,7 +142,7 @@ def _learnable(cells: Sequence[PeerCell], *, quiet: bool) -> list[PeerCell]:
     Raises:
         CommandError: none is left.
     """
-    from surrogym_client.cli.errors import CommandError
+    from surrogym.cli.errors import CommandError
     from surrogym_lab.peers.study import refusals
     from surrogym_shared.terminal import say
 
@@ -200,7 +200,7 @@ def _runner(address: str | None, after_round: AfterRound) -> Callable[[Sequence[
 
 def _ours(files: Sequence[Path], tasks: Sequence[str]) -> list[Point]:
     """Points of our arms at each task's budget."""
-    from surrogym_client.cli.errors import CommandError
+    from surrogym.cli.errors import CommandError
     from surrogym_lab.peers.points import points_of
     from surrogym_lab.peers.registry import OURS, task_of
     from surrogym_lab.reproduce.rows import merge, read_rows
@@ -215,7 +215,7 @@ def _ours(files: Sequence[Path], tasks: Sequence[str]) -> list[Point]:
 
 def _present(cells: Sequence[PeerCell], ours: Sequence[Point], out: Path, *, as_json: bool, quiet: bool) -> None:
     """Write points, table and pictures, and print the table."""
-    from surrogym_client.cli.columns import fitted
+    from surrogym.cli.columns import fitted
     from surrogym_lab.peers.pictures import draw_tasks
     from surrogym_lab.peers.points import Point
     from surrogym_lab.peers.table import NOTES, table, unfinished

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym_client.cli.groups import add
-from surrogym_client.cli.options import AsJson, Quiet
+from surrogym.cli.groups import add
+from surrogym.cli.options import AsJson, Quiet
 
 if TYPE_CHECKING:
     from surrogym_lab.reproduce.rows import Row
@@ -43,7 +43,7 @@ def command(
 
     Example: python -m surrogym_lab table --rows night/rows.csv --rows day/rows.csv --out runs/table
     """
-    from surrogym_client.cli.errors import CommandError
+    from surrogym.cli.errors import CommandError
     from surrogym_lab.reproduce.page import update
     from surrogym_lab.reproduce.rows import merge, read_rows, write_rows
     from surrogym_shared.terminal import give
@@ -62,7 +62,7 @@ def command(
 
 def present(rows: Sequence[Row], out: Path, *, as_json: bool, quiet: bool) -> None:
     """Write the table and the pictures of rows, and print the table."""
-    from surrogym_client.cli.columns import fitted
+    from surrogym.cli.columns import fitted
     from surrogym_lab.reproduce.table import report
     from surrogym_shared.terminal import give, progress
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.groups import add
-from surrogym_client.cli.options import AsJson, Quiet
+from surrogym.cli.groups import add
+from surrogym.cli.options import AsJson, Quiet
 from surrogym_lab.commands.efficiency import OnRay
 
 

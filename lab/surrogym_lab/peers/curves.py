@@ -9,9 +9,9 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.evaluation.evaluator import interquartile_mean
 from surrogym_lab.peers.points import Point
 from surrogym_lab.reproduce.statistics import bootstrap_interval
+from surrogym_trainer.evaluation.evaluator import interquartile_mean
 
 Array = NDArray[np.float64]
 FEW = 3  # seeds; fewer give no useful interval

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_client.original.protocol import Array, RealStep
+from surrogym_sampler.original.protocol import Array, RealStep
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,

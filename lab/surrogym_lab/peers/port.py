@@ -14,11 +14,11 @@ from typing import Protocol
 import numpy as np
 
 from surrogym_client.errors import SurrogymClientError
-from surrogym_client.original.episodes import Episode, Moment
-from surrogym_client.original.port import SEEDS
-from surrogym_client.original.protocol import LONGEST_EPISODE, Array
-from surrogym_client.policies.predict import Acting
+from surrogym_sampler.original.episodes import Episode, Moment
+from surrogym_sampler.original.port import SEEDS
+from surrogym_sampler.original.protocol import LONGEST_EPISODE, Array
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.policies.predict import Acting
 
 
 class NotApplicable(SurrogymClientError):

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from surrogym_client.demo.tasks import DemoTask, Target
-from surrogym_client.original.loading import has_specification
+from surrogym.demo.tasks import DemoTask, Target
 from surrogym_lab.peers.port import Peer
 from surrogym_lab.tasks import EVERY_TASK
+from surrogym_sampler.original.loading import has_specification
 from surrogym_shared.spec import EnvironmentSpec
 
 OURS = ("default", "latin_hypercube")  # arms of the efficiency study

@@ -9,17 +9,17 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from surrogym_client.demo.settings import fingerprint
-from surrogym_client.demo.tasks import DemoTask, Outcome, Target
-from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
-from surrogym_client.original import make
-from surrogym_client.original.episodes import Episode, open_episode
-from surrogym_client.policies.predict import Acting
+from surrogym.demo.settings import fingerprint
+from surrogym.demo.tasks import DemoTask, Outcome, Target
 from surrogym_client.runtime.versions import commit, machine
 from surrogym_lab.peers.points import BUDGET, REACHED, TIME, Point
 from surrogym_lab.peers.port import BudgetSpent, Clock, NotApplicable, OutOfTime, Real
 from surrogym_lab.peers.registry import METHODS, task_of
 from surrogym_lab.reproduce.rows import read_records, write_records
+from surrogym_sampler.original import make
+from surrogym_sampler.original.episodes import Episode, open_episode
+from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
+from surrogym_trainer.policies.predict import Acting
 
 LIMIT_MINUTES = 90.0
 

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from surrogym_client.evaluation.evaluator import interquartile_mean
 from surrogym_lab.peers.curves import by_method, by_seed
 from surrogym_lab.peers.points import TIME, Point
 from surrogym_lab.peers.registry import task_of
 from surrogym_lab.reproduce.markdown import markdown
 from surrogym_lab.reproduce.statistics import bootstrap_interval
+from surrogym_trainer.evaluation.evaluator import interquartile_mean
 
 HEADING = (
     "task",

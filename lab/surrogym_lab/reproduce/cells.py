@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_client.demo.settings import fingerprint
+from surrogym.demo.settings import fingerprint
 from surrogym_client.runtime.versions import commit, machine
 from surrogym_lab.arms import ARMS
 from surrogym_lab.reproduce.rows import Key, Row, merge, row_of, write_rows

@@ -16,15 +16,9 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from surrogym_client.demo.processes import Children, await_file
-from surrogym_client.original import make
-from surrogym_client.policies.files import load_policy
+from surrogym.demo.processes import Children, await_file
 from surrogym_client.runtime.versions import commit
-from surrogym_client.sampler.settings import Outcome, SamplerSettings
-from surrogym_client.sampler.worker import Sampler
 from surrogym_client.surrogates.waiting import wait_for_design
-from surrogym_client.training import TrainProgress, TrainSettings, train
-from surrogym_client.training.search import REFERENCE
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import Retries
 from surrogym_client.transport.http_surrogate import HttpSurrogate
@@ -33,7 +27,13 @@ from surrogym_lab.reproduce.markdown import markdown
 from surrogym_lab.reproduce.paper_cases import Cell
 from surrogym_lab.reproduce.paper_measures import Unseen, confidences, run_variation, some
 from surrogym_lab.reproduce.paper_table import per_seed, table
+from surrogym_sampler.original import make
+from surrogym_sampler.queries.settings import Outcome, SamplerSettings
+from surrogym_sampler.queries.worker import Sampler
 from surrogym_shared.wire import Query
+from surrogym_trainer.policies.files import load_policy
+from surrogym_trainer.training import TrainProgress, TrainSettings, train
+from surrogym_trainer.training.search import REFERENCE
 
 PATIENCE_SECONDS = 3_600.0
 DATABASE = "surrogym.db"

@@ -10,9 +10,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from surrogym_client.original import make
-from surrogym_client.original.loading import with_choices
 from surrogym_client.runtime.versions import versions
+from surrogym_sampler.original import make
+from surrogym_sampler.original.loading import with_choices
 from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform
 
 Preset = Literal["default", "paper"]

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.evaluation.evaluator import EvaluationSettings, Trace, evaluate
-from surrogym_client.original import OriginalEnvironment, make
-from surrogym_client.original.episodes import GymnasiumEpisode, Moment, draw
-from surrogym_client.original.protocol import RealStep
-from surrogym_client.original.simulator import SMALLEST_FACTOR
-from surrogym_client.policies.predict import Predict
 from surrogym_client.transport.api import Api
 from surrogym_lab.reproduce.paper_cases import ANYWHERE, Variation
+from surrogym_sampler.original import OriginalEnvironment, make
+from surrogym_sampler.original.episodes import GymnasiumEpisode, Moment, draw
+from surrogym_sampler.original.protocol import RealStep
+from surrogym_sampler.original.simulator import SMALLEST_FACTOR
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 from surrogym_shared.terms import observe
 from surrogym_shared.wire import ModelView
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, Trace, evaluate
+from surrogym_trainer.policies.predict import Predict
 
 Array = NDArray[np.float64]
 

@@ -11,11 +11,11 @@ matplotlib.use("Agg")
 
 from matplotlib.figure import Figure
 
-from surrogym_client.evaluation.evaluator import interquartile_mean
 from surrogym_lab.arms import ARMS
 from surrogym_lab.reproduce.rows import Row
 from surrogym_lab.reproduce.statistics import bootstrap_interval
 from surrogym_lab.reproduce.table import Group, column, grouped, tasks_with_results
+from surrogym_trainer.evaluation.evaluator import interquartile_mean
 
 OF_ARMS = (
     *("#dd8452", "#da8bc3", "#64b5cd", "#4c72b0", "#55a868", "#8172b3"),

@@ -11,7 +11,7 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.evaluation.evaluator import interquartile_mean
+from surrogym_trainer.evaluation.evaluator import interquartile_mean
 
 Array = NDArray[np.float64]
 

@@ -8,14 +8,14 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.demo.tasks import queries_a_round
-from surrogym_client.evaluation.evaluator import interquartile_mean
+from surrogym.demo.tasks import queries_a_round
 from surrogym_lab.arms import ARMS
 from surrogym_lab.reproduce.markdown import markdown
 from surrogym_lab.reproduce.promises import promise_tables
 from surrogym_lab.reproduce.rows import Row
 from surrogym_lab.reproduce.statistics import bootstrap_interval, difference_interval
 from surrogym_lab.tasks import EVERY_TASK
+from surrogym_trainer.evaluation.evaluator import interquartile_mean
 
 Group = tuple[str, str, int]
 HEADING = (

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.original.protocol import RealStep
+from surrogym_sampler.original.protocol import RealStep
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 Array = NDArray[np.float64]

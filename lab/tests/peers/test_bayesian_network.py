@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from surrogym_client.original import make
-from surrogym_client.original.episodes import open_episode
 from surrogym_lab.peers.methods.bayesian_network import (
     BayesianNetwork,
     Particles,
@@ -23,6 +21,8 @@ from surrogym_lab.peers.methods.pilco import start_beliefs
 from surrogym_lab.peers.methods.states import States
 from surrogym_lab.peers.methods.told import TOLD
 from surrogym_lab.peers.port import BudgetSpent, Clock, NotApplicable, Real
+from surrogym_sampler.original import make
+from surrogym_sampler.original.episodes import open_episode
 
 SWING_UP = "surrogym/CartPoleSwingUpNarrow-v0"
 SMALL = Settings(hidden=8, training=5, search=2, particles=10, basis=5)

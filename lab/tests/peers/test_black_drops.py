@@ -3,11 +3,11 @@
 import numpy as np
 import torch
 
-from surrogym_client.original import make
 from surrogym_lab.peers.methods.black_drops import BOUND, Imagined, Settings, search
 from surrogym_lab.peers.methods.gaussian_process import conditioned
 from surrogym_lab.peers.methods.states import States, Transitions
 from surrogym_lab.peers.methods.told import told
+from surrogym_sampler.original import make
 
 
 def test_a_search_finds_the_top_within_the_bounds():

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from surrogym_client.original import make
-from surrogym_client.original.episodes import open_episode
 from surrogym_lab.peers.methods.elites import Trained, fit, held_out
 from surrogym_lab.peers.methods.ensemble import Ensemble
 from surrogym_lab.peers.methods.mbpo import Mbpo, Model, Pools, Settings, Transitions
 from surrogym_lab.peers.methods.states import States
 from surrogym_lab.peers.port import BudgetSpent, Clock, Real
+from surrogym_sampler.original import make
+from surrogym_sampler.original.episodes import open_episode
 
 SMALL = Settings(
     hidden=(32, 32), decay=(0.0, 0.0, 0.0), epoch=1, explore=40, every=20, rollouts=20, updates=2, batch=32

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from surrogym_client.original import make
 from surrogym_lab.peers.methods.ensemble import Ensemble, negative_log_likelihood, train
 from surrogym_lab.peers.methods.pets import Planner, Planning, Settings, cross_entropy
 from surrogym_lab.peers.methods.states import States
 from surrogym_lab.peers.methods.told import told
+from surrogym_sampler.original import make
 from surrogym_shared.terms import observe
 
 

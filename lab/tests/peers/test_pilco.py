@@ -6,11 +6,11 @@ from functools import partial
 import numpy as np
 import torch
 
-from surrogym_client.original import make
 from surrogym_lab.peers.methods import belief, pilco
 from surrogym_lab.peers.methods.gaussian_process import conditioned
 from surrogym_lab.peers.methods.states import States
 from surrogym_lab.peers.methods.told import TOLD
+from surrogym_sampler.original import make
 from surrogym_shared.spec import BoxAction
 
 SPEC = make("Pendulum-v1").spec()

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_lab.peers.points import TIME, Point
 from surrogym_lab.peers.processes import run_cells
 from surrogym_lab.peers.study import PeerCell
+from surrogym_sampler.original.errors import UnknownEnvironment
 
 PATIENCE = 60.0
 OWN = """

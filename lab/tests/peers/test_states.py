@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from surrogym_client.original import make
-from surrogym_client.original.episodes import open_episode
 from surrogym_lab.peers.methods.states import Held, States, episode, random_control
 from surrogym_lab.peers.methods.told import TOLD, told
 from surrogym_lab.peers.port import BudgetSpent, Clock, NotApplicable, OutOfTime, Real
+from surrogym_sampler.original import make
+from surrogym_sampler.original.episodes import open_episode
 from surrogym_shared.terms import observe
 
 NAMES = sorted(TOLD)

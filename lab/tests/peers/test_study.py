@@ -7,13 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from surrogym_client.policies.predict import PerEpisode
 from surrogym_lab.peers import registry
 from surrogym_lab.peers.methods.model_free import goals
 from surrogym_lab.peers.points import BUDGET, REACHED, TIME
 from surrogym_lab.peers.port import NotApplicable
 from surrogym_lab.peers.registry import METHODS, Method, task_of
 from surrogym_lab.peers.study import PeerCell, run_cell
+from surrogym_trainer.policies.predict import PerEpisode
 
 
 class Balancing:

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from surrogym_client.original import make
-from surrogym_client.original.episodes import open_episode
 from surrogym_lab.peers.methods.mixture_network import Episode, MixtureNetwork, train
 from surrogym_lab.peers.methods.states import States
 from surrogym_lab.peers.methods.world_model import (
@@ -17,6 +15,8 @@ from surrogym_lab.peers.methods.world_model import (
     starts,
 )
 from surrogym_lab.peers.port import BudgetSpent, Clock, Real
+from surrogym_sampler.original import make
+from surrogym_sampler.original.episodes import open_episode
 
 SMALL = Settings(hidden=8, training=3, collect=20, population=6, rollouts=2, generations=2)
 

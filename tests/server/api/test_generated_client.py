@@ -16,8 +16,8 @@ import pytest
 
 from support import pendulum
 from support.server import ServerProcess
-from surrogym_client.original.classic import pendulum as pendulum_spec
-from surrogym_client.original.gymnasium import GymnasiumEnvironment
+from surrogym_sampler.original.classic import pendulum as pendulum_spec
+from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
 
 PACKAGE = "generated_surrogym_client"
 FRAMES = "Unsupported content type application/vnd.msgpack"  # beside JSON; no generator knows the frames

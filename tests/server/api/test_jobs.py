@@ -12,8 +12,8 @@ import pytest
 from support.policies import left_alone, network_file
 from support.server import ServerProcess
 from surrogym_client.errors import InvalidInput, LeaseExpired, NoModel, Overloaded, UnknownJob, UnknownPolicy
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api, Retries
+from surrogym_sampler.original.classic import pendulum
 from surrogym_shared import wire
 
 TRAIN = wire.TrainTask(kind="train", algorithm="fastppo", steps=1_000)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from support import pendulum, reactor
-from surrogym_client.logs import read_log
-from surrogym_client.original.classic import pendulum as original
-from surrogym_client.original.gymnasium import GymnasiumEnvironment
+from surrogym_sampler.logs import read_log
+from surrogym_sampler.original.classic import pendulum as original
+from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
 
 HEADING = "theta,theta_dot,action_torque,reward,episode"
 

@@ -17,8 +17,8 @@ import pytest
 
 from support.server import ServerProcess
 from surrogym_client.errors import InvalidInput, ServerFailure, SpecConflict, UnknownPolicy
-from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_shared import wire
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec

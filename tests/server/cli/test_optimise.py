@@ -9,11 +9,11 @@ import pytest
 
 from support.models import learn
 from support.real_steps import random_steps
-from surrogym_client.original.classic import cartpole, pendulum
-from surrogym_client.policies import read_card
+from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.models.files import to_bytes
 from surrogym_shared.network import Network
+from surrogym_trainer.policies import read_card
 
 
 def optimise(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from support.postgresql import Postgresql, running_postgresql
-from surrogym_client.original import classic
+from surrogym_sampler.original import classic
 from surrogym_server.cluster import pool
 from surrogym_server.convert import stored_definition
 from surrogym_server.engine.design_job import DesignJob, run_design_job

@@ -22,8 +22,8 @@ from support import pendulum
 from support.alternating import alternating
 from support.postgresql import Postgresql
 from support.server import ServerProcess, running_server
-from surrogym_client.diagnosis.conformance import conformance, leases, sessions
 from surrogym_client.transport import HttpSurrogate, Transport
+from surrogym_sampler.diagnosis.conformance import conformance, leases, sessions
 from surrogym_server.cluster import pool
 from surrogym_server.cluster.host import Refused
 from surrogym_server.engine.port import SessionEngine

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from surrogym_client.original import classic
+from surrogym_sampler.original import classic
 from surrogym_server.convert import stored_definition
 from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.environment.samples import Samples

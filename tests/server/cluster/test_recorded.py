@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from surrogym_client.original import classic
+from surrogym_sampler.original import classic
 from surrogym_server.cluster import leases
 from surrogym_server.cluster.host import HostSettings, recorded_engine
 from surrogym_server.cluster.leases import Pace

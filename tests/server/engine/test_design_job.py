@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from support.real_steps import answer
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
 from surrogym_server.models.files import from_bytes

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from surrogym_client.original.classic import acrobot, mountain_car_continuous, pendulum
-from surrogym_client.original.mujoco_tasks import reacher
+from surrogym_sampler.original.classic import acrobot, mountain_car_continuous, pendulum
+from surrogym_sampler.original.mujoco_tasks import reacher
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import ActionDefinition
 from surrogym_server.environment.features import Encoder, FeatureMap, encode, leading

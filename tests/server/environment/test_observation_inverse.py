@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from surrogym_client.original.classic import acrobot, cartpole_of_the_paper, pendulum
+from surrogym_sampler.original.classic import acrobot, cartpole_of_the_paper, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.errors import InvalidSpec

@@ -2,7 +2,7 @@
 
 import pytest
 
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidSpec
 from surrogym_server.models.gaussian_process import GaussianProcesses

@@ -7,7 +7,7 @@ import torch
 
 from support.models import learn
 from support.real_steps import answer, random_steps
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples

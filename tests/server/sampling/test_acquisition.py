@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from surrogym_client.original.classic import cartpole
+from surrogym_sampler.original.classic import cartpole
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
 from surrogym_server.errors import ChoiceFailed

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from support.real_steps import answer, join, random_steps
-from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition, wrap
 from surrogym_server.environment.points import Points

@@ -6,7 +6,7 @@ import torch
 from support.models import learn
 from support.plane import drifting, plane
 from support.real_steps import answer, join, random_steps
-from surrogym_client.original.classic import cartpole
+from surrogym_sampler.original.classic import cartpole
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples

@@ -10,7 +10,7 @@ import torch
 
 from support.models import learn
 from support.real_steps import join, roll
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.features import distances
 from surrogym_server.environment.points import Points

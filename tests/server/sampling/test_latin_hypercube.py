@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 from scipy.stats import truncnorm
 
-from surrogym_client.original.classic import acrobot, pendulum
+from surrogym_sampler.original.classic import acrobot, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import ActionDefinition, CoordinateDefinition
 from surrogym_server.environment.distributions import Distribution, Fixed, Normal, Uniform

@@ -7,7 +7,7 @@ from scipy.stats import norm
 
 from support.models import learn
 from support.real_steps import random_steps
-from surrogym_client.original.swingup import swing_up
+from surrogym_sampler.original.swingup import swing_up
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples, increments, saturated
 from surrogym_server.sampling.design import DesignState

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
 from surrogym_server.sampling.regions import regions_of

@@ -11,7 +11,7 @@ import torch
 from support.models import learn
 from support.plane import drifting, plane
 from support.real_steps import join, roll
-from surrogym_client.original.classic import acrobot, cartpole, pendulum
+from surrogym_sampler.original.classic import acrobot, cartpole, pendulum
 from surrogym_server.convert import default_budget, definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, run_design_job
 from surrogym_server.environment.definition import EnvironmentDefinition

@@ -13,8 +13,8 @@ import torch
 
 from support.models import gaussian_processes
 from support.real_steps import random_steps
-from surrogym_client.original.classic import acrobot, cartpole, pendulum
-from surrogym_client.original.swingup import swing_up, swing_up_narrow
+from surrogym_sampler.original.classic import acrobot, cartpole, pendulum
+from surrogym_sampler.original.swingup import swing_up, swing_up_narrow
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import NotReset
 from surrogym_server.models.gaussian_process import model as gaussian_process_model

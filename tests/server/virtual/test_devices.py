@@ -12,7 +12,7 @@ from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 
 from support.models import learn
 from support.real_steps import random_steps
-from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.gp import serving
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel

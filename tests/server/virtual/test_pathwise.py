@@ -9,7 +9,7 @@ import torch
 from support.exact_models import ExactModel, exact_pendulum
 from support.models import learn
 from support.real_steps import random_steps
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel

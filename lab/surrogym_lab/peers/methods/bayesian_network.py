@@ -17,13 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from surrogym_client.original.protocol import Array
-from surrogym_client.policies.predict import Acting
 from surrogym_lab.peers.methods.dropout_network import DropoutNetwork, train
 from surrogym_lab.peers.methods.pilco import start_beliefs
 from surrogym_lab.peers.methods.states import Held, States, Transitions, episode, random_control
 from surrogym_lab.peers.methods.told import TipCost, told
 from surrogym_lab.peers.port import NotApplicable, Real
+from surrogym_sampler.original.protocol import Array
+from surrogym_trainer.policies.predict import Acting
 
 JITTER = 1e-9  # of a covariance of particles
 

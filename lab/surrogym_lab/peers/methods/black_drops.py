@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from cmaes import CMA
 
-from surrogym_client.original.episodes import draw
-from surrogym_client.original.protocol import Array
-from surrogym_client.policies.predict import Acting
 from surrogym_lab.peers.methods.gaussian_process import Processes, fit
 from surrogym_lab.peers.methods.states import Held, States, Transitions, episode, random_control
 from surrogym_lab.peers.methods.told import Told, survives, told
 from surrogym_lab.peers.port import Real
+from surrogym_sampler.original.episodes import draw
+from surrogym_sampler.original.protocol import Array
+from surrogym_trainer.policies.predict import Acting
 
 BOUND = 5.0  # of the policy's parameters
 PAST = 1.5  # ranges of data that rollouts may leave them by, before they stay where they are

@@ -16,7 +16,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 from torch import Tensor
 
-from surrogym_client.original.protocol import Array
+from surrogym_sampler.original.protocol import Array
 
 MOST = 300  # samples; PILCO's authors take 300 inducing points beyond, we take a random subset
 SPREAD, POWER = 100.0, 30  # of PILCO's penalty: limit of a length scale, and steepness

@@ -19,13 +19,13 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from surrogym_client.policies.predict import Acting
 from surrogym_lab.peers.methods.elites import Trained, fit
 from surrogym_lab.peers.methods.ensemble import Ensemble
 from surrogym_lab.peers.methods.model_free import RealEnv
 from surrogym_lab.peers.methods.states import States
 from surrogym_lab.peers.methods.told import survives
 from surrogym_lab.peers.port import Real
+from surrogym_trainer.policies.predict import Acting
 
 Floats = NDArray[np.float32]
 Acts = Callable[[Floats], Floats]

@@ -10,10 +10,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from surrogym_client.policies.predict import Acting
 from surrogym_lab.peers.methods.states import States
 from surrogym_lab.peers.port import BudgetSpent, Real
 from surrogym_shared.spec import BoxAction, DiscreteAction
+from surrogym_trainer.policies.predict import Acting
 
 
 class RealEnv(gymnasium.Env[NDArray[np.float32], Any]):

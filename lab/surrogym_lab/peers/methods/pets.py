@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from surrogym_client.original.protocol import Array
-from surrogym_client.policies.predict import Acting, PerEpisode
 from surrogym_lab.peers.methods.ensemble import Ensemble, train
 from surrogym_lab.peers.methods.states import Control, States, Transitions, episode, random_control
 from surrogym_lab.peers.methods.told import Told, survives, told
 from surrogym_lab.peers.port import Clock, Real
+from surrogym_sampler.original.protocol import Array
+from surrogym_trainer.policies.predict import Acting, PerEpisode
 
 
 @dataclass(frozen=True)

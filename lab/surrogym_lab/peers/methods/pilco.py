@@ -15,14 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogym_client.original.protocol import Array
-from surrogym_client.policies.predict import Acting
 from surrogym_lab.peers.methods.belief import Imagination, expected_cost
 from surrogym_lab.peers.methods.gaussian_process import Processes, conditioned, fit, lowest
 from surrogym_lab.peers.methods.states import Control, Held, States, Transitions, episode, random_control
 from surrogym_lab.peers.methods.told import told
 from surrogym_lab.peers.port import NotApplicable, Real
+from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform
+from surrogym_trainer.policies.predict import Acting
 
 HALF_TURN = np.pi
 SIGNAL_TO_NOISE = 1_000.0  # limit of the processes' hyperparameters, as in the authors' penalty

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.original.protocol import Array
-from surrogym_client.policies.predict import PerEpisode
 from surrogym_lab.peers.port import NotApplicable, Real
+from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction, Term
 from surrogym_shared.spec.actions import Action
+from surrogym_trainer.policies.predict import PerEpisode
 
 Control = Callable[[Array], Array]
 """Coordinates (N, C) to controls (N, F) in [-1, 1]."""

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surrogym_client.original.protocol import Array
-from surrogym_client.original.swingup import LENGTH, WIDTH
 from surrogym_client.registration import SWING_UP, SWING_UP_NARROW
 from surrogym_lab.peers import figures
 from surrogym_lab.peers.port import NotApplicable
+from surrogym_sampler.original.protocol import Array
+from surrogym_sampler.original.swingup import LENGTH, WIDTH
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.terms import terminates
 

@@ -19,14 +19,14 @@ from cmaes import CMA
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogym_client.original.episodes import draw
-from surrogym_client.original.protocol import LONGEST_EPISODE, Array
-from surrogym_client.policies.predict import Acting, PerEpisode
 from surrogym_lab.peers.methods.mixture_network import Episode, MixtureNetwork, State, train
 from surrogym_lab.peers.methods.states import States
 from surrogym_lab.peers.port import Real
+from surrogym_sampler.original.episodes import draw
+from surrogym_sampler.original.protocol import LONGEST_EPISODE, Array
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.terms import observe
+from surrogym_trainer.policies.predict import Acting, PerEpisode
 
 SELECTION = 100  # rollouts of each of the controllers that a search chooses from at its end
 

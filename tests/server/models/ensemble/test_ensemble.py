@@ -9,7 +9,7 @@ import torch
 
 from support.models import learn, with_header
 from support.real_steps import random_steps
-from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, InvalidSpec

@@ -8,8 +8,8 @@ import torch
 
 from support.models import learn
 from support.real_steps import random_steps
-from surrogym_client.original.classic import acrobot, cartpole
-from surrogym_client.original.swingup import swing_up
+from surrogym_sampler.original.classic import acrobot, cartpole
+from surrogym_sampler.original.swingup import swing_up
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.features import FeatureMap, encode
 from surrogym_server.environment.samples import Samples, increments

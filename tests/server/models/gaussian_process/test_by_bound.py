@@ -12,8 +12,8 @@ import torch
 
 from support.models import learn
 from support.real_steps import random_steps
-from surrogym_client.original.classic import pendulum
 from surrogym_lab.unseen.machine import Array, Machine
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples, increments
 from surrogym_server.errors import InvalidSpec

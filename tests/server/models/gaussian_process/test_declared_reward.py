@@ -10,8 +10,8 @@ from pydantic import ValidationError
 
 from support.models import learn
 from support.real_steps import random_steps
-from surrogym_client.original.classic import cartpole, pendulum
-from surrogym_client.original.swingup import LENGTH, WIDTH, swing_up_narrow
+from surrogym_sampler.original.classic import cartpole, pendulum
+from surrogym_sampler.original.swingup import LENGTH, WIDTH, swing_up_narrow
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.files import from_bytes, to_bytes

@@ -12,7 +12,7 @@ from torch import Tensor
 from support.models import gaussian_processes
 from support.predictions import WAYS, check_compiled, check_processes
 from support.real_steps import random_steps
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.features import FeatureMap, features
 from surrogym_server.environment.samples import Samples

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from support.real_steps import random_steps
-from surrogym_client.original.classic import acrobot, cartpole, pendulum
-from surrogym_client.original.mujoco_tasks import reacher
+from surrogym_sampler.original.classic import acrobot, cartpole, pendulum
+from surrogym_sampler.original.mujoco_tasks import reacher
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.features import FeatureMap, encode, leading
 from surrogym_server.models.gaussian_process.feature_maps import candidates, reflection, reward_candidates

@@ -12,8 +12,8 @@ from safetensors.torch import load, save
 
 from support.models import learn
 from support.rail import SPEC, Rail
-from surrogym_client.original.protocol import RealStep
-from surrogym_client.original.rollouts import FromReset
+from surrogym_sampler.original.protocol import RealStep
+from surrogym_sampler.original.rollouts import FromReset
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples

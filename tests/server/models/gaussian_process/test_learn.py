@@ -7,7 +7,7 @@ import torch
 
 from support.models import learn
 from support.real_steps import join, random_steps
-from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
+from surrogym_sampler.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples
 from surrogym_server.environment.step_rules import paid

@@ -9,7 +9,7 @@ from safetensors.torch import load, save
 
 from support.models import learn
 from support.real_steps import random_steps
-from surrogym_client.original.classic import acrobot, cartpole
+from surrogym_sampler.original.classic import acrobot, cartpole
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.files import from_bytes, to_bytes

@@ -11,7 +11,7 @@ from torch import Tensor
 from support.models import gaussian_processes, learn
 from support.predictions import WAYS, check_compiled, check_processes
 from support.real_steps import random_steps
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.features import FeatureMap, encode
 from surrogym_server.environment.points import Points

@@ -9,7 +9,7 @@ import torch
 from support.models import gaussian_processes
 from support.plane import drifting, plane
 from support.real_steps import random_steps
-from surrogym_client.original.classic import pendulum
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import CompiledSteps, FunctionDraws

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from support.real_steps import random_steps
-from surrogym_client.original.classic import mountain_car_continuous
+from surrogym_sampler.original.classic import mountain_car_continuous
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.models.gaussian_process.learning.thresholds import explain, log_probability, thresholds

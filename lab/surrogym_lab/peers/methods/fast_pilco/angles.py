@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from surrogym_client.original.protocol import Array
+from surrogym_sampler.original.protocol import Array
 from surrogym_shared.compiled.jit import compiled
 
 ONE, THREE = 9 / 8, 1 / 8  # weights of sin(v) and sin(3 v) in a squashed control

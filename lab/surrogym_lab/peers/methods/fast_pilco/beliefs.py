@@ -13,7 +13,6 @@ import numpy as np
 import scipy.linalg.cython_blas  # noqa: F401  # numba calls it
 from numba import types
 
-from surrogym_client.original.protocol import Array
 from surrogym_lab.peers.methods.fast_pilco.angles import angles, angles_back, squashed, squashed_back
 from surrogym_lab.peers.methods.fast_pilco.processes import (
     Ints,
@@ -23,6 +22,7 @@ from surrogym_lab.peers.methods.fast_pilco.processes import (
     mean_and_gain_back,
     pair,
 )
+from surrogym_sampler.original.protocol import Array
 from surrogym_shared.compiled.jit import compiled, entry
 
 Exact = tuple[Array, Array, Array, Array]

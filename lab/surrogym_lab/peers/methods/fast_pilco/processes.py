@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.original.protocol import Array
+from surrogym_sampler.original.protocol import Array
 from surrogym_shared.compiled.jit import compiled, summing
 
 Ints = NDArray[np.int64]

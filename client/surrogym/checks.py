@@ -1,0 +1,118 @@
+"""Checks of a design's arguments.
+
+Each check returns the value, or raises ``InvalidInput`` with what was expected and what came.
+
+Shapes: C coordinates, F action entries.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_sampler.original.protocol import RealStep
+from surrogym_server.environment.actions import model_actions
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.errors import InvalidInput
+from surrogym_server.services.definitions import check_coordinates
+from surrogym_shared.checks import LARGEST
+
+Floats = NDArray[np.float64]
+
+MOST_STEPS = 100_000  # as in a specification
+MOST_THREADS = 1_024
+FARTHEST = 1e6  # distance from the middle of a sampling range, in its widths; a fit loses all digits beyond
+SHOWN = 80  # characters of the given value in an error message
+
+
+def whole(what: str, value: Any, low: int, high: int, why: str = "") -> int:
+    """Check a whole number within bounds. ``why`` explains the bounds in the error message."""
+    try:
+        number = None if isinstance(value, bool | np.bool_) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or not low <= number <= high:
+        raise InvalidInput(f"{what}: expected a whole number from {low} to {high}{why}, got {_shown(value)}")
+    return number
+
+
+def share(what: str, value: Any) -> float:
+    """Check a target confidence index."""
+    if isinstance(value, bool) or not isinstance(value, float | np.floating | int) or not 0.5 < value < 1:
+        raise InvalidInput(f"{what}: expected a number above 0.5 and below 1, got {_shown(value)}")
+    return float(value)
+
+
+def states(definition: EnvironmentDefinition, what: str, values: Any) -> Floats:
+    """Check states of shape (v, C), with at least one row."""
+    rows = check_coordinates(definition, what, _numbers(what, values))
+    if not len(rows):
+        raise InvalidInput(f"{what}: expected at least one state, got none")
+    return _near(definition, what, rows)
+
+
+def steps_of(given: Any) -> list[RealStep]:
+    """Return one or several real steps as a list."""
+    steps = [given] if isinstance(given, RealStep) else list(given) if isinstance(given, Sequence) else [given]
+    for step in steps:
+        if not isinstance(step, RealStep):
+            raise InvalidInput(f"expected a RealStep, or a list of them, got {_shown(step)}")
+    return steps
+
+
+def real_step(definition: EnvironmentDefinition, step: RealStep) -> RealStep:
+    """Check a real step, and return it with arrays of shapes (C,), (F,) and (C,)."""
+    q, q_next = (
+        _near(definition, what, check_coordinates(definition, what, _row(what, getattr(step, what))))
+        for what in ("coordinates", "next_coordinates")
+    )
+    u = model_actions(definition.action, _row("action", step.action))
+    reward = _numbers("reward", step.reward)
+    if reward.shape != () or not np.isfinite(reward) or abs(reward) > LARGEST:
+        raise InvalidInput(f"reward: expected a finite number within {LARGEST:g}, got {_shown(step.reward)}")
+    ends = (_truth("terminated", step.terminated), _truth("truncated", step.truncated))
+    return RealStep(q[0], u[0], q_next[0], float(reward), *ends)
+
+
+def _near(definition: EnvironmentDefinition, what: str, rows: Floats) -> Floats:
+    """Check that states (n, C) are finite and not absurdly far from the sampling range."""
+    if not np.isfinite(rows).all():
+        raise InvalidInput(f"{what}: expected finite numbers, got {_shown(rows.tolist())}")
+    for index, coordinate in enumerate(definition.coordinates):
+        low, high = coordinate.settable
+        most = min(LARGEST, max(abs(low), abs(high)) + FARTHEST * (high - low))
+        far = np.abs(rows[:, index]) > most
+        if far.any():
+            raise InvalidInput(
+                f"{what}: expected {coordinate.name!r} from {-most:g} to {most:g}, got {rows[far, index][0]:g}"
+            )
+    return rows
+
+
+def _numbers(what: str, values: Any) -> Floats:
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        array = np.array(None)
+    if array.dtype.kind not in "fiub":
+        raise InvalidInput(f"{what}: expected numbers, got {_shown(values)}")
+    return array.astype(np.float64)
+
+
+def _row(what: str, values: Any) -> Floats:
+    return _numbers(what, values).reshape(1, -1)
+
+
+def _truth(what: str, value: Any) -> bool:
+    if not isinstance(value, bool | np.bool_):
+        raise InvalidInput(f"{what}: expected True or False, got {_shown(value)}")
+    return bool(value)
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."

@@ -1,0 +1,102 @@
+"""The ``surrogym`` command. Each file here is one command, with a function ``register(app)``. Other packages add
+commands through an entry point.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from importlib.metadata import entry_points
+
+import typer
+
+from surrogym.cli.commands import Command, Commands
+from surrogym.cli.errors import sentence
+from surrogym_shared.terminal import say
+
+COMMANDS = (
+    "describe",
+    "register",
+    "sample",
+    "train",
+    "work",
+    "jobs",
+    "audit",
+    "evaluate",
+    "policies",
+    "policy",
+    "status",
+    "report",
+    "improve",
+    "change",
+    "export",
+    "import",
+    "export-policy",
+    "delete",
+    "doctor",
+    "conformance",
+    "demo",
+)
+ENTRY_POINTS = "surrogym.commands"
+INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one command and exit.
+
+    The exit status is 0 for success, 1 for failure, 2 for wrong usage, and 130 after Ctrl-C.
+    """
+    run(build, "surrogym", arguments)
+
+
+def run(built: Callable[[], typer.Typer], name: str, arguments: Sequence[str] | None = None) -> None:
+    """Build an app, run one of its commands under this program's name, and exit as ``main`` does."""
+    try:
+        built()(args=None if arguments is None else list(arguments), prog_name=name)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+    except Exception as error:
+        message = sentence(error)
+        if message is None:
+            raise
+        say(f"error: {message}")
+        sys.exit(1)
+
+
+def build() -> typer.Typer:
+    """Assemble all commands: the client's own, and those of other packages."""
+    app = typer.Typer(
+        name="surrogym",
+        cls=Commands,
+        help="Learn a virtual environment from a handful of real steps, serve it, and train on it.",
+        no_args_is_help=True,
+        rich_markup_mode=None,
+        pretty_exceptions_enable=False,
+    )
+    app.callback()(_version)
+    for name in COMMANDS:
+        register: Callable[[typer.Typer], None] = import_module(f"{__name__}.{name.replace('-', '_')}").register
+        register(app)
+    for entry in entry_points(group=ENTRY_POINTS):
+        entry.load()(app)
+    for info in app.registered_commands:
+        info.cls = Command
+    return app
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"surrogym {version('surrogym')}")
+        raise typer.Exit
+
+
+def _version(
+    version: bool = typer.Option(
+        False, "--version", is_eager=True, callback=_show_version, help="Print the version and exit."
+    ),
+) -> None:
+    """Learn a virtual environment from a handful of real steps, serve it, and train on it."""
+    del version  # its callback has acted on it

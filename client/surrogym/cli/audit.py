@@ -1,0 +1,192 @@
+"""``surrogym audit``: compare a few real steps on a policy's way with the model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from surrogym.cli.groups import Output, PolicyReading, Service, add
+from surrogym.cli.pushing import push_or_say
+
+if TYPE_CHECKING:
+    from surrogym_shared.port import SurrogatePort
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.wire import SurrogateView
+    from surrogym_trainer.evaluation.evaluator import EvaluationSettings
+    from surrogym_trainer.policies.card import PolicyCard
+    from surrogym_trainer.policies.predict import Predict
+    from surrogym_trainer.training.handover import Handover, Subject
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``surrogym audit`` to the app."""
+    add(app, "audit", command)
+
+
+def command(
+    context: typer.Context,
+    policy: Annotated[Path, typer.Argument(help="Policy file from surrogym train.")],
+    surrogate: Annotated[
+        str | None, typer.Option(help="Surrogate that the policy was trained on. [default: as noted beside the policy]")
+    ] = None,
+    steps: Annotated[
+        int,
+        typer.Option(
+            min=2,
+            max=256,
+            help="Number of real steps to begin with; as many again follow, up to 40 in all, while they leave the "
+            "promise undecided. They don't count towards the budget.",
+        ),
+    ] = 8,
+    env: Annotated[
+        str | None,
+        typer.Option(
+            help="Original environment in which to take whole episodes of the policy, in place of a sampler's single "
+            "steps. This tests all that the policy does where the environment can only be reset."
+        ),
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=1, max=100, help="Number of whole episodes, with --env.")] = 3,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of starts, of drawn functions, and of the places to audit.")
+    ] = 0,
+    *,
+    reading: PolicyReading,
+    service: Service,
+    output: Output,
+) -> None:
+    """Test a policy's promise with a few real steps.
+
+    The real steps are taken on the policy's way and compared with the model. This needs a running sampler. With --env
+    they are whole episodes, whose returns are compared too; the command says how many steps they may take. The promise,
+    the audit and the verdict (trusted or not) go into the card beside the policy. With --surrogate, the card names
+    that surrogate from then on.
+
+    Example: surrogym audit policy.zip --steps 16
+
+    Example: surrogym audit policy.zip --env rig:Rig --episodes 3
+    """
+    from surrogym.cli.errors import CommandError
+    from surrogym_client.surrogates.waiting import words_of_audit
+    from surrogym_client.transport import HttpSurrogate
+    from surrogym_shared.terminal import progress
+    from surrogym_trainer.evaluation.evaluator import EvaluationSettings
+    from surrogym_trainer.policies.card import read_card, write_card
+    from surrogym_trainer.training.handover import AuditSettings, Subject, hand_over
+    from surrogym_trainer.training.words import words_of_handover
+
+    card = read_card(policy)
+    name = surrogate or card.surrogate
+    if name is None:
+        raise CommandError(f"expected --surrogate NAME, because no card beside {policy} names a surrogate")
+    predict, asked = reading.load(policy, card), AuditSettings(steps=steps, seed=seed)
+    with (
+        service.connect(context) as api,
+        HttpSurrogate(api.url, name, service.token_for(context)) as port,
+        progress("audit", quiet=output.quiet) as update,
+    ):
+        view = api.surrogate(name)
+        _require_fit(predict, view.spec, f"{policy} does not fit {name!r}")
+        if card.surrogate not in (None, name):
+            card = _of_another(card)
+        session = session_of(card, view)
+        floor = _floor(port, seed, session) if card.untrained is None else card.untrained
+        subject = Subject(api, name, port, predict, session, floor, seed)
+        update(None, "computing the promise")
+        if env is None:
+            found = hand_over(subject, asked, lambda view: update(None, words_of_audit(view)))
+        else:
+            found = _by_episodes(subject, env, card, EvaluationSettings(episodes, seed), quiet=output.quiet)
+    if found.audit is None:
+        raise CommandError(_not_made(view, found.reason))
+    noted = card.model_copy(update={"surrogate": name, "spec": card.spec or view.spec, **vars(found)})
+    write_card(policy, noted)
+    version = push_or_say(service.server, service.token_for(context), policy, name, quiet=output.quiet)
+    result = {"policy": str(policy), **noted.model_dump(mode="json", include=set(vars(found))), "version": version}
+    output.give(result, lambda: words_of_handover(found))
+
+
+def _by_episodes(
+    subject: Subject, env: str, card: PolicyCard, settings: EvaluationSettings, *, quiet: bool
+) -> Handover:
+    """Audit by whole episodes in an environment. Their steps are announced, and counted in the ledger in any case."""
+    from surrogym.cli.errors import CommandError
+    from surrogym.cli.opening import opener_for_policy
+    from surrogym_sampler.original.errors import EvaluationFailed
+    from surrogym_sampler.original.protocol import LONGEST_EPISODE
+    from surrogym_shared.terminal import say
+    from surrogym_shared.words import counted
+    from surrogym_trainer.evaluation.evaluator import EvaluationInterrupted, evaluate
+    from surrogym_trainer.training.handover import judge_episodes
+
+    spec = subject.port.spec()
+    if subject.api.surrogate(subject.name).fidelity is None:
+        raise CommandError(f"{subject.name!r} has no model yet, so there is nothing to compare with")
+    most = settings.episodes * (spec.time_limit or LONGEST_EPISODE)
+    count = counted(settings.episodes, "whole episode")
+    say(f"the audit takes {count} in {env}: at most {most} real steps", quiet=quiet)
+    note, taken = f"audit, {count} from seed {settings.first_seed}", 0
+    try:
+        result = evaluate(subject.predict, opener_for_policy(env, None, card, quiet=quiet), settings, trained_for=spec)
+        taken = result.steps
+    except (EvaluationFailed, EvaluationInterrupted) as error:
+        taken = error.steps
+        raise
+    finally:
+        if taken:
+            subject.api.report_steps(subject.name, taken, episodes=settings.episodes, note=note)
+    return judge_episodes(subject, result)
+
+
+def _not_made(view: SurrogateView, reason: str) -> str:
+    """Say why no audit in a surrogate was made."""
+    from surrogym_sampler.original.loading import sample_command
+    from surrogym_trainer.training.handover import NO_SAMPLER
+
+    start = f"; start {sample_command(view.name, view.environment)} in another terminal"
+    return f"no audit was made, and the card is unchanged: {reason}{start if reason.endswith(NO_SAMPLER) else ''}"
+
+
+def _require_fit(predict: Predict, spec: EnvironmentSpec, misfit: str) -> None:
+    """Raise ``CommandError`` if a network of arrays has other observations or actions than the surrogate."""
+    from surrogym.cli.errors import CommandError
+    from surrogym_shared.network import Network, counts_of
+
+    if not isinstance(predict, Network):
+        return
+    own, seen = len(spec.observation), len(predict.mean)
+    if seen != own:
+        raise CommandError(f"{misfit}: expected a policy of {own} observations, got one of {seen}")
+    choices = counts_of(spec)
+    wanted, got = choices or spec.action.size, predict.counts or len(predict.low)
+    if wanted != got:
+        raise CommandError(f"{misfit}: expected a policy of actions {wanted}, got one of {got}")
+
+
+def _of_another(card: PolicyCard) -> PolicyCard:
+    """Return the card without what holds in the surrogate alone that it names."""
+    empty = {"server": None, "spec": None, "imagined_return": None, "untrained": None, "visited_confidence": ()}
+    return card.model_copy(update={**empty, "settings": {}})
+
+
+def _floor(port: SurrogatePort, seed: int, session: dict[str, object]) -> float:
+    """Return the imagined return without a policy, where no card notes that of an untrained one: a promise means
+    little without the gain over it."""
+    from surrogym_trainer.evaluation.imagined import imagined_returns
+    from surrogym_trainer.evaluation.uncontrolled import baseline, default_baseline
+    from surrogym_trainer.training.settings import CHECK_EPISODES
+
+    spec = port.spec()
+    predict = baseline(spec, default_baseline(spec), seed)
+    return float(imagined_returns(port, predict, CHECK_EPISODES, seed, **session).mean())
+
+
+def session_of(card: PolicyCard, view: SurrogateView) -> dict[str, object]:
+    """Return the session options that the policy was compared in, from its card. Noise that was confirmed since then is
+    added."""
+    from surrogym_trainer.training.settings import noise_of
+
+    judged = card.settings.get("judge") or card.settings.get("session") or {}
+    noise: dict[str, object] = noise_of(view)
+    return {**noise, **judged} if isinstance(judged, dict) else noise

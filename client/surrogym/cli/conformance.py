@@ -1,0 +1,86 @@
+"""``surrogym conformance``: check that a server, or a program, follows its protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.options import StepLimit
+
+if TYPE_CHECKING:
+    from surrogym_sampler.diagnosis.outcomes import Outcome
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``surrogym conformance`` to the app."""
+    add(app, "conformance", command)
+
+
+def command(
+    context: typer.Context,
+    surrogate: Annotated[
+        str,
+        typer.Option("--surrogate", help="Name for a temporary surrogate, not yet in use. It is deleted at the end."),
+    ] = "conformance",
+    program: Annotated[
+        str | None,
+        typer.Option("--exec", metavar="COMMAND", help="Program to check in place of a server. It takes real steps."),
+    ] = None,
+    step_limit: StepLimit = 30.0,
+    *,
+    service: Service,
+    output: Output,
+) -> None:
+    """Check that a server or a program keeps its protocol.
+
+    Each check prints one line. The exit status is 1 if a check fails. With --quiet, only failed checks are shown. With
+    --exec, no server is needed, and the line of a failed check says how to solve it.
+
+    Example: surrogym conformance --server http://127.0.0.1:8000
+
+    Example: surrogym conformance --exec "./plant --port 7"
+    """
+    from surrogym_shared.terminal import on_interrupt
+
+    if program is not None:
+        with on_interrupt(lambda: "interrupted; the program was ended"):
+            _show(_of_program(program, step_limit), output)
+        return
+    from surrogym_sampler.diagnosis.conformance import conformance
+
+    with on_interrupt(lambda: f"interrupted; {surrogate!r} was deleted"):
+        _show(conformance(service.server, service.token_for(context), surrogate), output)
+
+
+def _of_program(program: str, step_limit: float) -> Iterable[Outcome]:
+    from surrogym_sampler.diagnosis.executables import conformance
+
+    return conformance(program, step_limit)
+
+
+def _show(checked: Iterable[Outcome], output: Output) -> None:
+    """Show each outcome as soon as it is there, then the sum."""
+    from surrogym_shared.words import visible
+
+    outcomes = []
+    for outcome in checked:
+        outcomes.append(outcome)
+        if not output.as_json and (outcome.failure or not output.quiet):
+            typer.echo(visible(_line(outcome)))
+    failed = {outcome.name: outcome.failure for outcome in outcomes if outcome.failure}
+    left_out = {outcome.name: outcome.left_out for outcome in outcomes if outcome.left_out}
+    made = len(outcomes) - len(left_out)
+    result = {"passed": made - len(failed), "failed": failed, "left_out": left_out}
+    apart = f", {len(left_out)} left out" if left_out else ""
+    output.give(result, lambda: f"{result['passed']} of {made} checks passed{apart}")
+    if failed:
+        raise typer.Exit(1)
+
+
+def _line(outcome: Outcome) -> str:
+    if outcome.failure:
+        return f"✗ {outcome.name}: {outcome.failure}"
+    return f"- {outcome.name}: left out, {outcome.left_out}" if outcome.left_out else f"✓ {outcome.name}"

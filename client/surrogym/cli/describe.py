@@ -1,0 +1,50 @@
+"""``surrogym describe``: draft the specification of an environment that has a name."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from surrogym.cli.groups import add
+from surrogym.cli.options import Quiet
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``surrogym describe`` to the app."""
+    add(app, "describe", command)
+
+
+def command(
+    environment: Annotated[
+        str,
+        typer.Argument(
+            help="Environment: a Gymnasium id, package:Id-v0, dm_control:DOMAIN-TASK, pcgym:MODEL, pcgym:FILE.json, "
+            "fmu:PLANT.fmu or fmu:PLANT.json."
+        ),
+    ],
+    steps: Annotated[
+        int, typer.Option(min=20, help="Real steps to take in random episodes. Some more real steps check the result.")
+    ] = 400,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random actions.")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="No effect: the output is always JSON.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Draft an environment's specification from random steps.
+
+    The draft goes to standard output. Its notes say what the steps showed, and ask for what they can't show. The
+    command prints the number of real steps. surrogym register enters them into the ledger, if it gets this file.
+
+    Example: surrogym describe Swimmer-v5 > env.json
+    """
+    from surrogym.cli.printing import prints_aside, unregistered
+    from surrogym_shared.terminal import say
+
+    del as_json  # a specification is JSON in any case
+    with unregistered(lambda: 0, "nothing was described or registered"), prints_aside():
+        from surrogym_sampler.original.describing import describe  # it may take seconds
+
+        description = describe(environment, steps, seed)
+    typer.echo(description.text())
+    for line in description.words():
+        say(line, quiet=quiet)

@@ -1,0 +1,347 @@
+"""Text and JSON about where real steps and the model disagree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from surrogym.cli.learning import Learning, Steps
+    from surrogym_client.transport.api import Api
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.wire import SurrogateView
+    from surrogym_trainer.evaluation.comparing import Disagreement, Disagreements
+    from surrogym_trainer.evaluation.consequences import Effect
+    from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings
+    from surrogym_trainer.evaluation.systematic import Systematic
+    from surrogym_trainer.policies.card import PolicyCard
+    from surrogym_trainer.policies.evidence import Promise
+    from surrogym_trainer.policies.predict import Predict
+
+
+@dataclass(frozen=True)
+class Differences:
+    """Options for comparing the real steps of an evaluation with the model."""
+
+    where: Annotated[
+        bool,
+        typer.Option(
+            "--where",
+            help="Show the states at which real steps differ from the model. [default: on if the mean return is "
+            "outside the promise]",
+        ),
+    ] = False
+    learn: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Maximum number of differing steps to add to the surrogate's samples. They were taken already, so "
+            "they cost no real step and none of the budget.",
+        ),
+    ] = 0
+    learn_all: Annotated[
+        bool,
+        typer.Option(
+            "--learn-all",
+            help="Add every step of the episodes to the surrogate's samples, also those that the model predicts. They "
+            "cost no further real step and none of the budget.",
+        ),
+    ] = False
+    wait: Annotated[
+        float,
+        typer.Option(
+            min=0, help="Seconds to wait for the model that learns from these steps, with --learn or --learn-all."
+        ),
+    ] = 0.0
+
+    @property
+    def learns(self) -> bool:
+        return self.learn > 0 or self.learn_all
+
+    def check(self, settings: EvaluationSettings) -> None:
+        """Refuse to learn from an environment that was changed on purpose, and options that contradict each other.
+
+        Raises:
+            CommandError: ``--learn`` or ``--learn-all`` was given together with ``--perturb``, or with each other, or
+                ``--wait`` without either.
+        """
+        from surrogym.cli.errors import CommandError
+
+        if self.learn and self.learn_all:
+            raise CommandError("expected --learn or --learn-all, got both; give one of the two")
+        if self.wait and not self.learns:
+            raise CommandError(
+                "expected --wait with --learn or --learn-all, got neither: there is no model to wait for"
+            )
+        if self.learns and settings.perturb:
+            option = "--learn-all" if self.learn_all else "--learn"
+            raise CommandError(
+                f"expected {option} with the environment as it is, got --perturb, which changes it; give one of the two"
+            )
+
+    def learning(self, surrogate: str | None, server: str | None, token: str | None) -> Learning | None:
+        """Ask the server for the surrogate that is to learn from the steps, before the first one is taken. Returns None
+        if none is to learn. Errors as of ``learning_of``."""
+        from surrogym.cli.learning import learning_of
+
+        if not self.learns:
+            return None
+        return learning_of("--learn-all" if self.learn_all else "--learn", surrogate, server, token)
+
+    def between(
+        self,
+        surrogate: str | None,
+        server: str | None,
+        token: str | None,
+        result: Evaluation,
+        settings: EvaluationSettings,
+        promise: Promise | None,
+        steps: Steps | None,
+        imagining: Imagining,
+        *,
+        quiet: bool,
+    ) -> Differing | None:
+        """Compare the real steps of the episodes with the surrogate's model, and send ``steps`` if it is to learn.
+
+        With ``--learn-all`` the steps are sent first, and whether or not there is a model to compare with. Returns None
+        if nobody asked and the promise was kept, or if the steps can't be compared and none was sent.
+        """
+        from surrogym.cli.errors import sentence
+        from surrogym.cli.options import connect
+        from surrogym_client.errors import SurrogymClientError
+        from surrogym_shared.terminal import say
+        from surrogym_trainer.evaluation.comparing import samples_of
+
+        if surrogate is None or not (self.where or self.learns or left(promise, result)):
+            return None
+        found, without = None, f"{surrogate!r} has no model yet"
+        try:
+            with connect(server, token) as api:
+                if steps is not None and self.learn_all:
+                    steps.send(api)
+                found = _compare(api, surrogate, result, settings.first_seed, imagining)
+                if found is not None and missed(promise, result):
+                    found = replace(found, broken=True)
+                if steps is not None and self.learn and found is not None:
+                    steps.choose(samples_of(found.found, self.learn))
+                    steps.send(api)
+        except SurrogymClientError as error:
+            without = str(error)
+            if steps is not None and steps.waiting:
+                steps.fault = sentence(error) or without
+            elif steps is None:
+                say(f"not compared with the model of {surrogate!r}: {error}", quiet=quiet)
+        if steps is None or steps.waiting:
+            return found
+        if steps.new and self.wait:
+            _await_model(server, token, surrogate, self.wait, quiet=quiet)
+        found = found or _not_compared(settings.first_seed, without)
+        return replace(found, learned=steps.new, all_steps=self.learn_all)
+
+
+def left(promise: Promise | None, result: Evaluation) -> bool:
+    """Whether the mean return lies outside the promise's interval."""
+    return promise is not None and not promise.low <= result.returns.mean() <= promise.high
+
+
+def missed(promise: Promise | None, result: Evaluation) -> bool:
+    """Whether the mean return is below the promise's interval."""
+    return promise is not None and bool(result.returns.mean() < promise.low)
+
+
+@dataclass(frozen=True)
+class Imagining:
+    """How to imagine episodes of the policy that was evaluated."""
+
+    load: Callable[[], Predict]
+    card: PolicyCard
+    token: str | None
+    seed: int = 0
+
+    def changes(self, api: Api, view: SurrogateView, shifted: Systematic, weights: Any) -> Any:
+        """Compute by how much errors of the model of ``view`` change the imagined return, see ``changes_of``."""
+        from surrogym.cli.audit import session_of
+        from surrogym_client.transport import HttpSurrogate
+        from surrogym_trainer.evaluation.consequences import EFFECT_STARTS, changes_of
+
+        assert view.model_version is not None
+        session = session_of(self.card, view)
+        with HttpSurrogate(api.url, view.name, self.token) as port:
+            return changes_of(
+                port, self.load(), self.seed, session, view.model_version, shifted, weights, EFFECT_STARTS
+            )
+
+
+def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, imagining: Imagining) -> Differing | None:
+    """Compare steps with the model. Returns None without a model, or if the model has other coordinates."""
+    import numpy as np
+
+    from surrogym_trainer.evaluation.comparing import Disagreements, compared, disagreements, steady, steps_of
+    from surrogym_trainer.evaluation.consequences import effects_of
+
+    view = api.surrogate(surrogate)
+    if view.fidelity is None or result.trace.coordinates.shape[1] != len(view.spec.coordinates):
+        return None
+    known = [step for step in steps_of(result.traces) if view.spec.known(step.coordinates)]
+    steps = steady(view.spec, known)
+    left_out = len(known) - len(steps)
+    if not steps:
+        return Differing(Disagreements(0, (), {}), first_seed, changed=result.varied, left_out=left_out)
+    beside = compared(api, view.spec, view, steps)
+    changes = None if view.spec.design.preset == "paper" else partial(imagining.changes, api, view)
+    effects, share = effects_of(view.spec, beside, changes)  # preset paper moves observations, which take no residual
+    explaining = tuple(steps[i] for i in np.argsort(-share).tolist() if share[i] > 0)
+    found = replace(disagreements(steps, beside), shared=explaining)
+    return Differing(found, first_seed, effects=tuple(effects), changed=result.varied, left_out=left_out)
+
+
+def _not_compared(first_seed: int, why: str) -> Differing:
+    """Return no disagreements, because no step was compared."""
+    from surrogym_trainer.evaluation.comparing import Disagreements
+
+    return Differing(Disagreements(0, (), {}), first_seed, without=why)
+
+
+def _await_model(server: str | None, token: str | None, surrogate: str, seconds: float, *, quiet: bool) -> None:
+    """Wait until the server has fitted a model to all samples. If that takes too long or fails, say so."""
+    from surrogym.cli.options import connect
+    from surrogym_client.errors import SurrogymClientError
+    from surrogym_client.surrogates.waiting import DesignUnfinished, wait_for_model, words_of_design
+    from surrogym_shared.terminal import on_interrupt, progress, say
+
+    stays = f"interrupted while the server fits the model; surrogym status {surrogate} shows it"
+    try:
+        with (
+            on_interrupt(lambda: stays),
+            progress("fit", quiet=quiet) as update,
+            connect(server, token) as api,
+        ):
+            wait_for_model(api, surrogate, seconds, lambda view: update(None, words_of_design(view)))
+    except DesignUnfinished as error:
+        say(str(error), quiet=quiet)
+    except SurrogymClientError as error:
+        say(f"the steps are stored; not waited for the model of {surrogate!r}: {error}", quiet=quiet)
+
+
+@dataclass(frozen=True)
+class Differing:
+    """Steps at which reality and the model disagree.
+
+    Attributes:
+        found: the steps.
+        first_seed: reset seed of the first episode; each further episode has the next one.
+        learned: number of steps that were added to the surrogate's samples.
+        all_steps: whether these are all steps, and not only those at which the two disagree.
+        changed: names of the constants that changed within an episode.
+        left_out: number of steps within which one of them changed. They are not compared, because a model keeps
+            constants.
+        without: why no step was compared; empty if steps were.
+        effects: outputs that are wrong in all steps together.
+        broken: whether the return is below the promise.
+    """
+
+    found: Disagreements
+    first_seed: int
+    learned: int = 0
+    changed: tuple[str, ...] = ()
+    left_out: int = 0
+    all_steps: bool = False
+    without: str = ""
+    effects: tuple[Effect, ...] = ()
+    broken: bool = False
+
+    def in_words(self, spec: EnvironmentSpec | None) -> list[str]:
+        """Return one line about all steps, one for each of the worst episodes, and one for each of the worst steps."""
+        from surrogym_trainer.evaluation.comparing import SHOWN
+
+        found = self.found
+        if self.without:
+            return [f"not compared with a model: {self.without}", *self._learned()]
+        if not found.found:
+            return [*self._none(), *self._together(), *self._left_out(), *self._learned()]
+        count = len(found.found)
+        lines = [
+            f"{count} of {found.compared} real steps differ{'s' * (count == 1)} from the model by more than the "
+            "model's uncertainty"
+        ]
+        for episode, count in list(found.by_episode().items())[:SHOWN]:
+            more = found.missing.get(episode, 0.0)
+            lines.append(
+                f"  episode of seed {self.first_seed + episode}: {count} such step{'s' * (count > 1)}; its compared "
+                f"steps earned {abs(more):.4g} {'less' if more < 0 else 'more'} than predicted"
+            )
+        names = () if spec is None else spec.coordinate_names
+        lines += [f"  {self._at(one, names)}" for one in found.found[:SHOWN]]
+        return [*lines, *self._together(), *self._left_out(), *self._learned()]
+
+    def _none(self) -> list[str]:
+        """Say that no single step differs. That alone is no answer where the promise was broken."""
+        none = f"none of {self.found.compared} real steps differs from the model by more than the model's uncertainty"
+        if not self.broken:
+            return [] if self.effects else [none]
+        if self.effects:
+            return ["no single step shows why the promise was broken"]
+        return [
+            f"the compared steps do not explain why the promise was broken: {none}, and together they show no error "
+            "either; a hidden state or other starts would"
+        ]
+
+    def _together(self) -> list[str]:
+        """Describe the outputs that are wrong in all steps together. Nothing if there are none."""
+        if not self.effects:
+            return []
+        return [f"{self.found.compared} real steps together:", *(f"  {one.words()}" for one in self.effects)]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all disagreements as JSON."""
+        counts = self.found.by_episode()
+        return {
+            "compared": self.found.compared,
+            "left_out": self.left_out,
+            "learned": self.learned,
+            "together": [asdict(one) | {"region": one.region and one.region._asdict()} for one in self.effects],
+            "episodes": [
+                {"seed": self.first_seed + episode, "steps": counts.get(episode, 0), "missing_reward": missing}
+                for episode, missing in self.found.missing.items()
+            ],
+            "steps": [
+                {
+                    "seed": self.first_seed + one.step.episode,
+                    "step": one.step.number,
+                    "coordinates": list(one.step.coordinates),
+                    "action": list(one.step.action),
+                    "output": one.output,
+                    "error": one.error,
+                    "claimed": one.claimed,
+                }
+                for one in self.found.found
+            ],
+        }
+
+    def _left_out(self) -> list[str]:
+        """Say how many steps were not compared. Nothing if all were."""
+        if not self.left_out:
+            return []
+        steps = "1 real step, in which" if self.left_out == 1 else f"{self.left_out} real steps, in each of which"
+        names = " or ".join(self.changed) or "a constant"
+        return [f"not compared: {steps} {names} changed, because the model keeps it constant"]
+
+    def _learned(self) -> list[str]:
+        """Say from how many steps the model learns. Nothing without any."""
+        if not self.learned:
+            return []
+        which = "real steps" if self.all_steps else "of these steps"
+        return [f"the model learns from {self.learned} {which}; train again in the new model"]
+
+    def _at(self, one: Disagreement, names: Sequence[str]) -> str:
+        count = len(one.step.coordinates)
+        known = names if len(names) == count else [f"q{i}" for i in range(count)]
+        state = ", ".join(f"{name} {value:.4g}" for name, value in zip(known, one.step.coordinates, strict=True))
+        return (
+            f"seed {self.first_seed + one.step.episode}, step {one.step.number}, at {state}: {one.output} is "
+            f"{one.error:+.3g} off the prediction, whose deviation is {one.claimed:.3g}"
+        )

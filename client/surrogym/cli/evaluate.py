@@ -1,0 +1,436 @@
+"""``surrogym evaluate``: measure a policy in the original environment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from surrogym.cli.beside import Beside
+from surrogym.cli.disagreement import Differences, Imagining
+from surrogym.cli.filming import film
+from surrogym.cli.groups import Output, PolicyReading, Service, add
+from surrogym.cli.learning import kept
+from surrogym.cli.opening import opener_for_policy
+from surrogym.cli.options import NAMES, SpecFile, read_spec
+from surrogym.cli.pushing import push_or_say
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from surrogym_sampler.original.episodes import Episode
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.terminal import Update
+    from surrogym_shared.wire import Controller
+    from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, Progress
+    from surrogym_trainer.policies.card import PolicyCard
+    from surrogym_trainer.policies.evidence import Promise
+    from surrogym_trainer.policies.predict import Acting
+
+
+Environment = Annotated[
+    str | None,
+    typer.Option(
+        help=f"Environment to evaluate in: {NAMES}. [default: the one that the policy was trained for, if its name can "
+        "run no file of yours]"
+    ),
+]
+Ledger = Annotated[
+    str | None,
+    typer.Option(help="Surrogate whose ledger counts the real steps. [default: as noted beside the policy]"),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``surrogym evaluate`` to the app."""
+    add(app, "evaluate", command)
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Options of the real episodes: how many, from which starts, in how many instances of the environment."""
+
+    episodes: Annotated[int, typer.Option(min=1, help="Number of real episodes.")] = 100
+    first_seed: Annotated[
+        int, typer.Option(min=0, help="Reset seed of the first episode. Each further episode takes the next seed.")
+    ] = 10_000
+    wide: Annotated[bool, typer.Option("--wide", help="Start episodes anywhere in the sampling range.")] = False
+    start_scale: Annotated[
+        float, typer.Option(min=0, help="Factor by which to widen the declared starts about their middle.")
+    ] = 1.0
+    perturb: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            help="Standard deviation of the random factors that multiply masses, lengths and limits of a built-in "
+            "environment or a MuJoCo model; 0 leaves them as they are. For a changed plant of your own, give its class "
+            "as --env.",
+        ),
+    ] = 0.0
+    explore: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            max=1,
+            help="Change the actions at random, for --learn-all: a continuous one by normal noise of EXPLORE times "
+            "half its range, a discrete one with probability EXPLORE. The promise is then not judged.",
+        ),
+    ] = 0.0
+    parallel: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Number of instances of the environment that are open at once. [default: 1, or one for each episode "
+            "if the environment declares that it runs in parallel, as Gymnasium's do]",
+        ),
+    ] = None
+
+    def settings(self) -> EvaluationSettings:
+        """Return the settings of the evaluation.
+
+        Raises:
+            CommandError: two options contradict each other.
+        """
+        from surrogym.cli.errors import CommandError
+        from surrogym_trainer.evaluation.evaluator import EvaluationSettings
+
+        if self.wide and self.start_scale != 1:
+            raise CommandError("expected --wide or --start-scale, got both")
+        return EvaluationSettings(**vars(self))
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """Options of what is kept of the episodes."""
+
+    video: Annotated[
+        bool,
+        typer.Option(
+            "--video",
+            help="Draw the best, the median and the worst episode into a video beside the policy, which the server "
+            "stores too. The environment must be one that can be drawn. This takes no real step.",
+        ),
+    ] = False
+    push: Annotated[
+        bool, typer.Option("--push/--no-push", help="Store the policy and its episodes on the server as well.")
+    ] = True
+
+
+def command(
+    context: typer.Context,
+    policy: Annotated[Path, typer.Argument(help="Policy file from surrogym train or Stable-Baselines3.")],
+    env: Environment = None,
+    spec: SpecFile = None,
+    *,
+    episodes: Episodes,
+    reading: PolicyReading,
+    differences: Differences,
+    surrogate: Ledger = None,
+    beside: Beside,
+    keeping: Keeping,
+    service: Service,
+    output: Output,
+) -> None:
+    """Run real episodes with a policy, and report its returns.
+
+    The real steps count in the surrogate's ledger. The server stores the policy and the episodes; if it does not
+    answer, they wait beside the policy until surrogym policy push. If the mean return lies outside the promise's
+    interval, the command compares the steps with the model and shows the states at which the two disagree. With
+    --learn, the model learns from these steps; with --learn-all, from every step.
+
+    Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
+
+    Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 10 --learn 16
+    """
+    from surrogym_shared.terminal import give
+    from surrogym_trainer.evaluation.reporting import is_promised
+    from surrogym_trainer.policies.files import card_of_policy
+
+    card, settings, token = card_of_policy(policy), episodes.settings(), service.token_for(context)
+    differences.check(settings)
+    beside.check(settings)
+    opener = opener_for_policy(env, read_spec(spec), card, quiet=output.quiet)
+    ledger = _ledger(surrogate, service.server, card, policy, quiet=output.quiet)
+    if learning := differences.learning(ledger, service.server, token):
+        opener = learning.checked(opener)
+    enter = partial(_enter, ledger, service.server, token, quiet=output.quiet)
+    run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
+    reports = _reports(beside.controllers(policy, card, reading, opener), card.spec, run, enter, settings, policy)
+    result = reports[0][1]
+    promise = card.promise if is_promised(settings, result, card.spec) else None
+    judged = promise if _judges(settings.episodes) else None
+    with kept(learning, policy, result, quiet=output.quiet) as steps:
+        if stored := keeping.push and ledger is not None:
+            _keep(policy, reports, settings, _named(env, card), card.spec, quiet=output.quiet)
+        filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if keeping.video else None
+        version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
+        imagining = Imagining(partial(reading.load, policy, card), card, token)
+        found = differences.between(
+            ledger, service.server, token, result, settings, judged, steps, imagining, quiet=output.quiet
+        )
+    summary = {
+        "policy": str(policy),
+        "environment": _named(env, card),
+        **_settings(settings),
+        **_summary(reports, beside.reference),
+    }
+    summary |= {"promise_kept": _kept(judged, result), "version": version, "disagreements": found and found.as_json()}
+    summary |= {} if filmed is None else {"video": str(filmed)}
+    more = [*_elsewhere(env, card), *(found.in_words(card.spec) if found else [])]
+    more += [*_why_not_judged(card, settings, result), *_unseeded(reports), *_repeated(result)]
+    give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
+    if steps is not None:
+        steps.require_stored()
+
+
+def _named(env: str | None, card: PolicyCard) -> str:
+    """The name of the environment in which the episodes ran."""
+    return env or (card.spec.environment if card.spec else "")
+
+
+def _elsewhere(env: str | None, card: PolicyCard) -> list[str]:
+    """Say that the episodes ran in another environment than the policy's own. Nothing if that is not known."""
+    from surrogym_shared.environments import is_name, is_same
+
+    own = card.spec.environment if card.spec else ""
+    if env is None or not is_name(own) or is_same(env, own):
+        return []
+    return [f"these episodes ran in {env}, and the policy is for {own}: the server shows them apart"]
+
+
+def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Evaluation) -> list[str]:
+    """Say that actions were changed, that episodes had another limit, or which constants changed within an episode.
+    Nothing if none of these is true, or without a promise for these starts."""
+    from surrogym_trainer.evaluation.reporting import has_other_limit
+
+    if settings.explore:
+        return [f"actions were changed at random by {settings.explore:.2g}, so the promise is not judged"]
+    if card.promise is None or not settings.declared:
+        return []
+    if card.spec is not None and has_other_limit(result, card.spec):
+        return [
+            f"the promise is not judged: it is for episodes of at most {card.spec.time_limit} steps, and these had at "
+            f"most {result.limit}"
+        ]
+    if not result.varied:
+        return []
+    changed = ", ".join(result.varied)
+    return [f"the promise is not judged: it is for episodes without a change of {changed}, which changed here"]
+
+
+def _unseeded(reports: Sequence[tuple[Controller, Evaluation]]) -> list[str]:
+    """Say that seeds repeat no start. Nothing if they do."""
+    if all(result.seeded for _, result in reports):
+        return []
+    others = ", so these controllers did not run the same starts" if len(reports) > 1 else ""
+    return [f"the environment ignores its seed: each evaluation has other starts{others}"]
+
+
+def _repeated(result: Evaluation) -> list[str]:
+    """Say that the episodes were equal, so that a person takes fewer. Nothing if they differ, or are too few."""
+    from surrogym_trainer.evaluation.evaluator import FEW_EQUAL
+
+    if len(result.returns) < FEW_EQUAL or not result.equal:
+        return []
+    return [
+        f"all {len(result.returns)} episodes are equal in every number: nothing in them was random, so each shows the "
+        f"same return, with {result.lengths[0]} real steps"
+    ]
+
+
+def _judges(episodes: int) -> bool:
+    """Whether this number of episodes is enough to judge a promise."""
+    from surrogym_shared.wire import FEWEST_TO_JUDGE
+
+    return episodes >= FEWEST_TO_JUDGE
+
+
+def _summary(reports: Sequence[tuple[Controller, Evaluation]], reference: str | None) -> dict[str, Any]:
+    """Return the policy's episodes as JSON, together with those of ``--compare`` and ``--reference``."""
+    summary = reports[0][1].summary()
+    for actions, other in reports[1:]:
+        if actions == "reference":
+            summary["reference"] = {"controller": reference, **other.summary()}
+        else:
+            summary["without"] = {"actions": actions, **other.summary()}
+    return summary
+
+
+def _reports(
+    controllers: Mapping[Controller, Callable[[], Acting]],
+    trained_for: EnvironmentSpec | None,
+    run: Callable[..., Evaluation],
+    enter: Callable[[int, int, str], None],
+    settings: EvaluationSettings,
+    policy: Path,
+) -> list[tuple[Controller, Evaluation]]:
+    """Run the episodes of each controller, and enter their real steps into the ledger."""
+    from surrogym_shared.words import counted
+
+    reports: list[tuple[Controller, Evaluation]] = []
+    for controller, load in controllers.items():
+        actions = {"policy": "", "reference": "the reference controller"}.get(controller, f"{controller} actions")
+        result = run(load, trained_for if controller == "policy" else None, what=actions or str(policy))
+        note = f"{counted(settings.episodes, 'episode')} from seed {settings.first_seed}"
+        enter(result.steps, settings.episodes, f"{note}, {actions}" if actions else note)
+        reports.append((controller, result))
+    return reports
+
+
+def _keep(
+    policy: Path,
+    reports: Sequence[tuple[Controller, Evaluation]],
+    settings: EvaluationSettings,
+    environment: str,
+    spec: EnvironmentSpec | None,
+    *,
+    quiet: bool,
+) -> None:
+    """Write the episodes to files beside the policy, from which they are sent to the server.
+
+    Episodes that the server can't store, such as those with an infinite return, are reported and left out.
+    """
+    from uuid import uuid4
+
+    from pydantic import ValidationError
+
+    from surrogym.cli.errors import invalid
+    from surrogym_shared.terminal import say
+    from surrogym_trainer.evaluation.reporting import as_reported, paired_start
+    from surrogym_trainer.policies.pushing import keep
+
+    paired = paired_start(reports[0][1], settings.episodes)
+    try:
+        noted = [
+            as_reported(
+                result,
+                settings,
+                uuid4().hex,
+                environment=environment,
+                trained_for=spec,
+                controller=controller,
+                paired=paired,
+            )
+            for controller, result in reports
+        ]
+    except ValidationError as error:
+        say(f"the server can't store the episodes: {invalid(error)}", quiet=quiet)
+        return
+    for one in noted:
+        keep(policy, one)
+
+
+def _run(
+    load: Callable[[], Acting],
+    trained_for: EnvironmentSpec | None,
+    what: str,
+    opener: Callable[[], Episode],
+    settings: EvaluationSettings,
+    enter: Callable[[int, int, str], None],
+    *,
+    quiet: bool,
+) -> Evaluation:
+    """Run the episodes. Their real steps are entered into the ledger even if they fail or are interrupted."""
+    from surrogym_client.runtime.lifetime import terminations_as_interrupts
+    from surrogym_sampler.original.errors import EvaluationFailed
+    from surrogym_shared.terminal import progress, say
+    from surrogym_trainer.evaluation.evaluator import EvaluationInterrupted, evaluate
+
+    try:
+        with terminations_as_interrupts(), progress("evaluate", quiet=quiet) as update:
+            update(0.0, f"reading {what}")
+            tell = _telling(update, settings.episodes)
+            return evaluate(load(), opener, settings, tell, lambda words: say(words, quiet=quiet), trained_for)
+    except EvaluationFailed as failure:
+        enter(failure.steps, 0, "failed")
+        raise
+    except EvaluationInterrupted as interruption:
+        say(
+            f"interrupted after {interruption.steps} real steps; no result was kept; the same command starts from the "
+            "beginning"
+        )
+        enter(interruption.steps, 0, "interrupted")
+        raise
+
+
+def _telling(update: Update, episodes: int) -> Progress:
+    from surrogym_shared.words import counted
+
+    return lambda share, terminated: update(share, f"{counted(episodes, 'real episode')}, {terminated} terminated")
+
+
+def _ledger(surrogate: str | None, server: str | None, card: PolicyCard, policy: Path, *, quiet: bool) -> str | None:
+    """Return the name of the surrogate whose ledger counts the real steps; None if no server may be contacted.
+
+    An address that only the policy's card names is never contacted, unless it is the default one of this machine.
+    """
+    from surrogym_client.transport.connection import DEFAULT_URL
+    from surrogym_shared.terminal import say
+    from surrogym_trainer.policies.card import card_path
+
+    if surrogate or server or card.server is None or str(card.server).rstrip("/") == DEFAULT_URL:
+        return surrogate or card.surrogate
+    say(
+        f"the real steps are not reported to {str(card.server)!r}, which {card_path(policy)} names: give --server to "
+        f"enter them into the ledger of {card.surrogate!r}",
+        quiet=quiet,
+    )
+    return None
+
+
+def _enter(
+    surrogate: str | None,
+    server: str | None,
+    token: str | None,
+    steps: int,
+    episodes: int,
+    note: str,
+    *,
+    quiet: bool,
+) -> None:
+    """Enter the real steps into the ledger. If the server does not answer, say so and keep the evaluation's result."""
+    from surrogym.cli.options import connect
+    from surrogym_client.errors import SurrogymClientError
+    from surrogym_shared.terminal import say
+
+    if surrogate is None or steps == 0:
+        return
+    try:
+        with connect(server, token) as api:
+            api.report_steps(surrogate, steps, episodes=episodes, note=note)
+    except SurrogymClientError as error:
+        say(f"not entered into the ledger of {surrogate!r}: {error}", quiet=quiet)
+
+
+def _settings(settings: EvaluationSettings) -> dict[str, Any]:
+    names = ("first_seed", "wide", "start_scale", "perturb", "explore")
+    return {name: getattr(settings, name) for name in names}
+
+
+def _kept(promise: Promise | None, result: Evaluation) -> bool | None:
+    """Whether the mean return is at least the 5 % quantile of the promise; None without a promise."""
+    return None if promise is None else bool(result.returns.mean() >= promise.low)
+
+
+def _words(reports: Sequence[tuple[Controller, Evaluation]], promise: Promise | None) -> str:
+    from surrogym.cli.columns import columns
+    from surrogym_shared.wire import FEWEST_TO_JUDGE
+    from surrogym_shared.words import counted
+
+    names = ("mean", "iqm", "min", "max", "std", "mean_length", "success_rate", "episodes", "steps")
+    several = len(reports) > 1
+    rows = [
+        ([controller] if several else []) + [result.summary()[name] for name in names] for controller, result in reports
+    ]
+    table = columns([[*(["actions of"] if several else []), *names], *rows])
+    if promise is None:
+        return table
+    episodes = len(reports[0][1].returns)
+    if not _judges(episodes):
+        few = f"{counted(episodes, 'episode')} {'is' if episodes == 1 else 'are'} too few"
+        return f"{table}\n{few} to judge the promise: take {FEWEST_TO_JUDGE} or more"
+    kept = "kept: the mean return is at least" if _kept(promise, reports[0][1]) else "broken: the mean return is below"
+    return f"{table}\nthe promise of {promise.low:.4g} to {promise.high:.4g} was {kept} its lower end"

@@ -1,0 +1,123 @@
+"""Groups of command-line options: frozen dataclasses whose fields are options, which several commands share."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from functools import wraps
+from inspect import Parameter, Signature
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+import typer
+
+from surrogym.cli.options import AsJson, Quiet, Server, Token, TokenFile, TrustPolicy, connect, token_from
+
+if TYPE_CHECKING:
+    from surrogym_client.transport import Api
+    from surrogym_trainer.policies.card import PolicyCard
+    from surrogym_trainer.policies.predict import Predict
+
+
+@dataclass(frozen=True)
+class Service:
+    """Options of the server and its token."""
+
+    server: Server = None
+    token: Token = None
+    token_file: TokenFile = None
+
+    def token_for(self, context: typer.Context) -> str | None:
+        """Return the bearer token. Raises as ``token_from``."""
+        return token_from(context, self.token, self.token_file)
+
+    def connect(self, context: typer.Context, wait: float = 0.0, *, quiet: bool = False) -> Api:
+        """Connect to the server, and wait up to ``wait`` seconds until it answers. Raises as ``connect``."""
+        return connect(self.server, self.token_for(context), wait, quiet=quiet)
+
+
+@dataclass(frozen=True)
+class Output:
+    """Options of how a command shows its result."""
+
+    as_json: AsJson = False
+    quiet: Quiet = False
+
+    def give(self, result: dict[str, Any], words: Callable[[], str]) -> None:
+        """Print the result as JSON, or as text."""
+        from surrogym_shared.terminal import give
+
+        give(result, words, as_json=self.as_json, quiet=self.quiet)
+
+
+@dataclass(frozen=True)
+class PolicyReading:
+    """Options of how to read a policy file."""
+
+    algorithm: Annotated[
+        str | None,
+        typer.Option(
+            help="Algorithm of Stable-Baselines3 that wrote the file. [default: as noted beside the policy, or PPO]"
+        ),
+    ] = None
+    trust_policy: TrustPolicy = False
+
+    def load(self, policy: Path, card: PolicyCard) -> Predict:
+        """Load the policy as a function of observations. Raises as ``load_policy``."""
+        from surrogym_trainer.policies.files import load_policy
+
+        return load_policy(policy, self.algorithm or card.algorithm, trust=self.trust_policy)
+
+
+def add(app: typer.Typer, name: str, command: Callable[..., None]) -> None:
+    """Add a command to an app. Each parameter whose type is a group of options becomes these options, in their
+    order."""
+    app.command(name)(ungrouped(command))
+
+
+def ungrouped(command: Callable[..., None]) -> Callable[..., None]:
+    """Return the command with the options of its groups as separate parameters, which typer can read."""
+    asked = inspect.signature(command, eval_str=True).parameters.values()
+    groups: dict[str, Any] = {one.name: one.annotation for one in asked if is_dataclass(one.annotation)}
+    flat = [option for parameter in asked for option in _flattened(parameter)]
+
+    @wraps(command)
+    def run(**given: Any) -> None:
+        _require_finite(given)
+        for name, group in groups.items():
+            given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
+        command(**given)
+
+    run.__signature__ = Signature(flat)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in flat}
+    return run
+
+
+def _require_finite(given: dict[str, Any]) -> None:
+    """Refuse options that are no finite numbers: "nan" passes every range.
+
+    Raises:
+        BadParameter: naming the option.
+    """
+    for name, value in given.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise typer.BadParameter(
+                f"expected a finite number, got {value}", param_hint=f"'--{name.replace('_', '-')}'"
+            )
+
+
+def _flattened(parameter: Parameter) -> list[Parameter]:
+    group = parameter.annotation
+    if not is_dataclass(group):
+        return [parameter.replace(kind=Parameter.KEYWORD_ONLY)]
+    hints = get_type_hints(group, include_extras=True)
+    return [
+        Parameter(field.name, Parameter.KEYWORD_ONLY, default=_default(field), annotation=hints[field.name])
+        for field in fields(group)
+    ]
+
+
+def _default(field: Field[Any]) -> Any:
+    return Parameter.empty if field.default is MISSING else field.default

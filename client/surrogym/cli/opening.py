@@ -1,0 +1,85 @@
+"""Which environment a policy is evaluated in, and how it is opened."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from surrogym_sampler.original.episodes import Episode
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_trainer.policies.card import PolicyCard
+
+
+def opener_for_policy(
+    env: str | None, given: EnvironmentSpec | None, card: PolicyCard, *, quiet: bool
+) -> Callable[[], Episode]:
+    """Return a function that opens an episode, as ``opener_of``. A specification that the policy does not fit is
+    refused before anything is opened.
+
+    Raises:
+        PolicyMisfit: the policy was trained for another specification than the given one.
+        UnknownEnvironment: there is no such environment. If the policy is for another one, the message says so first.
+    """
+    from surrogym_sampler.original.errors import UnknownEnvironment
+    from surrogym_sampler.original.fitting import check_policy, meant_in_words
+
+    noted = card.spec
+    if given is not None and noted is not None:
+        check_policy(noted, given)
+    try:
+        return opener_of(env, given, card, quiet=quiet)
+    except UnknownEnvironment as error:
+        if noted is None or env is None or env == noted.environment:
+            raise
+        raise UnknownEnvironment(f"the policy is for {meant_in_words(noted)}; {error}") from error
+
+
+def opener_of(
+    env: str | None, given: EnvironmentSpec | None, card: PolicyCard, *, quiet: bool
+) -> Callable[[], Episode]:
+    """Return a function that opens an episode. An environment named by a card alone is opened only if it is Gymnasium's
+    own, because a module would run code.
+    """
+    from surrogym.cli.errors import CommandError
+    from surrogym_sampler.original.episodes import open_episode
+    from surrogym_sampler.original.loading import fits, is_known, is_own, make
+
+    noted = card.spec
+    name = env or (noted.environment if noted is not None else None)
+    if name is None or (env is None and not is_known(name)):
+        raise CommandError(f"expected --env with the original environment, got none (noted beside the policy: {name})")
+    if is_own(name):
+        bins = _bins(noted) if given is None else None
+        return lambda: open_episode(name, given, lambda: make(name, spec=given, bins=bins))
+    if given is None and noted is not None and fits(noted.environment, name):
+        given = _limited(noted, name, quiet=quiet)
+    spec = given or make(name).spec()
+    return lambda: open_episode(name, spec, lambda: make(name, spec=spec))
+
+
+def _limited(noted: EnvironmentSpec, name: str, *, quiet: bool) -> EnvironmentSpec:
+    """Shorten the environment's time limit to that of the card. A card can't lengthen it, as this would cost real
+    steps."""
+    from surrogym_sampler.original.loading import own_time_limit
+    from surrogym_shared.terminal import say
+
+    own = own_time_limit(name)
+    if noted.time_limit is not None and noted.time_limit <= own:
+        return noted
+    asked = "none" if noted.time_limit is None else f"{noted.time_limit} steps"
+    say(
+        f"the policy's card has a time limit of {asked}, that of {noted.environment} is {own}: episodes end after "
+        f"{own} steps; --spec FILE chooses another limit",
+        quiet=quiet,
+    )
+    return noted.model_copy(update={"time_limit": own})
+
+
+def _bins(spec: EnvironmentSpec | None) -> int | None:
+    """Number of values of each continuous action that the policy chooses from; None without discretisation."""
+    from surrogym_shared.spec import BoxAction
+
+    action = None if spec is None else spec.action
+    return action.bins[0] if isinstance(action, BoxAction) and action.bins else None

@@ -1,0 +1,283 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+if TYPE_CHECKING:
+    from surrogym_client.transport.api import Api
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.wire import SurrogateView
+
+SHOWN = (
+    "warning: --token shows the token in the list of processes; SURROGYM_TOKEN, --token-file or SURROGYM_TOKEN_FILE "
+    "keep it out of there"
+)
+NAMES = (  # of environments, in the help of every command that opens one
+    "a Gymnasium id, package:Id-v0, dm_control:DOMAIN-TASK, pcgym:MODEL, pcgym:FILE.json, fmu:PLANT.fmu or "
+    "package.module:factory"
+)
+QUICK = 1.0  # seconds a person waits for a server that is not there
+
+
+def names_of_surrogates(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Complete a surrogate's name in the shell. Empty if no server answers within a second."""
+    from surrogym_client.errors import SurrogymClientError
+    from surrogym_client.transport.api import Api
+    from surrogym_client.transport.connection import Retries, Timeouts, token_in
+
+    limits, at_once = Timeouts(connect=QUICK, request=QUICK), Retries(seconds=0)
+    try:
+        token = ctx.params.get("token") or (token_in(file) if (file := ctx.params.get("token_file")) else None)
+        with Api(ctx.params.get("server"), token, timeouts=limits, retries=at_once) as api:
+            return [surrogate.name for surrogate in api.surrogates() if surrogate.name.startswith(incomplete)]
+    except SurrogymClientError:
+        return []
+
+
+Surrogate = Annotated[str, typer.Argument(help="Name of the surrogate.", autocompletion=names_of_surrogates)]
+Server = Annotated[
+    str | None,
+    typer.Option("--server", envvar="SURROGYM_URL", help="URL of the server. [default: http://127.0.0.1:8000]"),
+]
+Token = Annotated[
+    str | None,
+    typer.Option(
+        "--token",
+        envvar="SURROGYM_TOKEN",
+        help="Bearer token for the server. A token typed here shows in the list of processes. SURROGYM_TOKEN and "
+        "--token-file keep it out of there.",
+    ),
+]
+TokenFile = Annotated[
+    Path | None, typer.Option("--token-file", envvar="SURROGYM_TOKEN_FILE", help="File that contains the bearer token.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress and no remarks.")]
+TrustPolicy = Annotated[
+    bool,
+    typer.Option(
+        "--trust-policy",
+        help="Unpickle the objects in the policy file. This runs any code in the file. Policies of surrogym "
+        "train don't need it.",
+    ),
+]
+Wait = Annotated[
+    float, typer.Option("--wait", min=0, help="Seconds to wait for a server or surrogate that is not there yet.")
+]
+ExitWithParent = Annotated[
+    bool, typer.Option("--exit-with-parent", hidden=True, help="End when the process that started this one ends.")
+]
+SpecFile = Annotated[
+    Path | None,
+    typer.Option("--spec", help="JSON file with a specification. It replaces the environment's own, or a log's draft."),
+]
+Tolerances = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--tolerance", help="Tolerance of an output, in its own unit, such as theta=0.01. May be given several times."
+    ),
+]
+StepLimit = Annotated[float, typer.Option(min=0.001, help="Seconds that one real step, or one reset, may take.")]
+Preset = Literal["default", "paper"]
+DESCRIBED = ("real_steps", "resets", "found", "asked", "specification")  # entries of what surrogym describe writes
+
+
+def connect(server: str | None, token: str | None, wait: float = 0.0, *, quiet: bool = False) -> Api:
+    """Connect to the server, and wait up to ``wait`` seconds until it answers. The terminal shows what the command
+    waits for.
+
+    Raises:
+        SurrogymClientError: no server answered in time, or what answered is not a Surrogym server.
+    """
+    from surrogym_client.errors import ServerUnreachable
+    from surrogym_client.transport.api import Api
+    from surrogym_client.transport.connection import Retries
+
+    api = Api(server, token, retries=Retries(seconds=QUICK))
+    if wait > 0:
+        try:
+            api.wait_until_ready(QUICK)
+        except ServerUnreachable:
+            with _waiting(f"for a server at {api.url}", quiet=quiet):
+                api.wait_until_ready(wait)
+    return api
+
+
+def token_from(context: typer.Context, token: str | None, file: Path | None) -> str | None:
+    """Return the bearer token. A value on the command line precedes the environment, and a token precedes a token file.
+
+    Warns on the terminal if other users of the machine can read the token.
+
+    Raises:
+        CommandError: both options are on the command line.
+        UnusableToken: the file does not contain a token.
+    """
+    from surrogym.cli.errors import CommandError
+    from surrogym_client.transport.connection import token_in
+    from surrogym_shared.secret_files import open_to_others
+    from surrogym_shared.terminal import say
+
+    quiet, typed_file = bool(context.params.get("quiet")), given_here(context, "token_file")
+    if given_here(context, "token"):
+        if typed_file:
+            raise CommandError("expected --token or --token-file, got both")
+        say(SHOWN, quiet=quiet)
+    if file is None or (token is not None and not typed_file):
+        return token
+    if warning := open_to_others(file):
+        say(f"warning: {warning}", quiet=quiet)
+    return token_in(file)
+
+
+def awaited_surrogate(api: Api, name: str, wait: float, *, quiet: bool) -> SurrogateView:
+    """Return the surrogate, and wait up to ``wait`` seconds until it is registered. The terminal shows what the command
+    waits for.
+
+    Raises:
+        UnknownSurrogate: the surrogate was not registered in time.
+    """
+    from surrogym_client.errors import UnknownSurrogate
+    from surrogym_client.surrogates.waiting import wait_for_surrogate
+
+    try:
+        return api.surrogate(name)
+    except UnknownSurrogate:
+        if wait == 0:
+            raise
+    with _waiting(f"for {name!r} to be registered", quiet=quiet):
+        return wait_for_surrogate(api, name, wait)
+
+
+@contextmanager
+def _waiting(words: str, *, quiet: bool) -> Iterator[None]:
+    from surrogym_shared.terminal import on_interrupt, progress
+
+    with on_interrupt(lambda: "interrupted; the same command waits again"), progress("wait", quiet=quiet) as update:
+        update(None, words)
+        yield
+
+
+def given_here(context: typer.Context, name: str) -> bool:
+    """Whether an option is on this command line. A value from the environment does not count."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
+def typed(context: typer.Context, without: Sequence[str] = ()) -> str:
+    """Return the arguments and options of this command line as text for a shell, except those named in ``without``."""
+    words: list[str] = []
+    for parameter in context.command.params:
+        name = str(parameter.name)
+        if name in without or not given_here(context, name):
+            continue
+        value = context.params[name]
+        if parameter.param_type_name == "argument":
+            words.append(str(value))
+        elif isinstance(value, bool):
+            words.append((parameter.opts if value else parameter.secondary_opts)[0])
+        else:
+            for one in value if isinstance(value, list | tuple) else [value]:
+                words += [parameter.opts[0], str(one)]
+    return shlex.join(words)
+
+
+@dataclass(frozen=True)
+class SpecContent:
+    """What a file of a specification contains.
+
+    Attributes:
+        spec: the specification.
+        steps: real steps that ``surrogym describe`` noted in the file; 0 in another file.
+        content: the file's bytes.
+    """
+
+    spec: EnvironmentSpec
+    steps: int
+    content: bytes
+
+
+def read_spec(path: Path | None) -> EnvironmentSpec | None:
+    """Read a specification from its file, or from the output of ``surrogym describe``. Errors as of
+    ``read_spec_file``."""
+    return None if path is None else read_spec_file(path).spec
+
+
+def read_spec_file(path: Path) -> SpecContent:
+    """Read a file of a specification once, because it may be a pipe.
+
+    Raises:
+        OSError: the file can't be read.
+        CommandError: the file is not a valid specification.
+    """
+    from pydantic import ValidationError
+
+    from surrogym.cli.errors import CommandError
+    from surrogym_shared.checks import first_fault
+    from surrogym_shared.spec import EnvironmentSpec
+
+    content = path.read_bytes()
+    if not content.strip():
+        raise CommandError(f"{path} is not a specification: it is empty")
+    try:
+        read = json.loads(content)
+        described = isinstance(read, dict) and "specification" in read
+        if described and (beside := sorted(map(str, read.keys() - DESCRIBED))):
+            raise CommandError(
+                f"{path} is not a specification: got {beside[0]!r} beside 'specification', where only "
+                f"{', '.join(DESCRIBED[:-1])} may stand; entries of a specification stand within it"
+            )
+        spec = EnvironmentSpec.model_validate_json(json.dumps(read["specification"]) if described else content)
+    except ValidationError as error:
+        raise CommandError(f"{path} is not a specification: {first_fault(error, of=EnvironmentSpec)}") from error
+    except json.JSONDecodeError as error:
+        raise CommandError(
+            f"{path} is not a specification: no JSON from line {error.lineno}, column {error.colno} on ({error.msg})"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise CommandError(f"{path} is not a specification: expected JSON as text in UTF-8") from error
+    except (ValueError, RecursionError) as error:
+        raise CommandError(f"{path} is not a specification: {error}") from error
+    steps = read.get("real_steps") if isinstance(read, dict) else None
+    return SpecContent(spec, steps if type(steps) is int and steps > 0 else 0, content)
+
+
+def read_tolerances(given: list[str]) -> dict[str, float]:
+    """Parse tolerances of the form ``output=number`` into a dictionary.
+
+    Raises:
+        CommandError: a text does not have this form.
+    """
+    from surrogym.cli.errors import CommandError
+
+    tolerances: dict[str, float] = {}
+    for text in given:
+        name, _, number = text.partition("=")
+        try:
+            tolerances[name] = float(number)
+        except ValueError as error:
+            raise CommandError(f"--tolerance: expected output=number, such as theta=0.01, got {text!r}") from error
+    return tolerances
+
+
+def require_known(algorithm: str) -> str:
+    """Return the registered name of a policy search. An unknown one is refused before any work begins.
+
+    Raises:
+        CommandError: no policy search has this name.
+    """
+    from surrogym.cli.errors import CommandError
+    from surrogym_trainer.training.search import SEARCHES
+
+    try:
+        return SEARCHES.name_of(algorithm)
+    except ValueError as error:
+        raise CommandError(str(error)) from error

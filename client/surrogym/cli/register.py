@@ -1,0 +1,276 @@
+"""``surrogym register``: register an original environment with the server."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shlex
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.options import (
+    NAMES,
+    Preset,
+    SpecFile,
+    Tolerances,
+    Wait,
+    read_spec_file,
+    read_tolerances,
+)
+
+if TYPE_CHECKING:
+    from surrogym_client.transport.api import Api
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.wire import SurrogateView
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``surrogym register`` to the app."""
+    add(app, "register", command)
+
+
+@dataclass(frozen=True)
+class DesignChoices:
+    """Options that replace parts of the environment's own specification; None keeps a part."""
+
+    preset: Annotated[
+        Preset | None,
+        typer.Option(
+            help="Settings of the method: default, or paper for the method as published. [default: from the "
+            "specification]"
+        ),
+    ] = None
+    budget: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="Maximum number of real steps that the design may take; 0 if all samples come from a log. [default: "
+            "from the specification]",
+        ),
+    ] = None
+    initial: Annotated[
+        int | None,
+        typer.Option(min=2, help="Number of real steps before the first model. [default: from the specification]"),
+    ] = None
+    target: Annotated[
+        float | None,
+        typer.Option(help="Confidence index to reach, between 0.5 and 1. [default: from the specification]"),
+    ] = None
+    acquisition: Annotated[
+        str | None,
+        typer.Option(
+            help="Criterion that chooses queries after the first model: integrated_variance, variance, "
+            "uncertainty_index, latin_hypercube, or one that a package on the server adds. [default: from the preset]"
+        ),
+    ] = None
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the design. [default: from the specification]")] = (
+        None
+    )
+    bins: Annotated[
+        int | None,
+        typer.Option(
+            min=2, help="Offer each continuous action to policies as this many discrete values. [default: continuous]"
+        ),
+    ] = None
+    access: Annotated[
+        Literal["any", "snapshot", "reset"] | None,
+        typer.Option(
+            help="Where a query may begin. any: at any state, to which the environment is set. snapshot: at a state "
+            "that was visited and saved, or at a reset. reset: at a reset only. [default: from the specification]"
+        ),
+    ] = None
+    max_rollout: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="If not any state can be set: maximum number of actions in one query. [default: from the "
+            "specification]",
+        ),
+    ] = None
+
+
+PrintSpec = Annotated[
+    bool,
+    typer.Option(
+        "--print-spec",
+        help="Print the specification, and register nothing. If it has to be drafted, this takes real steps.",
+    ),
+]
+
+
+def command(
+    context: typer.Context,
+    environment: Annotated[
+        str | None,
+        typer.Argument(
+            help=f"Environment: {NAMES}. With --env or FILE, this argument is the surrogate's name instead."
+        ),
+    ] = None,
+    file: Annotated[
+        Path | None, typer.Argument(help="Specification that surrogym describe wrote; the same as --spec.")
+    ] = None,
+    env: Annotated[str | None, typer.Option(help="Environment, if the first argument is the surrogate's name.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the surrogate. [default: derived from the environment's name]")
+    ] = None,
+    spec: SpecFile = None,
+    *,
+    choices: DesignChoices,
+    tolerance: Tolerances = None,
+    print_spec: PrintSpec = False,
+    wait: Wait = 0.0,
+    service: Service,
+    output: Output,
+) -> None:
+    """Register an original environment under a name.
+
+    Samplers and trainers use this name. If the environment has no built-in specification, the command first drafts one
+    as surrogym describe does, which takes real steps. The ledger counts them, also those noted in a described file.
+
+    Example: surrogym register Pendulum-v1 --name pendulum --budget 30
+    """
+    from surrogym.cli.printing import prints_aside, unregistered
+
+    environment, name, spec = _sorted_out(environment, file, env, name, spec)
+    read = None if spec is None else read_spec_file(spec)
+    given, steps = (None, 0) if read is None else (read.spec, read.steps)
+    with unregistered(lambda: 0 if read else steps, "nothing was registered"):
+        if given is None and environment is not None and _lacks_specification(environment):
+            if not print_spec:
+                with service.connect(context, wait, quiet=output.quiet) as api:
+                    _require_free(api, name or default_name(environment))
+            given, steps = _described(environment, quiet=output.quiet)
+        with prints_aside():
+            chosen = _specification(environment, given, **vars(choices))
+    if tolerance:
+        chosen = _with_tolerances(chosen, read_tolerances(tolerance))
+    if print_spec:
+        typer.echo(chosen.model_dump_json(indent=2))
+        return
+    with service.connect(context, wait, quiet=output.quiet) as api:
+        view = api.create_surrogate(name or default_name(chosen.environment or environment or ""), chosen)
+        if steps:
+            key = None if read is None else _key(view.name, read.content)
+            api.report_steps(view.name, steps, note="description", idempotency_key=key)
+    output.give(view.model_dump(mode="json"), lambda: _words(view, environment or ""))
+
+
+def _sorted_out(
+    environment: str | None, file: Path | None, env: str | None, name: str | None, spec: Path | None
+) -> tuple[str | None, str | None, Path | None]:
+    """Return the environment, the surrogate's name and the specification file, from either form of the command line."""
+    from surrogym.cli.errors import CommandError
+
+    if file is not None:
+        if spec is not None:
+            raise CommandError(
+                f"expected one specification, got the argument {file} and --spec {spec}: the environment of a "
+                "named surrogate is given by --env"
+            )
+        spec = file
+    if file is None and env is None:
+        return environment, name, spec
+    if environment is not None and name is not None:
+        raise CommandError(f"expected one name, got {environment!r} and --name {name!r}")
+    return env, environment or name, spec
+
+
+def _lacks_specification(environment: str) -> bool:
+    """Whether an environment has to be described. A name that can't be opened is an error without a server too."""
+    from surrogym.cli.printing import prints_aside
+    from surrogym_sampler.original.adapters import open_simulator
+    from surrogym_sampler.original.loading import has_specification
+
+    if has_specification(environment):
+        return False
+    with prints_aside():
+        open_simulator(environment).close()
+    return True
+
+
+def _key(name: str, described: bytes) -> str:
+    """Return the key of a described file's steps, so that registering it twice counts them once."""
+    return hashlib.sha256(name.encode() + b"\n" + described).hexdigest()[:32]
+
+
+def _require_free(api: Api, name: str) -> None:
+    """Check that no surrogate has this name, before a description takes real steps for it.
+
+    Raises:
+        CommandError: there is one.
+    """
+    from surrogym.cli.errors import CommandError
+    from surrogym_client.errors import UnknownSurrogate
+
+    with suppress(UnknownSurrogate):
+        api.surrogate(name)
+        raise CommandError(
+            f"a surrogate named {name!r} exists already, and no real step was taken; choose another name, or delete it "
+            f"with surrogym delete {name}"
+        )
+
+
+def _described(environment: str, *, quiet: bool) -> tuple[EnvironmentSpec, int]:
+    """Draft a specification, and return it with the number of real steps that were taken."""
+    from surrogym.cli.printing import prints_aside
+    from surrogym_sampler.original.describing import describe
+    from surrogym_shared.terminal import say
+
+    with prints_aside():
+        description = describe(environment)
+    for line in description.words():
+        say(line, quiet=quiet)
+    return description.spec, description.steps
+
+
+def default_name(environment: str) -> str:
+    """Derive a surrogate's name from an environment's, without the version: ``Pendulum-v1`` becomes ``pendulum``."""
+    plain = re.sub(r"-v\d+$", "", environment.rpartition(":")[2])
+    return re.sub(r"[^a-z0-9._-]+", "-", plain.lower()).strip("-._")[:64] or "surrogate"
+
+
+def _specification(environment: str | None, spec: EnvironmentSpec | None, **choices: object) -> EnvironmentSpec:
+    from surrogym.cli.errors import CommandError, invalid
+    from surrogym_sampler.original.loading import make, with_choices
+
+    given = {key: value for key, value in choices.items() if value is not None}
+    try:
+        if environment is not None:
+            original = make(environment, spec=spec, **given)  # type: ignore[arg-type]
+            try:
+                return original.spec()
+            finally:
+                original.close()
+        if spec is not None:
+            others = {name: given.pop(name) for name in ("bins", "access", "max_rollout") if name in given}
+            return with_choices(spec, given, **others)  # type: ignore[arg-type]
+    except ValueError as error:
+        raise CommandError(invalid(error)) from error
+    raise CommandError("expected an environment or --spec FILE, got neither")
+
+
+def _with_tolerances(spec: EnvironmentSpec, tolerances: dict[str, float]) -> EnvironmentSpec:
+    from surrogym.cli.errors import CommandError, invalid
+
+    try:
+        return type(spec).model_validate(spec.model_dump() | {"tolerances": spec.tolerances | tolerances})
+    except ValueError as error:
+        raise CommandError(invalid(error)) from error
+
+
+def _words(view: SurrogateView, environment: str) -> str:
+    from surrogym_client.surrogates.phases import awaits_log, words_of_no_log
+    from surrogym_sampler.original.loading import is_known, sample_command
+
+    registered = f"{view.name}: {view.environment or 'own environment'}, {len(view.spec.coordinates)} coordinates"
+    if awaits_log(view):
+        return f"{registered}; {words_of_no_log(view.name)}"
+    start = sample_command(view.name, view.environment)
+    if environment:  # its name was typed here
+        start = f"surrogym sample {view.name}" + ("" if is_known(environment) else f" --env {shlex.quote(environment)}")
+    return f"{registered}, budget of {view.budget} real steps, target {view.target:g}; next: {start}"

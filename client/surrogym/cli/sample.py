@@ -1,0 +1,317 @@
+"""``surrogym sample``: answer a surrogate's queries beside the original environment."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.options import (
+    NAMES,
+    ExitWithParent,
+    SpecFile,
+    StepLimit,
+    Surrogate,
+    Wait,
+    awaited_surrogate,
+    read_spec,
+)
+from surrogym.cli.sampling_on_ray import RayOptions
+
+if TYPE_CHECKING:
+    from surrogym_client.transport.api import Api
+    from surrogym_sampler.queries.on_ray import Line, SamplerPlan
+    from surrogym_sampler.queries.settings import Outcome, SamplerReport, SamplerSettings
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.wire import Phase, Query, SurrogateView
+
+    Tell = Callable[[Line], None]
+
+
+Environment = Annotated[
+    str | None,
+    typer.Option(
+        help=f"Environment to take real steps in: {NAMES}. [default: the surrogate's, if its name can run no file of "
+        "yours]"
+    ),
+]
+Command = Annotated[
+    str | None,
+    typer.Option(
+        "--exec",
+        metavar="COMMAND",
+        help='Program that takes the real steps, such as "./plant --port 7". Short for --env "exec:COMMAND".',
+    ),
+]
+UntilDone = Annotated[bool, typer.Option("--until-done", help="Stop when the design is ready or has spent its budget.")]
+MaxQueries = Annotated[int | None, typer.Option(min=1, help="Maximum number of queries to begin. [default: no limit]")]
+TimeLimit = Annotated[
+    float | None, typer.Option(min=0, help="Seconds after which no further query begins. [default: no limit]")
+]
+
+
+@dataclass(frozen=True)
+class SnapshotOptions:
+    """What the sampler keeps of the states that it visits."""
+
+    snapshots: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder that keeps snapshots for the next sampler; several samplers may share it. [default: they end "
+            "with the sampler]"
+        ),
+    ] = None
+    most_snapshots: Annotated[int, typer.Option(min=1, help="Largest number of snapshots to keep.")] = 1_000
+    most_bytes: Annotated[int, typer.Option(min=1, help="Largest size of all snapshots to keep, in bytes.")] = 1 << 30
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``surrogym sample`` to the app."""
+    add(app, "sample", command)
+
+
+def command(
+    context: typer.Context,
+    surrogate: Surrogate,
+    env: Environment = None,
+    program: Command = None,
+    spec: SpecFile = None,
+    once: Annotated[bool, typer.Option("--once", help="Stop after the first claim that returns queries.")] = False,
+    until_done: UntilDone = False,
+    max_queries: MaxQueries = None,
+    time_limit: TimeLimit = None,
+    step_limit: StepLimit = 30.0,
+    batch: Annotated[int, typer.Option(min=1, max=256, help="Number of queries to claim at once.")] = 4,
+    worker: Annotated[str | None, typer.Option(help="Name of this sampler. [default: host and process]")] = None,
+    wait: Wait = 0.0,
+    exit_with_parent: ExitWithParent = False,
+    *,
+    keeping: SnapshotOptions,
+    cluster: RayOptions,
+    service: Service,
+    output: Output,
+) -> None:
+    """Take the real steps that the server asks for.
+
+    For each query, the sampler sets the original environment to a state, takes one real step and reports the sample. If
+    the environment can't be set to any state, the sampler resets it, or returns to a snapshot, and takes a sequence of
+    actions. Ctrl-C ends the command.
+
+    Example: surrogym sample pendulum --until-done
+
+    Example: surrogym sample cart --env cart:Cart --on-ray 32 --ray-resources CPU=2 --runtime-env env.yaml
+    """
+    from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
+    from surrogym_sampler.queries.on_ray import SamplerPlan
+    from surrogym_sampler.queries.settings import SamplerSettings, worker_name
+    from surrogym_sampler.queries.snapshots import Bounds
+
+    cluster.require_fit(worker_limits=once or max_queries is not None)
+    if exit_with_parent:
+        watch_parent()
+    settings = SamplerSettings(
+        name=worker or worker_name(),
+        batch=batch,
+        once=once,
+        until_done=until_done,
+        max_queries=max_queries,
+        time_limit=time_limit,
+        snapshots=keeping.snapshots,
+        bounds=Bounds(keeping.most_snapshots, keeping.most_bytes),
+    )
+    with service.connect(context, wait, quiet=output.quiet) as api:
+        view = awaited_surrogate(api, surrogate, wait, quiet=output.quiet)
+        if _without_queries(view, output, until_done=until_done):
+            return
+        name, replaced = _environment(_named(env, program), read_spec(spec), view.spec)
+        plan = SamplerPlan(api.url, service.token_for(context), surrogate, name, replaced, step_limit, settings)
+        if cluster.on_ray is None:
+            _sample_here(api, plan, output)
+        else:
+            _require_shared(view.spec, settings)
+            _sample_on_ray(api, plan, cluster, output)
+
+
+def _sample_here(api: Api, plan: SamplerPlan, output: Output) -> None:
+    from surrogym_client.runtime.lifetime import terminations
+    from surrogym_sampler.original.loading import isolated
+    from surrogym_sampler.queries.on_ray import Line, line_of
+    from surrogym_sampler.queries.worker import Sampler
+    from surrogym_shared.terminal import on_interrupt, say
+
+    with (
+        closing(isolated(plan.environment, plan.step_limit, plan.spec)) as environment,
+        _telling(api, plan.surrogate, quiet=output.quiet) as tell,
+    ):
+
+        def report(query: Query, outcome: Outcome, error: str) -> None:
+            if tell is not None:
+                tell(Line(line_of(query, outcome, error), bool(error)))
+
+        def ended(phase: Phase) -> None:
+            if not plan.settings.until_done:  # otherwise the result follows at once
+                say(_words_of_end(plan.surrogate, phase), quiet=output.quiet)
+
+        sampler = Sampler(api, plan.surrogate, environment, plan.settings, report, ended)
+        for number in terminations():
+            signal.signal(number, lambda *_: sampler.stop())
+        with on_interrupt(lambda: _words_of_interruption(sampler.summary())):
+            result = sampler.run()
+    output.give(asdict(result), lambda: _words(plan.surrogate, result))
+    if result.phase == "failed":
+        raise typer.Exit(1)
+
+
+def _require_shared(asked: EnvironmentSpec, settings: SamplerSettings) -> None:
+    """Refuse several samplers that can't return to each other's snapshots."""
+    from surrogym.cli.errors import CommandError
+
+    if asked.snapshots and settings.snapshots is None:
+        raise CommandError("expected --snapshots FOLDER that all samplers see, got several samplers without one")
+
+
+def _sample_on_ray(api: Api, plan: SamplerPlan, cluster: RayOptions, output: Output) -> None:
+    from surrogym.cli.sampling_on_ray import result_of, run_samplers, samplers_on_ray
+    from surrogym_client.runtime.lifetime import terminations_as_interrupts
+    from surrogym_shared.terminal import on_interrupt, say
+
+    time_limit, endless = plan.settings.time_limit, replace(plan.settings, time_limit=None)
+    samplers = samplers_on_ray(cluster, replace(plan, settings=endless))
+    with (
+        _telling(api, plan.surrogate, quiet=output.quiet) as tell,
+        terminations_as_interrupts(),
+        on_interrupt(lambda: _words_of_interruption(samplers.report())),
+    ):
+        run_samplers(samplers, time_limit, tell or (lambda _: None), lambda text: say(text, quiet=output.quiet))
+    report = samplers.report()
+    output.give(result_of(samplers), lambda: f"{_words(plan.surrogate, report)}{_restarts(samplers.restarts)}")
+    if report.phase == "failed" or samplers.errors:
+        raise typer.Exit(1)
+
+
+def _named(env: str | None, program: str | None) -> str | None:
+    """Return the environment's name, from either option."""
+    from surrogym.cli.errors import CommandError
+    from surrogym_sampler.original.executables import name_of
+
+    if env is not None and program is not None:
+        raise CommandError(f"expected --env or --exec, got both: {env!r} and {program!r}")
+    return env if program is None else name_of(program)
+
+
+def _environment(
+    env: str | None, given: EnvironmentSpec | None, asked: EnvironmentSpec
+) -> tuple[str, EnvironmentSpec | None]:
+    """Return the environment's name, and the specification that replaces its own. The server's choice is trusted only
+    for Gymnasium's own ids, because a module or a program would run code.
+    """
+    from surrogym.cli.errors import CommandError
+    from surrogym_sampler.original.loading import is_known, is_own
+
+    if env is None and not is_known(asked.environment):
+        raise CommandError(_words_of_consent(asked.environment))
+    name = env or asked.environment
+    own = is_own(name) and given is None
+    return name, None if own else given or asked
+
+
+def _words_of_consent(name: str) -> str:
+    """Say why an environment's name from a server is not enough, and with which option it is opened."""
+    from surrogym_sampler.original.executables import is_executable
+    from surrogym_sampler.original.loading import env_option
+    from surrogym_shared.environments import is_name
+
+    if not is_executable(name) and is_name(name):
+        return (
+            f"the surrogate's environment {name!r} may run a file of yours, so its name has to come from you: "
+            f"expected{env_option(name)}"
+        )
+    return (
+        f"the surrogate's environment {name!r} can't be opened by this name alone: expected --env "
+        "package.module:factory, --env pcgym:FILE.json, --env fmu:PLANT.fmu, or --exec COMMAND"
+    )
+
+
+@contextmanager
+def _telling(api: Api, surrogate: str, *, quiet: bool) -> Iterator[Tell | None]:
+    """Show progress: one bar for the design on a terminal, or a line for each query otherwise."""
+    from surrogym_shared.terminal import progress, say
+
+    if quiet or not sys.stderr.isatty():
+        yield None if quiet else lambda line: say(line.text)
+        return
+    with progress("design") as update:
+
+        def tell(line: Line) -> None:
+            if line.is_error:
+                say(line.text)
+            with suppress(SurrogymClientError):  # the sampler itself handles a server that is away for a moment
+                view = api.surrogate(surrogate)
+                update(share_of_design(view), words_of_design(view))
+
+        from surrogym_client.errors import SurrogymClientError
+        from surrogym_client.surrogates.waiting import share_of_design, words_of_design
+
+        view = api.surrogate(surrogate)
+        update(share_of_design(view), words_of_design(view))
+        yield tell
+
+
+def _without_queries(view: SurrogateView, output: Output, *, until_done: bool) -> bool:
+    """Say that the design has no queries until a log is imported. Returns whether the command has done its work."""
+    from surrogym_client.surrogates.phases import awaits_log, words_of_no_log
+    from surrogym_sampler.queries.settings import SamplerReport
+    from surrogym_shared.terminal import say
+
+    if not awaits_log(view):
+        return False
+    if until_done:
+        nothing = SamplerReport(0, 0, 0, 0, 0, steps=0, seconds=0.0, phase=view.phase)
+        output.give(asdict(nothing), lambda: words_of_no_log(view.name))
+    else:
+        say(f"{words_of_no_log(view.name)}; this sampler waits for queries, Ctrl-C ends it", quiet=output.quiet)
+    return until_done
+
+
+def _words_of_end(surrogate: str, phase: Phase) -> str:
+    """Describe the end of a design while the sampler waits for further queries, such as those of an audit."""
+    from surrogym_client.surrogates.phases import COMPLETED, IN_WORDS
+
+    following = (
+        f"; next: surrogym train {surrogate}" if phase in COMPLETED else f": surrogym status {surrogate} says why"
+    )
+    return f"{IN_WORDS[phase]}{following}; this sampler waits for further queries, Ctrl-C ends it"
+
+
+def _words_of_interruption(report: SamplerReport) -> str:
+    return (
+        f"interrupted after {report.answered} queries answered with {report.steps} real steps; all of them are stored, "
+        "unfinished queries, if any, went back into the queue, and the same command continues"
+    )
+
+
+def _restarts(count: int) -> str:
+    return f"; {count} samplers died and were started again" if count else ""
+
+
+def _words(surrogate: str, report: SamplerReport) -> str:
+    from surrogym_client.surrogates.phases import COMPLETED, IN_WORDS
+
+    others = {name: getattr(report, name) for name in ("failed", "dropped", "refused", "impossible")}
+    apart = "".join(f", {count} {outcome}" for outcome, count in others.items() if count)
+    said = f"{report.answered} queries answered with {report.steps} real steps{apart} in {report.seconds:.1f} s"
+    if report.phase in IN_WORDS:
+        said += f"; {IN_WORDS[report.phase]}"
+    if report.phase == "failed":
+        said += (
+            f": surrogym status {surrogate} shows why; surrogym change {surrogate} --resume queues again the queries "
+            "that were set aside"
+        )
+    return f"{said}; next: surrogym train {surrogate}" if report.phase in COMPLETED else said

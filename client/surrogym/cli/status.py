@@ -1,0 +1,207 @@
+"""``surrogym status``: show the surrogates on the server."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from surrogym.cli.groups import Service, add
+from surrogym.cli.options import AsJson, names_of_surrogates
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from surrogym_client.transport.api import Api
+    from surrogym_shared.wire import ModelView, OutputFidelity, SurrogateSummary, SurrogateView
+
+Form = Literal["json", "short", "words"]
+
+FIDELITY = (
+    *("output", "confidence", "as in the paper", "tolerance", "coverage"),
+    *("leave-one-out error", "within 1 deviation", "within 2", "noise"),
+)
+PREQUENTIAL = ("output", "new samples", "in 50 %", "in 80 %", "in 90 %", "interval score")
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``surrogym status`` to the app."""
+    add(app, "status", command)
+
+
+def command(
+    context: typer.Context,
+    surrogate: Annotated[
+        str | None, typer.Argument(help="Name of a surrogate. [default: all]", autocompletion=names_of_surrogates)
+    ] = None,
+    watching: Annotated[bool, typer.Option("--watch", "-w", help="Refresh the output until Ctrl-C.")] = False,
+    as_json: AsJson = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Show names and phases only, without a heading.")
+    ] = False,
+    *,
+    service: Service,
+) -> None:
+    """Show all surrogates, or the details of one.
+
+    The details of a surrogate are its confidence index, errors and real steps. With --watch --json, each change is one
+    line of JSON.
+
+    Example: surrogym status pendulum --watch
+    """
+    from surrogym_shared.terminal import watch
+    from surrogym_shared.words import visible
+
+    form: Form = "json" if as_json else "short" if quiet else "words"
+    with service.connect(context) as api:
+        look = partial(_all, api, form) if surrogate is None else partial(_one, api, surrogate, form)
+        seen = look()  # an unknown name or a wrong address ends the command here, also with --watch
+        if watching:
+            watch(partial(_patiently, look, as_json))
+        else:
+            typer.echo(json.dumps(json.loads(seen), indent=2) if as_json else visible(seen))
+
+
+def _all(api: Api, form: Form) -> str:
+    surrogates = api.surrogates()
+    if form == "json":
+        return json.dumps({"server": api.url, "surrogates": [s.model_dump(mode="json") for s in surrogates]})
+    return "\n".join(map(_short, surrogates)) if form == "short" else _table(surrogates)
+
+
+def _one(api: Api, name: str, form: Form) -> str:
+    view = api.surrogate(name)
+    if form == "json":
+        return json.dumps(view.model_dump(mode="json"))
+    if form == "short":
+        return _short(view)
+    return _detail(view, api.models(name) if view.phase in ("over_budget", "unsure") else ())
+
+
+def _patiently(look: Callable[[], str], as_json: bool) -> str:
+    """Return the current output, or a remark that the server does not answer."""
+    from surrogym_client.errors import ServerUnreachable
+
+    try:
+        return look()
+    except ServerUnreachable as error:
+        return json.dumps({"error": str(error)}) if as_json else f"{error}; trying again until Ctrl-C"
+
+
+def _short(seen: SurrogateSummary) -> str:
+    return f"{seen.name} {_phase(seen)}"
+
+
+def _phase(seen: SurrogateSummary) -> str:
+    return "paused" if seen.paused else seen.phase
+
+
+def _table(surrogates: Sequence[SurrogateSummary]) -> str:
+    from surrogym.cli.columns import columns
+
+    if not surrogates:
+        return "no surrogates yet; next: surrogym register Pendulum-v1 --name pendulum"
+    heading = ("name", "environment", "phase", "real steps", "queries", "model", "confidence index", "target")
+    return columns([heading, *map(_row, surrogates)])
+
+
+def _row(seen: SurrogateSummary) -> tuple[str | float | None, ...]:
+    queries = seen.queries
+    waiting = f"{queries.pending} pending, {queries.leased} leased" if queries.pending + queries.leased else "none"
+    steps = _steps(seen)
+    environment = seen.environment or "own"
+    return (
+        *(seen.name, environment, _phase(seen), steps, waiting),
+        *(seen.model_version, seen.confidence_index, f"{seen.target:g}"),
+    )
+
+
+def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
+    from surrogym.cli.columns import columns
+    from surrogym_client.surrogates.advice import advice, noise_in_words, verdict
+
+    ledger = view.ledger
+    lines = [
+        f"{view.name}: {view.environment or 'own environment'}{_period(view)}, "
+        f"{'paused, ' if view.paused else ''}{view.phase}",
+        f"real steps: {ledger.initial} initial, {ledger.adaptive} adaptive, {ledger.manual} manual, "
+        f"{ledger.total} of {view.budget} in all; {ledger.audit} of audits, {ledger.logged} logged, "
+        f"{ledger.evaluation} in evaluation, "
+        f"{ledger.unresolved} unresolved ({ledger.failed} failed)",
+        f"queries: {view.queries.pending} pending, {view.queries.leased} leased, {view.queries.set_aside} set aside",
+    ]
+    if view.queries.set_aside:
+        lines[-1] += f" because they failed; surrogym change {view.name} --resume queues them again"
+    if view.queries.refused:
+        lines[-1] += f"; {view.queries.refused} refused by the environment, which took no real step of the budget"
+    if hint := _hint(view):
+        lines.append(hint)
+    if view.error:
+        lines.append(f"last error: {view.error}")
+    if view.fidelity is not None:
+        lines += [
+            f"model {view.model_version}: confidence index {view.fidelity.confidence_index:.4f}, "
+            f"target {view.target:g}; as the paper counts it {view.fidelity.confidence_index_paper:.4f}",
+            columns([FIDELITY, *(_judged(output) for output in view.fidelity.outputs)]),
+            *_predicted(view.fidelity.outputs),
+            f"verdict: {verdict(view)}",
+        ]
+    if noise := noise_in_words(view):
+        lines.append(f"noise of a single step, confirmed by real steps: {noise}")
+    if following := advice(view, models):
+        lines.append(f"next: {following}")
+    return "\n".join(lines)
+
+
+def _period(view: SurrogateView) -> str:
+    """The declared sampling period, with a comma before it; empty without one."""
+    period = view.spec.sampling_period
+    return "" if period is None else f", a step every {period:g} s"
+
+
+def _steps(seen: SurrogateSummary) -> str:
+    """Real steps of the budget, and logged steps, which don't count towards it."""
+    ledger = seen.ledger
+    taken = f"{ledger.total} of {seen.budget}" if seen.budget or ledger.total else ""
+    logged = f"{ledger.logged} logged" if ledger.logged else ""
+    return ", ".join(part for part in (taken, logged) if part) or "none"
+
+
+def _hint(view: SurrogateView) -> str | None:
+    """Return what a person has to do next, if nothing proceeds without them."""
+    from surrogym_client.surrogates.phases import awaits_log, words_of_no_log
+    from surrogym_sampler.original.loading import sample_command
+
+    if view.phase == "from_log":
+        return (
+            f"the model is fitted to the log, and the design requests no real steps; next: surrogym train {view.name}"
+        )
+    if awaits_log(view):
+        return words_of_no_log(view.name)
+    if view.queries.pending and not view.samplers and not view.paused:
+        logged = "; until then, the model of the log is served" if view.ledger.logged and view.model_version else ""
+        start = sample_command(view.name, view.environment)
+        return f"{view.queries.pending} queries wait for a sampler{logged}; next: {start}"
+    return None
+
+
+def _judged(output: OutputFidelity) -> tuple[str | float | None, ...]:
+    return (
+        *(output.name, output.confidence_index, output.confidence_index_paper, output.tolerance, output.coverage),
+        *(output.leave_one_out_error, output.leave_one_out_within_one, output.leave_one_out_within_two, output.noise),
+    )
+
+
+def _predicted(outputs: Sequence[OutputFidelity]) -> list[str]:
+    """Table of the samples that were predicted before the model learned from them; empty without any."""
+    from surrogym.cli.columns import columns
+
+    rows = [
+        (output.name, scores.predictions, scores.within_50, scores.within_80, scores.within_90, scores.interval_score)
+        for output in outputs
+        if (scores := output.prequential) is not None
+    ]
+    said = "new samples, predicted before the model learned from them (shares in intervals, or within the tolerance):"
+    return [said, columns([PREQUENTIAL, *rows])] if rows else []

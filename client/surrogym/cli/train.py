@@ -1,0 +1,313 @@
+"""``surrogym train``: learn a policy against a surrogate."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.options import (
+    ExitWithParent,
+    Surrogate,
+    Wait,
+    awaited_surrogate,
+    connect,
+    given_here,
+    require_known,
+    typed,
+)
+from surrogym.cli.pushing import push_or_say
+from surrogym.cli.train_options import LogOptions, LoopOptions, SearchOptions, SessionOptions, StartOptions
+
+if TYPE_CHECKING:
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.terminal import Update
+    from surrogym_shared.wire import CurvePoint, SurrogateView
+    from surrogym_trainer.training import TrainProgress, TrainResult, TrainSettings
+    from surrogym_trainer.training.handover import Handover
+
+    Record = Callable[[TrainProgress], None]
+
+NOTHING_YET = "interrupted before there was a policy; nothing was saved; the same command starts from the beginning"
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``surrogym train`` to the app."""
+    add(app, "train", command)
+
+
+def command(
+    context: typer.Context,
+    surrogate: Surrogate,
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write the policy to.")] = Path("policy.zip"),
+    *,
+    search: SearchOptions,
+    session: SessionOptions,
+    start: StartOptions,
+    loop: LoopOptions,
+    log: LogOptions,
+    wait: Wait = 0.0,
+    exit_with_parent: ExitWithParent = False,
+    service: Service,
+    output: Output,
+) -> None:
+    """Train a policy in the virtual environment.
+
+    A running sampler takes the few real steps of the audit. No other real step is taken, unless --improve is given. The
+    command prints the imagined return: what the policy earns in the virtual environment, not in the original
+    environment.
+
+    Example: surrogym train pendulum --out policy.zip --seed 0
+    """
+    from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
+    from surrogym_client.surrogates.budget import words_of_rounds
+    from surrogym_sampler.original.fitting import check_shape
+    from surrogym_sampler.original.loading import env_option
+    from surrogym_shared.terminal import say
+    from surrogym_trainer.training.search import with_algorithm
+    from surrogym_trainer.training.words import words_of_result
+
+    if exit_with_parent:
+        watch_parent()
+    settings, learned = _settings(search, session, start, log), start.learned()
+    token = service.token_for(context)
+    spec, url = _trainable(surrogate, service.server, token, wait, settings, quiet=output.quiet)
+    if learned is not None:
+        check_shape(learned, spec, "the surrogate")
+    settings = with_algorithm(settings, spec)
+    if loop.improve:
+        with connect(service.server, token) as api:
+            say(words_of_rounds(api, surrogate, loop.improve, loop.rounds), quiet=output.quiet)
+    _import(settings, quiet=output.quiet)
+    curve: list[CurvePoint] = []
+    card = partial(_write_card, surrogate=surrogate, spec=spec, url=url, seed=search.seed, curve=curve)
+    with _keeping(card, typed(context, without=("out", "start_from", "trust_policy", "token"))):
+        recording = partial(_recording, log.progress_file, curve)
+        result, handover = _train(url, token, surrogate, out, settings, loop, recording, quiet=output.quiet)
+    summary = card(result, handover)
+    if log.push:
+        summary["version"] = push_or_say(url, token, result.path, surrogate, quiet=output.quiet)
+    named = service.server if given_here(context, "server") else None
+    shown = partial(
+        words_of_result,
+        asked=search.steps,
+        closed_loop=loop.improve > 0,
+        server=named,
+        env_option=env_option(spec.environment),
+    )
+    output.give(summary, lambda: shown(result, handover))
+
+
+def _settings(search: SearchOptions, session: SessionOptions, start: StartOptions, log: LogOptions) -> TrainSettings:
+    """Return the settings of the training. Errors that can be found without a server are raised here."""
+    from surrogym_trainer.training import TrainSettings
+
+    given = session.fields()
+    hyperparameters = search.hyperparameters()
+    algorithm = None if search.algorithm is None else require_known(search.algorithm)
+    return TrainSettings(
+        algorithm=algorithm,
+        total_steps=search.steps,
+        num_envs=search.num_envs,
+        seed=search.seed,
+        tracker=log.tracker(algorithm),
+        tensorboard=log.tensorboard,
+        hyperparameters=hyperparameters,
+        session=given,
+        **vars(start),
+    )
+
+
+def _import(settings: TrainSettings, *, quiet: bool) -> None:
+    """Import the packages of the policy search, and show on the terminal what takes the time."""
+    from surrogym_shared.terminal import on_interrupt, progress
+    from surrogym_trainer.training.search import SEARCHES, name_of
+
+    with on_interrupt(lambda: NOTHING_YET), progress("prepare", quiet=quiet) as update:
+        update(None, f"importing what {name_of(settings)} needs")
+        SEARCHES.get(name_of(settings))
+
+
+@contextmanager
+def _keeping(write_card: Callable[[TrainResult], object], asked: str) -> Iterator[None]:
+    """After Ctrl-C or a polite kill, say what was saved and how to continue. A saved policy gets its card."""
+    from surrogym_client.runtime.lifetime import terminations_as_interrupts
+    from surrogym_shared.terminal import say
+    from surrogym_trainer.training.settings import TrainingInterrupted
+    from surrogym_trainer.training.words import words_of_interruption
+
+    try:
+        with terminations_as_interrupts():
+            yield
+    except TrainingInterrupted as interruption:
+        result = interruption.result
+        write_card(result)
+        say(words_of_interruption(result, asked))
+        raise
+    except KeyboardInterrupt:
+        say(NOTHING_YET)
+        raise
+
+
+def _words_of_sessions(view: SurrogateView) -> str:
+    """Warn of another training of the surrogate, which may be running."""
+    from surrogym_shared.words import counted
+
+    are = "is" if view.sessions == 1 else "are"
+    return (
+        f"warning: {counted(view.sessions, 'session')} of {view.name!r} {are} open, perhaps of another training. "
+        "Trainings at the same time share the budget of real steps, and each one's steps change the model of the others"
+    )
+
+
+def _trainable(
+    surrogate: str, server: str | None, token: str | None, wait: float, settings: TrainSettings, *, quiet: bool
+) -> tuple[EnvironmentSpec, str]:
+    """Wait until the surrogate's design has ended, and return its specification and the server's URL.
+
+    With ``wait``, the packages of the policy search are imported in the meantime.
+    """
+    from surrogym.cli.errors import CommandError
+    from surrogym_client.surrogates.phases import COMPLETED
+    from surrogym_client.surrogates.waiting import (
+        share_of_design,
+        wait_for_design,
+        words_of_design,
+        words_of_uncertainty,
+    )
+    from surrogym_shared.terminal import on_interrupt, progress, say
+    from surrogym_trainer.training.search import SEARCHES, name_of
+
+    with connect(server, token, wait, quiet=quiet) as api:
+        view = awaited_surrogate(api, surrogate, wait, quiet=quiet)
+        if wait > 0:
+            SEARCHES.get(name_of(settings))
+            stays = "interrupted; the design continues on the server; the same command waits again"
+            with on_interrupt(lambda: stays), progress("design", quiet=quiet) as update:
+                view = wait_for_design(
+                    api, surrogate, wait, lambda view: update(share_of_design(view), words_of_design(view))
+                )
+        if view.model_version is None:
+            raise CommandError(_words_without_model(view))
+        if view.sessions:
+            say(_words_of_sessions(view), quiet=quiet)
+        if view.phase in ("over_budget", "unsure"):
+            say(words_of_uncertainty(view), quiet=quiet)
+        if view.phase not in COMPLETED and not view.paused:
+            typer.echo(
+                f"the design of {surrogate!r} continues; training starts with model {view.model_version}", err=True
+            )
+        return view.spec, api.url
+
+
+def _words_without_model(view: SurrogateView) -> str:
+    """Say what to do about a surrogate that has no model yet: wait, or get samples for one."""
+    from surrogym_sampler.original.loading import sample_command
+
+    missing = f"{view.name!r} has no model yet, its phase is {view.phase}"
+    if view.phase == "fitting":
+        return f"{missing}: give --wait 120, and the training begins after the design"
+    if view.samplers:
+        return f"{missing}, and a sampler is connected: give --wait 120, and the training begins after the design"
+    learn = f"surrogym import LOG --to {view.name}" if view.budget == 0 else sample_command(view.name, view.environment)
+    return f"{missing}: run {learn}, or give --wait SECONDS"
+
+
+@contextmanager
+def _recording(path: Path | None, curve: list[CurvePoint], update: Update) -> Iterator[Record]:
+    """Show progress, collect the training curve, and append it to a file that other processes can watch."""
+    from surrogym_shared.wire import CurvePoint
+    from surrogym_trainer.training.course import Course, words_of_time_left
+    from surrogym_trainer.training.words import words_of
+
+    started, course = time.monotonic(), Course()
+    with path.open("a", encoding="utf-8") if path is not None else nullcontext() as file:
+
+        def record(now: TrainProgress) -> None:
+            seconds = round(time.monotonic() - started, 3)
+            left = words_of_time_left(now.steps, now.total_steps, seconds)
+            update(course.share(now.steps, now.total_steps), f"{words_of(asdict(now))}{left}")
+            curve.append(CurvePoint(steps=now.steps, imagined_return=now.imagined_return, seconds=seconds))
+            if file is not None:
+                file.write(json.dumps({**asdict(now), "seconds": seconds}) + "\n")
+                file.flush()
+
+        yield record
+
+
+def _train(
+    url: str,
+    token: str | None,
+    surrogate: str,
+    out: Path,
+    settings: TrainSettings,
+    loop: LoopOptions,
+    recording: Callable[[Update], AbstractContextManager[Record]],
+    *,
+    quiet: bool,
+) -> tuple[TrainResult, Handover]:
+    from surrogym.cli.errors import CommandError
+    from surrogym_client.transport import Api, HttpSurrogate
+    from surrogym_shared.terminal import progress
+    from surrogym_trainer.training.audited import AuditedTraining
+
+    with (
+        HttpSurrogate(url, surrogate, token) as port,
+        Api(url, token) as api,
+        progress("train", quiet=quiet) as update,
+        recording(update) as record,
+    ):
+        try:
+            training = AuditedTraining(
+                api,
+                surrogate,
+                port,
+                out,
+                settings,
+                rounds=loop.settings(),
+                audit=loop.audited(settings.seed),
+                progress=record,
+                waiting=_waiting(update),
+            )
+            return training.train()
+        except ValueError as error:
+            raise CommandError(str(error)) from error
+
+
+def _waiting(update: Update) -> Callable[[SurrogateView], None]:
+    """Show a round's real steps while a sampler takes them. The progress bar keeps the training's position."""
+    from surrogym_client.surrogates.waiting import words_of_waiting
+    from surrogym_sampler.original.loading import sample_command
+
+    return lambda view: update(None, words_of_waiting(view, sample_command(view.name, view.environment)))
+
+
+def _write_card(
+    result: TrainResult,
+    handover: Handover | None = None,
+    *,
+    surrogate: str,
+    spec: EnvironmentSpec,
+    url: str,
+    seed: int,
+    curve: list[CurvePoint],
+) -> dict[str, Any]:
+    """Write the policy's card beside it, and return the result as JSON."""
+    from surrogym_trainer.policies.card import write_card
+    from surrogym_trainer.training.cards import card_of
+
+    card = card_of(result, handover, surrogate=surrogate, spec=spec, url=url, seed=seed, curve=curve)
+    write_card(Path(result.path), card)
+    return {
+        "policy": str(result.path),
+        "lost_episodes": result.lost_episodes,
+        **card.model_dump(mode="json", exclude={"spec", "curve"}),
+    }

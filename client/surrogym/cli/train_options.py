@@ -1,0 +1,285 @@
+"""Options of ``surrogym train``, in groups."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+if TYPE_CHECKING:
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_trainer.training.closed_loop import LoopSettings
+    from surrogym_trainer.training.handover import AuditSettings
+    from surrogym_trainer.training.settings import Tracker
+
+Variant = Literal["deterministic", "probabilistic", "pathwise"]
+Propagation = Literal["mean", "sample"]
+Weighting = Literal["inverse_variance", "uniform"]
+Log = Literal["tensorboard", "wandb", "mlflow", "none"]
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """Options that choose the policy search and its length."""
+
+    algorithm: Annotated[
+        str | None,
+        typer.Option(
+            help="Policy search: fastppo (PPO in compiled code), ppo, a2c, sac, td3, ddpg, dqn (Stable-Baselines3), "
+            "cmaes, gradient, or one from an installed package. [default: fastppo; ppo if --log, --set or --start-from "
+            "needs it, or if the specification has the paper's preset]",
+            show_default=False,
+        ),
+    ] = None
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Virtual steps to train for, summed over all rounds of --improve. The steps that collect each "
+            "round's occupancy are not included. [default: from the algorithm]",
+        ),
+    ] = None
+    num_envs: Annotated[
+        int | None, typer.Option(min=1, help="Number of lanes to train on. [default: from the specification]")
+    ] = None
+    chosen: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Hyperparameter of the algorithm, as NAME=VALUE. May be given several times."),
+    ] = None
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the policy and of the virtual environment.")] = 0
+
+    def hyperparameters(self) -> dict[str, Any]:
+        """Parse ``--set``. A value is read as JSON, or as text if it is not valid JSON."""
+        from surrogym.cli.errors import CommandError
+
+        found: dict[str, Any] = {}
+        for pair in self.chosen or []:
+            name, equals, value = pair.partition("=")
+            if not (name and equals):
+                raise CommandError(f"--set: expected NAME=VALUE, got {pair!r}")
+            try:
+                found[name] = json.loads(value)
+            except ValueError:
+                found[name] = value
+        return found
+
+
+@dataclass(frozen=True)
+class SessionOptions:
+    """Options of the session that the policy learns in. Each is a field of ``OpenSession``."""
+
+    variant: Annotated[
+        Variant | None,
+        typer.Option(
+            help="How the state moves: by the mean (deterministic), as particles (probabilistic), or along a drawn "
+            "function (pathwise). [default: the mean. If the design is not ready, the final training draws from "
+            "the posterior]"
+        ),
+    ] = None
+    particles: Annotated[
+        int | None, typer.Option(min=1, help="Number of particles of each lane, for variant probabilistic.")
+    ] = None
+    propagation: Annotated[
+        Propagation | None,
+        typer.Option(
+            help="How a particle moves: to the predicted mean, or to a sample of the prediction. [default: sample]"
+        ),
+    ] = None
+    weighting: Annotated[
+        Weighting | None,
+        typer.Option(
+            help="How to average the particles' rewards: by inverse variance, or with equal weights. [default: "
+            "inverse_variance]"
+        ),
+    ] = None
+    spread: Annotated[
+        float | None,
+        typer.Option(
+            help="Initial standard deviation of the particles, as a share of the sampling range. [default: 0.01]"
+        ),
+    ] = None
+    process_noise: Annotated[
+        bool,
+        typer.Option(
+            "--process-noise",
+            help="Add the learned noise to the state. [default: on if repeated real steps confirm noise]",
+            show_default=False,
+        ),
+    ] = False
+    trust: Annotated[
+        float | None,
+        typer.Option(
+            help="Truncate the episode when an output's predicted standard deviation exceeds TRUST times the "
+            "output's standard deviation in the samples. [default: no limit]"
+        ),
+    ] = None
+    caution: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            help="Subtract CAUTION times the model's doubt from each reward. The doubt is the largest ratio that "
+            "--trust looks at, times the reward's standard deviation in the samples. [default: 0]",
+        ),
+    ] = None
+    penalty: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            help="Subtract PENALTY predicted standard deviations from each reward. [default: from the specification]",
+        ),
+    ] = None
+
+    def fields(self) -> dict[str, Any]:
+        """Return the options that were given, by the names of ``OpenSession``.
+
+        Raises:
+            CommandError: an option needs another variant.
+        """
+        from surrogym.cli.errors import CommandError
+        from surrogym_shared.wire import OF_PARTICLES
+
+        given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
+        for name in OF_PARTICLES:
+            if name in given and self.variant != "probabilistic":
+                raise CommandError(
+                    f"--{name} works with variant probabilistic alone: give --variant probabilistic as well"
+                )
+        return given
+
+
+@dataclass(frozen=True)
+class StartOptions:
+    """Options of where episodes and the policy start, and of prolonging the training."""
+
+    start_box: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            max=1,
+            help="Share of episodes that start anywhere in the sampling range, between 0 and 1. The others start "
+            "where the specification says. [default: 0.5; 0 if all samples come from a log]",
+        ),
+    ] = None
+    start_visited: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            max=1,
+            help="Share of episodes that start at a state at which a real step was taken, between 0 and 1. Then no "
+            "episode starts anywhere in the sampling range unless --start-box is given. Not with cmaes or gradient. "
+            "[default: 0]",
+        ),
+    ] = None
+    horizon: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Longest episode of the training, in virtual steps. The critic values what would follow. Policies "
+            "are still compared over whole episodes. Not with cmaes or gradient. [default: the time limit]",
+        ),
+    ] = None
+    start_from: Annotated[Path | None, typer.Option(help="Policy file to continue the training from.")] = None
+    trust_policy: Annotated[
+        bool,
+        typer.Option(
+            "--trust-policy",
+            help="Unpickle the objects of --start-from. This runs any code in the file. Policies of surrogym train "
+            "don't need it.",
+        ),
+    ] = False
+    prolong: Annotated[
+        bool | None,
+        typer.Option(
+            "--prolong/--no-prolong",
+            help="Train for as many virtual steps again, once, if the imagined return still rises at the end. Fastppo "
+            "then also fine-tunes its policy from the declared starts. Not with cmaes or gradient. [default: on if "
+            "--steps is not given]",
+            show_default=False,
+        ),
+    ] = None
+
+    def learned(self) -> EnvironmentSpec | None:
+        """Return the specification that the policy of ``--start-from`` was trained for, from its card; None without
+        one.
+
+        Raises:
+            UnusablePolicy: the file can't be a policy, or its card is none.
+            FileNotFoundError: there is no such file.
+        """
+        from surrogym_trainer.policies.files import card_of_policy
+
+        return None if self.start_from is None else card_of_policy(self.start_from).spec
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """Options of the closed loop, which takes real steps between trainings, and of the audit."""
+
+    improve: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Real steps to add in each round, at states that the policy visits; 0 trains without rounds. Rounds "
+            "end when the model is certain at these states, or when the design is ready. This needs a running "
+            "sampler and enough budget; an admin's token raises the budget.",
+        ),
+    ] = 0
+    rounds: Annotated[int, typer.Option(min=1, help="Maximum number of rounds of --improve.")] = 3
+    audit: Annotated[
+        bool,
+        typer.Option(
+            "--audit/--no-audit",
+            help="Audit the policy: compare a few real steps on its way with the model. They don't count towards the "
+            "budget. This needs a running sampler; without one the card says that there was no audit.",
+        ),
+    ] = True
+    audit_steps: Annotated[int, typer.Option(min=2, max=256, help="Number of real steps of an audit.")] = 8
+
+    def settings(self) -> LoopSettings | None:
+        from surrogym_trainer.training.closed_loop import LoopSettings
+
+        return LoopSettings(self.improve, self.rounds) if self.improve else None
+
+    def audited(self, seed: int) -> AuditSettings | None:
+        from surrogym_trainer.training.handover import AuditSettings
+
+        return AuditSettings(steps=self.audit_steps, seed=seed) if self.audit else None
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """Options of where the training's curves and the policy go."""
+
+    log: Annotated[
+        Log | None,
+        typer.Option(
+            help="Tracker that records the curves of the training. [default: tensorboard with an algorithm of "
+            "Stable-Baselines3, none with others]",
+            show_default=False,
+        ),
+    ] = None
+    tensorboard: Annotated[
+        Path | None, typer.Option(help="Folder for TensorBoard's files. [default: tensorboard, beside the policy]")
+    ] = None
+    push: Annotated[
+        bool,
+        typer.Option(
+            "--push/--no-push", help="Store the policy on the server as well. To do so later: surrogym policy push."
+        ),
+    ] = True
+    progress_file: Annotated[Path | None, typer.Option(hidden=True, help="Write progress as JSON lines.")] = None
+
+    def tracker(self, algorithm: str | None) -> Tracker | None:
+        """Return the tracker: as chosen, or TensorBoard if its folder is given or the algorithm is one that logs.
+
+        Args:
+            algorithm: registered name of the search; None if it was not chosen.
+        """
+        from surrogym_trainer.training.search import ALGORITHMS
+
+        if self.log is None:
+            return "tensorboard" if self.tensorboard is not None or algorithm in ALGORITHMS else None
+        return None if self.log == "none" else self.log

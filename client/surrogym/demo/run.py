@@ -1,0 +1,109 @@
+"""The demo from its first process to its run folder."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from surrogym.demo.judging import Judgement, judge
+from surrogym.demo.learning import Learned, SurrogateRun
+from surrogym.demo.processes import Children, RunFailed
+from surrogym.demo.report import metrics_of
+from surrogym.demo.settings import DemoSettings
+from surrogym_client.runtime.lifetime import terminations_as_interrupts
+from surrogym_client.runtime.versions import commit
+from surrogym_shared.terminal import on_interrupt, say
+
+S = TypeVar("S", bound=DemoSettings, contravariant=True)
+
+
+class Run(Protocol):
+    """One way to a policy."""
+
+    def learn(self) -> Learned:
+        """Learn a policy. Returns it with its costs."""
+        ...
+
+    def keep(self, judgement: Judgement) -> None:
+        """Enter the real steps of the evaluation into the ledger, and write pictures and data into the run folder."""
+        ...
+
+    def linger(self) -> None:
+        """Keep the server running until Ctrl-C, so that a person can look at its page."""
+        ...
+
+
+class Begin(Protocol[S]):
+    """Begins a run in a folder, with processes that end with it."""
+
+    def __call__(self, settings: S, folder: Path, children: Children, *, quiet: bool) -> Run: ...
+
+
+def run_demo(
+    settings: S,
+    out: Path | None = None,
+    tell: Callable[[dict[str, Any], Path], None] | None = None,
+    begin: Begin[S] = SurrogateRun,
+    *,
+    quiet: bool = False,
+) -> None:
+    """Run the whole loop. Then call ``tell`` with the metrics, which are also in the run folder, and with this folder.
+
+    Args:
+        settings: of the run.
+        out: an empty folder for its results; None makes one.
+        tell: called at the end.
+        begin: begins the way to a policy.
+        quiet: whether progress is hidden.
+
+    Raises:
+        RunFailed: the folder is not empty, or a process failed; the message has its last words and its log.
+        SurrogymClientError: the server refused, or the design failed.
+    """
+    started, code = time.monotonic(), commit()
+    folder = _empty_folder(out or _new_folder(settings))
+    with terminations_as_interrupts(), on_interrupt(partial(_what_stays, folder)), Children(folder) as children:
+        run = begin(settings, folder, children, quiet=quiet)
+        learned = run.learn()
+        judging = time.monotonic()
+        judgement = judge(settings, learned.policy, quiet=quiet)
+        keeping = time.monotonic()
+        run.keep(judgement)
+        now = time.monotonic()
+        seconds = {"evaluate": keeping - judging, "report": now - keeping, "total": now - started}
+        metrics = metrics_of(settings, learned, judgement, learned.seconds | seconds)
+        metrics["commit"] = code if code == commit() else f"{code} to {commit()}"
+        (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+        if tell is not None:
+            tell(metrics, folder)
+        if settings.keep:
+            run.linger()
+        elif (database := _database(folder)).exists():
+            say(f"next: surrogym serve --database {database}, and look at its page", quiet=quiet)
+
+
+def _new_folder(settings: DemoSettings) -> Path:
+    return Path("runs") / f"{settings.run_name}-seed{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def _empty_folder(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    if any(folder.iterdir()):
+        raise RunFailed(f"expected an empty run folder, got {folder}, which holds files already")
+    return folder.resolve()
+
+
+def _what_stays(folder: Path) -> str:
+    """Name the results that are kept after an interruption."""
+    database, policy = _database(folder), folder / "policy.zip"
+    kept = [f"the real samples (surrogym serve --database {database})"] if database.exists() else []
+    kept += [f"the policy so far ({policy})"] if policy.exists() else []
+    return f"interrupted; all processes have ended; {folder} keeps {' and '.join(kept) or 'only logs'}"
+
+
+def _database(folder: Path) -> Path:
+    return folder / "surrogym.db"

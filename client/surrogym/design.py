@@ -1,0 +1,376 @@
+"""The adaptive design of queries in this process.
+
+It calls the same functions as the server's designer, so the same samples lead to the same queries. It keeps everything
+in memory; ``save`` writes it to a file.
+
+Shapes: n samples, C coordinates, F action entries, T steps of a rollout.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Self
+from uuid import uuid4
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from surrogym import checks
+from surrogym.files import existing
+from surrogym_sampler.original.protocol import RealStep
+from surrogym_server.convert import default_budget, definition_from_spec
+from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, judge_stored, run_design_job
+from surrogym_server.errors import InvalidInput
+from surrogym_server.local import LocalSurrogate
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
+
+Floats = NDArray[np.float64]
+LEAST_SAMPLES = 2  # fewest samples that a model can be fitted to
+Phase = Literal["collecting", "sampling", "ready", "over_budget", "unsure", "from_log"]
+
+
+class QueriesOpen(RuntimeError):
+    """Queries of this round still lack an answer. ``ids`` are their numbers."""
+
+    def __init__(self, ids: Sequence[int]) -> None:
+        self.ids = tuple(ids)
+        super().__init__(f"expected the answers to the queries {list(ids)} first: tell() them, or give_up() them")
+
+
+@dataclass(frozen=True)
+class Query:
+    """A query: one step from ``coordinates``, or several ``actions`` from a snapshot or a reset if not any state can be
+    set."""
+
+    id: int
+    purpose: Literal["initial", "adaptive"]
+    coordinates: tuple[float, ...]  # (C,); empty for a rollout
+    actions: tuple[tuple[float, ...], ...]  # (T, F); T is 1 for a step
+    snapshot: str | None = None  # name of the snapshot to begin at; None: at a reset
+    design: str = field(default="", repr=False)  # identifies the design: equal specifications begin with equal queries
+
+    @property
+    def action(self) -> tuple[float, ...]:
+        """Action of a one-step query, (F,): continuous values, or the number of each discrete action."""
+        return self.actions[0]
+
+
+class Design:
+    """Choose real steps until the model is ready, or the budget is spent.
+
+    Args:
+        spec: what is known of the real environment.
+        budget: maximum number of real steps, 2 or more; None takes that of the specification.
+        target: confidence index to reach for each output, above 0.5 and below 1; None takes that of the specification.
+        threads: number of threads of a fit.
+
+    Raises:
+        InvalidInput: ``spec`` is not a specification; or another argument is out of its range; or the specification
+            needs a package that is not installed.
+
+    Examples:
+        >>> design = Design(spec, budget=20)
+        >>> while (query := design.ask()) is not None:
+        ...     design.tell(query, machine.step_from(query.coordinates, query.action))
+        >>> design.phase, design.steps
+        ('ready', 6)
+    """
+
+    def __init__(
+        self, spec: EnvironmentSpec, *, budget: int | None = None, target: float | None = None, threads: int = 1
+    ) -> None:
+        if not isinstance(spec, EnvironmentSpec):
+            raise InvalidInput(f"spec: expected an EnvironmentSpec, got {type(spec).__name__}")
+        self.spec = spec
+        self.budget = default_budget(spec) if budget is None else checks.whole("budget", budget, 2, checks.MOST_STEPS)
+        self.target = spec.design.target if target is None else checks.share("target", target)
+        self._threads = checks.whole("threads", threads, 1, checks.MOST_THREADS)
+        self._definition = definition_from_spec(spec)
+        self._name = uuid4().hex
+        self._ids = itertools.count(1)
+        self._samples: list[RealStep] = []
+        self._open: dict[int, Query] = {}
+        self._answered: list[Query] = []
+        self._given_up: list[Query] = []
+        self._extra = 0
+        self._visited: Floats | None = None
+        self._phase: Phase = "collecting"
+        self._result: DesignResult | None = None
+        self._settled = 0  # number of samples and abandoned queries at the last fit
+        self._state, q, u, rollouts = initial_queries(self._definition, self.budget)
+        self._snapshots: dict[str, tuple[float, ...]] = {}  # coordinates (C,) by name
+        self._queue = deque(self._queries("initial", q, u, rollouts, ()))
+
+    @property
+    def phase(self) -> Phase:
+        """Phase of the design: ``collecting`` the initial queries, ``sampling`` adaptive ones, ``ready``,
+        ``over_budget`` if the budget is spent, or ``unsure`` if no further query can be asked within it."""
+        return self._phase
+
+    @property
+    def steps(self) -> int:
+        """Number of real steps that ``tell`` has received."""
+        return len(self._samples)
+
+    @property
+    def fidelity(self) -> dict[str, Any]:
+        """How well the model is known: ``confidence_index`` and more, overall and for each output. Empty before the
+        first fit."""
+        return {} if self._result is None else self._result.fidelity
+
+    def ask(self) -> Query | None:
+        """Return the next query, or None once the design has ended. Fits the model when all queries of a round are
+        answered.
+
+        Raises:
+            QueriesOpen: all queries of this round were handed out, and some lack an answer.
+            InvalidInput: the model can't be fitted, because fewer than two steps were given and the other queries were
+                given up.
+            NumericalFailure, PluginFailed: the fit fails.
+        """
+        if not self._queue and self._open:
+            raise QueriesOpen(sorted(self._open))
+        if not self._queue and len(self._samples) < LEAST_SAMPLES:
+            raise InvalidInput(
+                f"a model needs at least {LEAST_SAMPLES} samples, got {len(self._samples)}, and no query is left: "
+                "tell(None, steps) adds steps of your own"
+            )
+        if not self._queue and (len(self._samples) + len(self._given_up) > self._settled or self._extra):
+            self._fit()
+        if not self._queue:
+            return None
+        query = self._queue.popleft()
+        self._open[query.id] = query
+        return query
+
+    def tell(
+        self, query: Query | None, steps: RealStep | Sequence[RealStep], snapshots: Sequence[str | None] = ()
+    ) -> None:
+        """Answer a query with its real step, or with the steps of its rollout in order.
+
+        Args:
+            query: a query from ``ask``; None for steps of your own, such as those of a log.
+            steps: the real steps, with the coordinates and the actions that were actually achieved.
+            snapshots: for each step, the name under which you saved the state after it, or None. Later queries may
+                begin there.
+
+        Raises:
+            InvalidInput: the query is not open; or a step has the wrong shape, is not finite, is absurdly far from the
+                sampling range, or has an action out of bounds. The design then keeps none of the steps.
+        """
+        taken = checks.steps_of(steps)
+        if query is not None:
+            self._require_open(query)
+        if not taken or (query is not None and len(taken) > len(query.actions)):
+            raise InvalidInput(f"expected {_count_of(query)}, got {len(taken)}")
+        if snapshots and len(snapshots) != len(taken):
+            raise InvalidInput(f"snapshots: expected one entry for each of {len(taken)} steps, got {len(snapshots)}")
+        told = [checks.real_step(self._definition, step) for step in taken]
+        self._samples += told
+        for name, step in zip(snapshots, told, strict=False):
+            if name is not None:
+                self._snapshots[name] = tuple(np.asarray(step.next_coordinates, dtype=np.float64).tolist())
+        if query is not None:
+            self._answered.append(self._open.pop(query.id))
+
+    def give_up(self, query: Query) -> None:
+        """Leave a query unanswered. It counts towards the budget, and similar queries are avoided. If it begins at a
+        snapshot, no other query begins there.
+
+        Raises:
+            InvalidInput: the query is not open.
+        """
+        self._require_open(query)
+        self._given_up.append(self._open.pop(query.id))
+        self._snapshots.pop(query.snapshot or "", None)
+
+    def improve(self, steps: int, visited: Floats | None = None) -> None:
+        """Add real steps to the next round within the budget, even if the design is ready.
+
+        Args:
+            steps: number of real steps.
+            visited: states that a policy visits, (v, C), at least one. Queries are then chosen for these states.
+
+        Raises:
+            InvalidInput: the budget has fewer steps left, or the states have the wrong shape or are not finite.
+        """
+        left = self.budget - self._spoken_for()
+        wanted = checks.whole("steps", steps, 1, left, why=", because the budget has no more left")
+        self._visited = None if visited is None else checks.states(self._definition, "visited", visited)
+        self._extra = wanted
+
+    def surrogate(self) -> LocalSurrogate:
+        """Return the model of the last fit, to be stepped in this process.
+
+        Raises:
+            InvalidInput: there was no fit yet.
+        """
+        return LocalSurrogate.from_bytes(self.spec, self._last().model)
+
+    def save(self, path: str | Path, name: str = "surrogate") -> None:
+        """Write specification, model and samples to one file.
+
+        ``surrogym import`` sends the file to a server, and ``load`` continues the design from it. The file's
+        specification contains the target and the budget, less the queries given up.
+
+        Raises:
+            InvalidInput: there is no model yet.
+            OSError: the file can't be written.
+        """
+        result, arrays = self._last(), self._arrays()
+        samples = RealSamples(*arrays, truncated=np.array([step.truncated for step in self._samples], dtype=np.bool_))
+        tolerances = {output["name"]: output["tolerance"] for output in result.fidelity["outputs"]}
+        predictions = self._state.get("predictions", [])
+        file = SurrogateFile(name, self._spec_to_save(), result.model, samples, tolerances, predictions=predictions)
+        Path(path).write_bytes(file.to_bytes())
+
+    @classmethod
+    def load(cls, path: str | Path, **options: Any) -> Self:
+        """Restore a design from a file that ``save`` or ``surrogym export`` wrote.
+
+        The design has the file's model and samples, and the phase that follows from them. It returns the queries that
+        the saved design would have returned.
+
+        Args:
+            path: the file.
+            options: arguments of the class: ``budget``, which includes the file's samples, ``target``, ``threads``.
+
+        Raises:
+            OSError: the file can't be read.
+            NotASurrogateFile: the file is not an exported surrogate.
+            InvalidInput: the file's model does not fit its specification, or an option is out of its range.
+        """
+        file = SurrogateFile.load(existing(path))
+        design = cls(file.spec, **options)
+        fields = (file.samples.coordinates, file.samples.action, file.samples.next_coordinates, file.samples.reward)
+        rows = zip(*fields, file.samples.terminated, file.samples.truncated, strict=True)
+        if len(file.samples):
+            design.tell(None, [RealStep(q, u, n, float(r), bool(e), bool(t)) for q, u, n, r, e, t in rows])
+        design._queue.clear()
+        design._take_up(file)
+        return design
+
+    def _take_up(self, file: SurrogateFile) -> None:
+        """Continue after the round that made the file's model.
+
+        The next ``ask`` fits again if the file has later samples, or if the budget or the target requires more.
+        """
+        known = [file.tolerances.get(output) for output in self._definition.outputs]
+        usual = [tolerance for tolerance in known if tolerance is not None]
+        if len(usual) == len(known):
+            self._state = self._state | {"usual": usual}
+        if len(file.predictions) == len(known):
+            self._state = self._state | {"predictions": file.predictions}
+        self._result = judge_stored(self._job(), file.model)
+        if self._result.verdict == "continue":
+            self._phase = "sampling"
+        else:
+            self._phase, self._settled = self._result.phase, len(self._samples)
+
+    def _spec_to_save(self) -> EnvironmentSpec:
+        budget = max(2, self.budget - sum(len(query.actions) for query in self._given_up))
+        initial = self.spec.design.initial
+        changed = {
+            "budget": budget,
+            "target": self.target,
+            "initial": None if initial is None else min(initial, budget),
+        }
+        if self.budget == default_budget(self.spec) and not self._given_up:
+            changed = {"target": self.target}
+        return self.spec.model_copy(update={"design": self.spec.design.model_copy(update=changed)})
+
+    def _fit(self) -> None:
+        threads = torch.get_num_threads()
+        try:
+            result = run_design_job(self._job())
+        finally:
+            torch.set_num_threads(threads)
+        self._state, self._result, self._extra = result.state, result, 0
+        self._settled = len(self._samples) + len(self._given_up)
+        self._queue.extend(
+            self._queries(
+                "adaptive",
+                result.query_coordinates,
+                result.query_action,
+                result.query_rollouts,
+                result.query_snapshots,
+            )
+        )
+        self._phase = result.phase
+
+    def _job(self) -> DesignJob:
+        q, u, q_next, reward, terminated = self._arrays()
+        steps = [query for query in self._given_up if query.coordinates]
+        rollouts = [query for query in self._given_up if not query.coordinates]
+        return DesignJob(
+            definition=self._definition,
+            coordinates=q,
+            action=u,
+            next_coordinates=q_next,
+            reward=reward,
+            terminated=terminated,
+            state=self._state,
+            budget=self.budget,
+            target=self.target,
+            pending_coordinates=np.array([query.coordinates for query in steps]) if steps else None,
+            pending_action=np.array([query.action for query in steps]) if steps else None,
+            pending_rollouts=tuple(np.array(query.actions) for query in rollouts),
+            pending_snapshots=tuple(query.snapshot for query in rollouts),
+            snapshots=dict(self._snapshots),
+            extra_queries=self._extra,
+            occupancy=self._visited,
+            threads=self._threads,
+            previous=None if self._result is None else self._result.model,
+        )
+
+    def _arrays(self) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.bool_]]:
+        def rows(field: str) -> Floats:
+            return np.array([getattr(step, field) for step in self._samples], dtype=np.float64)
+
+        ended = np.array([step.terminated for step in self._samples], dtype=np.bool_)
+        return rows("coordinates"), rows("action"), rows("next_coordinates"), rows("reward"), ended
+
+    def _queries(
+        self,
+        purpose: Literal["initial", "adaptive"],
+        q: Floats,
+        u: Floats,
+        rollouts: Sequence[Floats],
+        snapshots: Sequence[str | None],
+    ) -> list[Query]:
+        asked: list[tuple[tuple[float, ...], tuple[tuple[float, ...], ...], str | None]] = [
+            (tuple(row), (tuple(action),), None) for row, action in zip(q.tolist(), u.tolist(), strict=True)
+        ]
+        begun = snapshots or (None,) * len(rollouts)
+        asked += [((), tuple(map(tuple, u.tolist())), at) for u, at in zip(rollouts, begun, strict=True)]
+        return [Query(next(self._ids), purpose, at, actions, start, self._name) for at, actions, start in asked]
+
+    def _require_open(self, query: Query) -> None:
+        if not isinstance(query, Query):
+            raise InvalidInput(f"expected a Query that was asked, got {type(query).__name__}")
+        if self._open.get(query.id) == query:
+            return
+        why = "was answered already" if query in self._answered else "belongs to another design"
+        why = "was given up" if query in self._given_up else why
+        raise InvalidInput(f"expected an open query, got query {query.id}, which {why}")
+
+    def _spoken_for(self) -> int:
+        waiting = [*self._queue, *self._open.values(), *self._given_up]
+        return len(self._samples) + sum(len(query.actions) for query in waiting)
+
+    def _last(self) -> DesignResult:
+        if self._result is None:
+            raise InvalidInput("expected a design with a model: answer its first queries, then call ask() again")
+        return self._result
+
+
+def _count_of(query: Query | None) -> str:
+    if query is None:
+        return "at least 1 step"
+    return "1 step" if len(query.actions) == 1 else f"1 to {len(query.actions)} steps"

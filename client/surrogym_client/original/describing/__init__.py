@@ -1,9 +1,0 @@
-"""Draft a specification of an undescribed simulator from a few episodes, whose steps are counted.
-
-The steps show ranges, limits and coordinates. The file asks a person for everything that steps can't show.
-"""
-
-from surrogym_client.original.describing.description import Description, DescriptionInterrupted, describe
-from surrogym_client.original.describing.exploring import STEPS
-
-__all__ = ["STEPS", "Description", "DescriptionInterrupted", "describe"]

@@ -1,7 +1,0 @@
-"""Policies: their files, the cards beside them, their networks, and their export. Importing this package needs no
-torch."""
-
-from surrogym_client.policies.card import PolicyCard, UnusablePolicy, read_card
-from surrogym_client.policies.files import load_policy
-
-__all__ = ["PolicyCard", "UnusablePolicy", "load_policy", "read_card"]

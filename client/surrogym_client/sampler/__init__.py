@@ -1,6 +1,0 @@
-"""The sampler, a process beside the original environment that answers queries with real steps."""
-
-from surrogym_client.sampler.settings import Outcome, SamplerReport, SamplerSettings
-from surrogym_client.sampler.worker import Sampler
-
-__all__ = ["Outcome", "Sampler", "SamplerReport", "SamplerSettings"]

@@ -1,6 +1,0 @@
-"""Train a policy in a surrogate. Importing this package needs no torch; each search imports its own libraries."""
-
-from surrogym_client.training.settings import TrainingInterrupted, TrainProgress, TrainResult, TrainSettings
-from surrogym_client.training.trainer import train
-
-__all__ = ["TrainProgress", "TrainResult", "TrainSettings", "TrainingInterrupted", "train"]

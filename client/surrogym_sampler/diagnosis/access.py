@@ -1,0 +1,244 @@
+"""Checks of an environment before it is used. States are set and read back, steps and resets are repeated, and a step
+from a set state is compared with the same step of an episode. Every real step is counted.
+
+Shapes: C coordinates, F action entries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from surrogym_sampler.original.episodes import draw
+from surrogym_sampler.original.errors import StepFailed
+from surrogym_sampler.original.executables import Executable
+from surrogym_sampler.original.isolated import IsolatedEnvironment
+from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealStep
+from surrogym_sampler.original.simulator import Simulated
+from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
+
+PLACES = 3  # number of states that are set, and of steps of an episode
+EXACT = 1e-6  # of a range; a smaller error is rounding
+CLOSE = 1e-2  # of a range: the largest error of a state that can be set
+FEW = 3.0  # factor for noise that was estimated from few steps
+
+
+class CheckFailed(StepFailed):
+    """The environment failed after ``steps`` real steps had begun."""
+
+    def __init__(self, message: str, steps: int) -> None:
+        super().__init__(message)
+        self.steps = steps
+        self._arguments = (message, steps)
+
+    def __reduce__(self) -> tuple[type[CheckFailed], tuple[str, int]]:
+        return type(self), self._arguments
+
+
+@dataclass(frozen=True)
+class Access:
+    """Results of repeated steps and resets. Errors are shares of the sampling ranges, the largest of all. None if the
+    environment lacks the methods.
+
+    Attributes:
+        steps: number of real steps.
+        resets: number of resets.
+        set_error: between the requested coordinates and those that were read back.
+        repeat_error: between two steps from one state.
+        reset_error: between two resets with one seed.
+        replay_error: between two episodes from one seed under the same actions.
+        memory_error: between a step of an episode and the same step after its state was set.
+        restore_error: between a step from a saved state and the same step after a return to it.
+    """
+
+    steps: int
+    resets: int
+    set_error: float | None = None
+    repeat_error: float | None = None
+    reset_error: float | None = None
+    replay_error: float | None = None
+    memory_error: float | None = None
+    restore_error: float | None = None
+
+    @property
+    def ignores_seed(self) -> bool:
+        """Whether two resets with one seed began in different states."""
+        return self.reset_error is not None and self.reset_error > EXACT
+
+    @property
+    def noise(self) -> float:
+        """The error between equal steps; 0 if none were compared."""
+        return max(self.repeat_error or 0.0, self.replay_error or 0.0)
+
+    @property
+    def can_set(self) -> bool:
+        """Whether the state can be set completely."""
+        if self.set_error is None or self.set_error > CLOSE:
+            return False
+        return self.memory_error is None or self.memory_error <= self._allowed
+
+    @property
+    def can_restore(self) -> bool:
+        """Whether the environment can return to a saved state."""
+        return self.restore_error is not None and self.restore_error <= self._allowed
+
+    @property
+    def _allowed(self) -> float:
+        """The largest error of a step that is repeated from the same state."""
+        random = self.replay_error is None or self.replay_error > EXACT
+        return max(CLOSE, FEW * self.noise) if random else CLOSE
+
+    @property
+    def mode(self) -> str:
+        """The recommended mode."""
+        if self.can_set:
+            return "set any state"
+        return "snapshots (--access snapshot)" if self.can_restore else "reset only (--access reset)"
+
+
+def examine(environment: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> Access:
+    """Take some real steps twice.
+
+    Raises:
+        CheckFailed: a step failed for a reason that does not depend on the mode.
+    """
+    looking = _Looking(environment, spec)
+    try:
+        if spec.query == "step":
+            looking.set_states()
+        looking.begin_again()
+        looking.come_back()
+    except StepFailed as error:
+        raise CheckFailed(str(error), looking.access().steps) from error
+    return looking.access()
+
+
+class _Looking:
+    """The checks of one environment."""
+
+    def __init__(self, environment: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> None:
+        self._environment, self._spec = environment, spec
+        self._rng = np.random.default_rng(0)
+        self._steps = self._resets = 0
+        self._errors: dict[str, float] = {}
+
+    def access(self) -> Access:
+        """The results."""
+        return Access(self._steps, self._resets, **self._errors)
+
+    def set_states(self) -> None:
+        """Set states and read them back. Take two steps from each."""
+        for _ in range(PLACES):
+            q, u = draw(self._spec, self._rng, wide=True), self._action()
+            first, again = self._step_from(q, u), self._step_from(q, u)
+            self._note("set_error", self._apart(first.coordinates, q))
+            self._note("repeat_error", self._between([first], [again]))
+
+    def begin_again(self) -> None:
+        """Reset twice with one seed and take the same actions. Then set the last step's state and repeat the step."""
+        actions = [self._action() for _ in range(PLACES)]
+        try:
+            starts, episodes = zip(*(self._episode(actions) for _ in range(2)), strict=True)
+        except StepFailed:
+            if self._spec.query == "rollout":
+                raise
+            return  # it has no reset
+        self._note("reset_error", self._apart(starts[0], starts[1]))
+        self._note("replay_error", self._between(*episodes))
+        inside = [step for step in episodes[1] if self._is_inside(step)]
+        if self._spec.query == "step" and inside:
+            wanted = inside[-1]
+            again = self._step_from(np.asarray(wanted.coordinates), np.asarray(wanted.action))
+            self._note("memory_error", self._between([wanted], [again]))
+
+    def come_back(self) -> None:
+        """Take a step from a saved state, go on, return to the state and repeat the step."""
+        if not self._spec.snapshots and not self._can_save():
+            return
+        action = self._action()
+        self._episode([self._action()])
+        snapshot = self._environment.save()
+        first = self._act(action)
+        if not (first.terminated or first.truncated):
+            self._act(self._action())
+        try:
+            back = self._environment.restore(snapshot)
+        except StepFailed:
+            if self._spec.snapshots:
+                raise
+            return  # nobody declared that it returns to a state
+        again = self._act(action)
+        self._note("restore_error", self._apart(back, first.coordinates))
+        self._note("restore_error", self._between([first], [again]))
+
+    def _can_save(self) -> bool:
+        try:
+            return bool(self._environment.save())
+        except StepFailed:
+            return False
+
+    def _act(self, action: Array) -> RealStep:
+        self._steps += 1
+        return self._environment.act(action)
+
+    def _episode(self, actions: Sequence[Array]) -> tuple[Array, list[RealStep]]:
+        start = self._environment.begin(0)
+        self._resets += 1
+        steps: list[RealStep] = []
+        for action in actions:
+            steps.append(self._act(action))
+            if steps[-1].terminated or steps[-1].truncated:
+                break
+        return start, steps
+
+    def _step_from(self, coordinates: Array, action: Array) -> RealStep:
+        self._steps += 1
+        assert isinstance(self._environment, OriginalEnvironment)
+        return self._environment.step_from(coordinates, action)
+
+    def _is_inside(self, step: RealStep) -> bool:
+        """Whether a step began where the specification allows a state to be set."""
+        ends = np.array([c.settable for c in self._spec.coordinates])
+        at = np.asarray(step.coordinates)
+        return bool(((at >= ends[:, 0]) & (at <= ends[:, 1])).all())
+
+    def _between(self, ones: Sequence[RealStep], others: Sequence[RealStep]) -> float:
+        """The largest difference between the results of steps; that of the rewards if the states are equal."""
+        if len(ones) != len(others):
+            return 1.0  # one episode ended earlier
+        states = [self._apart(a.next_coordinates, b.next_coordinates) for a, b in zip(ones, others, strict=True)]
+        paid = [
+            abs(float(a.reward) - float(b.reward)) / max(1.0, abs(float(a.reward)))
+            for a, b in zip(ones, others, strict=True)
+        ]
+        return max([*states, *paid])
+
+    def _apart(self, one: object, other: object) -> float:
+        return apart(self._spec, one, other)
+
+    def _note(self, which: str, error: float) -> None:
+        self._errors[which] = max(self._errors.get(which, 0.0), error)
+
+    def _action(self) -> Array:
+        return random_action(self._spec, self._rng)
+
+
+def random_action(spec: EnvironmentSpec, rng: np.random.Generator) -> Array:
+    """Draw an action (F,) from the whole action space."""
+    action = spec.action
+    if isinstance(action, BoxAction):
+        return rng.uniform(action.low, action.high)
+    counts = [action.n] if action.kind == "discrete" else action.nvec
+    return rng.integers(0, counts).astype(np.float64)
+
+
+def apart(spec: EnvironmentSpec, one: object, other: object) -> float:
+    """Return the largest difference between coordinates (C,), as a share of the sampling range."""
+    difference = np.asarray(one, dtype=np.float64) - np.asarray(other, dtype=np.float64)
+    for i, coordinate in enumerate(spec.coordinates):
+        if coordinate.kind == "angle":
+            difference[i] = (difference[i] + np.pi) % (2 * np.pi) - np.pi
+    widths = np.array([np.ptp(limits(coordinate.sampling)) for coordinate in spec.coordinates])
+    return float((np.abs(difference) / widths).max())

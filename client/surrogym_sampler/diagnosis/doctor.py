@@ -1,0 +1,275 @@
+"""Checks for a first step: one finding for each thing that has to be in order."""
+
+from __future__ import annotations
+
+import platform
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import entry_points, version
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from surrogym_client.errors import ProblemError, ProtocolMismatch, Refused, ServerUnreachable, SurrogymClientError
+from surrogym_client.runtime.versions import versions
+from surrogym_client.runtime.ways_out import EXTRAS, GIVE_TOKEN, START_SERVER
+from surrogym_client.transport.api import Api
+from surrogym_sampler.diagnosis.access import EXACT, Access, CheckFailed, examine
+from surrogym_sampler.diagnosis.history import History, declared, look_back
+from surrogym_sampler.original.episodes import draw
+from surrogym_sampler.original.errors import OriginalError, StepFailed
+from surrogym_sampler.original.executables import Executable
+from surrogym_sampler.original.isolated import IsolatedEnvironment
+from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealStep
+from surrogym_sampler.original.simulator import Simulated
+from surrogym_sampler.queries.sample_conversion import sample_of
+from surrogym_shared.plugins import Registry
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.wire import PROTOCOL, StepQuery
+
+ROUND_TRIPS = 20
+NEEDS = "see docs/how-to/own-environment.md for what an environment needs"
+REGISTRIES = {  # by the group of their entry points; they load only where what they register can run
+    "surrogym.policy_searches": "surrogym_trainer.training.search:SEARCHES",
+    "surrogym.acquisitions": "surrogym_server.sampling.acquisition:ACQUISITIONS",
+    "surrogym.models": "surrogym_server.models.registry:MODELS",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One checked thing. ``way_out`` says what to do about a problem; None if there is none. ``notable``: no problem,
+    and a person has to know it."""
+
+    name: str
+    said: str
+    way_out: str | None = None
+    notable: bool = False
+
+
+def installation() -> Iterator[Finding]:
+    """Python, and the packages of this program."""
+    yield Finding("python", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
+    packages = ", ".join(f"{name} {number}" for name, number in versions().items() if name != "python")
+    lacking = [extra for extra, modules in EXTRAS.items() if not all(find_spec(module) for module in modules)]
+    without = f"; not installed: {', '.join(f'surrogym[{extra}]' for extra in lacking)}" if lacking else ""
+    yield Finding("packages", packages + without)
+    for registry in _registries():
+        for name, why in registry.broken.items():
+            said = f"the {registry.kind} {name!r} is left out: {why}"
+            yield Finding("plug-in", said, "update the package, or uninstall it")
+
+
+def _registries() -> Iterator[Registry[Any]]:
+    """Registries to which installed packages add. Some load torch, so one is read only if a package adds to it."""
+    for group, place in REGISTRIES.items():
+        module, _, name = place.partition(":")
+        if entry_points(group=group):
+            with suppress(
+                ImportError
+            ):  # what they register can't run on this machine, so nothing would use the package
+                yield getattr(import_module(module), name)
+
+
+def service(api: Api) -> Iterator[Finding]:
+    """Check whether the server answers, is ready, speaks this protocol and accepts this token, and measure a round
+    trip.
+
+    Findings that depend on a failed one are left out.
+    """
+    try:
+        health = api.health()
+    except ProtocolMismatch as error:
+        yield Finding("server", str(error), f"install a surrogym of protocol {PROTOCOL} on both sides")
+        return
+    except ServerUnreachable as error:
+        yield Finding("server", str(error), START_SERVER)
+        return
+    ours = version("surrogym")
+    same = "" if health.version == ours else f"; this client is {ours}"
+    yield Finding("server", f"surrogym {health.version} at {api.url}, protocol {health.protocol}{same}")
+    try:
+        yield Finding("ready", f"storage {api.ready().storage}")
+    except (ProblemError, ServerUnreachable) as error:
+        yield Finding("ready", str(error), "the server's database does not answer: see the server's log")
+    yield _access(api)
+    yield _round_trip(api)
+
+
+def environment(
+    opened: Callable[[], IsolatedEnvironment | Executable | Simulated], history: int = 0
+) -> Iterator[Finding]:
+    """The original environment: whether it can be opened, takes a step, and can be set to a state. The steps are real,
+    but they don't enter a ledger.
+
+    Args:
+        opened: opens it.
+        history: further real steps, to find how far one has to look back to tell what happens next; 0 takes none.
+    """
+    try:
+        with closing(opened()) as original:
+            spec = original.spec()
+            names = ", ".join(spec.coordinate_names)
+            yield Finding("environment", f"coordinates ({names}), {spec.action.kind} action, {spec.query} queries")
+            step = _one_step(original, spec)
+            yield step
+            if step.way_out is None:
+                yield from _access_of(original, spec)
+                if history:
+                    yield _history_of(original, spec, history)
+    except OriginalError as error:
+        yield Finding("environment", str(error), NEEDS)
+
+
+def _access_of(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> Iterator[Finding]:
+    """Exactness of the environment, and the recommended mode."""
+    try:
+        access = examine(original, spec)
+    except CheckFailed as error:
+        said = f"{error}; this took {error.steps + 1} real steps"
+        yield Finding("mode", said, "a sampler would fail in the same way: mend the environment first")
+        return
+    if access.set_error is not None:
+        read, again = _error(access.set_error), _error(access.repeat_error)
+        yield Finding("state", f"set and read back: {read}; two steps from one state: {again}")
+    if access.reset_error is not None:
+        yield _resets(access)
+    if access.memory_error is not None:
+        yield Finding("memory", f"a step of an episode, and from its state set anew: {_error(access.memory_error)}")
+    if access.restore_error is not None:
+        yield Finding(
+            "snapshots", f"a step from a saved state, and after a return to it: {_error(access.restore_error)}"
+        )
+    taken = f"{access.mode}; this took {access.steps + 1} real steps and {access.resets + 1} resets at most"
+    yield Finding("mode", taken, _way_out(spec, access))
+
+
+def _resets(access: Access) -> Finding:
+    """Whether a seed repeats a start."""
+    same, alike = _error(access.reset_error), _error(access.replay_error)
+    if not access.ignores_seed:
+        return Finding("resets", f"two with one seed: {same}; the same actions from there: {alike}")
+    said = (
+        f"the environment ignores its seed: two resets with one seed are {same}. Two controllers never run the same "
+        "starts, so compare the means of many episodes; for the same starts, reset(seed=...) has to seed every random "
+        "number"
+    )
+    return Finding("resets", said, notable=True)
+
+
+def _history_of(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec, steps: int) -> Finding:
+    """How far one has to look back, beside the declared lags."""
+    if spec.query != "rollout":
+        return Finding("history", "not looked for: an environment that is set to a state has no past")
+    try:
+        found = look_back(original, spec, steps)
+    except StepFailed as error:
+        return Finding("history", str(error), "a sampler would fail in the same way: mend the environment first")
+    if found is None:
+        return Finding("history", f"{steps} real steps of episodes this short don't tell", "give --history more steps")
+    took = f"this took {found.steps} real steps"
+    if not found.told:
+        return Finding("history", f"a linear regression does not show how far one has to look back; {took}")
+    has = declared(spec)
+    if found.changes <= has[0] and found.actions <= has[1]:
+        return Finding("history", f"what is declared tells what happens next; {took}")
+    needed = (
+        f"the next change of a coordinate depends on {found.changes} earlier changes and {found.actions} earlier "
+        f"actions: errors of {100 * found.error:.2g} % of its deviation, and of {100 * found.error_without:.2g} % "
+        f"without them; {took}"
+    )
+    return Finding("history", needed, _declaring(found))
+
+
+def _declaring(found: History) -> str:
+    """What to declare."""
+    moving = ", with at_start if a reset leaves it moving" if found.changes else ""
+    return f"declare {found.call}{moving}; see docs/how-to/history.md"
+
+
+def _way_out(spec: EnvironmentSpec, access: Access) -> str | None:
+    """What to do if the environment can't do what its specification declares."""
+    if spec.access == "any" and not access.can_set:
+        other = "snapshot" if access.can_restore else "reset"
+        return f"register it with --access {other}; what it remembers must be a coordinate for more"
+    if spec.access == "snapshot" and not access.can_restore:
+        return "register it with --access reset, or let save and restore keep everything that it remembers"
+    return None
+
+
+def _error(share: float | None) -> str:
+    """An error in words; shares are of the sampling range."""
+    if share is None:
+        return "not compared"
+    return "equal" if share <= EXACT else f"{100 * share:.2g} % of the range apart"
+
+
+def _access(api: Api) -> Finding:
+    try:
+        access = api.access()
+    except Refused as error:
+        return Finding("token", str(error), GIVE_TOKEN)
+    except SurrogymClientError as error:
+        return Finding("token", str(error), "bring server and client to the same version")
+    return Finding("token", f"role {access.role}" if access.tokens else "none needed: everybody is admin here")
+
+
+def _round_trip(api: Api) -> Finding:
+    try:
+        seconds = sorted(_timed(api) for _ in range(ROUND_TRIPS))
+    except SurrogymClientError as error:
+        return Finding("round trip", str(error), START_SERVER)
+    median, worst = 1_000 * statistics.median(seconds), 1_000 * seconds[-1]
+    return Finding("round trip", f"median {median:.2g} ms, longest {worst:.2g} ms of {ROUND_TRIPS}")
+
+
+def _timed(api: Api) -> float:
+    started = time.perf_counter()
+    api.health()
+    return time.perf_counter() - started
+
+
+def _one_step(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> Finding:
+    """A step from anywhere in the sampling range, or from a reset if the state can't be set."""
+    start, action = draw(spec, np.random.default_rng(0), wide=True), _middle(spec)
+    begun = time.perf_counter()
+    try:
+        if spec.query == "rollout":
+            start = original.begin(0)
+            step = original.act(action)
+        else:
+            assert isinstance(original, OriginalEnvironment)
+            step = original.step_from(start, action)
+        seconds = time.perf_counter() - begun
+        _check(step, start, action)
+    except StepFailed as error:
+        return Finding("step", str(error), "a sampler would fail in the same way: mend the environment first")
+    return Finding("step", f"one real step in {1_000 * seconds:.2g} ms, reward {float(step.reward):.4g}")
+
+
+def _check(step: RealStep, start: Array, action: Array) -> None:
+    """Raise ``StepFailed`` for a step that a sampler could not submit."""
+    query = StepQuery(
+        id=1,
+        number=0,
+        purpose="manual",
+        attempt=1,
+        lease_token="none",
+        lease_seconds=1.0,
+        coordinates=start.tolist(),
+        action=action.tolist(),
+    )
+    sample_of(query, step, len(start))
+
+
+def _middle(spec: EnvironmentSpec) -> Array:
+    """The action (F,) in the middle of the bounds; the first of discrete ones."""
+    if isinstance(spec.action, BoxAction):
+        middle: Array = (np.array(spec.action.low) + np.array(spec.action.high)) / 2
+        return middle
+    return np.zeros(spec.action.size)

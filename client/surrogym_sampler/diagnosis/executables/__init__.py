@@ -1,0 +1,47 @@
+"""Checks of a program that is an original environment: docs/how-to/executables.md has the protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from surrogym_sampler.diagnosis.executables import ends, requests, states
+from surrogym_sampler.diagnosis.executables.subject import LeftOut, Subject
+from surrogym_sampler.diagnosis.outcomes import Mismatch, Outcome
+from surrogym_sampler.original.errors import RequestRefused, StepFailed, UnknownEnvironment
+
+FIRST = "spec answers with protocol 1 and a valid specification"
+
+
+def conformance(command: str, seconds: float) -> Iterator[Outcome]:
+    """Run every check in turn on one program. Without a valid specification, no further check is made.
+
+    Args:
+        command: the program and its arguments, quoted as for a shell.
+        seconds: time for each answer.
+
+    Raises:
+        UnknownEnvironment: the command is empty, or its quotes don't match.
+    """
+    with Subject(command, seconds) as subject:
+        try:
+            subject.start()
+        except (UnknownEnvironment, StepFailed) as error:
+            yield Outcome(FIRST, f"{error}; see docs/how-to/executables.md for a first program")
+            return
+        yield Outcome(FIRST, None)
+        for check, way_out in (*requests.CHECKS, *states.CHECKS, *ends.CHECKS):
+            yield _outcome(check, way_out, subject)
+
+
+def _outcome(check: Callable[[Subject], None], way_out: str, subject: Subject) -> Outcome:
+    name = check.__name__.replace("_", " ")
+    try:
+        subject.revive()
+        check(subject)
+    except LeftOut as why:
+        return Outcome(name, None, str(why))
+    except RequestRefused as error:
+        return Outcome(name, f"expected a result, got an error: {error}; {way_out}")
+    except (Mismatch, StepFailed, UnknownEnvironment) as error:
+        return Outcome(name, f"{error}; {way_out}")
+    return Outcome(name, None)

@@ -1,0 +1,144 @@
+"""The program under test.
+
+Shapes: C coordinates, F action entries.
+"""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from surrogym_sampler.diagnosis.access import random_action
+from surrogym_sampler.diagnosis.outcomes import Mismatch
+from surrogym_sampler.original.episodes import draw
+from surrogym_sampler.original.errors import RequestRefused
+from surrogym_sampler.original.executables.messages import (
+    PROTOCOL,
+    Reply,
+    action_entries,
+    number,
+    numbers,
+    specification_in,
+    truth,
+)
+from surrogym_sampler.original.executables.program import Program
+from surrogym_sampler.original.protocol import Array
+from surrogym_shared.spec import EnvironmentSpec
+
+UNSUPPORTED = "unsupported"
+
+
+class LeftOut(Exception):
+    """The check does not apply; the message says why."""
+
+
+class Subject:
+    """A program, its specification, and random states and actions for it.
+
+    Args:
+        command: the program and its arguments, quoted as for a shell.
+        seconds: time for each answer.
+    """
+
+    spec: EnvironmentSpec
+
+    def __init__(self, command: str, seconds: float) -> None:
+        self.program = Program(command)
+        self.seconds = seconds
+        self._rng = np.random.default_rng(0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.program.close()
+
+    @property
+    def deadline(self) -> float:
+        """When the next answer must be there, on the monotonic clock."""
+        return time.monotonic() + self.seconds
+
+    def start(self) -> None:
+        """Start the program, and read its specification.
+
+        Raises:
+            UnknownEnvironment: there is no such program, or no valid specification.
+            StepFailed: the program did not answer.
+        """
+        self.program.start()
+        self.spec = specification_in(self.ask("spec", protocol=PROTOCOL))
+
+    def revive(self) -> None:
+        """Start the program anew if an earlier check has ended it."""
+        if not self.program.running:
+            self.start()
+
+    def ask(self, method: str, **fields: object) -> Reply:
+        """Send one request, and return the result."""
+        return self.program.ask(method, self.deadline, **fields)
+
+    def ask_if_supported(self, method: str, **fields: object) -> Reply:
+        """Send a request that a program need not support.
+
+        Raises:
+            LeftOut: it does not.
+        """
+        try:
+            return self.ask(method, **fields)
+        except RequestRefused as refused:
+            if refused.code == UNSUPPORTED:
+                raise LeftOut(f"the program does not support {method}, which it need not") from refused
+            raise
+
+    def refused(self, method: str, **fields: object) -> RequestRefused:
+        """Send a request that must get an error, and return the error."""
+        try:
+            result = self.ask(method, **fields)
+        except RequestRefused as error:
+            return error
+        raise Mismatch(f"expected an error for {method}, got the result {result}")
+
+    def reset(self, seed: int | None) -> Array:
+        """Reset; the coordinates (C,)."""
+        return self.state(self.ask("reset", seed=seed))
+
+    def set(self, state: Array) -> Array:
+        """Set the state (C,); the coordinates (C,) that were reached.
+
+        Raises:
+            LeftOut: the program declares rollout queries.
+        """
+        if self.spec.query == "rollout":
+            raise LeftOut("its specification declares rollout queries")
+        return self.state(self.ask("set", state=[float(entry) for entry in state]))
+
+    def begin(self) -> None:
+        """Go to a state from which a step can be taken."""
+        if self.spec.query == "rollout":
+            self.reset(0)
+        else:
+            self.set(self.random_state())
+
+    def step(self, action: Array) -> Array:
+        """Apply an action (F,); the coordinates (C,) after it and the reward, with every field checked."""
+        reply = self.ask("step", action=action_entries(self.spec.action, action))
+        truth(reply, "terminated")
+        truth(reply, "truncated")
+        return np.append(self.state(reply), number(reply, "reward"))
+
+    def state(self, reply: Reply) -> Array:
+        """The coordinates (C,) of a reply."""
+        return numbers(reply, "state", len(self.spec.coordinates))
+
+    def random_state(self) -> Array:
+        """Coordinates (C,) within the sampling range."""
+        return draw(self.spec, self._rng, wide=True)
+
+    def random_action(self) -> Array:
+        """An action (F,)."""
+        return random_action(self.spec, self._rng)

@@ -1,0 +1,294 @@
+"""Files to tables: text, NPZ, Parquet, HDF5, Minari. What a file is, is decided by what is in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from math import prod
+from pathlib import Path
+from typing import Any, Literal
+from zipfile import is_zipfile
+
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+
+from surrogym_sampler.logs.arrays import require_shapes, table_of_arrays
+from surrogym_shared.archives import Header, read_arrays
+from surrogym_shared.logs.decoding import decoded
+from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.sizes import LONGEST_CELL, MOST_COLUMNS, require_sizes
+from surrogym_shared.logs.table import Cells, Table
+from surrogym_shared.logs.text import table_of_text
+from surrogym_shared.logs.writing import EVALUATED
+from surrogym_shared.words import listed
+
+Format = Literal["csv", "npz", "parquet", "hdf5", "minari", "surrogate"]
+
+MOST_BYTES = 1024**3  # of the arrays in an NPZ file
+HDF5 = b"\x89HDF\r\n\x1a\n"
+OFFICE = {
+    "[Content_Types].xml": "a workbook of Excel or another file of Microsoft Office",
+    "_rels/.rels": "a workbook of Excel or another file of Microsoft Office",
+    "mimetype": "a file of LibreOffice or OpenDocument",
+    "modelDescription.xml": "an FMU",
+    "META-INF/MANIFEST.MF": "a Java archive",
+}  # first entries of zips that are no NPZ
+SURROGATE = ".surrogate"
+
+
+def format_of(path: Path) -> Format:
+    """The format of a log, or that of a surrogate's file."""
+    if path.suffix == SURROGATE:
+        return "surrogate"
+    if path.is_dir():
+        _require_data_set(path)
+        return "minari"
+    try:
+        with path.open("rb") as file:
+            head = file.read(9)
+    except FileNotFoundError:
+        if _minari_has(path):
+            return "minari"
+        raise
+    if head[:4] == b"PAR1":
+        return "parquet"
+    if head[:2] == b"PK":
+        return "npz"
+    if head[:8] == HDF5:
+        return "hdf5"
+    is_header = len(head) == 9 and head[8:] == b"{" and int.from_bytes(head[:8], "little") < 2**40
+    return "surrogate" if is_header else "csv"
+
+
+def read(path: Path) -> Table:
+    """The log at a path. Raises ``UnusableLog`` where it is none, or has no rows."""
+    kind = format_of(path)
+    if kind == "surrogate":
+        raise UnusableLog(f"expected a log, got a surrogate's file: surrogym import {path} without options for logs")
+    readers = {"csv": read_csv, "npz": read_npz, "parquet": read_parquet, "hdf5": read_hdf5, "minari": read_minari}
+    table = readers[kind](path)
+    if not len(table):
+        raise UnusableLog(f"expected a surrogate's file, or a log with a heading and rows, got neither in {path}")
+    return table
+
+
+def read_csv(path: Path) -> Table:
+    """A table of text with a heading, in UTF-8 or an encoding that the file shows."""
+    text, remarks = decoded(path.read_bytes(), str(path))
+    return table_of_text(text, str(path), remarks=remarks)
+
+
+def read_npz(path: Path) -> Table:
+    """The arrays of an NPZ file, as ``table_of_arrays`` has them. Nothing is unpickled."""
+    _require_npz(path)
+    try:
+        arrays = read_arrays(path, MOST_BYTES, lambda headers: require_shapes(path, _shapes(headers)))
+    except UnusableLog:
+        raise
+    except ValueError as error:
+        raise UnusableLog(f"{path}: {error}") from error
+    named = [str(name) for name in np.atleast_1d(arrays.pop("coordinate_names", ()))]
+    evaluated = arrays.pop(EVALUATED, np.array(False))
+    return replace(table_of_arrays(path, arrays, named), evaluated=evaluated.shape == () and bool(evaluated))
+
+
+def _shapes(headers: Mapping[str, Header]) -> dict[str, tuple[int, ...]]:
+    return {name: header.shape for name, header in headers.items()}
+
+
+def _require_npz(path: Path) -> None:
+    """Raise ``UnusableLog`` if a zip is damaged, or another kind of file. Its first entry is read even if it is cut."""
+    with path.open("rb") as file:
+        head = file.read(512)
+    first = head[30 : 30 + int.from_bytes(head[26:28], "little")].decode("utf-8", "replace")
+    name = next((words for entry, words in OFFICE.items() if first.startswith(entry)), None)
+    if name is not None:
+        raise UnusableLog(f"expected a log as text, NPZ, Parquet or HDF5 in {path}, got {name}: save the table as CSV")
+    if not is_zipfile(path):
+        raise UnusableLog(f"expected an NPZ file in {path}, as its first bytes show, got a damaged or incomplete zip")
+
+
+def read_hdf5(path: Path) -> Table:
+    """The data sets at the top of an HDF5 file, such as those of D4RL. Groups, such as infos and metadata, are ignored.
+
+    D4RL marks the end of an episode by ``terminals``, and by ``timeouts`` if it was cut off. The observation in the row
+    after such an end begins another episode.
+    """
+    try:
+        import h5py
+    except ModuleNotFoundError as error:
+        raise UnusableLog("a log in HDF5 needs the package h5py: pip install 'surrogym[logs]'") from error
+    try:
+        with h5py.File(path, "r") as file:
+            found = {name: one for name, one in file.items() if isinstance(one, h5py.Dataset)}
+            groups = {name: "it is a group" for name in file if name not in found}
+            require_shapes(path, {name: one.shape for name, one in found.items()})
+            if not found:
+                raise UnusableLog(f"expected data sets of one row a step in {path}, got the groups {listed(groups)}")
+            table = table_of_arrays(path, {name: _cells(one[()]) for name, one in found.items()})
+    except (OSError, KeyError, ValueError, RuntimeError) as error:
+        if isinstance(error, UnusableLog):
+            raise
+        raise UnusableLog(f"expected an HDF5 file in {path}, got one that can't be read: {_line(error)}") from error
+    return replace(table, ignored={**table.ignored, **groups})
+
+
+def _cells(array: Any) -> Cells:
+    """Return an array of HDF5 with its text as text."""
+    cells = np.asarray(array)
+    return np.char.decode(cells.astype(np.bytes_), "utf-8", "replace") if cells.dtype.kind in "SO" else cells
+
+
+def read_parquet(path: Path) -> Table:
+    """The columns of a Parquet file; lists of one length become columns of their own."""
+    try:
+        from pyarrow import ArrowException, parquet, types
+    except ModuleNotFoundError as error:
+        raise UnusableLog("a log in Parquet needs the package pyarrow: pip install 'surrogym[logs]'") from error
+    try:
+        file = parquet.ParquetFile(path)
+        _require_parquet(path, file.metadata)
+        kinds = {field.name: field.type for field in file.schema_arrow}
+        ignored = {
+            name: f"its type {kind} is not one value a step" for name, kind in kinds.items() if not _is_plain(kind)
+        }
+        texts = [name for name, kind in kinds.items() if types.is_string(kind) or types.is_large_string(kind)]
+        columns = parquet.ParquetFile(path, read_dictionary=texts).read([name for name in kinds if name not in ignored])
+        arrays = {name: _of_column(path, name, columns.column(name)) for name in columns.column_names}
+    except UnusableLog:
+        raise
+    except (ArrowException, OSError, ValueError) as error:
+        raise UnusableLog(f"expected a Parquet file in {path}, got one that can't be read: {_line(error)}") from error
+    table = table_of_arrays(path, arrays)
+    return replace(table, ignored={**table.ignored, **ignored})
+
+
+def _require_parquet(path: Path, metadata: Any) -> None:
+    """Raise ``UnusableLog`` if a Parquet file is too large, before anything of it is decompressed."""
+    if len(metadata.schema) > MOST_COLUMNS:
+        raise UnusableLog(f"expected at most {MOST_COLUMNS:,} columns in {path}, got {len(metadata.schema):,}")
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    chunks = [group.column(i) for group in groups for i in range(group.num_columns)]
+    require_sizes(path, metadata.num_rows, sum(chunk.num_values for chunk in chunks))
+    if (size := sum(chunk.total_uncompressed_size for chunk in chunks)) > MOST_BYTES:
+        raise UnusableLog(f"expected at most {MOST_BYTES:,} bytes inside {path}, got {size:,}")
+
+
+def _is_plain(kind: Any) -> bool:
+    """Whether a type of Parquet is one value, or a list of numbers."""
+    from pyarrow import types
+
+    inner = (
+        kind.value_type if types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind) else None
+    )
+    if inner is not None:
+        return bool(types.is_floating(inner) or types.is_integer(inner) or types.is_boolean(inner))
+    return not (types.is_nested(kind) or types.is_binary(kind) or types.is_large_binary(kind))
+
+
+def _of_column(path: Path, name: str, column: Any) -> Cells:
+    """Return a column of Parquet (n,) or (n, k). A long text is refused; equal texts share their memory."""
+    from pyarrow import compute, types
+
+    if not types.is_dictionary(column.type):
+        cells = column.to_numpy()
+        return _of_objects(path, name, cells) if cells.dtype == object else cells
+    parts = []
+    for chunk in column.chunks:
+        longest = compute.max(compute.binary_length(chunk.dictionary)).as_py() if len(chunk.dictionary) else 0
+        if types.is_string(chunk.dictionary.type) and longest > LONGEST_CELL:
+            raise UnusableLog(
+                f"expected cells of at most {LONGEST_CELL:,} letters in the column {name!r} of {path}, got {longest:,}"
+            )
+        words = np.array([*map(str, chunk.dictionary.to_pylist()), ""], dtype=object)
+        parts.append(words[chunk.indices.fill_null(len(words) - 1).to_numpy()])
+    return np.concatenate([np.zeros(0, dtype=object), *parts])
+
+
+def _of_objects(path: Path, name: str, cells: Cells) -> Cells:
+    """Return lists of one length as an array (n, k), and other cells as text (n,)."""
+    lists = [isinstance(cell, np.ndarray) for cell in cells]
+    if not any(lists):
+        return np.array(["" if cell is None else str(cell) for cell in cells], dtype=object)
+    shapes = {cell.shape if one else None for cell, one in zip(cells, lists, strict=True)}
+    if len(shapes) > 1:
+        raise UnusableLog(
+            f"expected lists of one length in the column {name} of {path}, got lists of different lengths"
+        )
+    return np.stack(list(cells))
+
+
+def _line(error: Exception) -> str:
+    """Return the first line of an error's message."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+def read_minari(path: Path) -> Table:
+    """All episodes of a Minari data set, by its name or its folder. Observations and actions have to be vectors."""
+    minari = _minari()
+    try:
+        data = minari.MinariDataset(path / "data") if path.is_dir() else minari.load_dataset(str(path))
+    except (ValueError, KeyError, AssertionError) as error:
+        raise UnusableLog(f"expected a Minari data set in {path}, got one that can't be read: {error}") from error
+    width = _width(path, data.observation_space)
+    spaces = _declared(path, data.action_space)
+    require_sizes(path, data.total_steps, data.total_steps * (2 * width + 1))
+    episodes = list(data.iterate_episodes())
+    table = table_of_arrays(
+        path,
+        {
+            "observations": np.concatenate([e.observations[:-1].reshape(-1, width) for e in episodes]),
+            "actions": np.concatenate([_rows(e.actions) for e in episodes]),
+            "next_observations": np.concatenate([e.observations[1:].reshape(-1, width) for e in episodes]),
+            "reward": np.concatenate([e.rewards for e in episodes]),
+            "terminated": np.concatenate([e.terminations for e in episodes]),
+            "truncated": np.concatenate([e.truncations for e in episodes]),
+            "episode": np.concatenate([np.full(len(e.rewards), e.id) for e in episodes]),
+        },
+    )
+    return replace(table, **spaces)
+
+
+def _width(path: Path, space: Any) -> int:
+    """Return the length of an observation. A column, (n, 1), is a vector too; a label of Discrete is none."""
+    if not isinstance(space, Box) or sum(size > 1 for size in space.shape) > 1:
+        raise UnusableLog(f"expected observations that are vectors (a Box) in {path}, got the space {space}")
+    return prod(space.shape)
+
+
+def _declared(path: Path, space: Any) -> dict[str, Any]:
+    """Return what a declared space says of the actions: whether they are discrete, and their limits."""
+    if isinstance(space, Discrete) and space.start == 0:
+        return {"discrete": True, "limits": {"0": (0.0, float(space.n - 1))}}
+    if not isinstance(space, Box) or len(space.shape) > 1:
+        raise UnusableLog(f"expected actions of a Box (n,), or of a Discrete from 0, in {path}, got the space {space}")
+    ends = zip(space.low.reshape(-1).tolist(), space.high.reshape(-1).tolist(), strict=True)
+    return {"discrete": False, "limits": {str(i): pair for i, pair in enumerate(ends) if np.isfinite(pair).all()}}
+
+
+def _rows(array: Cells) -> Cells:
+    return array[:, None] if array.ndim == 1 else array
+
+
+def _minari() -> Any:
+    try:
+        import minari
+    except ModuleNotFoundError as error:
+        raise UnusableLog("a Minari data set needs the package minari: pip install 'surrogym[logs]'") from error
+    return minari
+
+
+def _require_data_set(folder: Path) -> None:
+    """A folder is a log where Minari keeps a data set: with its metadata, or with its HDF5 file."""
+    if not any((folder / "data" / name).is_file() for name in ("main_data.hdf5", "metadata.json")):
+        raise UnusableLog(
+            f"expected a CSV, Parquet or NPZ file, or a Minari data set, got the folder {folder}, which has no "
+            "data/main_data.hdf5 or data/metadata.json"
+        )
+
+
+def _minari_has(path: Path) -> bool:
+    """Whether there is a Minari data set of this name here; the package is asked only for what looks like one."""
+    if path.suffix or path.is_absolute() or "-v" not in path.name:
+        return False
+    return str(path) in _minari().list_local_datasets()

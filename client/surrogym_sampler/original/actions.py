@@ -1,0 +1,86 @@
+"""Conversion of a policy's actions to those of the original environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_sampler.original.errors import UnknownEnvironment
+from surrogym_sampler.original.protocol import Array
+from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
+from surrogym_shared.spec.actions import Action
+
+
+def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], num_envs: int) -> Array:
+    """Convert a policy's actions to those of the environment, (N, F). Bins are converted to continuous values.
+
+    Raises:
+        ValueError: wrong shape.
+    """
+    rows = np.asarray(raw, dtype=np.float64)
+    if rows.size != num_envs * spec.action.size:
+        raise ValueError(f"expected actions of shape ({num_envs}, {spec.action.size}), got {np.shape(raw)}")
+    rows = rows.reshape(num_envs, spec.action.size)
+    if isinstance(spec.action, BoxAction) and spec.action.bins is None:
+        if not np.isfinite(rows).all():
+            raise ValueError(f"expected finite actions, got {rows.tolist()}")
+        return np.clip(rows, spec.action.low, spec.action.high)
+    counts = np.array(_counts(spec.action))
+    if not ((rows >= 0) & (rows < counts) & (rows == np.round(rows))).all():
+        raise ValueError(f"expected whole numbers from 0 to below {counts.tolist()}, got {rows.tolist()}")
+    if not isinstance(spec.action, BoxAction):
+        return rows
+    low, high = np.array(spec.action.low), np.array(spec.action.high)
+    return np.asarray(low + rows * (high - low) / (counts - 1))
+
+
+def explored(spec: EnvironmentSpec, action: Array, share: float, rng: np.random.Generator) -> Array:
+    """Change an action (F,) of the environment at random.
+
+    A continuous entry gets normal noise with a standard deviation of ``share`` times half its range, and stays within
+    its bounds. An entry with a finite number of values becomes a random one of them with probability ``share``.
+    """
+    size = spec.action.size
+    if isinstance(spec.action, BoxAction):
+        low, high = np.array(spec.action.low), np.array(spec.action.high)
+        if spec.action.bins is None:
+            return np.clip(action + rng.normal(0, share * (high - low) / 2, size), low, high)
+    counts = np.array(_counts(spec.action))
+    drawn = decode_actions(spec, rng.integers(counts, size=size), 1)[0]
+    return np.where(rng.random(size) < share, drawn, action)
+
+
+def require_same_action(name: str, declared: Action, own: Action) -> None:
+    """Refuse a declared action that the environment can't take. It may have fewer values, and other bounds.
+
+    Raises:
+        UnknownEnvironment: it has another kind, another number of entries, or more values.
+    """
+    fits = declared.kind == own.kind and declared.size == own.size
+    if fits and not isinstance(own, BoxAction):
+        fits = all(asked <= there for asked, there in zip(_counts(declared), _counts(own), strict=True))
+    if not fits:
+        raise UnknownEnvironment(
+            f"the specification has {_words_of(declared)}, but {name} takes {_words_of(own)}: write the latter in its "
+            "action"
+        )
+
+
+def _words_of(action: Action) -> str:
+    if isinstance(action, BoxAction):
+        return f"a continuous action of {action.size} entr{'y' if action.size == 1 else 'ies'}"
+    values = " and ".join(map(str, _counts(action)))
+    return f"a discrete action of {values} values"
+
+
+def _counts(action: BoxAction | DiscreteAction | MultiDiscreteAction) -> tuple[int, ...]:
+    """Number of values in each dimension of a policy's action."""
+    match action:
+        case BoxAction(bins=bins):
+            return bins or ()
+        case DiscreteAction(n=n):
+            return (n,)
+        case MultiDiscreteAction(nvec=nvec):
+            return nvec

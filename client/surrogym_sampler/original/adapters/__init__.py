@@ -1,0 +1,101 @@
+"""Simulators by name: any Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL`` or ``pcgym:FILE.json``,
+``fmu:PLANT.fmu`` or ``fmu:PLANT.json``.
+
+Each adapter opens one kind of simulator. Its packages are an optional extra, imported when a name needs them.
+"""
+
+from __future__ import annotations
+
+import re
+from importlib import import_module
+from typing import NamedTuple
+
+from pydantic import ValidationError
+
+from surrogym_sampler.original.errors import RAISED, UnknownEnvironment, sentence
+from surrogym_sampler.original.simulator import Simulator
+from surrogym_shared.checks import first_fault
+from surrogym_shared.environments import GYMNASIUM_ID
+
+WITH_SPECIFICATION = re.compile(r"exec:.*|[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # a program, or package.module:factory
+
+
+class Adapter(NamedTuple):
+    """An adapter for one package of environments, such as dm_control.
+
+    Attributes:
+        module: Python module of the adapter, which is imported when it is needed.
+        names: pattern of the names of environments that the adapter opens.
+        trusted: pattern of the names that a client also opens when only a server gave the name. They can open nothing
+            but the package's own environments.
+        extra: extra of pip that installs the package.
+        separate: whether its simulators run in processes of their own.
+    """
+
+    module: str
+    names: re.Pattern[str]
+    trusted: re.Pattern[str]
+    extra: str
+    separate: bool = False
+
+
+NEVER = re.compile(r"(?!)")
+ADAPTERS = (
+    Adapter(
+        "surrogym_sampler.original.adapters.dm_control",
+        re.compile(r"dm_control:.*"),
+        re.compile(r"dm_control:[a-z0-9_]+-[a-z0-9_]+"),
+        "dm-control",
+    ),
+    Adapter("surrogym_sampler.original.adapters.pcgym", re.compile(r"pcgym:.*"), re.compile(r"pcgym:cstr"), "pcgym"),
+    Adapter("surrogym_sampler.original.adapters.fmu", re.compile(r"fmu:.*"), NEVER, "fmu", separate=True),
+    Adapter(
+        "surrogym_sampler.original.adapters.gymnasium_ids",
+        re.compile(r"gymnasium_robotics:.*"),
+        re.compile(r"gymnasium_robotics:[\w-]+-v\d+"),
+        "robotics",
+    ),
+    Adapter("surrogym_sampler.original.adapters.gymnasium_ids", GYMNASIUM_ID, NEVER, "mujoco"),
+)
+
+
+def adapter_of(name: str) -> Adapter | None:
+    """The adapter that opens a name; None for ``package.module:factory`` and for other texts."""
+    return next((adapter for adapter in ADAPTERS if adapter.names.fullmatch(name)), None)
+
+
+def is_trusted(name: str) -> bool:
+    """Whether a name from a server may be opened without further consent: it can only open environments of known
+    packages."""
+    return any(adapter.trusted.fullmatch(name) for adapter in ADAPTERS)
+
+
+def open_simulator(name: str) -> Simulator:
+    """Open the simulator of a name.
+
+    Raises:
+        UnknownEnvironment: no adapter knows the name, its package is not installed, or the simulator fails or can't be
+            used.
+    """
+    adapter = adapter_of(name)
+    if adapter is None and WITH_SPECIFICATION.fullmatch(name):
+        raise UnknownEnvironment(
+            f"{name} is a factory or a program, which gives its own specification: there is nothing to describe. A "
+            "Gymnasium class without one is described by its id: register it with Gymnasium, and give package:Id-v0"
+        )
+    if adapter is None:
+        raise UnknownEnvironment(
+            f"no adapter knows the environment {name!r}: expected a Gymnasium id such as Pendulum-v1, package:Id-v0, "
+            "dm_control:DOMAIN-TASK, pcgym:cstr, pcgym:FILE.json, fmu:PLANT.fmu or fmu:PLANT.json"
+        )
+    try:
+        opened: Simulator = import_module(adapter.module).open_simulator(name)
+    except ImportError as error:
+        raise UnknownEnvironment(f"{name} can't be made: {error} (pip install 'surrogym[{adapter.extra}]')") from error
+    except UnknownEnvironment:
+        raise
+    except ValidationError as error:
+        raise UnknownEnvironment(f"{name} can't be specified: {first_fault(error)}") from error
+    except RAISED as error:
+        raise UnknownEnvironment(f"{name} can't be opened: {sentence(error)}") from error
+    return opened

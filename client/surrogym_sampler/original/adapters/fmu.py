@@ -1,0 +1,205 @@
+"""Functional Mock-up Units by ``fmu:PLANT.fmu``, or ``fmu:PLANT.json`` that names one and sets something about it.
+
+Their native code runs in a process of its own. The state is what can be set before the FMU is initialised: a state is
+set by a new start.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from surrogym_sampler.original.errors import StepFailed, UnknownEnvironment
+from surrogym_sampler.original.fmus.archive import Archive, Declared, read_archive
+from surrogym_sampler.original.fmus.choices import (
+    Choices,
+    described_by,
+    driven,
+    read_choices,
+    start_values,
+    step_of,
+)
+from surrogym_sampler.original.fmus.environment import FmuEnvironment, SavingSimulator
+from surrogym_sampler.original.fmus.process import Process
+from surrogym_sampler.original.protocol import Array
+from surrogym_sampler.original.simulator import Motion, Simulated, Simulator, Taken, Variable
+from surrogym_shared.spec import MAX_DIMENSIONS, BoxAction, EnvironmentSpec
+from surrogym_shared.spec.base import REWARD
+
+UNKNOWN_LIMITS = (-1.0, 1.0)  # of an input that declares none
+SAME = 1e-9  # of a number: the largest error of a value that counts as set
+SHIFT = 0.05  # of a variable's limits, or of 1, by which a start is shifted to see whether it can be set
+MOTIONS: dict[str | None, Motion] = {"rad": "turn", "rad/s": "speed", "m/s": "speed"}
+
+
+def open_simulator(name: str) -> Simulator:
+    """Open an FMU.
+
+    Raises:
+        UnknownEnvironment: it can't be used here, or what is set about it does not fit.
+        ImportError: fmpy is not installed.
+    """
+    path, choices = read_choices(name)
+    return Fmu(name, read_archive(path), choices)
+
+
+class Fmu(SavingSimulator):
+    """One FMU for co-simulation. A reset always begins at its start values. Its observation is its outputs."""
+
+    pays = False
+
+    def __init__(self, name: str, archive: Archive, choices: Choices) -> None:
+        self._name = name
+        inputs, state = driven(archive, choices), described_by(archive, choices)
+        if len(state) > MAX_DIMENSIONS:
+            raise UnknownEnvironment(
+                f"{archive.path} has {len(state)} variables that describe its state: expected at most "
+                f'{MAX_DIMENSIONS}; choose some by "coordinates" in a JSON file'
+            )
+        outputs = archive.of_causality("output") or state
+        self._state, self._size = state, len(state)
+        self.has_snapshots = archive.snapshots
+        step = step_of(archive, choices)
+        self._process = Process(archive, inputs, [*state, *outputs], step, start_values(archive, choices))
+        try:
+            self.variables = _variables(state)
+            limits = [choices.limits.get(v.name) or _limits(v) or UNKNOWN_LIMITS for v in inputs]
+            self.action = BoxAction(low=tuple(low for low, _ in limits), high=tuple(high for _, high in limits))
+            self.time_limit = round(archive.stop / step) if archive.stop and archive.stop >= step else None
+            self.reset(None)
+            self.rest = self.read()
+            self.fixed = self._why_fixed()
+            self.settable = not self.fixed
+            self.notes = _notes(archive, step, inputs, limits, self._named())
+            self.questions = _questions(inputs, choices)
+        except StepFailed as error:
+            self.close()
+            raise UnknownEnvironment(f"{name} can't be started: {error}") from error
+        except BaseException:
+            self.close()
+            raise
+
+    def reset(self, seed: int | None) -> Array:
+        del seed  # an FMU draws no start
+        self._process.initialise()
+        return self.observe()
+
+    def step(self, action: Array) -> Taken:
+        over = self._process.step(action)
+        return Taken(self.observe(), 0.0, False, over)
+
+    def read(self) -> Array:
+        return self._process.values[: self._size].copy()
+
+    def write(self, state: Array) -> None:
+        if not self.settable:
+            raise UnknownEnvironment(f"{self._name} can't be set to {state.tolist()}: it can only be reset")
+        self._set(state)
+
+    def observe(self) -> Array:
+        return self._process.values[self._size :].copy()
+
+    def snapshot(self) -> bytes:
+        return self._process.save()
+
+    def go_back(self, snapshot: bytes) -> None:
+        self._process.restore(snapshot)
+
+    def close(self) -> None:
+        self._process.close()
+
+    def action_taken(self, action: Array) -> Array:
+        return np.array(action, dtype=np.float64)
+
+    def with_specification(self, spec: EnvironmentSpec, *, shows_own: bool, step_limit: float) -> Simulated:
+        del shows_own  # outputs may depend on the last input, so a policy observes what the specification declares
+        self._process.step_limit = step_limit
+        return FmuEnvironment(self, spec)
+
+    def _set(self, state: Array) -> None:
+        self._process.initialise(
+            [(v.type, v.reference, float(value)) for v, value in zip(self._state, state, strict=True)]
+        )
+
+    def _why_fixed(self) -> str:
+        """Why the state can't be set; empty if a shifted start was read back."""
+        if calculated := [v.name for v in self._state if not v.can_start]:
+            return f"the FMU calculates {', '.join(calculated)}, which has no start to set, so it can only be reset"
+        wanted = np.array([_shifted(v, at) for v, at in zip(self._state, self.rest, strict=True)])
+        try:
+            self._set(wanted)
+            got = self.read()
+        except StepFailed as error:
+            return f"another start of its state failed, so it can only be reset ({error})"
+        finally:
+            self._process.initialise()
+        for variable, want, at in zip(self._state, wanted, got, strict=True):
+            if abs(at - want) > SAME * max(1.0, abs(want)):
+                return f"{variable.name} was started at {want:g} and read back as {at:g}, so it can only be reset"
+        return ""
+
+    def _named(self) -> list[str]:
+        """Names that a specification can't use, and those that stand for them."""
+        return [
+            f"{v.name} is called {ours.name}"
+            for v, ours in zip(self._state, self.variables, strict=True)
+            if v.name != ours.name
+        ]
+
+
+def _variables(state: Sequence[Declared]) -> tuple[Variable, ...]:
+    """The state's variables, with names that a specification can use."""
+    found: dict[str, Variable] = {}
+    for one in state:
+        plain = re.sub(r"[^A-Za-z0-9._-]+", "_", one.name).strip("._-")[:60] or "variable"
+        name, number = plain, 2
+        while name in found or name == REWARD:
+            name, number = f"{plain}_{number}", number + 1
+        limits = _limits(one)
+        motion = "other" if limits else MOTIONS.get(one.unit, "other")
+        found[name] = Variable(name, motion, *(limits or (None, None)))
+    return tuple(found.values())
+
+
+def _limits(variable: Declared) -> tuple[float, float] | None:
+    if variable.low is None or variable.high is None or not variable.low < variable.high:
+        return None
+    return variable.low, variable.high
+
+
+def _shifted(variable: Declared, at: float) -> float:
+    """Another start of a variable, within its limits."""
+    low, high = _limits(variable) or (at - 1.0, at + 1.0)
+    shift = SHIFT * (high - low)
+    return at + shift if at + shift <= high else at - shift
+
+
+def _notes(
+    archive: Archive,
+    step: float,
+    inputs: Sequence[Declared],
+    limits: Sequence[tuple[float, float]],
+    named: Sequence[str],
+) -> tuple[str, ...]:
+    actions = ", ".join(f"{v.name} ({low:g} to {high:g})" for v, (low, high) in zip(inputs, limits, strict=True))
+    lines = [f"an action sets {actions} for {step:g} s"]
+    if named:
+        lines.append(f"names that a specification can't use: {', '.join(named)}")
+    if archive.snapshots:
+        lines.append("it can save its whole state and return to it")
+    return tuple(lines)
+
+
+def _questions(inputs: Sequence[Declared], choices: Choices) -> tuple[str, ...]:
+    unknown = [v.name for v in inputs if v.name not in choices.limits and _limits(v) is None]
+    lines = []
+    if unknown:
+        low, high = UNKNOWN_LIMITS
+        lines.append(
+            f"action: {', '.join(unknown)} declares no min and max, so {low:g} to {high:g} is assumed: give its limits "
+            'under "actions" of a JSON file, and describe it again'
+        )
+    lines.append("start: an FMU always begins at its start values. Give ranges if episodes should begin elsewhere")
+    return tuple(lines)

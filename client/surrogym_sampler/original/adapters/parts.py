@@ -1,0 +1,94 @@
+"""Simulators whose state consists of parts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from surrogym_sampler.original.errors import UnknownEnvironment
+from surrogym_sampler.original.protocol import Array
+from surrogym_sampler.original.simulator import Simulator, random_factor
+from surrogym_sampler.original.state_parts import StatePart
+from surrogym_shared.spec import MAX_DIMENSIONS, BoxAction, DiscreteAction, MultiDiscreteAction
+from surrogym_shared.spec.actions import Action
+
+
+class OfParts(Simulator):
+    """A simulator with a state of parts. The first part is written last, because MuJoCo's kinematics depend on the
+    others."""
+
+    def __init__(self, parts: Sequence[StatePart], model: Any = None, data: Any = None) -> None:
+        self._parts = tuple(parts)
+        self._model, self._data = model, data
+        self._masses = None if model is None else np.array(model.body_mass)
+        self.variables = tuple(variable for part in parts for variable in part.variables)
+        self.rest = self.read()
+
+    def read(self) -> Array:
+        return np.concatenate([part.read() for part in self._parts])
+
+    def write(self, state: Array) -> None:
+        ends = np.cumsum([len(part.variables) for part in self._parts])[:-1]
+        for part, values in reversed(list(zip(self._parts, np.split(state, ends), strict=True))):
+            part.write(values)
+
+    def save(self) -> Array:
+        return np.concatenate([part.save() for part in self._parts])
+
+    def restore(self, saved: Array) -> None:
+        ends = np.cumsum([len(part.save()) for part in self._parts])[:-1]
+        for part, values in reversed(list(zip(self._parts, np.split(saved, ends), strict=True))):
+            part.restore(values)
+
+    def touches(self) -> bool:
+        return self._data is not None and int(self._data.ncon) > 0
+
+    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
+        if self._model is None or self._masses is None:
+            super().perturb(rng, sigma)
+            return
+        for body, mass in enumerate(self._masses):
+            self._model.body_mass[body] = mass * random_factor(rng, sigma)
+
+
+def action_of(name: str, space: Any) -> Action:
+    """Convert the action space of Gymnasium to a specification's action.
+
+    Raises:
+        UnknownEnvironment: a space, or bounds, that no specification can express.
+    """
+    kind = type(space).__name__
+    shape: tuple[int, ...] = getattr(space, "shape", None) or ()
+    if len(shape) == 1 and not 1 <= shape[0] <= MAX_DIMENSIONS:
+        raise UnknownEnvironment(
+            f"{name} has an action of {shape[0]} entries: expected 1 to {MAX_DIMENSIONS}; write a wrapper class that "
+            "chooses them (docs/how-to/own-environment.md)"
+        )
+    if kind == "Box" and len(space.shape) == 1 and np.isfinite([space.low, space.high]).all():
+        return BoxAction(low=tuple(map(float, space.low)), high=tuple(map(float, space.high)))
+    if kind == "Discrete" and int(space.start) == 0:
+        return DiscreteAction(n=int(space.n))
+    if kind == "MultiDiscrete" and len(space.shape) == 1 and not np.any(space.start):
+        return MultiDiscreteAction(nvec=tuple(map(int, space.nvec)))
+    raise UnknownEnvironment(
+        f"{name} has the action space {space}: expected a Box with one row of finite bounds, Discrete or "
+        "MultiDiscrete from 0; write a wrapper class (docs/how-to/own-environment.md)"
+    )
+
+
+def flat(name: str, observation: Any) -> Array:
+    """An observation as one row of numbers (D,). Entries of a dictionary are in the order of their names.
+
+    Raises:
+        UnknownEnvironment: it contains an image, or a value that is not a number.
+    """
+    entries = [observation[key] for key in sorted(observation)] if isinstance(observation, dict) else [observation]
+    arrays = [np.asarray(entry) for entry in entries]
+    if any(sum(size > 1 for size in a.shape) > 1 or a.dtype.kind not in "fiub" for a in arrays):
+        raise UnknownEnvironment(
+            f"{name} observes images, or values that are not numbers: expected a row of numbers, or a dictionary of "
+            "rows"
+        )
+    return np.concatenate([a.astype(np.float64).ravel() for a in arrays])

@@ -1,0 +1,94 @@
+"""A simulator whose real steps are counted, and whose failures say how many there were.
+
+Shapes: V variables of the state, C coordinates, F action entries, D observation entries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from surrogym_sampler.original.errors import RAISED, StepFailed, UnknownEnvironment, sentence
+from surrogym_sampler.original.protocol import Array
+from surrogym_sampler.original.simulator import Simulator, Taken
+
+
+class Counted:
+    """A simulator whose real steps and resets are counted. A description calls the environment only through it.
+
+    Whatever the environment raises, ``sys.exit`` too, becomes ``StepFailed`` with the number of real steps before it.
+    ``simulator`` is for what is known without a call, such as the variables.
+    """
+
+    def __init__(self, simulator: Simulator, name: str = "the environment") -> None:
+        self.simulator = simulator
+        self.steps = 0
+        self.resets = 0
+        self.name = name
+
+    def reset(self, seed: int) -> Array:
+        """Begin an episode. Returns the state (V,)."""
+        self.resets += 1
+        with self._failures(self.steps):
+            self.simulator.reset(seed)
+            return self._read()
+
+    def step(self, action: Array) -> Taken:
+        """Take a step with action (F,)."""
+        self.steps += 1
+        with self._failures(self.steps - 1):
+            return self.simulator.step(action)
+
+    def read(self) -> Array:
+        """The state (V,)."""
+        with self._failures(self.steps):
+            return self._read()
+
+    def write(self, state: Array) -> None:
+        """Set the state (V,)."""
+        with self._failures(self.steps):
+            self.simulator.write(state)
+
+    def place(self, columns: list[int], coordinates: Array) -> None:
+        """Set some variables to coordinates (C,), the others to rest."""
+        with self._failures(self.steps):
+            self.simulator.place(columns, coordinates)
+
+    def observe(self) -> Array:
+        """The observation (D,) of the state as it is."""
+        with self._failures(self.steps):
+            return self.simulator.observe()
+
+    def touches(self) -> bool:
+        """Whether bodies touch in the state as it is."""
+        with self._failures(self.steps):
+            return self.simulator.touches()
+
+    def step_from(self, state: Array, action: Array) -> tuple[Array, Taken]:
+        """Set the state (V,) and take a step. Returns the next state and the step's results."""
+        self.write(state)
+        taken = self.step(action)
+        return self.read(), taken
+
+    def close(self) -> tuple[str, ...]:
+        """Close the environment. Returns a sentence if that fails, because the steps were taken all the same."""
+        try:
+            self.simulator.close()
+        except RAISED as error:
+            return (f"{self.name} could not be closed: {sentence(error)}",)
+        return ()
+
+    def _read(self) -> Array:
+        state, expected = self.simulator.read(), len(self.simulator.variables)
+        if len(state) != expected:
+            raise StepFailed(f"expected a state of {expected} numbers, as after its first reset, got {len(state)}")
+        return state
+
+    @contextmanager
+    def _failures(self, steps: int) -> Iterator[None]:
+        try:
+            yield
+        except UnknownEnvironment:
+            raise
+        except RAISED as error:
+            raise StepFailed(f"{self.name} failed after {steps} real steps: {sentence(error)}") from error

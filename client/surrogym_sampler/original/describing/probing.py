@@ -1,0 +1,213 @@
+"""Steps repeated from states that were set: whether this is exact, and which shifts change nothing.
+
+Shapes: V variables of the state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from surrogym_sampler.original.describing.counting import Counted
+from surrogym_sampler.original.describing.exploring import RESETS, Seen, moved_by
+from surrogym_sampler.original.errors import StepFailed
+from surrogym_sampler.original.protocol import Array
+from surrogym_sampler.original.simulator import Taken
+
+PLACES = 4  # number of states for each question
+EXACT = 1e-6  # of a variable's observed range
+SETTABLE = 1e-3  # of the same range: the largest error of a state that can be set
+FEW = 3.0  # factor for noise that was estimated from few steps
+FARTHEST = 3.0  # largest shift of a position
+TURN = 2 * np.pi
+PART = 1.0  # rad, of a turn
+ANYWHERE = 32  # states within the limits from which a step is taken
+
+
+@dataclass(frozen=True)
+class Probed:
+    """Results of repeated steps. Errors are shares of each variable's observed range, the largest of all variables.
+
+    Attributes:
+        set_error: between a step of an episode and the same step from a state that was set.
+        repeat_error: between two steps from the same state.
+        replay_error: between two episodes from one seed under the same actions.
+        shifts: positions whose shift changes nothing.
+        turns: angles whose whole turn changes nothing.
+        leaving: share of the steps from random states within declared limits that lead outside by more than the width
+            of the limits; 0 if it was not asked.
+    """
+
+    set_error: float
+    repeat_error: float
+    replay_error: float
+    shifts: frozenset[str] = frozenset()
+    turns: frozenset[str] = frozenset()
+    leaving: float = 0.0
+
+    @property
+    def stays(self) -> bool:
+        """Whether the environment stays near its declared limits if it begins within them."""
+        return self.leaving == 0
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the environment is random: equal episodes differ, not only steps from states that were set."""
+        return self.replay_error > EXACT
+
+    @property
+    def settable(self) -> bool:
+        """Whether the state can be set completely. An error that two equal episodes don't explain means
+        hidden memory."""
+        noise = FEW * max(self.replay_error, self.repeat_error) if self.noisy else 0.0
+        return self.set_error <= max(SETTABLE, noise)
+
+
+def probe(counted: Counted, seen: Seen, rng: np.random.Generator) -> Probed:
+    """Repeat some of the steps."""
+    simulator, scale = counted.simulator, _scale(seen)
+    at = np.unique(np.linspace(0, len(seen.states) - 1, PLACES + 1).astype(int)[1:])
+    taken = [(seen.states[i], seen.actions[i], seen.next_states[i], float(seen.rewards[i])) for i in at]
+    first = [counted.step_from(state, action) for state, action, _, _ in taken]
+    again = [counted.step_from(state, action) for state, action, _, _ in taken]
+    set_error = max(
+        _error(reached, wanted, scale, got.reward, reward)
+        for (reached, got), (_, _, wanted, reward) in zip(first, taken, strict=True)
+    )
+    repeat_error = max(
+        _error(a, b, scale, one.reward, other.reward) for (a, one), (b, other) in zip(first, again, strict=True)
+    )
+    replay_error = _replayed(counted, seen, scale)
+    probed = Probed(set_error, repeat_error, replay_error)
+    if not probed.settable:
+        return probed
+    places = [(state, action, *got) for (state, action, _, _), got in zip(taken, first, strict=True)]
+    shifted = _Shifted(counted, places, scale, max(EXACT, FEW * repeat_error))
+    shifts, turns = set(), set()
+    for i, variable in enumerate(simulator.variables):
+        if variable.limited or not moved_by(seen.next_states[:, i]):
+            continue
+        if variable.motion == "slide" and shifted.changes_nothing(i, float(rng.uniform(1, FARTHEST))):
+            shifts.add(variable.name)
+        if (variable.motion == "turn" and shifted.turns(i)) or (variable.motion == "other" and shifted.is_angle(i)):
+            turns.add(variable.name)
+    leaving = _leaving(counted, seen, rng)
+    return Probed(set_error, repeat_error, replay_error, frozenset(shifts), frozenset(turns), leaving)
+
+
+class _Alike(NamedTuple):
+    """What a shift of a variable leaves alike in one step.
+
+    ``itself``: its own next value, which has the shift, apart from whole turns. ``others``: the other variables, the
+    reward and the end. ``shown``: the observation.
+    """
+
+    itself: bool
+    others: bool
+    shown: bool
+
+
+class _Shifted:
+    """Steps from some places with one variable shifted, compared with the same steps without the shift.
+
+    ``places``: state (V,), action (F,), next state (V,), and the step's results.
+    """
+
+    def __init__(
+        self, counted: Counted, places: Sequence[tuple[Array, Array, Array, Taken]], scale: Array, same: float
+    ) -> None:
+        self._counted, self._places, self._scale, self._same = counted, places, scale, same
+
+    def changes_nothing(self, index: int, shift: float) -> bool:
+        """Whether neither the motion nor the observation changes."""
+        return all(all(alike) for alike in self._compared(index, shift))
+
+    def turns(self, index: int) -> bool:
+        """Whether a whole turn changes nothing about the motion."""
+        return all(alike.itself and alike.others for alike in self._compared(index, TURN))
+
+    def is_angle(self, index: int) -> bool:
+        """Whether whole turns change nothing about a variable of an unknown kind, and a part of a turn does.
+
+        Without the part, a position on which nothing depends would pass for an angle. The variable's own next value is
+        no such change: it may forget the shift, such as that of an action that the state remembers.
+        """
+        whole = []
+        for shift in (TURN, -2 * TURN):
+            for alike in self._compared(index, shift):
+                if not (alike.itself and alike.others):
+                    return False  # the other places would cost real steps
+                whole.append(alike.shown)
+        part = list(self._compared(index, PART))
+        return not all(alike.others for alike in part) or (all(whole) and not all(alike.shown for alike in part))
+
+    def _compared(self, index: int, shift: float) -> Iterator[_Alike]:
+        """The comparison at each place."""
+        for state, action, reached, got in self._places:
+            moved = state.copy()
+            moved[index] += shift
+            try:
+                there, step = self._counted.step_from(moved, action)
+            except StepFailed:
+                yield _Alike(itself=False, others=False, shown=False)
+                continue
+            wrong = there[index] - shift - reached[index]
+            wrong -= TURN * np.round(wrong / TURN)  # it may be read without whole turns
+            there[index] = reached[index]
+            others = _error(there, reached, self._scale, step.reward, got.reward) <= self._same
+            yield _Alike(
+                itself=abs(wrong) / self._scale[index] <= self._same,
+                others=others and step.terminated == got.terminated,
+                shown=np.allclose(step.observation, got.observation, atol=1e-6),
+            )
+
+
+def _leaving(counted: Counted, seen: Seen, rng: np.random.Generator) -> float:
+    """Share of the steps from random states within declared limits that lead far outside of them.
+
+    Every second state is a corner of the limits, because a state that runs away most likely does so at an extreme.
+
+    Mechanical variables are not asked: their limits are those of joints.
+    """
+    simulator = counted.simulator
+    limited = [i for i, v in enumerate(simulator.variables) if v.motion == "other" and v.limited]
+    mechanical = any(v.motion in ("slide", "turn", "speed") for v in simulator.variables)
+    if mechanical or not limited:
+        return 0.0
+    low, high = np.array([(simulator.variables[i].low, simulator.variables[i].high) for i in limited], float).T
+    outside = 0
+    for number in range(ANYWHERE):
+        state, share = seen.states[rng.integers(len(seen.states))].copy(), rng.random(len(limited))
+        state[limited] = low + (high - low) * (np.round(share) if number % 2 else share)
+        try:
+            reached, _ = counted.step_from(state, seen.actions[rng.integers(len(seen.actions))])
+        except StepFailed:
+            reached = np.full(len(state), np.inf)
+        inside = (reached[limited] >= 2 * low - high) & (reached[limited] <= 2 * high - low)
+        outside += not inside.all()
+    return outside / ANYWHERE
+
+
+def _replayed(counted: Counted, seen: Seen, scale: Array) -> float:
+    """Repeat the first episode, with its seed and actions."""
+    counted.reset(RESETS)
+    rows = np.flatnonzero(seen.episodes == 0)[:PLACES]
+    errors = []
+    for i in rows:
+        taken = counted.step(seen.actions[i])
+        reached = counted.read()
+        errors.append(_error(reached, seen.next_states[i], scale, taken.reward, float(seen.rewards[i])))
+    return max(errors)
+
+
+def _scale(seen: Seen) -> Array:
+    """Observed range of each variable (V,), followed by that of the reward."""
+    moved = np.append(moved_by(np.concatenate([seen.states, seen.next_states])), np.ptp(seen.rewards))
+    return np.where(moved > 0, moved, 1.0)
+
+
+def _error(reached: Array, wanted: Array, scale: Array, reward: float, wanted_reward: float) -> float:
+    return float((np.abs(np.append(reached - wanted, reward - wanted_reward)) / scale).max())

@@ -1,0 +1,130 @@
+"""Coordinates with their sampling ranges and starts, from what a simulator declares and what random steps reached.
+
+Shapes: n values, V variables of the state, D observation entries.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from surrogym_sampler.original.describing.exploring import Seen
+from surrogym_sampler.original.describing.probing import Probed
+from surrogym_sampler.original.protocol import Array
+from surrogym_sampler.original.simulator import Simulator
+from surrogym_shared.spec import Coordinate, Fixed, Uniform, limits
+
+FASTER = 1.5  # times the largest observed speed: what a policy may reach
+MARGIN = 0.25  # of the observed range, on each side
+SINGLE = 1e-6  # relative error of an observation in single precision
+SHORT_WAY = 0.05  # of the way between two stops; a step that is longer may meet a stop from anywhere
+UNKNOWN_SPEED = 1.0  # of a variable that never moved, in the simulator's unit
+
+
+class Ranges:
+    """The ranges of one simulator's variables, which are given by their indices.
+
+    ``visited``: (n, V) all states of the explored episodes.
+    """
+
+    def __init__(self, simulator: Simulator, seen: Seen, probed: Probed, visited: Array) -> None:
+        self._simulator, self._seen, self._probed, self._visited = simulator, seen, probed, visited
+
+    def coordinate(self, index: int) -> Coordinate:
+        """The coordinate of a variable, with its kind and sampling range."""
+        variable = self._simulator.variables[index]
+        if variable.name in self._probed.turns:
+            circle = Uniform(low=-math.pi, high=math.pi)
+            return Coordinate(name=variable.name, kind="angle", sampling=circle, unit="rad")
+        kind = "constant" if self._is_constant(index) else "linear"
+        low, high = self._range(index, constant=kind == "constant")
+        return Coordinate(name=variable.name, kind=kind, sampling=Uniform(low=low, high=high))
+
+    def start(self, index: int, coordinate: Coordinate) -> Uniform | Fixed:
+        """The range of starts: that of a schedule, or else the seen one. The latter is widened, because the range of n
+        uniform draws is too narrow on average."""
+        if coordinate.name in self._simulator.scheduled:
+            low, high = self._simulator.scheduled[coordinate.name]
+            return Uniform(low=low, high=high) if low < high else Fixed(value=low)
+        if coordinate.kind == "constant" and self._simulator.variables[index].limited:
+            return Uniform(low=limits(coordinate.sampling)[0], high=limits(coordinate.sampling)[1])
+        starts = self._seen.starts[:, index]
+        if coordinate.kind == "angle":
+            starts = _on_an_arc(starts)
+        low, high = float(starts.min()), float(starts.max())
+        if high - low <= 1e-12 * max(1.0, abs(low)):
+            return Fixed(value=low)
+        wider = (high - low) / (len(starts) - 1)
+        if coordinate.kind == "angle" and high - low + 2 * wider >= 2 * math.pi:
+            return Uniform(low=-math.pi, high=math.pi)
+        return Uniform(low=low - wider, high=high + wider)
+
+    def _is_constant(self, index: int) -> bool:
+        """Whether a variable is constant in every episode, and differs between episodes."""
+        variable, seen = self._simulator.variables[index], self._seen
+        if variable.motion in ("slide", "turn", "speed"):
+            return False
+        moved = (seen.states[:, index] != seen.next_states[:, index]).any()
+        return variable.motion == "held" or not moved
+
+    def _range(self, index: int, *, constant: bool) -> tuple[float, float]:
+        """The sampling range of a variable. It ends at the limits with which the environment shows the variable."""
+        low, high = self._reached(index, constant=constant)
+        for shown, ends in zip(self._seen.observations.T, self._shown_limits(), strict=True):
+            within = ends[0] <= self._visited[:, index].min() and self._visited[:, index].max() <= ends[1]
+            if within and np.allclose(shown, self._seen.next_states[:, index], rtol=SINGLE, atol=SINGLE):
+                low, high = max(low, float(ends[0])), min(high, float(ends[1]))
+        return low, high
+
+    def _shown_limits(self) -> Array:
+        """Limits (D, 2) of the observation's entries."""
+        given, entries = self._simulator.shown_limits, self._seen.observations.shape[1]
+        fits = given is not None and given.shape == (entries, 2)
+        return given if given is not None and fits else np.tile([-np.inf, np.inf], (entries, 1))
+
+    def _reached(self, index: int, *, constant: bool) -> tuple[float, float]:
+        """The sampling range of a variable by its own limits, or by what random actions reached."""
+        variable, seen = self._simulator.variables[index], self._visited[:, index]
+        low, high = float(seen.min()), float(seen.max())
+        if variable.motion == "speed":
+            fastest = FASTER * max(abs(low), abs(high)) or UNKNOWN_SPEED
+            return -fastest, fastest
+        pushed = variable.motion == "slide" and not variable.driven  # its limits may be far away
+        trusted = not pushed and (self._probed.stays or constant)
+        if variable.low is not None and variable.high is not None and trusted:
+            if variable.motion in ("slide", "turn"):
+                return self._before_the_stops(index, variable.low, variable.high)
+            return min(low, variable.low), max(high, variable.high)
+        if pushed and variable.limited:
+            near = self._seen.starts[:, index]
+            wider = float(np.ptp(near)) or MARGIN * (high - low)
+            return float(near.min()) - wider, float(near.max()) + wider
+        margin = (0.0 if constant else MARGIN) * (high - low)
+        return low - margin, high + margin
+
+    def _before_the_stops(self, index: int, low: float, high: float) -> tuple[float, float]:
+        """The sampling range of a joint with stops. A step that meets a stop is not smooth.
+
+        The range therefore ends before each stop, by the longest way of one step. It always has all starts. If
+        that way is a large part of the whole, stops are met everywhere, and nothing is left out.
+        """
+        seen, starts = self._seen, self._seen.starts[:, index]
+        way = FASTER * float(np.abs(seen.next_states[:, index] - seen.states[:, index]).max())
+        if way > SHORT_WAY * (high - low):
+            way = 0.0
+        return min(low + way, float(starts.min())), max(high - way, float(starts.max()))
+
+
+def _on_an_arc(angles: Array) -> Array:
+    """The same angles (n,), with whole turns added, so that they lie on the shortest arc that has them all.
+
+    Its middle is within half a turn of 0. Angles near half a turn are read on both sides of the jump there.
+    """
+    turn = 2 * math.pi
+    placed = np.sort(np.mod(angles, turn))
+    gaps = np.diff(np.append(placed, placed[0] + turn))
+    first = placed[(int(gaps.argmax()) + 1) % len(placed)]
+    arc: Array = np.mod(angles - first, turn) + first
+    middle = (arc.min() + arc.max()) / 2
+    return arc - turn * round(float(middle) / turn)

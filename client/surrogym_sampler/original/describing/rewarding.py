@@ -1,0 +1,231 @@
+"""Find a reward that is a quadratic function of coordinates, cosines, sines and the action.
+
+Setpoints and costs of control are of this kind. The fit is
+
+    r = c + b . z + z' A z
+
+by least squares, where z holds coordinates, cosines and sines of angles, and action entries, each centred and scaled.
+
+Shapes: n steps, C coordinates, F action entries, k entries of z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_sampler.original.describing.probing import EXACT
+from surrogym_sampler.original.protocol import Array
+from surrogym_shared.logs.rewards import declared_reward
+from surrogym_shared.spec import BoxAction, DeclaredReward, EnvironmentSpec, Quantity, RewardTerm, Term
+from surrogym_shared.spec.base import MAX_TERM_PARTS
+from surrogym_shared.spec.terms import Part
+from surrogym_shared.terms import evaluate
+
+MOST = 120  # most coefficients of a fit
+ENOUGH = 1.5  # steps for each coefficient
+MOSTLY = 0.9  # share of an episode's steps: a schedule that a state does not show may decide about the others
+TRIMS = 5  # fits to the steps that the fit before explained best
+NOTHING = 1e-10  # size of a term that is rounding, as a share of the reward's range
+
+Timing = Literal["after", "before"]
+
+
+@dataclass(frozen=True)
+class Paid:
+    """Steps with their rewards: q (n, C), u (n, F), q_next (n, C), reward (n,)."""
+
+    q: Array
+    u: Array
+    q_next: Array
+    reward: Array
+
+    def at(self, chosen: slice | NDArray[np.bool_]) -> Paid:
+        return Paid(self.q[chosen], self.u[chosen], self.q_next[chosen], self.reward[chosen])
+
+    def one(self, number: int) -> Paid:
+        return self.at(slice(number, number + 1))
+
+    def before(self) -> Array:
+        """The states (n, C) before the steps."""
+        return self.q
+
+    def after(self) -> Array:
+        """The states (n, C) after the steps."""
+        return self.q_next
+
+    def joined(self, other: Paid) -> Paid:
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Paid(*(np.concatenate(pair) for pair in pairs))
+
+    def __len__(self) -> int:
+        return len(self.reward)
+
+
+def coefficients(spec: EnvironmentSpec) -> int:
+    """Number of coefficients of a fit."""
+    k = len(_quantities(spec))
+    return (k + 1) * (k + 2) // 2
+
+
+def quadratic_reward(spec: EnvironmentSpec, fitted: Paid, checked: Paid) -> DeclaredReward | None:
+    """Fit a reward to some steps, and return it if it explains these and others exactly; None otherwise.
+
+    Args:
+        spec: the environment. Its actions are continuous, or the result is None.
+        fitted: steps for the fit.
+        checked: steps that the fit does not see.
+    """
+    size = float(np.ptp(fitted.reward))
+    enough = ENOUGH * coefficients(spec) <= len(fitted) and coefficients(spec) <= MOST
+    if not (isinstance(spec.action, BoxAction) and enough and size > 0):
+        return None
+    whole = fitted.joined(checked)
+    for timing in ("after", "before"):
+        found = _fitted(spec, fitted, timing, size)
+        if found is not None and error_of(spec, found, whole) <= EXACT * size:
+            return found
+    return None
+
+
+def may_be_quadratic(spec: EnvironmentSpec, steps: Paid) -> bool:
+    """Whether a quadratic function explains most of the rewards exactly."""
+    if not isinstance(spec.action, BoxAction) or not ENOUGH * coefficients(spec) <= MOSTLY * len(steps):
+        return False
+    size, kept = float(np.ptp(steps.reward)), round(MOSTLY * len(steps))
+    if coefficients(spec) > MOST or size == 0:
+        return False
+    for read in (steps.q_next, steps.q):
+        columns = _columns(_scaled(_read(spec, read, steps.u))[0])
+        errors = np.zeros(len(steps))
+        for _ in range(TRIMS):
+            best = np.argsort(errors, kind="stable")[:kept] if errors.any() else np.arange(len(steps))
+            weights = np.linalg.lstsq(columns[best], steps.reward[best], rcond=None)[0]
+            errors = np.abs(columns @ weights - steps.reward)
+        if np.sort(errors)[kept - 1] <= EXACT * size:
+            return True
+    return False
+
+
+def error_of(spec: EnvironmentSpec, reward: DeclaredReward, steps: Paid) -> float:
+    """Largest error of a reward over some steps."""
+    declared = spec.model_copy(update={"reward": reward})
+    ended = np.zeros(len(steps), dtype=bool)
+    return float(np.abs(declared_reward(declared, steps.q, steps.u, steps.q_next, ended) - steps.reward).max())
+
+
+def _fitted(spec: EnvironmentSpec, steps: Paid, timing: Timing, size: float) -> DeclaredReward | None:
+    quantities, x = _quantities(spec), _read(spec, steps.q_next if timing == "after" else steps.q, steps.u)
+    z, centre, reach = _scaled(x)
+    columns = _columns(z)
+    weights = np.linalg.lstsq(columns, steps.reward, rcond=None)[0]
+    if np.abs(columns @ weights - steps.reward).max() > EXACT * size:
+        return None
+    if (fewer := _fewest(_columns(x / reach), steps.reward, EXACT * size)) is not None:
+        weights, centre = fewer, np.zeros_like(centre)
+    c, b, a = _parts(np.where(np.abs(weights) > NOTHING * size, weights, 0.0), z.shape[1])
+    form, b = a / np.outer(reach, reach), b / reach
+    c, b = float(c - b @ centre + centre @ form @ centre), b - 2 * form @ centre
+    b = np.where(np.abs(b) * np.abs(x).max(0) > NOTHING * size, b, 0.0)
+    terms = (*_squares(quantities, a, reach), *_rest(quantities, c if abs(c) > NOTHING * size else 0.0, b))
+    return DeclaredReward(kind="declared", timing=timing, terms=terms) if 0 < len(terms) <= MAX_TERM_PARTS else None
+
+
+def _fewest(columns: Array, reward: Array, tolerance: float) -> Array | None:
+    """Weights of the columns (n, k) that still explain the reward (n,) without many of the others, which are 0.
+
+    Columns are left out one by one, that with the smallest share first. So no rounding remains, and nothing that
+    cancels, such as squares of a cosine and a sine. None if all columns together don't explain the reward.
+    """
+    kept = np.ones(columns.shape[1], dtype=bool)
+
+    def refit() -> Array | None:
+        weights = np.zeros(len(kept))
+        weights[kept] = np.linalg.lstsq(columns[:, kept], reward, rcond=None)[0]
+        return weights if np.abs(columns @ weights - reward).max() <= tolerance else None
+
+    best = refit()
+    if best is None:
+        return None
+    for index in np.argsort(np.abs(best) * np.abs(columns).max(0)):
+        kept[index] = False
+        fewer = refit() if kept.any() else None
+        kept[index] = fewer is None
+        best = best if fewer is None else fewer
+    return best
+
+
+def _read(spec: EnvironmentSpec, q: Array, u: Array) -> Array:
+    """The entries of x at states (n, C) and actions (n, F): (n, k)."""
+    return np.stack([_values(spec, one, q, u) for one in _quantities(spec)], axis=1)
+
+
+def _scaled(x: Array) -> tuple[Array, Array, Array]:
+    """z (n, k), and the centre (k,) and reach (k,) by which x was scaled."""
+    centre, reach = x.mean(0), np.where(np.ptp(x, axis=0) > 0, x.std(0), 1.0)
+    return (x - centre) / reach, centre, reach
+
+
+def _columns(z: Array) -> Array:
+    """1, the entries of z (n, k), and their products."""
+    first, second = np.triu_indices(z.shape[1])
+    return np.concatenate([np.ones((len(z), 1)), z, z[:, first] * z[:, second]], axis=1)
+
+
+def _parts(weights: Array, k: int) -> tuple[float, Array, Array]:
+    """c, b (k,) and the symmetric A (k, k) of the weights of ``_columns``."""
+    a = np.zeros((k, k))
+    a[np.triu_indices(k)] = weights[1 + k :]
+    return float(weights[0]), weights[1 : 1 + k], (a + a.T) / 2
+
+
+def _squares(quantities: Sequence[Quantity], a: Array, reach: Array) -> Iterator[RewardTerm]:
+    """x' A x as squares along the eigenvectors of A (k, k), which is scaled by the reach (k,) of each entry of x."""
+    values, vectors = np.linalg.eigh(a)
+    for value, vector in zip(values, vectors.T, strict=True):
+        if abs(value) > EXACT**2 * np.abs(values).max():
+            direction = np.where(np.abs(vector) > EXACT**2, vector, 0.0) / reach
+            largest = direction[np.abs(direction).argmax()]
+            of = (_sum(quantities, direction / largest),)
+            yield RewardTerm(weight=float(value * largest**2), shape="square", of=of)
+
+
+def _rest(quantities: Sequence[Quantity], c: float, b: Array) -> Iterator[RewardTerm]:
+    """The terms of c + b . x."""
+    if b.any():
+        yield RewardTerm(shape="linear", of=(_sum(quantities, b),))
+    if c:
+        yield RewardTerm(weight=c, shape="one")
+
+
+def _sum(quantities: Sequence[Quantity], weights: Array) -> Quantity:
+    """Weighted sum of quantities."""
+    parts: tuple[Part, ...] = ()
+    action = np.zeros(max(len(one.action) for one in quantities))
+    for one, weight in zip(quantities, weights, strict=True):
+        if weight and one.term is not None:
+            parts += (float(weight) * one.term).parts
+        elif weight:
+            action += weight * np.array(one.action)
+    acting = tuple(map(float, action)) if action.any() else ()
+    return Quantity(term=Term(parts=parts) if parts else None, action=acting)
+
+
+def _quantities(spec: EnvironmentSpec) -> list[Quantity]:
+    """The entries of x: coordinates, cosines and sines of angles, and action entries."""
+    terms: list[Term] = []
+    for coordinate in spec.coordinates:
+        terms.append(Term.linear(**{coordinate.name: 1.0}))
+        if coordinate.kind == "angle":
+            terms += [Term.cos(**{coordinate.name: 1.0}), Term.sin(**{coordinate.name: 1.0})]
+    unit = np.eye(spec.action.size)
+    return [*(Quantity(term=term) for term in terms), *(Quantity(action=tuple(map(float, row))) for row in unit)]
+
+
+def _values(spec: EnvironmentSpec, quantity: Quantity, q: Array, u: Array) -> Array:
+    values = u @ np.array(quantity.action) if quantity.term is None else evaluate(spec, quantity.term, q)
+    return np.asarray(values, dtype=np.float64)

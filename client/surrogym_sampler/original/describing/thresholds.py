@@ -1,0 +1,250 @@
+"""Find a reward of two values that changes at a level of an observation entry, at an ellipsoid or at a box of some.
+
+Bonuses for being near a goal or above a height are of this kind. Bisections between a step with one value and a step
+with the other give points x of the boundary. One end of most bisections is in a random state, so that the points
+lie on all sides. A form is found if all points satisfy
+
+    x_i = level,   or   sum_i ((x_i - c_i) / r_i)^2 = 1
+
+where x holds one to three entries, or if most points have one of a few levels, as on the faces of a box, and if the
+form gives the reward of every other step.
+
+Shapes: n steps, C coordinates, F action entries, K points of the boundary, k entries.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_sampler.original.describing.boxes import LEVEL, MOST_FACES, alone, box, contains, has_face
+from surrogym_sampler.original.describing.probing import EXACT
+from surrogym_sampler.original.describing.rewarding import Paid, Timing, error_of
+from surrogym_sampler.original.protocol import Array
+from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Inequality, Quantity, RewardTerm, Term
+from surrogym_shared.terms import evaluate
+
+SEEK = 200  # most steps from random states that look for the second value
+BATCH = 12
+ENOUGH = 4  # steps with the rarer value, at which bisections begin
+POINTS = 12  # of the boundary: twice the numbers of an ellipsoid of three entries
+HALVINGS = 24
+COARSE = 10  # halvings after which a step is still far enough from the boundary to check a form
+NEAR = 0.02  # of the range of states: how far the end of a bisection moves for a point beside another
+FLAT = 1e-3  # a share of the largest singular value: with one below it, points lie on more than one ellipsoid
+MOST = 5_000  # groups of entries
+READS: dict[Timing, Callable[[Paid], Array]] = {"after": Paid.after, "before": Paid.before}
+
+Steps = Callable[[Array, Array], Paid]  # from states (n, C) with actions (n, F), without those that end an episode
+Drawn = Callable[[int], tuple[Array, Array]]  # n random states (n, C) and actions (n, F)
+
+
+def threshold_reward(spec: EnvironmentSpec, seen: Paid, step: Steps, draw: Drawn) -> DeclaredReward | None:
+    """Find a reward of two values, and return it if it explains all steps; None otherwise.
+
+    Args:
+        spec: the environment.
+        seen: steps so far, of few episodes.
+        step: takes real steps.
+        draw: draws states and actions for further steps.
+    """
+    steps = _with_both_values(seen, step, draw)
+    values, counts = np.unique(steps.reward, return_counts=True)
+    if len(values) != 2:
+        return None
+    rare, usual = (float(value) for value in values[np.argsort(counts)])
+    boundary = _Boundary(steps, len(seen), steps.reward == rare, step)
+    bounds = boundary.more()
+    if len(bounds) < POINTS:
+        return None
+    for found in itertools.chain(_smooth(spec, bounds, steps, rare, usual), _boxes(spec, boundary, steps)):
+        if error_of(spec, found, steps.joined(boundary.passed)) <= EXACT * abs(rare - usual):
+            return found
+    return None
+
+
+def _smooth(spec: EnvironmentSpec, bounds: Paid, steps: Paid, rare: float, usual: float) -> Iterator[DeclaredReward]:
+    """Rewards whose boundary is a level or an ellipsoid."""
+    for timing, reads in READS.items():
+        for group in itertools.islice(_groups(spec), MOST):
+            for inside in regions(spec, group, reads(bounds), reads(steps)):
+                yield _paying(timing, inside, rare, usual)
+                yield _paying(timing, inside, usual, rare)
+
+
+def _boxes(spec: EnvironmentSpec, boundary: _Boundary, steps: Paid) -> Iterator[DeclaredReward]:
+    """Rewards whose boundary has faces. If the points so far share a level, as many are added, and then a neighbour of
+    each that shares none, to find the quantity that has a level there.
+
+    A face that no point meets leaves steps inside whose reward is that of outside. The way to one of them crosses it.
+    """
+    terms, values = _single(spec), np.unique(steps.reward)
+    timings = [time for time, reads in READS.items() if has_face(spec, terms, reads(boundary.points), reads(steps))]
+    if timings:
+        boundary.more()
+    for timing, (within, elsewhere) in itertools.product(timings, (values, values[::-1])):
+        reads = READS[timing]
+        for _ in range(MOST_FACES):
+            boundary.beside(alone(spec, terms, reads(boundary.points), reads(steps)))
+            known = steps.joined(boundary.passed)
+            when = box(spec, terms, reads(boundary.points), reads(known), known.reward == within)
+            if not when:
+                break
+            wrong = np.flatnonzero(contains(spec, when, reads(known)) & (known.reward != within))
+            if not len(wrong):
+                yield _paying(timing, RewardTerm(shape="one", when=when), float(within), float(elsewhere))
+                break
+            boundary.between(known.one(np.flatnonzero(known.reward == within)[0]), known.one(wrong[0]))
+
+
+def _with_both_values(steps: Paid, step: Steps, draw: Drawn) -> Paid:
+    """Take a batch of further steps, and then up to ``SEEK`` until the rarer of two values was met ``ENOUGH`` times."""
+    for taken in range(0, SEEK, BATCH):
+        counts = np.unique(steps.reward, return_counts=True)[1]
+        if len(counts) > 2 or (taken and len(counts) == 2 and counts.min() >= ENOUGH):
+            break
+        steps = steps.joined(step(*draw(min(BATCH, SEEK - taken))))
+    return steps
+
+
+class _Boundary:
+    """Steps next to the boundary, by bisection between steps with the rare value and others.
+
+    The first ``explored`` steps are those of few episodes. All of them that have the rare value may be neighbours, and
+    a small part of a boundary does not tell its form. So one end of most bisections is in a random state.
+    """
+
+    def __init__(self, steps: Paid, explored: int, rare: NDArray[np.bool_], step: Steps) -> None:
+        self.points = self.passed = steps.at(slice(0))  # near the boundary, and on the way to it
+        self._steps, self._step = steps, step
+        self._ends: list[tuple[Paid, Paid]] = []  # of the bisection of each point
+        few, others = ([steps.one(i) for i in _spread(np.flatnonzero(of), explored)] for of in (rare, ~rare))
+        self._paired = 0  # points that have a neighbour, or were tried
+        self._pairs = ((few[n % len(few)], others[(n + n // len(few)) % len(others)]) for n in itertools.count())
+
+    def more(self) -> Paid:
+        """Add at most ``POINTS`` points, of at most twice as many bisections, and return all."""
+        enough = len(self.points) + POINTS
+        for one, other in itertools.islice(self._pairs, 2 * POINTS):
+            self.between(one, other)
+            if len(self.points) == enough:
+                break
+        return self.points
+
+    def beside(self, chosen: NDArray[np.bool_]) -> None:
+        """Add a point near each of some points (K,), once."""
+        width = np.ptp(self._steps.q, axis=0)
+        new = self._paired + np.flatnonzero(chosen[self._paired :])
+        self._paired = len(chosen)
+        for number in new:
+            self.between(*self._ends[number], shift=NEAR * width * np.where(np.arange(len(width)) % 2, 1, -1))
+
+    def between(self, one: Paid, other: Paid, shift: Array | float = 0.0) -> None:
+        """Add a point between two steps with different values. The state of the other one is shifted (C,)."""
+        found = self._bisected(one, other, shift)
+        self.points = self.points.joined(found)
+        self._ends += [(one, other)] * len(found)
+
+    def _bisected(self, one: Paid, other: Paid, shift: Array | float) -> Paid:
+        """The step next to the boundary between two steps, with state and action between theirs. The state of the
+        other step is shifted (C,).
+
+        None if a step ends an episode, or all have the same reward: then one of the two steps can't be repeated
+        exactly, or the shifted end is on the same side.
+        """
+        q, u, q_other, u_other = one.q[0], one.u[0], other.q[0] + shift, other.u[0]
+        last, met = self._steps.at(slice(0)), set[bool]()
+        for number in range(HALVINGS):
+            middle, action = (q + q_other) / 2, (u + u_other) / 2
+            last = self._step(middle[None], action[None])
+            if not len(last):
+                return last
+            if number < COARSE:
+                self.passed = self.passed.joined(last)
+            met.add(same := bool(last.reward[0] == one.reward[0]))
+            if same:
+                q, u = middle, action
+            else:
+                q_other, u_other = middle, action
+        return last if len(met) == 2 else last.at(slice(0))
+
+
+def _spread(chosen: NDArray[np.int64], explored: int) -> NDArray[np.int64]:
+    """Indices of the steps from random states, and then of at most ``POINTS`` explored ones, evenly spread."""
+    near, anywhere = chosen[chosen < explored], chosen[chosen >= explored]
+    return np.append(anywhere, near[np.linspace(0, len(near) - 1, min(POINTS, len(near))).astype(int)])
+
+
+def _groups(spec: EnvironmentSpec) -> Iterator[tuple[Term, ...]]:
+    """Groups of one to three terms whose level may be the boundary, the simplest ones first."""
+    shown = _shown(spec)
+    yield from ((term,) for term in _single(spec))
+    yield from itertools.combinations(shown, 2)
+    yield from itertools.combinations(shown, 3)
+    yield from itertools.combinations([*shown, *_differences(shown)], 2)
+
+
+def _single(spec: EnvironmentSpec) -> list[Term]:
+    """Terms that may be at a level each: what is observed, coordinates, cosines and sines, and differences."""
+    own: list[Term] = []
+    for coordinate in spec.coordinates:
+        own.append(Term.linear(**{coordinate.name: 1.0}))
+        if coordinate.kind == "angle":
+            own += [Term.cos(**{coordinate.name: 1.0}), Term.sin(**{coordinate.name: 1.0})]
+    return [*(shown := _shown(spec)), *own, *_differences(shown)]
+
+
+def _shown(spec: EnvironmentSpec) -> list[Term]:
+    return [entry.term for entry in spec.observation if entry.term.low is None and entry.term.high is None]
+
+
+def _differences(shown: Sequence[Term]) -> list[Term]:
+    return [one + (-1.0) * other for one, other in itertools.combinations(shown, 2)]
+
+
+def regions(spec: EnvironmentSpec, group: Sequence[Term], bounds: Array, states: Array) -> Iterator[RewardTerm]:
+    """Terms that are 1 on one side of the boundary, if the points ``bounds`` (K, C) of it agree.
+
+    ``states`` (n, C) give the size of an entry's range.
+    """
+    x, elsewhere = (np.stack([evaluate(spec, term, q) for term in group], axis=1) for q in (bounds, states))
+    if len(group) == 1 and np.ptp(x) <= LEVEL * np.ptp(elsewhere):
+        level = Inequality(term=group[0], relation=">=", value=float(x.mean()))
+        yield RewardTerm(shape="one", when=(level,))
+    elif (of := _ellipsoid(group, x, elsewhere)) is not None:
+        yield RewardTerm(shape="ball", of=of)
+
+
+def _ellipsoid(group: Sequence[Term], x: Array, elsewhere: Array) -> tuple[Quantity, ...] | None:
+    """The quantities (x_i - c_i) / r_i of an ellipsoid through the points x (K, k), or None.
+
+    None also if other ellipsoids go through them, or if all other states are on it: x holds ``elsewhere`` (n, k) there.
+    A cosine and a sine do this.
+    """
+    middle, reach = x.mean(0), x.std(0)
+    if (reach <= LEVEL * np.ptp(elsewhere, axis=0)).any():
+        return None
+    # 0 is inside of the ellipsoid, so a . z^2 + b . z = 1 on it, where z is centred and scaled
+    columns, others = (np.concatenate([z**2, z], axis=1) for z in ((x - middle) / reach, (elsewhere - middle) / reach))
+    weights, _, rank, _ = np.linalg.lstsq(columns, np.ones(len(x)), rcond=FLAT)
+    a, b = np.split(weights, 2)
+    if rank < len(weights) or np.abs(columns @ weights - 1).max() > LEVEL or a.min() <= LEVEL:
+        return None
+    if np.abs(others @ weights - 1).max() <= LEVEL:
+        return None
+    scale = np.sqrt(a / (1 + (b**2 / (4 * a)).sum())) / reach  # 1 / r
+    centre = middle - reach * b / (2 * a)
+    return tuple(
+        Quantity(term=float(s) * (term + Term.constant(-float(c))))
+        for term, s, c in zip(group, scale, centre, strict=True)
+    )
+
+
+def _paying(timing: Timing, inside: RewardTerm, within: float, elsewhere: float) -> DeclaredReward:
+    """A reward of two values."""
+    bonus = inside.model_copy(update={"weight": within - elsewhere})
+    terms = (bonus, RewardTerm(weight=elsewhere, shape="one")) if elsewhere else (bonus,)
+    return DeclaredReward(kind="declared", timing=timing, terms=terms)

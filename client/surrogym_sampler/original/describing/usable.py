@@ -1,0 +1,68 @@
+"""Refusals of environments that no specification can express, before their real steps where this is possible.
+
+Shapes: n steps, R resets, V variables of the state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_sampler.original.errors import UnknownEnvironment
+from surrogym_sampler.original.protocol import Array
+from surrogym_sampler.original.simulator import Variable
+from surrogym_shared.spec import MAX_DIMENSIONS
+
+OWN_CLASS = "in a class of your own (docs/how-to/own-environment.md)"
+
+
+def require_variables(name: str, variables: Sequence[Variable]) -> None:
+    """Raise ``UnknownEnvironment`` if a state has no numbers."""
+    if not variables:
+        raise UnknownEnvironment(
+            f"{name} shows no state and observes nothing: expected a state of 1 to {MAX_DIMENSIONS} numbers; declare "
+            f"them {OWN_CLASS}"
+        )
+
+
+def require_few(name: str, variables: Sequence[Variable], moved: NDArray[np.bool_]) -> None:
+    """Raise ``UnknownEnvironment`` if too many variables moved, (V,).
+
+    Those that a description may leave out don't count: variables that are held, and slides without limits.
+    """
+    needed = np.array([v.motion != "held" and (v.motion != "slide" or v.limited) for v in variables])
+    _require_at_most(name, int((moved & needed).sum()))
+
+
+def require_numbers(name: str, states: Sequence[Array], rewards: Array) -> None:
+    """Raise ``UnknownEnvironment`` if states, each (n, V), or rewards (n,) are infinite or NaN."""
+    if not all(np.isfinite(some).all() for some in states):
+        raise UnknownEnvironment(f"{name} reached states with infinite values or NaN: expected finite numbers")
+    if not np.isfinite(rewards).all():
+        raise UnknownEnvironment(f"{name} paid infinite rewards or NaN under random actions: expected numbers")
+
+
+def require_coordinates(name: str, count: int, steps: int) -> None:
+    """Raise ``UnknownEnvironment`` if ``count`` variables are no number of coordinates.
+
+    Args:
+        name: of the environment.
+        count: variables that are needed.
+        steps: random steps that showed it.
+    """
+    if not count:
+        raise UnknownEnvironment(
+            f"no variable of {name} differed between resets or moved in {steps} random steps: expected one at least; "
+            f"take more steps (--steps), or declare the coordinates {OWN_CLASS}"
+        )
+    _require_at_most(name, count)
+
+
+def _require_at_most(name: str, count: int) -> None:
+    if count > MAX_DIMENSIONS:
+        raise UnknownEnvironment(
+            f"{name} has {count} variables that move: expected at most {MAX_DIMENSIONS}; choose those that decide what "
+            f"happens next, {OWN_CLASS}"
+        )

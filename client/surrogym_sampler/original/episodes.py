@@ -1,0 +1,283 @@
+"""Whole episodes in an original environment, for evaluation.
+
+Shapes: C coordinates, D observation entries, F action entries.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from surrogym_sampler.original.errors import NotPerturbable, NotSettable, StepFailed
+from surrogym_sampler.original.gymnasium import native_action, opens_task, shows_the_same, task_for, wrapped
+from surrogym_sampler.original.protocol import (
+    Array,
+    Environment,
+    Factory,
+    OriginalEnvironment,
+    RealStep,
+    RolloutEnvironment,
+    runs_in_parallel,
+)
+from surrogym_sampler.original.rollouts import answering
+from surrogym_sampler.original.simulator import Simulated, random_factor
+from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform, limits
+from surrogym_shared.terms import observe
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Results of one step of an episode."""
+
+    observation: Array  # (D,)
+    reward: float
+    terminated: bool
+    coordinates: Array  # (C,)
+    truncated: bool = False  # by the environment itself, which then takes no further step
+
+
+class Episode(ABC):
+    """The running episode of one instance of an environment.
+
+    To begin the next one, call ``perturb`` if needed, then ``reset`` or ``place``, then ``step``.
+    """
+
+    parallel = False  # whether several instances may be open at once
+
+    def __init__(self, spec: EnvironmentSpec) -> None:
+        self.spec = spec
+
+    @abstractmethod
+    def reset(self, seed: int) -> Moment:
+        """Start as the environment does."""
+
+    @abstractmethod
+    def place(self, coordinates: Array) -> Moment:
+        """Start at coordinates (C,)."""
+
+    @abstractmethod
+    def step(self, action: Array) -> Moment:
+        """Apply action (F,)."""
+
+    @abstractmethod
+    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
+        """Multiply the physical attributes by normal factors with mean 1 and deviation sigma."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release what the episode holds."""
+
+    def _shown(self, coordinates: Array) -> Array:
+        """The declared observation (D,)."""
+        shown: Array = observe(self.spec, coordinates[None])[0]
+        return shown
+
+
+class GymnasiumEpisode(Episode):
+    """An episode of a Gymnasium environment with a built-in adapter. Its observation is the environment's own."""
+
+    parallel = True
+
+    def __init__(self, spec: EnvironmentSpec) -> None:
+        super().__init__(spec)
+        self._env = self._open()
+        self._physics = self._read_physics()
+        self._own_observation = shows_the_same(spec)
+
+    def _open(self) -> Any:
+        import gymnasium
+
+        self._task = task_for(self.spec.environment, "default")
+        return gymnasium.make(self.spec.environment).unwrapped
+
+    def _read_physics(self) -> Any:
+        """The attributes that ``perturb`` changes, with their original values."""
+        return {name: getattr(self._env, name) for name in self._task.perturbable}
+
+    def _read(self) -> Array:
+        coordinates: Array = self._task.read(self._env)
+        return coordinates
+
+    def _write(self, coordinates: Array) -> None:
+        self._env.reset(seed=0)
+        self._task.write(self._env, coordinates)
+
+    def reset(self, seed: int) -> Moment:
+        observation, _ = self._env.reset(seed=seed)
+        return self._moment(observation, 0.0, terminated=False)
+
+    def place(self, coordinates: Array) -> Moment:
+        self._write(coordinates)
+        return Moment(self._shown(coordinates), 0.0, False, coordinates)
+
+    def step(self, action: Array) -> Moment:
+        observation, reward, terminated, _, _ = self._env.step(native_action(self.spec.action, action))
+        return self._moment(observation, float(reward), terminated=bool(terminated))
+
+    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
+        for name, value in self._physics.items():
+            setattr(self._env, name, value * random_factor(rng, sigma))
+        if self._task.settle is not None:
+            self._task.settle(self._env)
+
+    def close(self) -> None:
+        self._env.close()
+
+    def _moment(self, observation: Any, reward: float, *, terminated: bool) -> Moment:
+        coordinates = wrapped(self.spec, self._read())
+        shown = np.asarray(observation) if self._own_observation else self._shown(coordinates)
+        return Moment(shown, reward, terminated, coordinates)
+
+
+class SimulatedEpisode(Episode):
+    """An episode of a simulator that an adapter opened. ``perturb`` changes the masses of all bodies.
+
+    Its observation is the environment's own if the built-in specification shows the same.
+    """
+
+    def __init__(self, environment: Simulated) -> None:
+        super().__init__(environment.spec())
+        self._environment = environment
+        self.parallel = runs_in_parallel(environment)
+
+    def reset(self, seed: int) -> Moment:
+        if self._environment.shows_own:
+            observation = self._environment.simulator.reset(seed)
+            return Moment(observation, 0.0, False, self._environment.coordinates())
+        coordinates = self._environment.begin(seed)
+        return Moment(self._shown(coordinates), 0.0, False, coordinates)
+
+    def place(self, coordinates: Array) -> Moment:
+        if not self._environment.simulator.settable:
+            raise NotSettable(f"this environment can't be set to {coordinates.tolist()}: it can only be reset")
+        self._environment.simulator.reset(0)
+        self._environment.place(coordinates)
+        return Moment(self._shown(coordinates), 0.0, False, coordinates)
+
+    def step(self, action: Array) -> Moment:
+        step = self._environment.act(action)
+        reached = np.asarray(step.next_coordinates)
+        shown = self._shown(reached) if step.next_observation is None else np.asarray(step.next_observation)
+        return Moment(shown, step.reward, step.terminated, reached, step.truncated)
+
+    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
+        self._environment.simulator.perturb(rng, sigma)
+
+    def close(self) -> None:
+        self._environment.close()
+
+
+class OwnEpisode(Episode):
+    """An episode of a user's environment."""
+
+    def __init__(self, environment: Environment) -> None:
+        super().__init__(environment.spec())
+        self.parallel = runs_in_parallel(environment)
+
+    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
+        del rng, sigma
+        raise NotPerturbable("only environments with a built-in adapter can be perturbed")
+
+    def _started(self, coordinates: Array) -> Moment:
+        return Moment(self._shown(coordinates), 0.0, False, coordinates)
+
+    def _stepped(self, step: RealStep) -> Moment:
+        reached, reward = np.asarray(step.next_coordinates, dtype=np.float64), float(step.reward)
+        if reached.shape != (size := len(self.spec.coordinates),) or not np.isfinite([*reached, reward]).all():
+            raise StepFailed(
+                f"expected {size} finite coordinates and a finite reward, got {reached.tolist()} and {reward}"
+            )
+        return Moment(self._shown(reached), reward, bool(step.terminated), reached, bool(step.truncated))
+
+
+class RolloutEpisode(OwnEpisode):
+    """An episode of an environment that can't be set to a state."""
+
+    def __init__(self, environment: RolloutEnvironment) -> None:
+        super().__init__(environment)
+        self._environment = environment
+
+    def reset(self, seed: int) -> Moment:
+        return self._started(self._environment.begin(seed))
+
+    def place(self, coordinates: Array) -> Moment:
+        raise NotSettable(f"this environment can't be set to {coordinates.tolist()}: it can only be reset")
+
+    def step(self, action: Array) -> Moment:
+        return self._stepped(self._environment.act(action))
+
+    def close(self) -> None:
+        self._environment.close()
+
+
+class SteppedEpisode(OwnEpisode):
+    """An episode of real steps, each from the end of the one before."""
+
+    def __init__(self, environment: OriginalEnvironment) -> None:
+        super().__init__(environment)
+        self._environment = environment
+        self._at = np.zeros(0)
+
+    def reset(self, seed: int) -> Moment:
+        return self.place(draw(self.spec, np.random.default_rng(seed), wide=False))
+
+    def place(self, coordinates: Array) -> Moment:
+        self._at = coordinates
+        return self._started(coordinates)
+
+    def step(self, action: Array) -> Moment:
+        moment = self._stepped(self._environment.step_from(self._at, action))
+        self._at = moment.coordinates
+        return moment
+
+    def close(self) -> None:
+        self._environment.close()
+
+
+def open_episode(name: str, spec: EnvironmentSpec | None, factory: Factory) -> Episode:
+    """Open an episode of the environment called ``name``. ``factory`` makes the environment if no adapter knows the
+    name."""
+    if opens_task(name, spec):
+        return GymnasiumEpisode(spec or factory().spec())
+    made = factory()
+    if isinstance(made, Simulated):
+        return SimulatedEpisode(made)
+    environment = answering(made)
+    if isinstance(environment, OriginalEnvironment):
+        return SteppedEpisode(environment)
+    return RolloutEpisode(environment)
+
+
+def draw(spec: EnvironmentSpec, rng: np.random.Generator, *, wide: bool, scale: float = 1.0) -> Array:
+    """Draw start coordinates (C,), from the start distribution or from the whole sampling range.
+
+    Args:
+        spec: of the environment.
+        rng: random generator.
+        wide: draw from the sampling range.
+        scale: factor for the distance from the middle of each start distribution; bounds are kept.
+    """
+    if spec.starts and not wide and scale == 1:
+        return np.array(spec.starts[rng.integers(len(spec.starts))])
+    chosen = [c.sampling if wide else spec.start[c.name] for c in spec.coordinates]
+    drawn = np.array([_draw_one(distribution, rng) for distribution in chosen])
+    if scale == 1:
+        return drawn
+    middle = np.array([sum(limits(distribution)) / 2 for distribution in chosen])
+    return wrapped(spec, middle + scale * (drawn - middle))
+
+
+def _draw_one(distribution: Uniform | Normal | Fixed, rng: np.random.Generator) -> float:
+    match distribution:
+        case Fixed():
+            return distribution.value
+        case Uniform():
+            return float(rng.uniform(distribution.low, distribution.high))
+        case Normal():
+            low, high = distribution.limits
+            while not low <= (value := float(rng.normal(distribution.mean, distribution.std))) <= high:
+                pass
+            return value

@@ -1,0 +1,188 @@
+"""The original environment behind a program.
+
+Shapes: C coordinates, F action entries.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from surrogym_sampler.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_sampler.original.executables.messages import (
+    PROTOCOL,
+    Reply,
+    action_entries,
+    number,
+    numbers,
+    specification_in,
+    text,
+    truth,
+)
+from surrogym_sampler.original.executables.program import Program
+from surrogym_sampler.original.gymnasium import wrapped
+from surrogym_sampler.original.protocol import Array, RealStep
+from surrogym_shared.spec import EnvironmentSpec
+
+PREFIX = "exec:"
+MORE_TIME = "a larger --step-limit gives it more time"
+START_LIMIT = 120.0  # seconds until the specification is there; a simulator may start slowly
+
+
+class Executable:
+    """A program that can be reset and acted on. If it dies, hangs or prints something else than an answer, the query
+    fails, and the next query starts it anew, once.
+
+    Args:
+        program: has answered with a specification.
+        own: the specification that it answered with.
+        spec: the specification that is used: its own, or one that a person gave.
+        step_limit: seconds that one step, or one reset, may take.
+    """
+
+    def __init__(self, program: Program, own: EnvironmentSpec, spec: EnvironmentSpec, step_limit: float) -> None:
+        self._program = program
+        self._own = own
+        self._spec = spec
+        self._step_limit = step_limit
+        self._at: Array | None = None
+
+    def spec(self) -> EnvironmentSpec:
+        return self._spec
+
+    def begin(self, seed: int | None = None) -> Array:
+        """Reset the program; the coordinates (C,) it starts at."""
+        self._at = None
+        self._revive()
+        self._at = self._state(self._ask("reset", self._deadline(), seed=seed))
+        return self._at
+
+    def act(self, action: Array) -> RealStep:
+        """Take the next step of the running episode, with action (F,).
+
+        Raises:
+            StepFailed: no episode is running, or the program did not give a step.
+        """
+        before, self._at = self._at, None
+        if before is None:
+            raise StepFailed("expected an action in a running episode, got one after its end or before a reset")
+        step = self._stepped(before, action, self._deadline())
+        if not (step.terminated or step.truncated):
+            self._at = step.next_coordinates  # type: ignore[assignment]  # an array (C,), from _stepped
+        return step
+
+    def save(self) -> bytes:
+        """The program's snapshot: the text that it answered with, as bytes."""
+        return text(self._ask("save", self._deadline()), "snapshot").encode()
+
+    def restore(self, snapshot: bytes) -> Array:
+        """Let the program return to a snapshot; the coordinates (C,) there."""
+        self._at = None
+        self._revive()
+        reply = self._ask("restore", self._deadline(), snapshot=snapshot.decode(errors="replace"))
+        self._at = self._state(reply)
+        return self._at
+
+    def close(self) -> None:
+        """Ask the program to close, and end it if it does not."""
+        self._program.close()
+
+    def _stepped(self, before: Array, action: Array, deadline: float) -> RealStep:
+        sent = action_entries(self._spec.action, action)
+        reply = self._ask("step", deadline, action=sent)
+        return RealStep(
+            coordinates=before,
+            action=numbers(reply if "action" in reply else {"action": sent}, "action", len(sent)),
+            next_coordinates=self._state(reply),
+            reward=number(reply, "reward"),
+            terminated=truth(reply, "terminated"),
+            truncated=truth(reply, "truncated"),
+        )
+
+    def _state(self, reply: dict[str, object]) -> Array:
+        return wrapped(self._spec, numbers(reply, "state", len(self._spec.coordinates)))
+
+    def _revive(self) -> None:
+        """Start the program anew if it has ended. Only a query's first request may do so, because the others depend on
+        the state."""
+        if self._program.running:
+            return
+        try:
+            own = _specification(self._program)
+        except UnknownEnvironment as error:
+            self._program.end()
+            raise EnvironmentDied(f"the program could not be started anew: {error}") from error
+        if own != self._own:
+            self._program.end()
+            raise EnvironmentDied(
+                "expected the same specification from the program that was started anew, got another one"
+            )
+
+    def _ask(self, method: str, deadline: float, **fields: object) -> Reply:
+        try:
+            return self._program.ask(method, deadline, **fields)
+        except StepTimedOut as error:
+            raise StepTimedOut(f"{error}; {MORE_TIME}") from error
+
+    def _deadline(self) -> float:
+        return time.monotonic() + self._step_limit
+
+
+class SettableExecutable(Executable):
+    """A program that can be set to any state as well."""
+
+    def step_from(self, coordinates: Array, action: Array) -> RealStep:
+        """Set the program to coordinates (C,), apply action (F,). Both together have one time limit."""
+        self._revive()
+        deadline = self._deadline()
+        achieved = self._state(self._ask("set", deadline, state=[float(c) for c in coordinates]))
+        return self._stepped(achieved, action, deadline)
+
+
+def is_executable(name: str) -> bool:
+    """Whether a name is ``exec:COMMAND``."""
+    return name.startswith(PREFIX)
+
+
+def name_of(command: str) -> str:
+    """The environment's name of a command."""
+    return f"{PREFIX}{command}"
+
+
+def open_executable(
+    name: str,
+    spec: EnvironmentSpec | None = None,
+    choose: Callable[[EnvironmentSpec], EnvironmentSpec] = lambda spec: spec,
+    step_limit: float = 30.0,
+) -> Executable:
+    """Start the program of ``exec:COMMAND``.
+
+    Args:
+        name: of the environment.
+        spec: replaces the specification that the program declares.
+        choose: changes the specification.
+        step_limit: seconds that one step, or one reset, may take.
+
+    Raises:
+        UnknownEnvironment: the program can't be started, or does not give a specification.
+        ValueError: the choices contradict the specification.
+    """
+    command = name.removeprefix(PREFIX)
+    program = Program(command, grace=step_limit)
+    try:
+        own = _specification(program)
+        chosen = choose(spec or own)
+    except StepFailed as error:
+        program.end()
+        raise UnknownEnvironment(f"expected a specification from {command!r}, got none: {error}") from error
+    except BaseException:
+        program.end()
+        raise
+    kind = Executable if chosen.query == "rollout" else SettableExecutable
+    return kind(program, own, chosen, step_limit)
+
+
+def _specification(program: Program) -> EnvironmentSpec:
+    """Start a program, and return its specification."""
+    program.start()
+    return specification_in(program.ask("spec", time.monotonic() + START_LIMIT, protocol=PROTOCOL))

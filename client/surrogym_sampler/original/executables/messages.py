@@ -1,0 +1,190 @@
+"""Lines of the protocol between this client and a program. Pure functions: docs/how-to/executables.md has the protocol.
+
+Shapes: C coordinates, F action entries.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any, NoReturn
+
+import numpy as np
+from pydantic import ValidationError
+
+from surrogym_sampler.original.errors import RequestRefused, StepFailed, StepRefused, UnknownEnvironment
+from surrogym_sampler.original.protocol import Array
+from surrogym_shared.checks import first_fault
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.spec.actions import Action
+
+PROTOCOL = 1
+LONGEST_LINE = 1 << 24  # bytes, without the end of the line
+SHOWN = 80  # characters of a line that an error repeats
+SHOWN_ERROR = 400  # characters of a program's own error
+
+Reply = dict[str, Any]
+
+
+def encode(number: int, method: str, **fields: object) -> bytes:
+    """Return the line of a request.
+
+    Raises:
+        StepFailed: a number is not finite, or the line is too long.
+    """
+    try:
+        line = json.dumps({"id": number, "method": method, **fields}, allow_nan=False).encode()
+    except ValueError as error:
+        raise StepFailed(f"expected finite numbers for {method}, got {fields}") from error
+    if len(line) > LONGEST_LINE:
+        raise StepFailed(f"expected a request of at most {LONGEST_LINE} bytes, got {len(line)}")
+    return line + b"\n"
+
+
+def decode(line: bytes, number: int) -> Reply:
+    """Return the result in the line that answers request ``number``.
+
+    Raises:
+        RequestRefused: the program answered with an error.
+        StepRefused: its code is "refused".
+        StepFailed: the line is not an answer to this request.
+    """
+    try:
+        answer = json.loads(line, parse_constant=_not_finite, object_pairs_hook=_once)
+    except _NotFinite as error:
+        raise StepFailed(f"expected finite numbers from the program, got {error} in {short(line)}") from error
+    except _Twice as error:
+        raise StepFailed(f"expected each key once from the program, got {error} twice in {short(line)}") from error
+    except (ValueError, RecursionError) as error:
+        raise StepFailed(
+            f"expected one line of JSON from the program, got {short(line)}; let it print everything else to "
+            "standard error"
+        ) from error
+    if not isinstance(answer, dict) or type(answer.get("id")) is not int or answer["id"] != number:
+        raise StepFailed(f"expected an answer with id {number} from the program, got {short(line)}")
+    if answer.get("error") is not None:
+        said, code = one_line(str(answer["error"]), SHOWN_ERROR), one_line(str(answer.get("code", "failed")), SHOWN)
+        words = f"the program answered: {said or 'an error without words'}"
+        raise StepRefused(words) if code == "refused" else RequestRefused(words, code)
+    if not isinstance(answer.get("result"), dict):
+        raise StepFailed(f"expected 'result' or 'error' in the program's answer, got {short(line)}")
+    result: Reply = answer["result"]
+    return result
+
+
+def numbers(reply: Reply, key: str, size: int) -> Array:
+    """Return a list of finite numbers as an array (``size``,).
+
+    Raises:
+        StepFailed: the reply has no such list.
+    """
+    came = reply.get(key)
+    if not isinstance(came, list) or len(came) != size or not all(map(_is_number, came)):
+        raise StepFailed(f"expected {size} finite numbers for {key!r} in the program's answer, got {_got(reply, key)}")
+    return np.array(came, dtype=np.float64)
+
+
+def number(reply: Reply, key: str) -> float:
+    """Return a finite number.
+
+    Raises:
+        StepFailed: the reply has none under this key.
+    """
+    if not _is_number(reply.get(key)):
+        raise StepFailed(f"expected a finite number for {key!r} in the program's answer, got {_got(reply, key)}")
+    return float(reply[key])
+
+
+def truth(reply: Reply, key: str) -> bool:
+    """Return true or false.
+
+    Raises:
+        StepFailed: the reply has neither under this key.
+    """
+    came = reply.get(key)
+    if not isinstance(came, bool):
+        raise StepFailed(f"expected true or false for {key!r} in the program's answer, got {_got(reply, key)}")
+    return came
+
+
+def text(reply: Reply, key: str) -> str:
+    """Return a text.
+
+    Raises:
+        StepFailed: the reply has none under this key.
+    """
+    came = reply.get(key)
+    if not isinstance(came, str):
+        raise StepFailed(f"expected a text for {key!r} in the program's answer, got {_got(reply, key)}")
+    return came
+
+
+def action_entries(space: Action, action: Array) -> list[float] | list[int]:
+    """Return an action (F,) as it is sent: whole numbers if the action is discrete."""
+    if isinstance(space, BoxAction):
+        return [float(entry) for entry in np.atleast_1d(action)]
+    return [int(entry) for entry in np.atleast_1d(action)]
+
+
+def specification_in(reply: Reply) -> EnvironmentSpec:
+    """Return the specification in the answer to ``spec``.
+
+    Raises:
+        UnknownEnvironment: the program has another version of the protocol, or the specification is not valid.
+    """
+    version = reply.get("protocol")
+    if type(version) is not int or version != PROTOCOL:
+        raise UnknownEnvironment(
+            f"expected protocol {PROTOCOL} from the program, got {short(version)}: update surrogym, or start the "
+            f"program with protocol {PROTOCOL}"
+        )
+    try:
+        return EnvironmentSpec.model_validate_json(json.dumps(reply.get("spec")))
+    except ValidationError as error:
+        raise UnknownEnvironment(f"expected a valid specification from the program: {first_fault(error)}") from error
+
+
+def _is_number(value: object) -> bool:
+    try:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # an int beyond the range of a float
+        return False
+
+
+class _Twice(ValueError):
+    """A key that an object has twice: which of the values is meant is unknown."""
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise _Twice(repr(one_line(key, SHOWN)))
+        found[key] = value
+    return found
+
+
+class _NotFinite(ValueError):
+    """NaN or an infinity, which is not JSON."""
+
+
+def _not_finite(constant: str) -> NoReturn:
+    raise _NotFinite(constant)
+
+
+def _got(reply: Reply, key: str) -> str:
+    return short(reply[key]) if key in reply else "nothing"
+
+
+def short(value: object) -> str:
+    """Return a line, or another value, as an error repeats it."""
+    if not isinstance(value, bytes):
+        return one_line(repr(value), SHOWN)
+    return one_line(value.decode(errors="replace"), SHOWN) or ("no printable character" if value else "an empty line")
+
+
+def one_line(text: str, most: int) -> str:
+    """Return the first printable characters of a text, ``most`` at most, in one line."""
+    printable = "".join(c if c.isprintable() else " " for c in text[: 2 * most])
+    line = " ".join(printable.split())
+    return line if len(line) <= most and len(text) <= 2 * most else f"{line[:most]}…"

@@ -1,0 +1,264 @@
+"""One running program: its start, its requests within a time limit, and its end."""
+
+from __future__ import annotations
+
+import os
+import selectors
+import shlex
+import signal
+import subprocess
+import time
+from contextlib import suppress
+
+from surrogym_sampler.original.errors import (
+    EnvironmentDied,
+    RequestRefused,
+    StepFailed,
+    StepRefused,
+    StepTimedOut,
+    UnknownEnvironment,
+)
+from surrogym_sampler.original.executables.guard import Guard
+from surrogym_sampler.original.executables.messages import LONGEST_LINE, Reply, decode, encode, short
+from surrogym_sampler.original.executables.standard_error import StandardError
+
+GRACE_SECONDS = 30.0  # for a running step, after this process was killed
+END_SECONDS = 2.0  # after the request to close, and again after SIGTERM
+CHUNK = 1 << 16  # bytes
+
+
+class Program:
+    """A program that is started without a shell, in a session of its own, so that Ctrl-C does not reach it.
+
+    Its standard error is passed on to that of this process. After a time-out, an end or a line that is no answer, the
+    program is ended, and ``start`` starts it anew. If this process is killed, the program sees the end of its standard
+    input, and is killed some time later.
+
+    Args:
+        command: the program and its arguments, quoted as for a shell.
+        called: what errors call it.
+        grace: seconds that a running step has left after this process was killed.
+
+    Raises:
+        UnknownEnvironment: the command is empty, or its quotes don't match.
+    """
+
+    def __init__(self, command: str, called: str = "the program", grace: float = GRACE_SECONDS) -> None:
+        self._called, self._grace = called, grace
+        try:
+            self._words = shlex.split(command)
+        except ValueError as error:
+            raise UnknownEnvironment(
+                f"expected a command such as './plant --port 7', got {command!r}: {error}"
+            ) from error
+        if not self._words:
+            raise UnknownEnvironment("expected a command such as './plant --port 7', got an empty one")
+        if os.name == "nt":
+            raise UnknownEnvironment("expected Linux or macOS to start a program, got Windows")
+        self._process: subprocess.Popen[bytes] | None = None
+        self._guard: Guard | None = None
+        self._standard_error: StandardError | None = None
+        self._unread = bytearray()
+        self._number = 0  # of the last request
+
+    @property
+    def running(self) -> bool:
+        """Whether the process exists and has not ended."""
+        return self._process is not None and self._process.poll() is None
+
+    def start(self) -> None:
+        """Start the program, and end one that is left.
+
+        Raises:
+            UnknownEnvironment: there is no such program, or it can't be executed.
+        """
+        self.end()
+        try:
+            self._process = subprocess.Popen(
+                self._words,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                bufsize=0,
+                start_new_session=True,
+            )
+            self._guard = Guard(self._process.pid, self._grace)
+        except OSError as error:
+            raise UnknownEnvironment(
+                f"expected a program that can be started, got {self._words[0]!r}: {error}"
+            ) from error
+        self._unread.clear()
+        assert self._process.stdin is not None
+        assert self._process.stderr is not None
+        os.set_blocking(self._process.stdin.fileno(), False)
+        self._standard_error = StandardError(self._process.stderr)
+
+    def ask(self, method: str, deadline: float, **fields: object) -> Reply:
+        """Send one request, and return the result.
+
+        Args:
+            method: what the program shall do.
+            deadline: when the answer must be complete, on the monotonic clock, in seconds.
+            fields: of the request.
+
+        Raises:
+            RequestRefused, StepRefused: the program answered with an error; it keeps running.
+            StepFailed: it died, hung or sent something else; it was ended.
+        """
+        self._number += 1
+        answer = self.exchange(encode(self._number, method, **fields), method, deadline)
+        try:
+            return decode(answer, self._number)
+        except (RequestRefused, StepRefused):
+            raise
+        except StepFailed:
+            self.end()
+            raise
+
+    def exchange(self, line: bytes, what: str, deadline: float) -> bytes:
+        """Send one line, and return the next line that the program prints, without its end.
+
+        Args:
+            line: with its end.
+            what: name of the request, for errors.
+            deadline: when the answer must be complete, on the monotonic clock, in seconds.
+
+        Raises:
+            StepFailed: the program died, hung or printed too long a line; it was ended.
+        """
+        try:
+            self._write(line, what, deadline)
+            return self._read(what, deadline)
+        except StepFailed:
+            self.end()
+            raise
+
+    def surplus(self, seconds: float) -> bytes:
+        """Wait, and return what the program printed beyond its answers."""
+        if self._process is not None and self._process.stdout is not None:
+            with selectors.DefaultSelector() as selector:
+                selector.register(self._process.stdout.fileno(), selectors.EVENT_READ)
+                if selector.select(seconds):
+                    self._unread += os.read(self._process.stdout.fileno(), CHUNK)
+        return bytes(self._unread)
+
+    def end_input(self) -> None:
+        """Close the program's standard input."""
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(OSError):
+                self._process.stdin.close()
+
+    def wait(self, seconds: float) -> int | None:
+        """Return the exit code; None if the program still runs after ``seconds``."""
+        try:
+            return None if self._process is None else self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return None
+
+    def close(self) -> None:
+        """Ask the program to close, and end it if it does not."""
+        process = self._process
+        if process is not None and self.running:
+            assert process.stdin is not None
+            with suppress(OSError, StepFailed):
+                self._write(encode(self._number + 1, "close"), "close", time.monotonic() + END_SECONDS)
+                process.stdin.close()
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(END_SECONDS)
+        self.end()
+
+    def end(self) -> int | None:
+        """End the program, and what it has started, by SIGTERM, then by SIGKILL.
+
+        Returns:
+            Its exit code; None if there was no program.
+        """
+        process, self._process = self._process, None
+        if process is None:
+            return None
+        if self._guard is not None:
+            self._guard.dismiss()
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(process.pid, number)  # the group may outlive the program
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(END_SECONDS)
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                with suppress(OSError):
+                    pipe.close()
+        if self._standard_error is not None:
+            self._standard_error.finish()
+        return process.wait()
+
+    def _write(self, line: bytes, method: str, deadline: float) -> None:
+        process = self._process
+        if process is None or process.stdin is None:
+            raise EnvironmentDied(f"expected a running program for {method}, got none")
+        begun, left = time.monotonic(), memoryview(line)
+        with selectors.DefaultSelector() as selector:
+            selector.register(process.stdin.fileno(), selectors.EVENT_WRITE)
+            while left:
+                if not selector.select(max(0.0, deadline - time.monotonic())):
+                    raise StepTimedOut(
+                        f"{self._called} read {len(line) - len(left)} of {len(line)} bytes of {method} within "
+                        f"{max(0.0, deadline - begun):.3g} s and was ended{self._complaint()}"
+                    )
+                try:
+                    left = left[os.write(process.stdin.fileno(), left) :]
+                except BlockingIOError:
+                    continue
+                except OSError as error:
+                    raise self._death(method, "input") from error
+
+    def _read(self, method: str, deadline: float) -> bytes:
+        assert self._process is not None
+        assert self._process.stdout is not None
+        begun, output = time.monotonic(), self._process.stdout.fileno()
+        searched = 0
+        with selectors.DefaultSelector() as selector:
+            selector.register(output, selectors.EVENT_READ)
+            while (end := self._unread.find(b"\n", searched)) < 0:
+                searched = len(self._unread)
+                if searched > LONGEST_LINE:
+                    raise StepFailed(
+                        f"expected a line of at most {LONGEST_LINE} bytes from the program, got a longer one"
+                    )
+                left = deadline - time.monotonic()
+                if left <= 0 or not selector.select(left):
+                    raise StepTimedOut(
+                        f"{self._called} did not answer {method} within {max(0.0, deadline - begun):.3g} s and was "
+                        f"ended{self._unfinished()}{self._complaint()}"
+                    )
+                if not (chunk := os.read(output, CHUNK)):
+                    raise self._death(method, "output")
+                self._unread += chunk
+        line = bytes(self._unread[:end])
+        del self._unread[: end + 1]
+        return line
+
+    def _unfinished(self) -> str:
+        """What an error says of a line that has begun."""
+        return f"; it printed {short(bytes(self._unread))} without an end of the line" if self._unread else ""
+
+    def _death(self, method: str, closed: str) -> EnvironmentDied:
+        """The error of a program that closed its ``closed``, input or output. It has a moment to end by itself."""
+        code = self.wait(END_SECONDS)
+        printed = self.surplus(0.0)
+        after = f", after it printed {short(printed)}" if printed.strip() else ""
+        self.end()
+        did = f"closed its standard {closed} and was ended" if code is None else f"ended with exit code {_named(code)}"
+        return EnvironmentDied(f"{self._called} {did} during {method}{after}{self._complaint()}")
+
+    def _complaint(self) -> str:
+        """What an error says of the program's standard error."""
+        last = "" if self._standard_error is None else self._standard_error.last_line()
+        return f"; the last line of its standard error: {last}" if last else ""
+
+
+def _named(code: int) -> str:
+    """An exit code, with the signal's name if a signal ended the program."""
+    try:
+        return f"{code} ({signal.Signals(-code).name})" if code < 0 else str(code)
+    except ValueError:  # a real-time signal, which has no name
+        return str(code)

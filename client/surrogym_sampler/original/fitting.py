@@ -1,0 +1,115 @@
+"""Whether a policy that was trained for one specification may act in an environment of another one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+from surrogym_sampler.original.errors import PolicyMisfit
+from surrogym_sampler.original.executables import is_executable
+from surrogym_sampler.original.periods import is_other
+from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
+
+ROUNDING = 1e-6  # share of the larger limit; float32 rounds by less
+
+Range: TypeAlias = tuple[float, float]
+
+
+def check_shape(trained: EnvironmentSpec, own: EnvironmentSpec, called: str) -> None:
+    """Check that another specification has the coordinates and the kind of action that a policy was trained for.
+
+    Args:
+        trained: specification that the policy was trained for.
+        own: the other specification.
+        called: what the message calls it, such as "the environment".
+
+    Raises:
+        PolicyMisfit: they differ.
+    """
+    expected, got = shape_in_words(trained), shape_in_words(own)
+    if expected != got:
+        raise PolicyMisfit(f"{_misfit(trained, called)}: expected {expected}, got {got}")
+
+
+def check_policy(trained: EnvironmentSpec, own: EnvironmentSpec) -> None:
+    """Check that an environment has what a policy was trained for: coordinates, action, observation and
+    sampling period.
+
+    Limits of continuous actions must lie within the environment's, because every action beyond them would be cut off.
+    Bins must be equal, because a policy gives their numbers. How queries begin, ranges and starts may differ.
+
+    Args:
+        trained: specification that the policy was trained for.
+        own: specification of the environment.
+
+    Raises:
+        PolicyMisfit: the environment does not fit.
+    """
+    misfit = _misfit(trained, "the environment")
+    check_shape(trained, own, "the environment")
+    asked, allowed = action_ranges(trained), action_ranges(own)
+    both = zip(asked, allowed, strict=True)
+    if not all(is_within(a, b) and (_bins(own) is None or is_within(b, a)) for a, b in both):
+        raise PolicyMisfit(f"{misfit}: expected actions from {range_in_words(asked)}, got {range_in_words(allowed)}")
+    if is_other(trained.sampling_period, own.sampling_period):
+        raise PolicyMisfit(
+            f"{misfit}: expected a step every {trained.sampling_period:g} s (sampling_period), got "
+            f"{own.sampling_period:g} s"
+        )
+    expected, got = _observation_in_words(trained), _observation_in_words(own)
+    if len(trained.observation) != len(own.observation):
+        raise PolicyMisfit(f"{misfit}: expected observation ({expected}), got ({got})")
+    for a, b in zip(trained.observation, own.observation, strict=True):
+        if a.term != b.term:
+            raise PolicyMisfit(
+                f"{misfit}: expected observation ({expected}), got ({got}), in which {b.name!r} is another "
+                f"term than {a.name!r}"
+            )
+
+
+def action_ranges(spec: EnvironmentSpec) -> list[Range]:
+    """Return the limits of each entry of an action; those of a discrete one are its first and last number."""
+    action = spec.action
+    if isinstance(action, BoxAction):
+        return list(zip(action.low, action.high, strict=True))
+    counts = (action.n,) if isinstance(action, DiscreteAction) else action.nvec
+    return [(0, n - 1) for n in counts]
+
+
+def is_within(asked: Range, allowed: Range) -> bool:
+    """Whether a range lies in another one, apart from rounding. A range with NaN lies in none."""
+    slack = ROUNDING * max(map(abs, allowed))
+    return allowed[0] - slack <= asked[0] and asked[1] <= allowed[1] + slack
+
+
+def range_in_words(ranges: Sequence[Range]) -> str:
+    """Describe the limits of several entries: "[0, -2] to [1, 2]"."""
+    low, high = (", ".join(f"{bound:g}" for bound in bounds) for bounds in zip(*ranges, strict=True))
+    return f"[{low}] to [{high}]"
+
+
+def shape_in_words(spec: EnvironmentSpec) -> str:
+    """Describe coordinates and action: "coordinates (x, v) and a box action of 1"."""
+    bins = _bins(spec)
+    of = "" if bins is None else f" in {', '.join(map(str, bins))} bins"
+    return f"coordinates ({', '.join(spec.coordinate_names)}) and a {spec.action.kind} action of {spec.action.size}{of}"
+
+
+def meant_in_words(spec: EnvironmentSpec) -> str:
+    """Describe which environment a policy is for. A program's command is not repeated: a stranger may have noted it."""
+    name = "a program" if is_executable(spec.environment) else spec.environment or "an environment"
+    return f"{name} with {shape_in_words(spec)}"
+
+
+def _misfit(trained: EnvironmentSpec, called: str) -> str:
+    name = trained.environment
+    meant = "" if not name or is_executable(name) else f", it is for {name}"
+    return f"the policy does not fit {called}{meant}"
+
+
+def _observation_in_words(spec: EnvironmentSpec) -> str:
+    return ", ".join(entry.name for entry in spec.observation)
+
+
+def _bins(spec: EnvironmentSpec) -> tuple[int, ...] | None:
+    return spec.action.bins if isinstance(spec.action, BoxAction) else None

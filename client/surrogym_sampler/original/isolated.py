@@ -1,0 +1,254 @@
+"""An original environment in its own process, so that an error or a hang costs a query and not the worker."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+from surrogym_sampler.original.errors import (
+    RAISED,
+    EnvironmentDied,
+    StepFailed,
+    StepRefused,
+    StepTimedOut,
+    UnknownEnvironment,
+    sentence,
+)
+from surrogym_sampler.original.protocol import Array, Environment, Factory, RealStep
+from surrogym_sampler.original.rollouts import answering
+from surrogym_shared.spec import EnvironmentSpec
+
+START_LIMIT = 120.0  # seconds; importing a simulator may take long
+PARENTS_BUSINESS = (signal.SIGINT, getattr(signal, "SIGHUP", signal.SIGINT))
+CLOSE_LIMIT = 2.0  # seconds, in addition to the limit of a step
+
+
+class IsolatedEnvironment:
+    """An environment whose steps and resets run in a child process, each within a time limit.
+
+    After a step that hung, or a process that died, the next step starts a new environment. In all other cases,
+    including the end of this process, the running step is finished and the environment is closed.
+
+    Args:
+        factory: makes the environment in the child; it must pickle (a module's function, a ``partial``).
+        step_limit: seconds that one step may take.
+
+    Raises (from any method):
+        UnknownEnvironment: the factory failed.
+        StepFailed: the environment raised an error, hung or died; the message says which.
+    """
+
+    def __init__(self, factory: Factory, step_limit: float = 30.0) -> None:
+        self._factory = factory
+        self._step_limit = step_limit
+        self._number = 0  # of the last request
+        self._process: BaseProcess | None = None
+        self._pipe: Connection | None = None
+
+    def spec(self) -> EnvironmentSpec:
+        return EnvironmentSpec.model_validate(self._call("spec", (), self._step_limit))
+
+    def step_from(self, coordinates: Array, action: Array) -> RealStep:
+        step: RealStep = self._call("step_from", (coordinates, action), self._step_limit)
+        return step
+
+    def begin(self, seed: int | None = None) -> Array:
+        start: Array = self._call("begin", (seed,), self._step_limit)
+        return start
+
+    def act(self, action: Array) -> RealStep:
+        step: RealStep = self._call("act", (action,), self._step_limit)
+        return step
+
+    def save(self) -> bytes:
+        snapshot: bytes = self._call("save", (), self._step_limit)
+        return snapshot
+
+    def restore(self, snapshot: bytes) -> Array:
+        at: Array = self._call("restore", (snapshot,), self._step_limit)
+        return at
+
+    def close(self) -> None:
+        """Let the environment finish its step and close. If that takes too long, or at Ctrl-C, it is killed."""
+        try:
+            if self._pipe is not None and self._process is not None and self._process.is_alive():
+                with suppress(StepFailed):
+                    self._call("close", (), self._step_limit + CLOSE_LIMIT)
+        finally:
+            self._kill()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _call(self, method: str, arguments: tuple[Any, ...], limit: float) -> Any:
+        pipe = self._start()
+        self._number += 1
+        try:
+            pipe.send((self._number, method, arguments))
+            answer = _await_answer(pipe, self._number, limit)
+        except (EOFError, OSError) as error:
+            code = self._kill()
+            raise EnvironmentDied(f"the environment's process ended with exit code {code} during {method}") from error
+        if answer is None:
+            self._kill()
+            raise StepTimedOut(f"{method} took longer than {limit:g} s and was killed")
+        ok, value = answer
+        if isinstance(value, StepRefused):
+            raise value
+        if ok is None:
+            assert self._process is not None
+            self._process.join(self._step_limit + CLOSE_LIMIT)  # it closes the environment
+            self._kill()
+            raise EnvironmentDied(f"the environment ended its process during {method}: {value}")
+        if not ok:
+            raise StepFailed(value)
+        return value
+
+    def _start(self) -> Connection:
+        if self._pipe is not None and self._process is not None and self._process.is_alive():
+            return self._pipe
+        self._kill()
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs, self._factory, self._step_limit), daemon=True)
+        self._process.start()
+        theirs.close()
+        try:
+            self._await_start(self._pipe)
+        except KeyboardInterrupt:
+            self._kill()  # nobody read its first message, so ``close`` would read it as an answer
+            raise
+        return self._pipe
+
+    def _await_start(self, pipe: Connection) -> None:
+        try:
+            if not pipe.poll(START_LIMIT):
+                self._kill()
+                raise StepTimedOut(f"the environment took longer than {START_LIMIT:g} s to start")
+            ok, value = pipe.recv()
+        except EOFError as error:
+            raise EnvironmentDied(f"the environment's process ended with exit code {self._kill()}") from error
+        if not ok:
+            self._kill()
+            raise UnknownEnvironment(value)
+
+    def _kill(self) -> int | None:
+        process, self._process = self._process, None
+        pipe, self._pipe = self._pipe, None
+        if pipe is not None:
+            pipe.close()
+        if process is None:
+            return None
+        process.join(0.1)
+        if process.is_alive():
+            process.kill()
+            process.join()
+        return process.exitcode
+
+
+def _await_answer(pipe: Connection, number: int, limit: float) -> tuple[bool | None, Any] | None:
+    """The answer (ok, value) to one request; None after ``limit`` seconds. Answers to earlier requests are skipped."""
+    deadline = time.monotonic() + limit
+    while pipe.poll(max(0.0, deadline - time.monotonic())):
+        answered, ok, value = pipe.recv()
+        if answered == number:
+            return ok, value
+    return None
+
+
+class _Ending:
+    """End of the child on SIGTERM, but not in the middle of a step."""
+
+    def __init__(self) -> None:
+        self._working = self._ending = False
+        signal.signal(signal.SIGTERM, self._end_soon)
+
+    def _end_soon(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        self._ending = True
+        if not self._working:
+            sys.exit()
+
+    def __enter__(self) -> None:
+        self._working = True
+
+    def __exit__(self, *_: object) -> None:
+        self._working = False
+        if self._ending:
+            sys.exit()
+
+
+def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
+    """Main function of the child: one answer (ok, value) for the start, then one for every request.
+
+    What the environment prints goes to standard error, because the output of a command may be JSON.
+    """
+    sys.stdout = sys.stderr
+    for number in PARENTS_BUSINESS:
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_exit_after_parent, args=(step_limit + CLOSE_LIMIT,), daemon=True).start()
+    working = _Ending()
+    with working:
+        try:
+            environment = answering(factory())
+        except RAISED as error:
+            pipe.send((False, sentence(error)))
+            return
+    closed = False
+    try:
+        pipe.send((True, None))
+        while not closed:
+            closed = _serve_one(pipe, environment, working) == "close"
+    except (EOFError, OSError):
+        return  # the parent has ended
+    finally:
+        if not closed:
+            environment.close()
+
+
+def _serve_one(pipe: Connection, environment: Environment, working: _Ending) -> str:
+    """Answer one request, and return its method. Raises ``SystemExit`` if the environment asked for the end."""
+    number, method, arguments = pipe.recv()
+    with working:
+        ok, value = _answer(environment, method, arguments)
+        pipe.send((number, ok, value))
+        if ok is None:
+            sys.exit()  # ``_serve`` closes the environment
+    return str(method)
+
+
+def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -> tuple[bool | None, Any]:
+    """The answer (ok, value). ``ok`` is None if the environment asked for the end of its process, as ``sys.exit``
+    does."""
+    try:
+        value = getattr(environment, method)(*arguments)
+        return True, value.model_dump() if isinstance(value, EnvironmentSpec) else value
+    except StepRefused as refused:
+        return False, StepRefused(str(refused))
+    except Exception as error:
+        return False, sentence(error)
+    except SystemExit as error:
+        return None, sentence(error)
+
+
+def _exit_after_parent(seconds: float) -> None:
+    """Exit some time after the parent has ended, so that the environment can close."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        time.sleep(seconds)
+        os._exit(1)

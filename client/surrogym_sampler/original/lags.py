@@ -1,0 +1,60 @@
+"""Coordinates with their lags, from what an environment reads.
+
+Shapes: C coordinates, of which R are read and the others are lags; F action entries.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from surrogym_sampler.original.gymnasium import wrapped
+from surrogym_sampler.original.protocol import Array
+from surrogym_shared.spec import EnvironmentSpec, limits
+
+
+def read_names(spec: EnvironmentSpec) -> tuple[str, ...]:
+    """Names of the coordinates that the environment itself reads, (R,)."""
+    return tuple(c.name for c in spec.coordinates if c.lag is None)
+
+
+def begun(spec: EnvironmentSpec, read: Array) -> Array:
+    """Coordinates (C,) after a reset that read (R,). No step has been taken, and each other lag has the middle of its
+    declared start.
+
+    Examples:
+        A policy on a machine observes ``surrogym_shared.terms.observe(spec, begun(spec, read)[None])[0]``.
+    """
+    middle = [0.0 if c.counted else sum(limits(spec.start[c.name])) / 2 for c in spec.coordinates]
+    return placed(spec, read, np.array(middle))
+
+
+def followed(spec: EnvironmentSpec, before: Array, action: Array, read: Array) -> Array:
+    """Coordinates (C,) after a step from coordinates ``before`` (C,) under action (F,) that read (R,)."""
+    after = placed(spec, read, before)
+    names = spec.coordinate_names
+    for i, coordinate in enumerate(spec.coordinates):
+        match coordinate.lag:
+            case None:
+                continue
+            case lag if lag.kind == "action":
+                after[i] = action[lag.entry or 0]
+            case lag if lag.kind == "steps":
+                after[i] = before[i] + 1
+            case lag:
+                source = names.index(lag.of or "")
+                after[i] = before[source] if lag.kind == "value" else _change(spec, source, before, after)
+    return wrapped(spec, after)
+
+
+def placed(spec: EnvironmentSpec, read: Array, lags: Array) -> Array:
+    """Coordinates (C,) of what was read (R,), and of lags (C,)."""
+    placed = lags.copy()
+    placed[[c.lag is None for c in spec.coordinates]] = read
+    return wrapped(spec, placed)
+
+
+def _change(spec: EnvironmentSpec, index: int, before: Array, after: Array) -> float:
+    change = float(after[index] - before[index])
+    if spec.coordinates[index].kind == "angle":
+        return (change + np.pi) % (2 * np.pi) - np.pi
+    return change

@@ -1,0 +1,280 @@
+"""Load an original environment by name: an adapter's, or a user's by ``package.module:factory``."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shlex
+import sys
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, Literal
+
+from surrogym_sampler.original.actions import require_same_action
+from surrogym_sampler.original.adapters import adapter_of, is_trusted, open_simulator
+from surrogym_sampler.original.classic import TASKS
+from surrogym_sampler.original.errors import UnknownEnvironment, sentence
+from surrogym_sampler.original.executables import Executable, is_executable, open_executable
+from surrogym_sampler.original.gymnasium import GymnasiumEnvironment, opens_task, task_for
+from surrogym_sampler.original.isolated import IsolatedEnvironment
+from surrogym_sampler.original.mujoco_tasks import SPECIFICATIONS
+from surrogym_sampler.original.periods import period_of, require_period
+from surrogym_sampler.original.protocol import LONGEST_EPISODE, Environment
+from surrogym_sampler.original.rollouts import answering
+from surrogym_sampler.original.simulator import Simulated
+from surrogym_shared.environments import is_name, is_same
+from surrogym_shared.spec import Access, BoxAction, EnvironmentSpec
+
+Preset = Literal["default", "paper"]
+Choose = Callable[[EnvironmentSpec], EnvironmentSpec]
+ACCESS: dict[Access, dict[str, Any]] = {  # fields of a specification
+    "any": {"query": "step", "snapshots": False},
+    "snapshot": {"query": "rollout", "snapshots": True},
+    "reset": {"query": "rollout", "snapshots": False},
+}
+PLACEHOLDER = "YOUR.MODULE:CLASS"  # for an environment whose name nobody noted
+ATTRIBUTES = (
+    *("step_from", "reset", "step", "coordinates", "begin", "act", "save", "restore"),
+    *("picture", "close", "parallel"),
+)
+
+
+def make(
+    name: str,
+    *,
+    spec: EnvironmentSpec | None = None,
+    preset: Preset | None = None,
+    budget: int | None = None,
+    initial: int | None = None,
+    target: float | None = None,
+    acquisition: str | None = None,
+    seed: int | None = None,
+    bins: int | None = None,
+    access: Access | None = None,
+    max_rollout: int | None = None,
+    step_limit: float = 30.0,
+) -> Environment:
+    """Build an original environment.
+
+    Args:
+        name: a Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL``, ``fmu:PLANT.fmu``, ``exec:COMMAND``, or
+            ``package.module:factory``.
+        spec: a specification that replaces the adapter's own; most names have none until ``describe`` writes one.
+        preset, budget, initial, target, acquisition, seed: choices of the design; None keeps the specification's.
+        bins: number of discrete values that replace each dimension of a continuous action for policies.
+        access: where a query may begin: ``any`` state, a ``snapshot`` or a reset, or at a ``reset`` only. None keeps
+            the specification's.
+        max_rollout: the longest of them.
+        step_limit: seconds that one step of ``exec:COMMAND`` or ``fmu:PLANT.fmu`` may take; ``isolated`` limits the
+            others.
+
+    Raises:
+        UnknownEnvironment: no adapter knows the name, or its module or factory can't be found.
+        ValueError: the options contradict the specification.
+
+    Examples:
+        >>> make("CartPole-v1", preset="paper").spec().time_limit
+        200
+    """
+    asked = {"budget": budget, "initial": initial, "target": target, "acquisition": acquisition, "seed": seed}
+    chosen = {key: value for key, value in {"preset": preset, **asked}.items() if value is not None}
+    choose = partial(with_choices, design=chosen, bins=bins, access=access, max_rollout=max_rollout)
+    if is_executable(name):
+        return open_executable(name, spec, choose, step_limit)
+    if is_own(name):
+        return _own(name, _made(name), spec, choose)
+    return _known(name, spec, choose, preset or "default", step_limit)
+
+
+def isolated(
+    name: str, step_limit: float, spec: EnvironmentSpec | None = None
+) -> IsolatedEnvironment | Executable | Simulated:
+    """Build an original environment that runs in a process of its own, where a step has a time limit in seconds."""
+    if is_executable(name):
+        return open_executable(name, spec, step_limit=step_limit)
+    if (adapter := adapter_of(name)) is not None and adapter.separate:
+        made = make(name, spec=spec, step_limit=step_limit)
+        assert isinstance(made, Simulated)
+        return made
+    return IsolatedEnvironment(partial(make, name, spec=spec), step_limit)
+
+
+def is_own(name: str) -> bool:
+    """Whether a name is ``package.module:factory`` or ``exec:COMMAND``, and not an adapter's."""
+    return ":" in name and adapter_of(name) is None
+
+
+def is_known(name: str) -> bool:
+    """Whether a name from a server may be opened without further consent: an adapter knows it, and it runs no user's
+    code."""
+    import gymnasium
+
+    entry = gymnasium.registry.get(name)
+    its_own = entry is not None and str(entry.entry_point).startswith("gymnasium.envs.mujoco.")
+    return name in TASKS or its_own or is_trusted(name)
+
+
+def env_option(name: str) -> str:
+    """Return the option ``--env`` that a suggested command needs, with a space before it. Empty if the environment may
+    be opened by its name alone.
+
+    A program's command is never repeated, because the name may come from a server.
+    """
+    if is_known(name):
+        return ""
+    if is_executable(name):
+        return " --env exec:COMMAND"
+    return f" --env {shlex.quote(name) if is_name(name) else PLACEHOLDER}"
+
+
+def sample_command(surrogate: str, environment: str) -> str:
+    """Return the command that starts a sampler of a surrogate, whose environment has this name."""
+    return f"surrogym sample {surrogate}{env_option(environment)}"
+
+
+def has_specification(name: str) -> bool:
+    """Whether an environment has its own specification, built in or from its class."""
+    return name in TASKS or name in SPECIFICATIONS or adapter_of(name) is None
+
+
+def specification(name: str) -> EnvironmentSpec:
+    """Return the built-in specification of a name.
+
+    Raises:
+        UnknownEnvironment: there is none.
+    """
+    if name in SPECIFICATIONS:
+        return SPECIFICATIONS[name]()
+    known = ", ".join((*TASKS, *SPECIFICATIONS))
+    if adapter_of(name) is None:
+        raise UnknownEnvironment(
+            f"no adapter knows the environment {name!r}: expected one of {known}, another Gymnasium id, "
+            "dm_control:DOMAIN-TASK, pcgym:MODEL, fmu:PLANT.fmu, or package.module:factory"
+        )
+    open_simulator(name).close()
+    raise UnknownEnvironment(
+        f"{name} has no built-in specification (built in: {known}): surrogym describe {name} > env.json writes "
+        "one, and --spec env.json uses it"
+    )
+
+
+def fits(noted: str, name: str) -> bool:
+    """Whether the specification noted for one environment may be used for another that an adapter opens: both are the
+    same, and known or without a specification of its own."""
+    return is_same(noted, name) and (is_known(name) or not has_specification(name))
+
+
+def own_time_limit(name: str) -> int:
+    """Time limit of a known name in steps, from its registration; ``LONGEST_EPISODE`` if it has none."""
+    import gymnasium
+
+    if name in gymnasium.registry:
+        return gymnasium.spec(name).max_episode_steps or LONGEST_EPISODE
+    simulator = open_simulator(name)
+    simulator.close()
+    return simulator.time_limit or LONGEST_EPISODE
+
+
+def with_choices(
+    spec: EnvironmentSpec,
+    design: Mapping[str, Any],
+    bins: int | None = None,
+    access: Access | None = None,
+    max_rollout: int | None = None,
+) -> EnvironmentSpec:
+    """Replace choices of a specification's design, and other options of ``make``, and validate the result.
+
+    Raises:
+        ValueError: they contradict the specification.
+    """
+    fields = spec.model_dump()
+    fields["design"].update(design)
+    if bins is not None:
+        if not isinstance(spec.action, BoxAction):
+            raise ValueError(f"bins need a continuous action, got a {spec.action.kind} one")
+        fields["action"]["bins"] = (bins,) * spec.action.size
+    if access is not None:
+        fields |= ACCESS[access]
+    if max_rollout is not None:
+        fields["max_rollout"] = max_rollout
+    return EnvironmentSpec.model_validate(fields)
+
+
+def load_factory(name: str) -> Any:
+    """Import the factory ``package.module:attribute``. The working directory is searched too."""
+    module_name, _, attribute = name.partition(":")
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        factory = getattr(importlib.import_module(module_name), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UnknownEnvironment(f"expected package.module:factory, got {name!r}: {error}") from error
+    except SystemExit as error:
+        raise UnknownEnvironment(f"{module_name} ended while it was imported: {sentence(error)}") from error
+    if not callable(factory):
+        raise UnknownEnvironment(f"expected {name!r} to be callable, got a {type(factory).__name__}")
+    return factory
+
+
+def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str, step_limit: float) -> Environment:
+    if spec is not None and spec.environment and not is_same(spec.environment, name):
+        raise UnknownEnvironment(
+            f"expected a specification of {name}, got one of {spec.environment}: if it describes {name} as well, write "
+            f'"environment": "{name}" in it'
+        )
+    if opens_task(name, spec):
+        spec = spec and spec.model_copy(update={"environment": name})
+        base = spec or task_for(name, preset).spec()
+        made = choose(base)
+        require_same_action(name, made.action, TASKS[name].spec().action)
+        environment = GymnasiumEnvironment(made)
+        require_period(name, made, environment.period)
+        return environment
+    base = choose(spec or specification(name))
+    own = name in SPECIFICATIONS and SPECIFICATIONS[name]().observation == base.observation
+    simulator = open_simulator(name)
+    try:
+        require_same_action(name, base.action, simulator.action)
+        require_period(name, base, simulator.period)
+        return simulator.with_specification(base, shows_own=own, step_limit=step_limit)
+    except UnknownEnvironment as error:
+        simulator.close()
+        if name not in TASKS:
+            raise
+        raise UnknownEnvironment(
+            f"{error}, or {', '.join(TASKS[name].spec().coordinate_names)} in this order"
+        ) from error
+    except BaseException:
+        simulator.close()
+        raise
+
+
+class _Respecified:
+    """A user's environment whose specification was replaced on the command line."""
+
+    def __init__(self, environment: object, spec: EnvironmentSpec) -> None:
+        self._spec = spec
+        for name in ATTRIBUTES:
+            if hasattr(environment, name):
+                setattr(self, name, getattr(environment, name))
+
+    def spec(self) -> EnvironmentSpec:
+        return self._spec
+
+
+def _made(name: str) -> Any:
+    """Call a user's factory. Raises ``UnknownEnvironment`` if the name has none, or if it ended by ``sys.exit``."""
+    factory = load_factory(name)
+    try:
+        return factory()
+    except SystemExit as error:
+        raise UnknownEnvironment(f"{name} ended while it was made: {sentence(error)}") from error
+
+
+def _own(name: str, made: Any, spec: EnvironmentSpec | None, choose: Choose) -> Environment:
+    if not callable(getattr(made, "spec", None)):
+        return answering(made)  # its error says what is missing
+    own = made.spec()
+    given = choose(spec or own)
+    require_period(name, given, period_of(made))
+    return answering(made if given == own else _Respecified(made, given))

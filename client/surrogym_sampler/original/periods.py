@@ -1,0 +1,39 @@
+"""Sampling period of an environment: the seconds from one step to the next."""
+
+from __future__ import annotations
+
+from math import isclose
+
+from surrogym_sampler.original.errors import UnknownEnvironment
+from surrogym_shared.spec import EnvironmentSpec
+
+NAMES = ("sampling_period", "dt")  # of attributes, and of entries of ``metadata``
+CLOSE = 1e-3  # relative
+
+
+def period_of(environment: object) -> float | None:
+    """Return the period in seconds that an environment has as an attribute or in its ``metadata``, such as MuJoCo's
+    ``dt``; None if it has none."""
+    metadata = getattr(environment, "metadata", None)
+    noted = metadata if isinstance(metadata, dict) else {}
+    found = [value for name in NAMES for value in (getattr(environment, name, None), noted.get(name))]
+    numbers = (float(value) for value in found if isinstance(value, int | float) and not isinstance(value, bool))
+    return next((number for number in numbers if number > 0), None)
+
+
+def is_other(one: float | None, other: float | None) -> bool:
+    """Whether two periods are known and differ by more than rounding."""
+    return one is not None and other is not None and not isclose(one, other, rel_tol=CLOSE)
+
+
+def require_period(name: str, spec: EnvironmentSpec, own: float | None) -> None:
+    """Check that an environment with its ``own`` period has the one that its specification declares, if both are known.
+
+    Raises:
+        UnknownEnvironment: they differ.
+    """
+    if is_other(own, spec.sampling_period):
+        raise UnknownEnvironment(
+            f"expected {name} to take a step every {spec.sampling_period:g} s, as its specification declares by "
+            f"sampling_period, got {own:g} s"
+        )

@@ -1,0 +1,170 @@
+"""Environments that can only be reset and acted on, as the sampler uses them."""
+
+from __future__ import annotations
+
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from surrogym_sampler.original.errors import StepFailed, UnknownEnvironment
+from surrogym_sampler.original.gymnasium import native_action
+from surrogym_sampler.original.lags import begun, followed, placed, read_names
+from surrogym_sampler.original.protocol import (
+    Array,
+    Environment,
+    OriginalEnvironment,
+    RealStep,
+    ResettableEnvironment,
+    RolloutEnvironment,
+    SnapshotEnvironment,
+    runs_in_parallel,
+)
+from surrogym_shared.spec import EnvironmentSpec
+
+KINDS = (("spec", "step_from", "close"), ("spec", "reset", "step", "coordinates", "close"))  # methods that each needs
+
+
+class FromReset:
+    """A ``ResettableEnvironment`` as a ``RolloutEnvironment``: each step begins where the one before ended.
+
+    The environment reads R coordinates; the others are lags of these and of the actions.
+    """
+
+    def __init__(self, environment: ResettableEnvironment) -> None:
+        self._environment = environment
+        self._spec = environment.spec()
+        self._at: Array | None = None
+        size = len(self._spec.coordinates)
+        self._prefix = 8 * size if size > len(read_names(self._spec)) else 0  # bytes of coordinates in a snapshot
+        self.parallel = runs_in_parallel(environment)
+
+    def spec(self) -> EnvironmentSpec:
+        return self._spec
+
+    def begin(self, seed: int | None = None) -> Array:
+        """Reset the environment; the coordinates (C,) it starts at.
+
+        Raises:
+            StepFailed: ``reset`` gives no pair, or ``coordinates`` no (R,).
+        """
+        self._at = None
+        first: Any = self._environment.reset(seed=seed)
+        if not isinstance(first, tuple) or len(first) != 2:
+            raise StepFailed(f"expected (observation, info) of reset, got a {type(first).__name__}")
+        self._at = begun(self._spec, self._read(first[0]))
+        return self._at
+
+    def act(self, action: Array) -> RealStep:
+        """Apply action (F,).
+
+        Raises:
+            StepFailed: no episode is running, or ``coordinates`` gives no (R,).
+        """
+        if self._at is None:
+            raise StepFailed("expected an action in a running episode, got one after its end or before a reset")
+        before, self._at = self._at, None
+        native = native_action(self._spec.action, action)
+        observation, reward, terminated, truncated, _ = self._environment.step(native)
+        taken = np.atleast_1d(np.asarray(native, dtype=np.float64))
+        reached = followed(self._spec, before, taken, self._read(observation))
+        if not (terminated or truncated):
+            self._at = reached
+        return RealStep(
+            coordinates=before,
+            action=taken,
+            next_coordinates=reached,
+            reward=float(reward),
+            terminated=bool(terminated),
+            truncated=bool(truncated),
+        )
+
+    def save(self) -> bytes:
+        """The whole state, in the environment's own form. With lags, which it does not know, coordinates come first.
+
+        Raises:
+            StepFailed: the environment's form is not bytes, or with lags no episode is running.
+        """
+        snapshot: Any = _saving(self._environment).save()
+        if not isinstance(snapshot, bytes):
+            raise StepFailed(f"expected bytes from save, got a {type(snapshot).__name__}")
+        if not self._prefix:
+            return snapshot
+        if self._at is None:
+            raise StepFailed("expected a running episode to save with its lags, got none")
+        return self._at.astype("<f8").tobytes() + snapshot
+
+    def restore(self, snapshot: bytes) -> Array:
+        """Return to the state of a snapshot; the coordinates (C,) there.
+
+        Raises:
+            StepFailed: the snapshot is too short for its lags, or ``coordinates`` gives no (R,).
+        """
+        self._at = None
+        if len(snapshot) < self._prefix:
+            raise StepFailed(f"expected a snapshot of at least {self._prefix} bytes, got {len(snapshot)}")
+        read = self._read(_saving(self._environment).restore(snapshot[self._prefix :]))
+        before = np.frombuffer(snapshot[: self._prefix], dtype="<f8") if self._prefix else np.zeros(len(read))
+        self._at = placed(self._spec, read, before)
+        return self._at
+
+    def close(self) -> None:
+        self._environment.close()
+
+    def _read(self, observation: Any) -> Array:
+        read = np.asarray(self._environment.coordinates(observation), dtype=np.float64)
+        names = read_names(self._spec)
+        if read.shape != (len(names),):
+            raise StepFailed(f"expected coordinates ({', '.join(names)}), got an array of shape {read.shape}")
+        return read
+
+
+def _saving(environment: object) -> SnapshotEnvironment:
+    """Return the environment if it has ``save`` and ``restore``. Raises ``StepFailed`` otherwise."""
+    if not isinstance(environment, SnapshotEnvironment):
+        raise StepFailed("expected the methods save and restore for snapshots, got an environment without them")
+    return environment
+
+
+def _only_resets(environment: object) -> TypeGuard[ResettableEnvironment]:
+    if isinstance(environment, RolloutEnvironment) or not isinstance(environment, ResettableEnvironment):
+        return False
+    return environment.spec().query == "rollout" or not isinstance(environment, OriginalEnvironment)
+
+
+def answering(environment: object) -> Environment:
+    """Adapt an environment to the kind of query that its specification declares."""
+    _check_snapshots(environment)
+    if _only_resets(environment):
+        environment = FromReset(environment)
+    if not isinstance(environment, (OriginalEnvironment, RolloutEnvironment)):
+        raise UnknownEnvironment(
+            "expected an object with spec, step_from and close, or with spec, reset, step, coordinates and close, "
+            f"got a {type(environment).__name__} without {_missing(environment)}"
+        )
+    query = environment.spec().query
+    needed, methods = (
+        (RolloutEnvironment, "reset, step and coordinates")
+        if query == "rollout"
+        else (OriginalEnvironment, "step_from")
+    )
+    if not isinstance(environment, needed):
+        raise UnknownEnvironment(
+            f"its specification declares query={query!r}, which needs {methods}: some of them are missing"
+        )
+    return environment
+
+
+def _missing(environment: object) -> str:
+    """Name the methods that an object lacks of the kind of environment to which it is nearest: the one of which it
+    lacks fewest, and of two such the one of which it has more."""
+    lacking = [[name for name in names if not callable(getattr(environment, name, None))] for names in KINDS]
+    nearest = min(range(len(KINDS)), key=lambda kind: (len(lacking[kind]), -len(KINDS[kind])))
+    return " and ".join(lacking[nearest])
+
+
+def _check_snapshots(environment: object) -> None:
+    declared = callable(getattr(environment, "spec", None)) and environment.spec().snapshots  # type: ignore[attr-defined]
+    if declared and not isinstance(environment, SnapshotEnvironment):
+        raise UnknownEnvironment(
+            "its specification declares snapshots, which need the methods save and restore: some of them are missing"
+        )

@@ -1,0 +1,285 @@
+"""Samplers as actors of a Ray cluster. Ray starts an actor again when its process or machine dies."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from typing import Any
+from uuid import uuid4
+
+from surrogym_client.errors import SurrogymClientError
+from surrogym_client.transport.api import Api
+from surrogym_sampler.original.errors import OriginalError
+from surrogym_sampler.original.loading import isolated
+from surrogym_sampler.queries.settings import Outcome, SamplerReport, SamplerSettings
+from surrogym_sampler.queries.worker import Sampler
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import Query
+
+IDLE_SECONDS = 5.0  # of one claim: a sampler that is to stop ends after it
+LOOK_SECONDS = 1.0  # between two looks at the samplers
+STOP_SECONDS = 15.0  # in addition to the limit of a step, for samplers that were told to stop
+NO_MODULE = "No module named "
+WITHOUT_CODE = (
+    "; install it on each machine of the cluster, or bring it by --runtime-env FILE, a YAML file with working_dir: ."
+)
+NOTHING = SamplerReport(answered=0, failed=0, dropped=0, refused=0, impossible=0, steps=0, seconds=0.0, phase=None)
+
+
+@dataclass(frozen=True)
+class SamplerPlan:
+    """What each sampler of a cluster works on. It is sent to the machines of the cluster.
+
+    ``environment``: a name that ``isolated`` opens; its modules have to be importable there. ``spec`` replaces the
+    environment's own. ``step_limit``: seconds of one real step.
+    """
+
+    url: str
+    token: str | None = field(repr=False)
+    surrogate: str
+    environment: str
+    spec: EnvironmentSpec | None
+    step_limit: float
+    settings: SamplerSettings
+    version: str = field(default_factory=lambda: version("surrogym"))
+
+
+@dataclass(frozen=True)
+class Line:
+    """One answered or failed query, in words."""
+
+    text: str
+    is_error: bool
+
+
+@dataclass(frozen=True)
+class Look:
+    """How far a sampler is. ``start`` differs after each start; ``lines`` are those since the last look."""
+
+    start: str
+    host: str
+    process: int
+    report: SamplerReport
+    lines: tuple[Line, ...] = ()
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a sampler ended: by itself or by ``stop``, or with an error."""
+
+    look: Look
+    error: str | None = None
+
+
+def line_of(query: Query, outcome: Outcome, error: str) -> str:
+    """Return what happened to a query, as one line."""
+    asked = f", {len(query.actions)} steps" if query.kind == "rollout" else ""
+    return f"query {query.id} ({query.purpose}{asked}) {outcome}{': ' if error else ''}{error}"
+
+
+class SamplerActor:
+    """One sampler, in a process of the cluster. ``look`` and ``stop`` are called while ``run`` runs."""
+
+    def __init__(self, plan: SamplerPlan) -> None:
+        self._plan = plan
+        self._start = uuid4().hex
+        self._lines: list[Line] = []
+        self._sampler: Sampler | None = None
+        self._stopped = False
+
+    def run(self) -> Ended:
+        """Answer queries until the plan's settings end it, or ``stop`` is called."""
+        plan = self._plan
+        if (here := version("surrogym")) != plan.version:
+            wrong = f"expected surrogym {plan.version} on every machine of the cluster, got {here} on {platform.node()}"
+            return Ended(self.look(), wrong)
+        try:
+            with (
+                Api(plan.url, plan.token) as api,
+                closing(isolated(plan.environment, plan.step_limit, plan.spec)) as environment,
+            ):
+                self._sampler = Sampler(api, plan.surrogate, environment, plan.settings, self._note)
+                if self._stopped:
+                    self._sampler.stop()
+                self._sampler.run()
+        except (SurrogymClientError, OriginalError) as error:
+            return Ended(self.look(), f"{error}{WITHOUT_CODE if NO_MODULE in str(error) else ''}")
+        return Ended(self.look())
+
+    def look(self) -> Look:
+        report = NOTHING if self._sampler is None else self._sampler.summary()
+        lines, self._lines = self._lines, []
+        return Look(self._start, platform.node(), os.getpid(), report, tuple(lines))
+
+    def stop(self) -> None:
+        """End ``run`` after the running step, or after a claim that waits."""
+        self._stopped = True
+        if self._sampler is not None:
+            self._sampler.stop()
+
+    def _note(self, query: Query, outcome: Outcome, error: str) -> None:
+        self._lines.append(Line(line_of(query, outcome, error), bool(error)))
+
+
+@dataclass
+class _Member:
+    """One sampler as this process knows it."""
+
+    name: str
+    actor: Any
+    run: Any  # reference of its end
+    asked: Any  # reference of the look that it owes
+    reports: dict[str, SamplerReport] = field(default_factory=dict)  # of each start, the last one known
+
+
+@dataclass(frozen=True)
+class News:
+    """What a look at the samplers has found."""
+
+    lines: tuple[Line, ...]
+    over: bool  # no sampler is left
+
+
+class RaySamplers:
+    """Samplers in the cluster that this process is connected to. They end when this process ends, however it ends.
+
+    Args:
+        plan: what each of them does. The number of the sampler is added to ``settings.name``.
+        count: number of samplers.
+        resources: what each takes of the cluster, by Ray's names: ``CPU``, ``GPU``, ``memory`` or a name of one's own.
+
+    Raises:
+        ValueError: Ray refuses the resources.
+    """
+
+    def __init__(self, plan: SamplerPlan, count: int, resources: Mapping[str, float]) -> None:
+        import ray
+
+        self._ray: Any = ray
+        self._step_limit = plan.step_limit
+        self.errors: list[str] = []
+        self._needs = {"CPU": 1.0, **resources}
+        self.takes = amounts(self._needs)
+        options = {**_options(resources), "max_restarts": -1, "max_concurrency": 4}
+        made: Any = ray.remote(SamplerActor).options(**options)
+        self._members: list[_Member] = []
+        for number in range(count):
+            name = f"{plan.settings.name}-{number}"[-128:]
+            settings = replace(plan.settings, name=name, wait_seconds=IDLE_SECONDS)
+            actor: Any = made.remote(replace(plan, settings=settings))
+            self._members.append(
+                _Member(name, actor, actor.run.options(max_task_retries=-1).remote(), actor.look.remote())
+            )
+        self._running = list(self._members)
+
+    @property
+    def running(self) -> int:
+        """Number of samplers that have not ended, with those that wait for room."""
+        return len(self._running)
+
+    @property
+    def waiting(self) -> int:
+        """Number of samplers that have not begun yet."""
+        return sum(not member.reports for member in self._running)
+
+    def lacking(self) -> dict[str, float]:
+        """Return what the cluster has free of each resource that it has too little of for one sampler."""
+        free: dict[str, float] = self._ray.available_resources()
+        return {name: free.get(name, 0.0) for name, amount in self._needs.items() if free.get(name, 0.0) < amount}
+
+    @property
+    def restarts(self) -> int:
+        """How often a sampler was started again."""
+        return sum(max(0, len(member.reports) - 1) for member in self._members)
+
+    def look(self, seconds: float = LOOK_SECONDS) -> News:
+        """Wait until a sampler has ended, ``seconds`` at most, and return what is new."""
+        lines: list[Line] = []
+        ended, _ = self._ray.wait([member.run for member in self._running], timeout=seconds, fetch_local=False)
+        for member in self._running:
+            done, _ = self._ray.wait([member.asked], timeout=0)
+            if done:
+                lines += self._heard(member)
+        for member in [member for member in self._running if member.run in ended]:
+            lines += self._ended(member)
+        return News(tuple(lines), not self._running)
+
+    def stop(self) -> None:
+        """Let each sampler finish its running step and give its other queries back. End those that do not."""
+        for member in self._running:
+            member.actor.stop.remote()
+        deadline = time.monotonic() + self._step_limit + STOP_SECONDS
+        try:
+            while any(member.reports for member in self._running) and time.monotonic() < deadline:
+                self.look()
+        finally:
+            self.end()
+
+    def end(self) -> None:
+        """End all samplers at once."""
+        for member in self._members:
+            self._ray.kill(member.actor, no_restart=True)
+        self._running = []
+
+    def report(self) -> SamplerReport:
+        """Return the sum of all reports. Of a process that died, its last second may be missing."""
+        all_reports = [report for member in self._members for report in member.reports.values()]
+        phases = [report.phase for report in all_reports if report.phase is not None]
+        return SamplerReport(
+            answered=sum(report.answered for report in all_reports),
+            failed=sum(report.failed for report in all_reports),
+            dropped=sum(report.dropped for report in all_reports),
+            refused=sum(report.refused for report in all_reports),
+            impossible=sum(report.impossible for report in all_reports),
+            steps=sum(report.steps for report in all_reports),
+            seconds=max((report.seconds for report in all_reports), default=0.0),
+            phase=phases[-1] if phases else None,
+        )
+
+    def _heard(self, member: _Member) -> Sequence[Line]:
+        owed, member.asked = member.asked, member.actor.look.remote()
+        with suppress(self._ray.exceptions.RayError):  # one that has died owes no look
+            return _noted(member, self._ray.get(owed))
+        return ()
+
+    def _ended(self, member: _Member) -> Sequence[Line]:
+        self._running.remove(member)
+        try:
+            ended: Ended = self._ray.get(member.run)
+        except self._ray.exceptions.RayError as error:
+            said = (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()
+            self.errors.append(f"{member.name}: {said}")
+            return (Line(self.errors[-1], True),)
+        lines = _noted(member, ended.look)
+        if ended.error is None:
+            return lines
+        self.errors.append(f"{member.name} on {ended.look.host}: {ended.error}")
+        return [*lines, Line(self.errors[-1], True)]
+
+
+def _noted(member: _Member, look: Look) -> list[Line]:
+    """Keep the report of a look, and return its lines. The first look at a process also says where it runs."""
+    lines = list(look.lines)
+    if look.start not in member.reports:
+        again = bool(member.reports)
+        begun = "was started again" if again else "runs"
+        lines.insert(0, Line(f"{member.name} {begun} on {look.host}, process {look.process}", again))
+    member.reports[look.start] = look.report
+    return lines
+
+
+def amounts(resources: Mapping[str, float]) -> str:
+    """Return resources in the form of ``--ray-resources``."""
+    return ", ".join(f"{name}={amount:g}" for name, amount in resources.items())
+
+
+def _options(resources: Mapping[str, float]) -> dict[str, Any]:
+    """Options of an actor: Ray has names of its own for some resources."""
+    own = {"CPU": "num_cpus", "GPU": "num_gpus", "memory": "memory"}
+    options: dict[str, Any] = {own[name]: amount for name, amount in resources.items() if name in own}
+    return {"num_cpus": 1, **options, "resources": {name: resources[name] for name in resources if name not in own}}

@@ -1,0 +1,90 @@
+"""Check the server's queries against the limits of the original environment's own specification."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from surrogym_sampler.original.errors import QueryRefused, UnknownEnvironment
+from surrogym_sampler.original.fitting import Range, action_ranges, is_within, range_in_words
+from surrogym_sampler.original.periods import is_other
+from surrogym_shared.spec import MAX_ROLLOUT_QUERY, Access, BoxAction, EnvironmentSpec
+from surrogym_shared.spec import limits as sampled
+from surrogym_shared.wire import Query, StepQuery
+
+IN_WORDS: dict[Access, str] = {"any": "any state", "snapshot": "snapshots", "reset": "resets alone"}
+
+
+def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSpec) -> None:
+    """Check that an environment fits a surrogate: coordinates, action, kind of query, and ranges within its own.
+
+    Raises:
+        UnknownEnvironment: the environment does not fit.
+    """
+    expected, got = _shape(asked), _shape(own)
+    if expected != got:
+        raise UnknownEnvironment(
+            f"the environment does not fit surrogate {surrogate!r}: expected {expected}, got {got}"
+        )
+    if is_other(asked.sampling_period, own.sampling_period):
+        raise UnknownEnvironment(
+            f"the environment does not fit surrogate {surrogate!r}: expected a step every {asked.sampling_period:g} s "
+            f"(sampling_period), got {own.sampling_period:g} s"
+        )
+    _check_ranges("actions", action_ranges(asked), action_ranges(own))
+    _check_ranges("coordinates", [sampled(c.sampling) for c in asked.coordinates], _coordinate_ranges(own))
+
+
+def check_query(own: EnvironmentSpec, query: Query) -> None:
+    """Check a query against the environment's own specification, before its first step.
+
+    A coordinate may be anywhere within its bounds or, on a side without a bound, within its sampling range.
+
+    Raises:
+        QueryRefused: the environment does not allow the query.
+    """
+    if query.kind != own.query:
+        raise QueryRefused(f"expected a {own.query} query, got a {query.kind} query")
+    if isinstance(query, StepQuery):
+        names = [f"coordinate {name!r}" for name in own.coordinate_names]
+        _check_values("coordinates", names, query.coordinates, _coordinate_ranges(own))
+        _check_action(own, query.action)
+        return
+    if query.snapshot is not None and not own.snapshots:
+        raise QueryRefused("expected a query that begins at a reset, got one that begins at a snapshot")
+    longest = own.max_rollout or own.time_limit or MAX_ROLLOUT_QUERY
+    if not 1 <= len(query.actions) <= longest:
+        raise QueryRefused(f"expected a rollout of 1 to {longest} actions, got {len(query.actions)}")
+    for action in query.actions:
+        _check_action(own, action)
+
+
+def _check_action(own: EnvironmentSpec, action: Sequence[float]) -> None:
+    _check_values("action", [f"action {i}" for i in range(own.action.size)], action, action_ranges(own))
+    if not isinstance(own.action, BoxAction) and not all(float(value).is_integer() for value in action):
+        raise QueryRefused(f"expected the numbers of discrete actions, got {list(action)}")
+
+
+def _check_values(what: str, names: Sequence[str], values: Sequence[float], ranges: Sequence[Range]) -> None:
+    if len(values) != len(ranges):
+        raise QueryRefused(f"{what}: expected {len(ranges)} numbers, got {len(values)}")
+    for name, value, allowed in zip(names, values, ranges, strict=True):
+        if not is_within((value, value), allowed):
+            raise QueryRefused(f"{name}: expected a value in [{allowed[0]:g}, {allowed[1]:g}], got {value:g}")
+
+
+def _check_ranges(what: str, asked: Sequence[Range], own: Sequence[Range]) -> None:
+    if not all(map(is_within, asked, own)):
+        raise UnknownEnvironment(
+            f"the surrogate's {what} are not the environment's: expected {what} from {range_in_words(own)}, "
+            f"got {range_in_words(asked)}; register it under another name"
+        )
+
+
+def _coordinate_ranges(spec: EnvironmentSpec) -> list[Range]:
+    return [coordinate.settable for coordinate in spec.coordinates]
+
+
+def _shape(spec: EnvironmentSpec) -> str:
+    names = ", ".join(spec.coordinate_names)
+    access = IN_WORDS[spec.access]
+    return f"coordinates ({names}), a {spec.action.kind} action of {spec.action.size}, and access to {access}"

@@ -1,0 +1,202 @@
+"""Saves the states of an environment, and returns to them."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.transport.api import Api
+from surrogym_sampler.original.errors import (
+    EnvironmentDied,
+    SnapshotGone,
+    SnapshotNotKept,
+    StepFailed,
+    StepTimedOut,
+    sentence,
+)
+from surrogym_sampler.original.protocol import Array, Environment, SnapshotEnvironment
+from surrogym_sampler.queries.settings import SamplerSettings
+from surrogym_sampler.queries.snapshots import SnapshotFolder
+from surrogym_shared.spec import EnvironmentSpec, limits
+
+MOST_HANGS = 2  # of ``save`` in a row; one may be the machine's fault
+ELSEWHERE = 0.01  # share of a sampling range by which a return may miss the coordinates that were saved, unmentioned
+
+
+@runtime_checkable
+class Resettable(SnapshotEnvironment, Protocol):
+    """An environment that can also be reset."""
+
+    def begin(self, seed: int | None = None) -> Array: ...
+
+
+class Returning:
+    """The snapshots of an environment that answers queries.
+
+    Args:
+        environment: saves and restores its state.
+        spec: of the environment.
+        folder: keeps the snapshots.
+        known: names of the snapshots that the server knows.
+
+    Attributes:
+        gone: names of snapshots that the server has yet to forget.
+    """
+
+    def __init__(
+        self,
+        environment: Resettable,
+        spec: EnvironmentSpec,
+        folder: SnapshotFolder,
+        known: Collection[str] = (),
+    ) -> None:
+        self._environment, self._spec, self._folder = environment, spec, folder
+        self.gone = sorted(set(known) - set(folder.names()))
+        self._hung_saves = 0
+        self._remarks: dict[str, str] = {}  # first remark of each kind; "" after it was told
+        if self.gone:
+            self._remark(
+                "start",
+                f"{len(self.gone)} of {len(known)} snapshots that the server knew are not in this sampler's folder, or "
+                "can't be used, so the server forgets them",
+            )
+
+    def begin(self, name: str) -> None:
+        """Return to a snapshot.
+
+        Raises:
+            SnapshotGone: it can't be used, or the environment died or hung at it twice; it is dropped.
+            StepTimedOut, EnvironmentDied: the environment hung or died, and can't be reset either.
+        """
+        try:
+            try:
+                self._restore(name)
+            except (StepTimedOut, EnvironmentDied):
+                if not self._resets():
+                    raise  # the fault is the machine's
+                self._restore_again(name)
+        except SnapshotGone:
+            self._folder.drop(name)
+            self.gone.append(name)
+            raise
+
+    def save(self, coordinates: Sequence[float]) -> str | None:
+        """Save the present state, which has the coordinates (C,). Returns its name; None if it can't be saved.
+
+        Raises:
+            StepTimedOut, EnvironmentDied: the environment hung or died, so no step can follow.
+        """
+        if self._hung_saves >= MOST_HANGS:
+            return None
+        try:
+            name, dropped = self._folder.add(self._state(), coordinates)
+        except (StepTimedOut, EnvironmentDied):
+            self._hung_saves += 1
+            if self._hung_saves == MOST_HANGS:
+                self._remark("hangs", "this sampler saves no state any more, because save hung or died too often")
+            raise
+        except (StepFailed, SnapshotNotKept) as error:
+            self._remark("save", f"a state is not kept, so no query will begin there: {error}")
+            return None
+        self._hung_saves = 0
+        self.gone += dropped
+        return name
+
+    def handed_in(self, names: Iterable[str]) -> None:
+        """Notice which of these snapshots, of which the server has just learned, are gone already: another sampler has
+        dropped them, or this one has while their samples were on the way."""
+        self.gone += [name for name in names if name not in self._folder and name not in self.gone]
+
+    def remarks(self) -> str:
+        """What went wrong without harm to a query, and was not told yet: once for each kind."""
+        untold = "; ".join(filter(None, self._remarks.values()))
+        self._remarks = dict.fromkeys(self._remarks, "")
+        return untold
+
+    def _remark(self, kind: str, remark: str) -> None:
+        self._remarks.setdefault(kind, remark)
+
+    def _state(self) -> bytes:
+        try:
+            state: Any = self._environment.save()
+        except StepFailed:
+            raise
+        except Exception as error:  # an environment that is not isolated may raise anything
+            raise SnapshotNotKept(sentence(error)) from error
+        if not isinstance(state, bytes):
+            raise SnapshotNotKept(f"expected bytes from save, got a {type(state).__name__}")
+        return state
+
+    def _restore(self, name: str) -> None:
+        saved, state = self._folder.read(name)
+        try:
+            reached: Any = self._environment.restore(state)
+        except (StepTimedOut, EnvironmentDied):
+            raise  # the fault may be the snapshot's or the machine's
+        except Exception as error:  # an environment that is not isolated may raise anything
+            raise SnapshotGone(f"snapshot {name} can't be restored: {sentence(error)}") from error
+        self._compare(name, np.array(saved), reached)
+
+    def _restore_again(self, name: str) -> None:
+        """Return to a snapshot at which the environment died or hung, although it can be reset."""
+        try:
+            self._restore(name)
+        except (StepTimedOut, EnvironmentDied) as error:
+            raise SnapshotGone(f"snapshot {name} can't be restored: {error}, twice") from error
+
+    def _resets(self) -> bool:
+        """Whether the environment, started anew, can be reset."""
+        try:
+            self._environment.begin()
+        except Exception:  # an environment that is not isolated may raise anything
+            return False
+        return True
+
+    def _compare(self, name: str, saved: NDArray[np.float64], reached: Any) -> None:
+        """Check that a return led to coordinates (C,), and remark if they are others than were saved."""
+        try:
+            at = np.asarray(reached, dtype=np.float64)
+        except (TypeError, ValueError):
+            at = np.zeros(0)
+        if at.shape != saved.shape or not np.isfinite(at).all():
+            names = ", ".join(self._spec.coordinate_names)
+            raise SnapshotGone(
+                f"snapshot {name} can't be restored: expected coordinates ({names}), got {reached!r:.200}"
+            )
+        apart = np.abs(at - saved)
+        for coordinate, number, now, before in zip(self._spec.coordinates, apart, at, saved, strict=True):
+            turned = min(number, abs(2 * np.pi - number)) if coordinate.kind == "angle" else number
+            if turned > ELSEWHERE * float(np.ptp(limits(coordinate.sampling))):
+                self._remark(
+                    "restore",
+                    f"restore leads to another state than was saved, first at snapshot {name}: expected {before:g} for "
+                    f"{coordinate.name!r}, got {now:g}; surrogym doctor checks save and restore",
+                )
+                return
+
+
+@contextmanager
+def snapshots_of(
+    api: Api, surrogate: str, environment: Environment, spec: EnvironmentSpec, settings: SamplerSettings
+) -> Iterator[Returning | None]:
+    """Open the folder of a surrogate's snapshots. None: no query begins at a snapshot.
+
+    Raises:
+        UnusableFolder: it can't be made, or not written to.
+    """
+    if not spec.snapshots:
+        yield None
+        return
+    assert isinstance(environment, Resettable)  # see check_environment
+    with tempfile.TemporaryDirectory(prefix="surrogym-snapshots-") as ended:
+        kept = SnapshotFolder((settings.snapshots or Path(ended)) / surrogate, spec, settings.bounds)
+        before = kept.names()  # what is written from now on may be of a sample that is on its way to the server
+        known = {one.name for one in api.snapshots(surrogate)}
+        kept.drop_first(set(before) - known)
+        yield Returning(environment, spec, kept, known)

@@ -1,0 +1,69 @@
+"""Convert a real step to the sample that answers a query."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from surrogym_sampler.original.errors import StepFailed
+from surrogym_sampler.original.protocol import RealStep
+from surrogym_shared.checks import first_fault
+from surrogym_shared.wire import NewSample, Query, StepQuery
+
+
+def reset_seed(query: Query, design_seed: int) -> int:
+    """Seed of a rollout's reset. Each attempt has its own; it is the same on any server for the same query and
+    design."""
+    return int(np.random.SeedSequence([design_seed, query.number, query.attempt]).generate_state(1)[0])
+
+
+def sample_of(query: Query, step: RealStep, size: int, number: int = 0) -> NewSample:
+    """Return the sample of a query's step. ``number`` counts the steps of an action sequence from 0; ``size`` is the
+    number of coordinates.
+
+    Raises:
+        StepFailed: the step has numbers that are not finite, or of the wrong shape.
+    """
+    try:
+        return NewSample(
+            query_id=query.id,
+            lease_token=query.lease_token,
+            step=number,
+            coordinates=_numbers(step.coordinates, size, "coordinates"),
+            action=_numbers(step.action, len(_requested_actions(query)[number]), "action"),
+            next_coordinates=_numbers(step.next_coordinates, size, "next_coordinates"),
+            reward=float(step.reward),
+            terminated=bool(step.terminated),
+            truncated=bool(step.truncated),
+            observation=_entries(step.observation),
+            next_observation=_entries(step.next_observation),
+        )
+    except (ValidationError, TypeError) as error:
+        raise StepFailed(
+            f"expected a step that can be used as a sample, got one with an error: {_first(error)}"
+        ) from error
+
+
+def _requested_actions(query: Query) -> list[list[float]]:
+    """Return the actions (T, F) of a query."""
+    return [query.action] if isinstance(query, StepQuery) else query.actions
+
+
+def _numbers(values: Any, size: int, what: str) -> list[float]:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (size,):
+        raise StepFailed(f"expected the shape ({size},) for {what} of a step, got {array.shape}")
+    numbers: list[float] = array.tolist()
+    return numbers
+
+
+def _entries(values: Any) -> list[float] | None:
+    return None if values is None else np.asarray(values, dtype=np.float64).ravel().tolist()
+
+
+def _first(error: Exception) -> str:
+    if not isinstance(error, ValidationError):
+        return str(error)
+    return first_fault(error, got=True)

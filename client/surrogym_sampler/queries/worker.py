@@ -1,0 +1,407 @@
+"""The sampler: claims queries, takes the real steps, and sends the samples."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar, get_args
+
+import numpy as np
+
+from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere
+from surrogym_client.surrogates.phases import ENDED
+from surrogym_client.transport.api import Api
+from surrogym_client.transport.connection import Retries
+from surrogym_sampler.original.errors import QueryRefused, SnapshotGone, StepFailed, StepRefused, message_of
+from surrogym_sampler.original.protocol import (
+    Environment,
+    OriginalEnvironment,
+    RolloutEnvironment,
+)
+from surrogym_sampler.original.rollouts import answering
+from surrogym_sampler.queries.failures import Failures
+from surrogym_sampler.queries.leases import AWAY, ONE_ATTEMPT, LeaseEnded, Leases
+from surrogym_sampler.queries.pipeline import Pipeline
+from surrogym_sampler.queries.query_limits import check_environment, check_query
+from surrogym_sampler.queries.returning import Returning, snapshots_of
+from surrogym_sampler.queries.sample_conversion import reset_seed, sample_of
+from surrogym_sampler.queries.settings import Outcome, SamplerReport, SamplerSettings
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQuery
+
+PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # for a server or a storage that does not answer
+LOOK_SECONDS = 0.1  # how often a waiting sampler checks whether it was stopped
+LAST_SECONDS = 5.0  # how long a stopped sampler retries to send its last real step
+END_SECONDS = 2.0  # longest time until a waiting sampler notices that the design had ended before its claim
+AGAIN_SECONDS = 1.0  # pause after a claim in which no query could begin
+MOST_GONE = 1_000  # snapshots that one request reports as gone
+STOPPED = "the sampler was stopped"
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """The real steps of a query. ``outcome``: if there are none. ``remark``: what went wrong without harm to it.
+    ``for_good``: the environment itself refused it, so no other sampler should try."""
+
+    query: Query
+    taken: list[NewSample]
+    outcome: Outcome
+    error: str
+    remark: str = ""
+    for_good: bool = False
+
+    @property
+    def clean(self) -> bool:
+        return bool(self.taken) and not self.error
+
+
+class Sampler:
+    """Answers the queries of one surrogate with real steps.
+
+    While the environment steps, the sampler sends the answer of the query before and claims the one after. So the
+    environment waits for no request, as long as all answers are accepted. At most one query that it has stepped is not
+    acknowledged yet. A query is claimed shortly before the running step ends, and goes back if the step takes longer.
+
+    If a step fails, its query is returned with the error; in a rollout, the steps before it are the answer. If the
+    server does not answer, the sampler waits and keeps its samples.
+
+    No real step begins after the lease of its query has ended, for example while the machine was suspended: another
+    sampler may have taken the query. A step that is running then is finished and sent.
+
+    After failures at several different queries in a row, the sampler waits longer and longer, and then ends. So a fault
+    of the machine does not use up the three attempts that each query has.
+
+    The server is not trusted with the environment. Each query is checked against the environment's own specification,
+    and one outside of it is returned as not begun before anything is sent to the environment.
+
+    Args:
+        api: the server.
+        surrogate: name of the surrogate.
+        environment: the original environment; wrap it in ``IsolatedEnvironment`` if it may hang or crash.
+        settings: when to stop, and how many queries to claim.
+        report: called after every query with the query, its outcome, and the error if there was one.
+        ended: called with the phase whenever a claim shows that the design has ended, once for each end.
+
+    Examples:
+        >>> with Api("http://127.0.0.1:8000") as api:
+        ...     Sampler(api, "pendulum", original.make("Pendulum-v1")).run()
+    """
+
+    def __init__(
+        self,
+        api: Api,
+        surrogate: str,
+        environment: Environment,
+        settings: SamplerSettings | None = None,
+        report: Callable[[Query, Outcome, str], None] | None = None,
+        ended: Callable[[Phase], None] | None = None,
+    ) -> None:
+        self._api = api
+        self._surrogate = surrogate
+        self._environment = environment
+        self._settings = settings or SamplerSettings()
+        self._report = report
+        self._ended = ended
+        self._counts: dict[Outcome, int] = dict.fromkeys(get_args(Outcome), 0)
+        self._refused: set[int] = set()  # ids of refused queries, which the server offers again
+        self._failures = Failures()
+        self._steps = 0
+        self._returning: Returning | None = None  # None: no query begins at a snapshot
+        self._phase: Phase | None = None
+        self._spec: EnvironmentSpec
+        self._own: EnvironmentSpec
+        self._leases: Leases
+        self._pipeline = Pipeline(self._settle, self._return)
+        self._started = time.monotonic()
+        self._broken_off = False  # by an error or Ctrl-C
+        self._stopping = False  # not an Event, because a signal handler that sets one can deadlock
+
+    def stop(self) -> None:
+        """End ``run`` after the running step. Call it from another thread or a signal handler.
+
+        The sampler then no longer waits for a server that does not answer, except for ``LAST_SECONDS`` to send its last
+        real step. Retries of a single request by ``api`` add to that.
+        """
+        self._stopping = True
+
+    def run(self) -> SamplerReport:
+        """Answer queries until a setting ends it, ``stop`` is called, or Ctrl-C is pressed.
+
+        Raises:
+            UnknownSurrogate: there is no surrogate of this name, or it was deleted.
+            ServerUnreachable, Unavailable: the server, or its storage, did not answer for too long.
+            UnknownEnvironment: the environment can't be made, or does not fit the surrogate.
+            MachineFails: the machine failed at several queries in a row.
+        """
+        self._started, self._broken_off = time.monotonic(), False
+        self._check()
+        leases = Leases(self._api, self._surrogate, self._settings.lease_seconds)
+        saved = snapshots_of(self._api, self._surrogate, self._environment, self._own, self._settings)
+        with saved as self._returning, leases as self._leases, closing(self._pipeline):
+            self._report_gone()
+            try:
+                self._answer_all()
+            except BaseException:
+                self._broken_off = True  # the answer under way is sent all the same, though not with patience
+                raise
+        return self.summary()
+
+    def _answer_all(self) -> None:
+        while not self._stopped() and (limit := self._limit()) > 0:
+            try:
+                claimed = self._pipeline.next() or self._patiently(partial(self._claim, limit, self._wait_seconds()))
+            except AWAY:
+                if self._stopped():
+                    break
+                raise
+            self._enter(claimed.phase)
+            self._work(claimed.queries)
+            if self._enough(claimed):
+                break
+            if claimed.queries and self._none_allowed(claimed):
+                self._pause(AGAIN_SECONDS)
+
+    def summary(self) -> SamplerReport:
+        """Return the report of the work so far."""
+        seconds = time.monotonic() - self._started
+        return SamplerReport(**self._counts, steps=self._steps, seconds=seconds, phase=self._phase)
+
+    def _enter(self, phase: Phase) -> None:
+        before, self._phase = self._phase, phase
+        if self._ended is not None and phase in ENDED and phase != before:
+            self._ended(phase)
+
+    def _check(self) -> None:
+        """Refuse an environment that does not fit the surrogate."""
+        self._environment = answering(self._environment)
+        self._spec, self._own = self._api.surrogate(self._surrogate).spec, self._environment.spec()
+        check_environment(self._surrogate, self._spec, self._own)
+
+    def _wait_seconds(self) -> float:
+        """Seconds that a claim waits for queries."""
+        s = self._settings
+        if s.until_done and (self._phase is None or self._phase in ENDED):
+            return 0.0
+        return self._within_time(min(s.wait_seconds, END_SECONDS) if s.until_done else s.wait_seconds)
+
+    def _claim(self, limit: int, wait_seconds: float, retries: Retries | None = None) -> ClaimedQueries:
+        s, since = self._settings, self._leases.clock()
+        claimed = self._api.claim(
+            self._surrogate,
+            s.name,
+            max_queries=limit,
+            wait_seconds=wait_seconds,
+            lease_seconds=s.lease_seconds,
+            retries=retries,
+        )
+        self._leases.hold(claimed.queries, since)
+        return claimed
+
+    def _work(self, queries: list[Query]) -> None:
+        """Answer queries one by one. Queries that are left after Ctrl-C or the time limit are returned to the queue."""
+        left, begun = list(queries), None
+        try:
+            while left:
+                self._failures.check([query.id for query in left])
+                self._pause(self._within_time(self._failures.delay()))
+                if self._stopped() or self._out_of_time():
+                    break
+                begun = left[0]
+                self._answer(begun, last=len(left) == 1)
+                left.pop(0)
+        finally:
+            for query in left:
+                self._leases.release(query)
+                self._give_back(query, STOPPED, begun=query is begun)
+
+    def _return(self, claimed: ClaimedQueries) -> None:
+        """Return queries to the queue that were not begun."""
+        for query in claimed.queries:
+            self._leases.release(query)
+            self._give_back(query, STOPPED, begun=False)
+
+    def _answer(self, query: Query, *, last: bool) -> None:
+        """Take the real steps of a query, and send them. ``last``: the next query has to be claimed."""
+        flows = not self._settings.once
+        ahead = self._limit(running=1) if flows and last else 0
+        claim = partial(self._claim, ahead, 0.0, ONE_ATTEMPT) if ahead > 0 else None
+        answer = self._pipeline.step(partial(self._step, query), claim)
+        self._pipeline.send(partial(self._deliver, answer), clean=flows and answer.clean, last=last)
+
+    def _step(self, query: Query) -> _Answer:
+        taken: list[NewSample] = []
+        error, for_good = "", False
+        outcome: Outcome = "failed"  # if no step was taken
+        try:
+            check_query(self._own, query)
+            self._take(query, taken)
+        except QueryRefused as refused:
+            outcome, error = "refused", str(refused)
+        except LeaseEnded as ended:
+            outcome, error = "dropped", str(ended)
+        except SnapshotGone as gone:
+            outcome, error = "impossible", str(gone)
+        except StepRefused as refused:
+            error, for_good = message_of(refused) or "no reason given", not taken
+            outcome = "refused"
+        except StepFailed as failed:
+            error = message_of(failed) or "no reason given"
+        except Exception as raised:  # an environment that is not isolated may raise anything
+            error = f"{type(raised).__name__}: {message_of(raised)}"
+        except BaseException:  # Ctrl-C: real steps that were taken are reported all the same
+            self._hand_in(taken)
+            self._steps += len(taken)
+            raise
+        remark = self._returning.remarks() if self._returning else ""
+        return _Answer(query, taken, outcome, error, remark, for_good)
+
+    def _deliver(self, answer: _Answer) -> _Answer:
+        """Send the samples of an answer, or return its query. Returns the answer as the server took it."""
+        try:
+            self._hand_in(answer.taken)
+        except InvalidInput as invalid:
+            answer = replace(answer, taken=[], outcome="failed", error=str(invalid))
+        if not answer.taken:
+            if answer.outcome == "impossible":
+                self._report_gone()  # first, or another sampler claims the query and finds its snapshot gone too
+            begun = bool(answer.error) and answer.outcome == "failed"
+            give_back = partial(
+                self._give_back, answer.query, answer.error or STOPPED, begun=begun, refused=answer.for_good
+            )
+            self._patiently(give_back, LAST_SECONDS)
+        return answer
+
+    def _settle(self, answer: _Answer) -> bool:
+        """Count a query whose answer was acknowledged. Returns whether it has one."""
+        self._leases.release(answer.query)
+        self._steps += len(answer.taken)
+        if self._returning is not None:
+            self._returning.handed_in([sample.snapshot for sample in answer.taken if sample.snapshot is not None])
+        self._report_gone()
+        said = "; ".join(filter(None, (answer.error, answer.remark)))
+        self._count(answer.query, "answered" if answer.taken else answer.outcome, said, again=not answer.for_good)
+        return answer.clean
+
+    def _take(self, query: Query, taken: list[NewSample]) -> None:
+        """Take the real steps of a query, and append each to ``taken`` as soon as it is done."""
+        environment, size = self._environment, len(self._spec.coordinates)
+        if isinstance(query, StepQuery):
+            assert isinstance(environment, OriginalEnvironment)
+            self._leases.check(query)
+            step = environment.step_from(np.array(query.coordinates), np.array(query.action))
+            taken.append(sample_of(query, step, size))
+            return
+        assert isinstance(environment, RolloutEnvironment)
+        self._leases.check(query)
+        if query.snapshot is None:
+            environment.begin(reset_seed(query, self._spec.design.seed))
+        else:
+            assert self._returning is not None  # see check_query
+            self._returning.begin(query.snapshot)
+        for number, action in enumerate(query.actions):
+            if self._stopped():
+                return
+            self._leases.check(query)
+            step = environment.act(np.array(action))
+            taken.append(sample_of(query, step, size, number))
+            if step.terminated or step.truncated:
+                return
+            if self._returning is not None:
+                snapshot = self._returning.save(taken[-1].next_coordinates)
+                taken[-1] = taken[-1].model_copy(update={"snapshot": snapshot})
+
+    def _report_gone(self) -> None:
+        """Tell the server which of its snapshots are gone, so that the design chooses other queries."""
+        while self._returning is not None and (some := self._returning.gone[:MOST_GONE]):
+            self._patiently(partial(self._api.drop_snapshots, self._surrogate, some), LAST_SECONDS)
+            del self._returning.gone[: len(some)]
+
+    def _hand_in(self, samples: list[NewSample]) -> None:
+        if samples:
+            self._patiently(lambda: self._api.add_samples(self._surrogate, self._settings.name, samples), LAST_SECONDS)
+
+    def _patiently(self, request: Callable[[], T], once_stopped: float = 0.0) -> T:
+        """Repeat a request until the server and its storage answer. Every request here is safe to repeat.
+
+        Raises:
+            ServerUnreachable, Unavailable: no answer for longer than ``PATIENCE``, or than ``once_stopped`` seconds
+                after ``stop``.
+        """
+        delays, stopped = PATIENCE.delays(), None
+        while True:
+            try:
+                return request()
+            except AWAY:
+                pause = next(delays, None)
+                if pause is None:
+                    raise
+                self._pause(pause)
+                if self._stopped():
+                    stopped = stopped or time.monotonic()
+                    if time.monotonic() - stopped >= once_stopped:
+                        raise
+                    time.sleep(pause)
+
+    def _stopped(self) -> bool:
+        return self._stopping or self._broken_off
+
+    def _pause(self, seconds: float) -> None:
+        """Wait for ``seconds``, or until the sampler is stopped."""
+        until = time.monotonic() + seconds
+        while not self._stopped() and (left := until - time.monotonic()) > 0:
+            time.sleep(min(left, LOOK_SECONDS))
+
+    def _give_back(self, query: Query, error: str, *, begun: bool, refused: bool = False) -> None:
+        try:
+            self._api.fail(self._surrogate, query.id, query.lease_token, error[:4_000], begun=begun, refused=refused)
+        except (LeaseExpired, NotThere):
+            return  # another sampler has the query already
+
+    def _count(self, query: Query, outcome: Outcome, error: str, *, again: bool) -> None:
+        if outcome == "refused" and again:  # the server offers it again, and it counts once
+            if query.id in self._refused:
+                return
+            self._refused.add(query.id)
+        if outcome == "answered":
+            self._failures.answered()
+        elif outcome == "failed":
+            self._failures.failed(query.id, error)
+        self._counts[outcome] += 1
+        if self._report is not None:
+            self._report(query, outcome, error)
+
+    def _limit(self, running: int = 0) -> int:
+        """Number of queries to claim next; 0 if it is time to stop. Dropped queries don't count, as others answer
+        them. ``running``: number of queries whose steps are taken meanwhile."""
+        s = self._settings
+        if self._out_of_time():
+            return 0
+        begun = self._done + self._pipeline.under_way + running
+        return s.batch if s.max_queries is None else min(s.batch, s.max_queries - begun)
+
+    @property
+    def _done(self) -> int:
+        return self._counts["answered"] + self._counts["failed"] + self._counts["refused"]
+
+    def _out_of_time(self) -> bool:
+        return self._settings.time_limit is not None and self._time_left() <= 0
+
+    def _time_left(self) -> float:
+        return self._started + (self._settings.time_limit or 0.0) - time.monotonic()
+
+    def _within_time(self, seconds: float) -> float:
+        return seconds if self._settings.time_limit is None else min(seconds, max(0.0, self._time_left()))
+
+    def _enough(self, claimed: ClaimedQueries) -> bool:
+        if self._settings.once and claimed.queries:
+            return True
+        return self._settings.until_done and self._none_allowed(claimed) and claimed.phase in ENDED
+
+    def _none_allowed(self, claimed: ClaimedQueries) -> bool:
+        """Whether a claim returned nothing, or only queries that the environment does not allow."""
+        return all(query.id in self._refused for query in claimed.queries)

@@ -1,0 +1,348 @@
+"""The audit of a policy: choose states on its imagined way, and judge the model by real steps there. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import sqrt
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.evaluation.systematic import Inputs, Systematic, columns, systematic
+from surrogym_trainer.policies.evidence import Audit, Promise
+
+AUDIT_STEPS = 8
+MOST_STEPS = 40  # of an audit that is undecided
+ALARM = 0.01  # probability that the test of output errors fails for a right model
+SHIFT_ALARM = 0.05  # probability that the errors of a right model ever count as shifted, at any number of steps
+UNDECIDED = 0.05  # probability of a lost promise from which on an audit takes more steps, and the promise widens
+MISPLACED_ENDS = 2  # an audit fails if the model predicted the termination of this many steps wrongly
+SLACK = 0.1  # share of the gain over an untrained policy by which a promise may leave its former interval
+FAR = 1.0  # standard deviations of a coordinate on the policy's way
+MOST_UNTESTED = 0.2  # share of a policy's states that may be far from every step of an audit
+QUANTILES = 200  # of a promise's distribution
+UNSURE = 0.2  # share of the same gain: real steps may narrow a promise whose lower half is wider
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Real steps together with the model's predictions of them.
+
+    Attributes:
+        names: names of the outputs, (O,).
+        errors: real minus predicted values (n, O), in each output's unit.
+        deviations: predicted standard deviations of the function (n, O), without noise.
+        expected: error (O,) that the model allows in addition: its tolerance, or its leave-one-out error if that is
+            larger, which includes the noise; for the reward at least the error that matters for the return.
+        misplaced: number of steps whose termination was predicted wrongly.
+        cut_short: whether the steps are one rollout that an end has cut short which the model did not predict.
+        unanswered: number of steps on the policy's way that the original environment failed to take.
+        elsewhere: number of steps off the policy's way; they come last.
+        claimed_alone: error (O,) of the model on left-out samples, without any tolerance.
+        states: states (n, C) at which the steps began.
+        actions: actions (n, F) of the steps.
+    """
+
+    names: Sequence[str]
+    errors: Array
+    deviations: Array
+    expected: Array
+    misplaced: int = 0
+    cut_short: bool = False
+    unanswered: int = 0
+    elsewhere: int = 0
+    claimed_alone: Array = field(default_factory=lambda: np.zeros(0))
+    states: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    actions: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def claimed(self) -> Array:
+        """Standard deviation (n, O) of each error that the model claims."""
+        scale: Array = np.sqrt(self.deviations**2 + self.expected**2)
+        return scale
+
+    def together(self, spec: EnvironmentSpec, inputs: Inputs) -> Systematic:
+        """Test the errors on the policy's way together."""
+        on_way = slice(len(self.errors) - self.elsewhere)
+        return systematic(
+            self.names,
+            self.errors[on_way],
+            self.deviations[on_way],
+            self.claimed_alone,
+            inputs,
+            inputs.at(spec, self.states[on_way], self.actions[on_way]),
+        )
+
+
+@dataclass(frozen=True)
+class Consequence:
+    """What the errors that all steps share would change in a policy's return.
+
+    Attributes:
+        shifted: the joint test of the errors.
+        changes: changes (K,) of the mean return, under errors that the steps support.
+        before: promise without them.
+        slack: by how much a return may leave the promise.
+    """
+
+    shifted: Systematic
+    changes: Array
+    before: Promise
+    slack: float
+
+    @property
+    def beyond(self) -> Bools:
+        """Under which of the errors (K,) the return leaves the promise."""
+        returns = self.before.median + self.changes
+        outside: Bools = (returns < self.before.low - self.slack) | (returns > self.before.high + self.slack)
+        return outside
+
+    @property
+    def undecided(self) -> bool:
+        """Whether more steps are needed to tell whether the promise stands."""
+        return float(self.beyond.mean()) > UNDECIDED and not self.proven
+
+    @property
+    def proven(self) -> bool:
+        """Whether the model is shifted for certain, and the promise more likely lost than not."""
+        moved = self.changes[self.changes != 0]
+        return self.shifted.evidence >= 1 / SHIFT_ALARM and len(moved) > 0 and self.beyond.sum() > len(moved) / 2
+
+    def fault(self, compared: Compared) -> str | None:
+        """Describe what is wrong in a sentence; None if nothing is proven."""
+        if not self.proven:
+            return None
+        worst = int(np.argmax(self.shifted.chances))
+        error = float(compared.errors[: len(compared.errors) - compared.elsewhere, worst].mean())
+        moved = self.before.median + float(np.median(self.changes[self.changes != 0]))
+        return (
+            f"{compared.names[worst]}: errors that all steps share, {error:+.3g} on average; with them the policy "
+            f"would earn {moved:.4g} instead of {self.before.median:.4g}"
+        )
+
+    def widened(self, promise: Promise) -> Promise:
+        """The promise of a model that has learned from the steps, with the returns that the errors make likely.
+
+        Unchanged if it is hardly possible that they matter.
+        """
+        if float(self.beyond.mean()) <= UNDECIDED:
+            return promise
+        quantiles = (np.arange(QUANTILES) + 0.5) / QUANTILES
+        own = np.interp(quantiles, [0.05, 0.5, 0.95], [promise.low, promise.median, promise.high])
+        moves = np.where(self.beyond, self.before.median + self.changes - promise.median, 0.0)
+        low, median, high = np.quantile(own[:, None] + moves, [0.05, 0.5, 0.95]).tolist()
+        return promise.model_copy(update={"low": low, "median": median, "high": high})
+
+
+def judge(
+    compared: Compared,
+    before: Promise,
+    after: Promise,
+    floor: float | None,
+    consequence: Consequence | None = None,
+) -> Audit:
+    """Judge the model by an audit's real steps, and compare the promises before and after them.
+
+    An output is at fault in either of two cases:
+
+    - The sum of its squared errors, each divided by its claimed deviation, is larger than chance explains: beyond the
+      1 % quantile of the chi-squared distribution, shared between the outputs. Single errors within the tolerance are
+      never a fault.
+    - The errors have a part that all steps share, beyond chance, and with it in the model the policy's return leaves
+      the promise, see ``Consequence``. A shared part that costs nothing is no fault.
+
+    A rollout has one end at most, so a single one that was not predicted is a fault. A step that the original
+    environment fails to take is a fault, because the policy would need it.
+
+    Args:
+        compared: the real steps with their predictions.
+        before: promise before the audit.
+        after: promise of the model that has learned from the audit.
+        floor: return of an untrained policy; None if it was not measured.
+        consequence: what the errors together mean for the return; None if that was not computed.
+    """
+    n, count = compared.errors.shape
+    sums = ((compared.errors / compared.claimed) ** 2).sum(0)
+    limit = chi_squared(n, ALARM / count)
+    actual, claimed = (np.sqrt((values**2).mean(0)) for values in (compared.errors, compared.claimed))
+    faults = [
+        f"{name}: errors of {actual[i]:.3g}, where the model expected {claimed[i]:.3g}"
+        for i, name in enumerate(compared.names)
+        if sums[i] > limit
+    ]
+    if consequence is not None and (shared := consequence.fault(compared)) is not None:
+        faults.append(shared)
+    if compared.unanswered:
+        faults.insert(0, unanswered(compared.unanswered, n + compared.unanswered))
+    if compared.cut_short:
+        faults.append(f"the episode ended after {n} step{'s' * (n > 1)}, where the model predicted no end")
+    elif compared.misplaced >= MISPLACED_ENDS:
+        faults.append(f"{compared.misplaced} of {n} steps ended where the model predicted no end, or the reverse")
+    slack = SLACK * max(earned(before, floor), earned(after, floor))
+    if not before.low - slack <= after.median <= before.high + slack:
+        faults.append(
+            f"the promise moved from {before.median:.4g} to {after.median:.4g} after the model learned the audit's "
+            "steps"
+        )
+    return Audit(
+        steps=n,
+        elsewhere=compared.elsewhere,
+        passed=not faults,
+        faults=tuple(faults),
+        errors=dict(zip(compared.names, actual.tolist(), strict=True)),
+        expected=dict(zip(compared.names, claimed.tolist(), strict=True)),
+        before=before,
+        after=after if consequence is None else consequence.widened(after),
+    )
+
+
+def missed(audit: Audit, returns: Array, floor: float | None) -> Audit:
+    """Compare the returns (k,) of whole real episodes with the promise, in addition to their steps.
+
+    Their mean may leave the promise by ``SLACK`` of the gain, and by two of its standard errors.
+    """
+    mean, before = float(returns.mean()), audit.before
+    chance = 2 * float(returns.std(ddof=1)) / sqrt(len(returns)) if len(returns) > 1 else 0.0
+    slack = SLACK * earned(before, floor) + chance
+    if before.low - slack <= mean <= before.high + slack:
+        return audit
+    fault = (
+        f"{len(returns)} whole episode{'s' * (len(returns) > 1)} earned {mean:.4g} on average, where "
+        f"{before.low:.4g} to {before.high:.4g} was promised"
+    )
+    return audit.model_copy(update={"passed": False, "faults": (fault, *audit.faults)})
+
+
+def untested(spec: EnvironmentSpec, q: Array, audited: Array) -> float:
+    """Share of the states q (m, C) of a policy's way from which every audited state (n, C) is far.
+
+    A state is far from another one if a coordinate differs by more than ``FAR`` standard deviations over the way.
+    """
+    none = np.zeros((len(q) + len(audited), 0))
+    at = on_one_scale(spec, np.concatenate([q, audited]), none, len(q))
+    way, known = at[: len(q)], at[len(q) :]
+    nearest = np.full(len(way), np.inf)
+    for one in known:
+        nearest = np.minimum(nearest, np.abs(way - one).max(1))
+    return float((nearest > FAR).mean())
+
+
+def unanswered(count: int, of: int) -> str:
+    """Describe that the original environment failed at ``count`` queries ``of`` an audit."""
+    return f"the original environment failed at {count} of {of} queries, so nothing is known there"
+
+
+def disappointed(audit: Audit, floor: float | None, imagined: float | None = None) -> bool:
+    """Whether the model that has learned from an audit promises clearly less than the model that chose the policy.
+
+    The policy was chosen by its imagined return. A promise is lower from the beginning if the imagined return rests on
+    what the model does not know. So the promise is compared with the larger of the two.
+
+    Args:
+        audit: the audit.
+        floor: return of an untrained policy; None if it was not measured.
+        imagined: imagined return of the policy in its training; None if it was not measured.
+    """
+    before = audit.before.median if imagined is None else max(audit.before.median, imagined)
+    lost = before - audit.after.median
+    return lost > SLACK * max(earned(audit.before, floor), earned(audit.after, floor))
+
+
+def wider(promise: Promise, share: float, floor: float | None) -> bool:
+    """Whether the lower half of a promise is wider than ``share`` of the gain over an untrained policy of ``floor``."""
+    return not promise.median - promise.low <= share * earned(promise, floor)
+
+
+def earned(promise: Promise, floor: float | None) -> float:
+    """Gain of a policy over an untrained one of return ``floor``. Without ``floor``, the policy's whole return."""
+    return abs(promise.median - (floor or 0.0))
+
+
+def chi_squared(degrees: int, above: float) -> float:
+    """Value that a chi-squared variable exceeds with probability ``above`` (Wilson and Hilferty 1931)."""
+    z, c = NormalDist().inv_cdf(1 - above), 2 / (9 * degrees)
+    return float(degrees * (1 - c + z * sqrt(c)) ** 3)
+
+
+def places(spec: EnvironmentSpec, q: Array, u: Array, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Choose at most ``count`` of the visited states q (m, C) and their actions u (m, F) for an audit.
+
+    Half of them are drawn at random, so that they represent the policy's time. Each other one is the farthest from all
+    chosen before, so that they cover the policy's way. Distances are in standard deviations of the visited states.
+    """
+    settable = np.flatnonzero(_settable(spec, q))
+    count = min(count, len(settable))
+    if not count:
+        return settable
+    at = on_one_scale(spec, q[settable], u[settable])
+    drawn = rng.choice(len(settable), size=(count + 1) // 2, replace=False)
+    chosen: list[int] = drawn.tolist()
+    nearest = np.min([np.linalg.norm(at - at[i], axis=1) for i in chosen], axis=0)
+    while len(chosen) < count:
+        farthest = int(np.argmax(nearest))
+        chosen.append(farthest)
+        nearest = np.minimum(nearest, np.linalg.norm(at - at[farthest], axis=1))
+    found: NDArray[np.intp] = settable[chosen]
+    return found
+
+
+def gaps(spec: EnvironmentSpec, q: Array, u: Array, samples: tuple[Array, Array], count: int) -> NDArray[np.intp]:
+    """Choose at most ``count`` of the states q (m, C) and actions u (m, F) in the widest gaps of single inputs.
+
+    A gap is a coordinate's or an action's distance from the nearest of the samples, states (n, C) and actions (n, F),
+    as a share of the range of q and u. No sample can show a wall or a threshold behind such a gap.
+    """
+    settable = np.flatnonzero(_settable(spec, q))
+    q, u = q[settable], u[settable]
+    circles = [coordinate.kind == "angle" for coordinate in spec.coordinates]
+    ranges = np.concatenate([np.where(circles, 2 * np.pi, np.ptp(q, axis=0)), np.ptp(u, axis=0)])
+    ranges[ranges == 0] = np.inf
+
+    def away(states: Array, actions: Array) -> Array:
+        """Distance (m, C + F) of each input from the nearest of these points."""
+        off = differences(spec, q[:, None], states[None]), u[:, None] - actions[None]
+        nearest: Array = np.abs(np.concatenate(off, 2)).min(1)
+        return nearest
+
+    chosen: list[int] = []
+    nearest = away(*samples)
+    while len(chosen) < min(count, len(settable)):
+        chosen.append(int(np.argmax((nearest / ranges).max(1))))
+        nearest = np.minimum(nearest, away(q[chosen[-1:]], u[chosen[-1:]]))
+    found: NDArray[np.intp] = settable[chosen]
+    return found
+
+
+def differences(spec: EnvironmentSpec, real: Array, predicted: Array) -> Array:
+    """Real minus predicted coordinates, (..., C). Angles differ by the shorter way."""
+    difference = real - predicted
+    for index, coordinate in enumerate(spec.coordinates):
+        if coordinate.kind == "angle":
+            difference[..., index] = (difference[..., index] + np.pi) % (2 * np.pi) - np.pi
+    return difference
+
+
+def on_one_scale(spec: EnvironmentSpec, q: Array, u: Array, first: int | None = None) -> Array:
+    """Scale states q (m, C) and actions u (m, F) to points whose distances are meaningful.
+
+    Each column is divided by its standard deviation, or by that of the ``first`` rows.
+    """
+    at = columns(spec, q, u)
+    spread = at[:first].std(0)
+    scaled: Array = at / np.where(spread > 0, spread, 1.0)
+    return scaled
+
+
+def _settable(spec: EnvironmentSpec, q: Array) -> Bools:
+    """Which states (m,) the original environment can be set to."""
+    inside = np.ones(len(q), dtype=bool)
+    for index, coordinate in enumerate(spec.coordinates):
+        low, high = coordinate.settable
+        inside &= (q[:, index] >= low) & (q[:, index] <= high)
+    return inside

@@ -1,0 +1,214 @@
+"""Compare real steps with a model's predictions, and find the steps at which the two disagree.
+
+Shapes: n steps, O outputs, C coordinates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import sqrt
+from typing import Any, Protocol
+
+import numpy as np
+
+from surrogym_client.transport.api import Api
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import NewSample, OutputFidelity, SurrogateView
+from surrogym_trainer.evaluation.audit import ALARM, Compared, chi_squared, differences
+from surrogym_trainer.evaluation.evaluator import ROUNDING, Trace, span
+from surrogym_trainer.evaluation.systematic import LEAST
+
+MOST = 400  # most real steps to compare
+LEAST_ERROR = 1e-12  # in an output's unit, so that an exact output can be tested
+SHOWN = 3  # number of worst steps, and of worst episodes, to show
+
+
+class Step(Protocol):
+    """One real step, from a sample or an episode."""
+
+    @property
+    def coordinates(self) -> Any: ...
+    @property
+    def action(self) -> Any: ...
+    @property
+    def next_coordinates(self) -> Any: ...
+    @property
+    def reward(self) -> float: ...
+    @property
+    def terminated(self) -> bool: ...
+
+
+def compared(
+    api: Api, spec: EnvironmentSpec, view: SurrogateView, samples: Sequence[Step], matters: float = 0.0
+) -> Compared:
+    """Return real steps together with the predictions of the model of ``view``, which was not fitted to them.
+
+    Errors of the reward below ``matters`` don't count.
+    """
+    q, u = [list(sample.coordinates) for sample in samples], [list(sample.action) for sample in samples]
+    predicted = api.predict(view.name, q, u, model=view.model_version)
+    uncertain = api.query_uncertainty(view.name, q, u, model=view.model_version)
+    moved = differences(
+        spec, np.array([sample.next_coordinates for sample in samples]), np.array(predicted.next_coordinates)
+    )
+    rewards = np.array([sample.reward for sample in samples]) - np.array(predicted.reward)
+    columns = {coordinate.name: moved[:, i] for i, coordinate in enumerate(spec.coordinates)} | {"reward": rewards}
+    assert view.fidelity is not None
+    claims = [output for output in view.fidelity.outputs if output.name in columns]
+    deviations = np.array(uncertain.deviation)[:, [uncertain.outputs.index(claim.name) for claim in claims]]
+    ended, foreseen = np.array([sample.terminated for sample in samples]), np.array(predicted.terminated)
+    return Compared(
+        names=[claim.name for claim in claims],
+        errors=np.stack([columns[claim.name] for claim in claims], 1),
+        deviations=deviations,
+        expected=np.array([_expected(claim, matters if claim.name == "reward" else 0.0) for claim in claims]),
+        claimed_alone=np.array([_alone(claim) for claim in claims]),
+        states=np.array(q),
+        actions=np.array(u),
+        misplaced=int((ended != foreseen).sum()),
+        cut_short=spec.query == "rollout" and bool((ended & ~foreseen).any()),
+    )
+
+
+def _expected(claim: OutputFidelity, matters: float) -> float:
+    """Error of an output that the model allows: its tolerance, its error on left-out samples, or one without effect."""
+    return max(claim.tolerance, claim.leave_one_out_error or 0.0, matters)
+
+
+def _alone(claim: OutputFidelity) -> float:
+    """Error of an output on left-out samples, noise included; its tolerance if the family of models knows none."""
+    known = claim.tolerance if claim.leave_one_out_error is None else claim.leave_one_out_error
+    return max(known, claim.noise, LEAST * claim.tolerance, LEAST_ERROR)
+
+
+@dataclass(frozen=True)
+class StepOfEpisode:
+    """One real step with the number of its episode, and its own number there, both from 0."""
+
+    episode: int
+    number: int
+    coordinates: tuple[float, ...]
+    action: tuple[float, ...]
+    next_coordinates: tuple[float, ...]
+    reward: float
+    terminated: bool
+
+
+def steps_of(traces: Sequence[Trace], most: int = MOST) -> list[StepOfEpisode]:
+    """Return at most ``most`` steps of episodes, evenly spaced."""
+    places = [(episode, t) for episode, trace in enumerate(traces) for t in range(len(trace.reward))]
+    kept = np.unique(np.linspace(0, len(places) - 1, min(len(places), most)).astype(int))
+    return [_step(traces[episode], episode, t) for episode, t in (places[i] for i in kept)]
+
+
+def steady(spec: EnvironmentSpec, steps: Sequence[StepOfEpisode]) -> list[StepOfEpisode]:
+    """Return the steps within which no constant changed, such as a setpoint. A model keeps constants."""
+    held = [(i, ROUNDING * span(c)) for i, c in enumerate(spec.coordinates) if c.kind == "constant"]
+    return [one for one in steps if all(abs(one.next_coordinates[i] - one.coordinates[i]) <= most for i, most in held)]
+
+
+def _step(trace: Trace, episode: int, t: int) -> StepOfEpisode:
+    last = t == len(trace.reward) - 1
+    return StepOfEpisode(
+        episode=episode,
+        number=t,
+        coordinates=tuple(map(float, trace.coordinates[t])),
+        action=tuple(map(float, trace.action[t])),
+        next_coordinates=tuple(map(float, trace.coordinates[t + 1])),
+        reward=float(trace.reward[t]),
+        terminated=last and trace.terminated,
+    )
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """A real step that the model excludes, with its worst output, the error there, and the error that the model
+    claimed."""
+
+    step: StepOfEpisode
+    output: str
+    error: float
+    claimed: float
+
+
+@dataclass(frozen=True)
+class Disagreements:
+    """Disagreements between a model and real episodes.
+
+    Attributes:
+        compared: number of real steps that were compared.
+        found: steps whose error exceeds the model's claim, the worst first.
+        missing: real minus predicted reward over the compared steps of each episode, by its number.
+        shared: further steps that have much of an error that all steps share, the most first.
+    """
+
+    compared: int
+    found: tuple[Disagreement, ...]
+    missing: dict[int, float]
+    shared: tuple[StepOfEpisode, ...] = ()
+
+    def by_episode(self) -> dict[int, int]:
+        """Number of excluded steps of each episode, the largest first."""
+        counts: dict[int, int] = {}
+        for one in self.found:
+            counts[one.step.episode] = counts.get(one.step.episode, 0) + 1
+        return dict(sorted(counts.items(), key=lambda item: -item[1]))
+
+
+def disagreements(steps: Sequence[StepOfEpisode], beside: Compared) -> Disagreements:
+    """Find the steps whose error is larger than chance explains, at a level of 1 % for all of them together."""
+    n, count = beside.errors.shape
+    limit = sqrt(chi_squared(1, ALARM / (n * count)))
+    ratio = np.abs(beside.errors) / beside.claimed
+    worst = ratio.argmax(1)
+    order = [i for i in np.argsort(-ratio.max(1)).tolist() if ratio[i].max() > limit]
+    found = tuple(
+        Disagreement(
+            steps[i], beside.names[worst[i]], float(beside.errors[i, worst[i]]), float(beside.claimed[i, worst[i]])
+        )
+        for i in order
+    )
+    missing: dict[int, float] = {}
+    if "reward" in beside.names:
+        errors = beside.errors[:, list(beside.names).index("reward")]
+        for step, error in zip(steps, errors.tolist(), strict=True):
+            missing[step.episode] = missing.get(step.episode, 0.0) + error
+    return Disagreements(n, found, missing)
+
+
+def samples_of(found: Disagreements, most: int) -> list[NewSample]:
+    """Return at most ``most`` of the steps as samples: those that differ each by itself, then those that explain an
+    error that all steps share.
+
+    Of either kind the worst step of each episode comes first, then the second worst, and so on. Neighbours in one
+    episode often err for the same reason, so the episodes take turns.
+    """
+    alone = [one.step for one in found.found]
+    known = {(step.episode, step.number) for step in alone}
+    shared = [step for step in found.shared if (step.episode, step.number) not in known]
+    return as_samples([*_in_turns(alone), *_in_turns(shared)][:most])
+
+
+def _in_turns(steps: Sequence[StepOfEpisode]) -> list[StepOfEpisode]:
+    """Order steps, so that their episodes take turns."""
+    rank: dict[int, int] = {}
+    turns: list[tuple[int, StepOfEpisode]] = []
+    for step in steps:
+        turn = rank[step.episode] = rank.get(step.episode, 0) + 1
+        turns.append((turn, step))
+    return [step for _, step in sorted(turns, key=lambda item: item[0])]
+
+
+def as_samples(steps: Sequence[StepOfEpisode]) -> list[NewSample]:
+    """Return the steps as samples."""
+    return [
+        NewSample(
+            coordinates=list(step.coordinates),
+            action=list(step.action),
+            next_coordinates=list(step.next_coordinates),
+            reward=step.reward,
+            terminated=step.terminated,
+        )
+        for step in steps
+    ]

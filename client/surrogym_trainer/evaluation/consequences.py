@@ -1,0 +1,126 @@
+"""Put the errors that real steps have shown into the model, and compute a policy's imagined return again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import OF_PARTICLES
+from surrogym_trainer.evaluation.audit import SHIFT_ALARM, Compared
+from surrogym_trainer.evaluation.imagined import imagine
+from surrogym_trainer.evaluation.systematic import Inputs, Region, Systematic, region
+from surrogym_trainer.policies.predict import Predict
+
+DRAWS = 64  # of errors that the steps support
+STARTS = 4  # virtual episodes under each of them
+CERTAIN = 0.9  # probability from which on an output counts as shifted
+EFFECT_STARTS = 32  # virtual episodes under the errors of a single output
+
+Array = NDArray[np.float64]
+
+
+def changes_of(
+    port: SurrogatePort,
+    predict: Predict,
+    seed: int,
+    session: Mapping[str, Any],
+    version: int,
+    shifted: Systematic,
+    weights: Array,
+    starts: int = STARTS,
+) -> Array:
+    """Return by how much the policy's mean return changes, (K,), if the model errs by ``weights`` (K, O, 1 + P).
+
+    The episodes with and without the errors have the same starts and the same noise, and follow the model's mean.
+
+    Args:
+        port: the surrogate.
+        predict: the policy.
+        seed: seed of the starts and the noise.
+        session: fields of ``OpenSession`` that the policy was trained with.
+        version: version of the model that was compared with the real steps.
+        shifted: the joint test of the errors.
+        weights: errors of its outputs.
+        starts: number of virtual episodes for each row of weights.
+    """
+    if not weights.any():
+        return np.zeros(len(weights))
+    spec = port.spec()
+    outputs = [coordinate.name for coordinate in spec.coordinates if coordinate.moves] + ["reward"]
+    placed = np.zeros((len(weights), len(outputs), weights.shape[2]))
+    placed[:, [outputs.index(name) for name in shifted.names]] = weights
+    left_out = {"variant", "functions", "penalty", "caution", *OF_PARTICLES}
+    options = {name: value for name, value in session.items() if name not in left_out}
+    options |= {"variant": "deterministic", "penalty": 0.0, "model": version}
+    lanes = len(weights) * starts
+    usual = imagine(port, predict, lanes, seed, **options).returns
+    changed = imagine(port, predict, lanes, seed, **options, residual=shifted.inputs.residual(placed)).returns
+    changes: Array = (changed - usual).reshape(starts, len(weights)).mean(0)
+    return np.where(weights.any((1, 2)), changes, 0.0)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """An output that is wrong in all steps together.
+
+    Attributes:
+        output: its name.
+        error: mean of real minus predicted values, in the output's unit.
+        region: range of an input in which it is worst; None if it is much the same everywhere.
+        change: by how much the errors change the imagined return; None if that was not computed.
+    """
+
+    output: str
+    error: float
+    region: Region | None
+    change: float | None
+
+    def words(self) -> str:
+        """Describe the effect in a sentence."""
+        where = ""
+        if (at := self.region) is not None:
+            where = f", {at.error:+.3g} where {at.name} is between {at.low:.4g} and {at.high:.4g}"
+        cost = "" if self.change is None else f"; in the model this changes the return by {self.change:+.4g}"
+        return f"{self.output} is {self.error:+.3g} off the prediction on average{where}{cost}"
+
+
+def effects_of(
+    spec: EnvironmentSpec, compared: Compared, change: Callable[[Systematic, Array], Array] | None
+) -> tuple[list[Effect], Array]:
+    """Find the outputs that are wrong in all steps together, the costliest first.
+
+    Args:
+        spec: specification of the environment.
+        compared: the real steps with their predictions.
+        change: computes by how much weights (K, O, 1 + P) change the return, (K,); None leaves that open.
+
+    Returns:
+        the effects, and how much each step has of them: the sum of its errors that they explain, each divided by what
+        the model claims (n,).
+    """
+    shifted = compared.together(spec, Inputs.over(spec, compared.states, compared.actions))
+    weights, outputs = shifted.expected(), np.flatnonzero(shifted.chances > CERTAIN).tolist()
+    if shifted.evidence < 1 / SHIFT_ALARM or not len(outputs):
+        return [], np.zeros(len(compared.errors))
+    alone = np.zeros((len(outputs), *weights.shape))
+    for row, output in enumerate(outputs):
+        alone[row, output] = weights[output]
+    changes = [None] * len(outputs) if change is None else change(shifted, alone).tolist()
+    names = [*spec.coordinate_names, *(f"action {i}" for i in range(spec.action.size))]
+    at = np.concatenate([compared.states, compared.actions], 1)
+    found = [
+        Effect(compared.names[o], float(errors.mean()), region(names, at, errors), moved)
+        for o, errors, moved in zip(outputs, compared.errors.T[outputs], changes, strict=True)
+    ]
+    explained = shifted.inputs.at(spec, compared.states, compared.actions) @ weights[outputs].T
+    importance = np.array([1.0 if moved is None else abs(moved) for moved in changes])
+    importance = importance / max(float(importance.max()), 1e-300)
+    along = np.sign(explained) * compared.errors[:, outputs] / compared.claimed_alone[outputs]
+    share = (np.maximum(along, 0.0) * importance).sum(1)
+    return sorted(found, key=lambda one: -abs(one.change or 0.0)), share

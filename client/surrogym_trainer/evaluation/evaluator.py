@@ -1,0 +1,424 @@
+"""Evaluate a policy in the original environment, by real episodes that are counted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.runtime.lifetime import signals_between_steps
+from surrogym_sampler.original.actions import decode_actions, explored
+from surrogym_sampler.original.episodes import Episode, Moment, draw
+from surrogym_sampler.original.errors import RAISED, EvaluationFailed, PolicyMisfit
+from surrogym_sampler.original.fitting import check_policy
+from surrogym_sampler.original.protocol import LONGEST_EPISODE
+from surrogym_shared.spec import Coordinate, EnvironmentSpec, Success, limits
+from surrogym_shared.terms import holds
+from surrogym_shared.wire import TraceRank
+from surrogym_trainer.policies.predict import Acting, PerEpisode
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, int], None]  # arguments: share done in [0, 1], number of episodes that terminated
+
+FIRST_SEED = 10_000
+FEW_EQUAL = 3  # episodes that are compared; if they are equal, the evaluation says so
+EXPLORING = 1  # part of the seed of random changes of actions
+ROUNDING = 1e-6  # share of its range by which a constant may change within an episode
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """Settings of an evaluation: how many episodes, from which starts, in which environment.
+
+    ``wide`` starts anywhere in the sampling range. ``start_scale`` widens the declared starts about their middle by
+    this factor. ``perturb`` is the standard deviation of random factors on physical attributes. ``explore`` changes the
+    actions at random, see ``explored``. ``parallel`` is the number of instances of the environment that are open at
+    once; None takes one for each episode if the environment declares that it runs in parallel, and a single one
+    otherwise.
+    """
+
+    episodes: int = 100
+    first_seed: int = FIRST_SEED
+    wide: bool = False
+    start_scale: float = 1.0
+    perturb: float = 0.0
+    explore: float = 0.0
+    parallel: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1 or (self.parallel is not None and self.parallel < 1):
+            raise ValueError(f"expected at least 1 episode and 1 instance, got {self.episodes} and {self.parallel}")
+        if self.wide and self.start_scale != 1:
+            raise ValueError("expected either starts over the whole range or scaled starts, got both")
+        if not 0 <= self.explore <= 1:
+            raise ValueError(f"expected explore to be from 0 to 1, got {self.explore}")
+
+    @property
+    def declared(self) -> bool:
+        """Whether episodes are those of the policy from the specification's starts, in the environment as it is."""
+        return not self.wide and self.start_scale == 1 and not self.perturb and not self.explore
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One episode, step by step."""
+
+    coordinates: Array  # (T + 1, C)
+    action: Array  # (T, F)
+    reward: Array  # (T,)
+    terminated: bool = False  # at its last step
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Result of N real episodes."""
+
+    returns: Array  # (N,)
+    lengths: NDArray[np.int64]  # (N,)
+    success: NDArray[np.bool_] | None  # (N,); None where the specification has no criterion
+    traces: tuple[Trace, ...]  # of every episode
+    varied: tuple[str, ...] = ()  # constants of the specification that changed within an episode
+    limit: int | None = None  # most steps of an episode, by the specification or by an end of the environment's own
+    seeded: bool = True  # whether a second reset with the first seed began in the same state
+
+    @property
+    def trace(self) -> Trace:
+        """Trace of the first episode."""
+        return self.traces[0]
+
+    def ranked(self) -> dict[TraceRank, int]:
+        """Return the numbers of the best, the median and the worst episode by return. In few episodes they may
+        coincide."""
+        order = np.argsort(self.returns, kind="stable")
+        return {"best": int(order[-1]), "median": int(order[(len(order) - 1) // 2]), "worst": int(order[0])}
+
+    @property
+    def steps(self) -> int:
+        """Number of real steps taken."""
+        return int(self.lengths.sum())
+
+    @property
+    def equal(self) -> bool:
+        """Whether several episodes are equal in every number, so that one of them would have shown as much."""
+        return len(self.traces) > 1 and all(_is_equal(self.trace, other) for other in self.traces[1:])
+
+    @property
+    def success_rate(self) -> float | None:
+        return None if self.success is None else float(self.success.mean())
+
+    def summary(self) -> dict[str, Any]:
+        """Return statistics of the return, and every episode, as JSON."""
+        return {
+            "mean": float(self.returns.mean()),
+            "iqm": interquartile_mean(self.returns),
+            "min": float(self.returns.min()),
+            "max": float(self.returns.max()),
+            "std": float(self.returns.std()),
+            "episodes": len(self.returns),
+            "mean_length": float(self.lengths.mean()),
+            "success_rate": self.success_rate,
+            "steps": self.steps,
+            "varied": list(self.varied),
+            "equal": self.equal,
+            "limit": self.limit,
+            "seeded": self.seeded,
+            "per_episode": [float(r) for r in self.returns],
+        }
+
+
+def _is_equal(one: Trace, other: Trace) -> bool:
+    """Whether two episodes are equal in every number."""
+    return one.terminated == other.terminated and all(
+        np.array_equal(getattr(one, name), getattr(other, name)) for name in ("coordinates", "action", "reward")
+    )
+
+
+class EvaluationInterrupted(KeyboardInterrupt):
+    """Ctrl-C interrupted an evaluation after ``steps`` real steps had begun."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+
+
+def evaluate(
+    policy: Acting,
+    open_episode: Callable[[], Episode],
+    settings: EvaluationSettings | None = None,
+    progress: Progress | None = None,
+    remark: Callable[[str], None] | None = None,
+    trained_for: EnvironmentSpec | None = None,
+) -> Evaluation:
+    """Run N real episodes with a policy.
+
+    Each episode runs in one instance of the environment. By default there is one instance, and the episodes run one
+    after the other. With several, the policy is called once for all running episodes. Ctrl-C takes effect between two
+    steps, a second Ctrl-C at once. Every instance is closed in any case.
+
+    Args:
+        policy: function from observations (N, D) to actions, or a controller that also gets the numbers of
+            the episodes.
+        open_episode: opens one instance of the environment.
+        settings: number of episodes, their starts and the environment's perturbation.
+        progress: called after every step.
+        remark: called with a sentence, once, if the first episodes are equal and others are still to begin.
+        trained_for: specification that the policy was trained for, such as that of its card. The environment must fit.
+
+    Returns:
+        returns and successes of each episode, in the order of their seeds. The number of instances has an effect only
+            if
+        the policy answers a batch of observations differently from single ones, usually in the last bits.
+
+    Raises:
+        PolicyMisfit: the policy was trained for another environment, which was then not even reset; or it gave actions
+            that are not the environment's, and nothing was sent.
+        EvaluationFailed: the environment or the policy raised an error after real steps, which are counted.
+        EvaluationInterrupted: Ctrl-C was pressed; real steps so far are counted.
+    """
+    run = _Run(policy, settings or EvaluationSettings(), progress, remark)
+    try:
+        with signals_between_steps() as heed, ExitStack() as instances:
+            return run.on(_open(open_episode, run.settings, instances, trained_for), heed)
+    except KeyboardInterrupt:
+        raise EvaluationInterrupted(run.begun) from None
+    except RAISED as error:
+        if run.begun == 0 and not isinstance(error, SystemExit):
+            raise
+        raise EvaluationFailed(run.begun, error) from error
+
+
+def _open(
+    open_episode: Callable[[], Episode],
+    settings: EvaluationSettings,
+    instances: ExitStack,
+    trained_for: EnvironmentSpec | None,
+) -> list[Episode]:
+    """Open as many instances as may be open at once, at most one for each episode. ``instances`` closes them.
+
+    Raises:
+        PolicyMisfit: the environment is another one than ``trained_for``. One instance was opened.
+    """
+
+    def open_one() -> Episode:
+        episode = open_episode()
+        instances.callback(episode.close)
+        return episode
+
+    first = open_one()
+    if trained_for is not None:
+        check_policy(trained_for, first.spec)
+    allowed = settings.parallel or (settings.episodes if first.parallel else 1)
+    return [first, *(open_one() for _ in range(min(allowed, settings.episodes) - 1))]
+
+
+def interquartile_mean(values: Array) -> float:
+    """Mean of the middle half of the values (n,)."""
+    cut = len(values) // 4
+    return float(np.sort(values)[cut : len(values) - cut].mean())
+
+
+@dataclass
+class _Tally:
+    """Running sums of one episode, which begins at the present state of ``episode``."""
+
+    number: int  # from 0, in the order of the seeds
+    episode: Episode
+    moment: Moment
+    rng: np.random.Generator  # of the exploration
+    total: float = 0.0
+    length: int = 0
+    held: int = 0  # number of last steps in a row that met the success criterion
+    limit: int = field(init=False)
+    path: list[Array] = field(default_factory=list)
+    actions: list[Array] = field(default_factory=list)
+    rewards: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.limit = self.episode.spec.time_limit or LONGEST_EPISODE
+        self.path.append(self.moment.coordinates)
+
+    @property
+    def over(self) -> bool:
+        return self.moment.terminated or self.moment.truncated or self.length >= self.limit
+
+    @property
+    def trace(self) -> Trace:
+        """The episode so far, with at least one step."""
+        ended = self.moment.terminated
+        return Trace(np.stack(self.path), np.stack(self.actions), np.array(self.rewards), ended)
+
+    def step(self, action: Array) -> None:
+        """Take one real step."""
+        self.moment = moment = self.episode.step(action)
+        self.total += moment.reward
+        self.length += 1
+        self.held = self.held + 1 if _holds(self.episode.spec, moment.coordinates) else 0
+        self.path.append(moment.coordinates)
+        self.actions.append(action)
+        self.rewards.append(moment.reward)
+
+
+class _Run:
+    """Runs episodes in the order of their seeds, each as soon as an instance is free."""
+
+    def __init__(
+        self,
+        policy: Acting,
+        settings: EvaluationSettings,
+        progress: Progress | None,
+        remark: Callable[[str], None] | None,
+    ) -> None:
+        self.settings = settings
+        self.begun = 0  # real steps begun, including interrupted and failed ones
+        self._seeded = True
+        self._policy = policy
+        self._progress = progress
+        self._remark = remark
+        self._tallies: list[_Tally] = []
+
+    def on(self, instances: Sequence[Episode], between_steps: Callable[[], None]) -> Evaluation:
+        """Run all episodes."""
+        free, running = list(instances), list[_Tally]()
+        while running or len(self._tallies) < self.settings.episodes:
+            running += self._begin(free)
+            self._step(running)
+            free = [tally.episode for tally in running if tally.over]
+            if free:
+                running = [tally for tally in running if not tally.over]
+                self._look_for_equal_ones()
+            self._tell()
+            between_steps()
+        return replace(_account(self._tallies), seeded=self._seeded)
+
+    def _begin(self, free: Sequence[Episode]) -> list[_Tally]:
+        """Begin the next episodes, one in each free instance, until all have begun."""
+        first = len(self._tallies)
+        before = _reset(free[0], self.settings) if first == 0 else None
+        begun = [
+            _Tally(first + i, episode, _start(episode, self.settings, first + i), self._noise(first + i))
+            for i, episode in enumerate(free[: self.settings.episodes - first])
+        ]
+        if before is not None:
+            self._seeded = _same_start(free[0].spec, before, begun[0].moment.coordinates)
+        self._tallies += begun
+        return begun
+
+    def _noise(self, number: int) -> np.random.Generator:
+        return np.random.default_rng([self.settings.first_seed + number, EXPLORING])
+
+    def _step(self, running: Sequence[_Tally]) -> None:
+        share = self.settings.explore
+        for tally, action in zip(running, self._actions(running), strict=True):
+            self.begun += 1
+            tally.step(explored(tally.episode.spec, action, share, tally.rng) if share else action)
+
+    def _actions(self, running: Sequence[_Tally]) -> Array:
+        """Return the policy's actions (N, F)."""
+        observations = np.stack([tally.moment.observation for tally in running]).astype(np.float32)
+        try:
+            return decode_actions(running[0].episode.spec, self._act(running, observations), len(running))
+        except ValueError as error:
+            raise PolicyMisfit(f"the policy does not fit the environment: {error}") from error
+
+    def _act(self, running: Sequence[_Tally], observations: NDArray[np.float32]) -> NDArray[Any]:
+        if isinstance(self._policy, PerEpisode):
+            return self._policy.actions([tally.number for tally in running], observations)
+        return self._policy(observations)
+
+    def _look_for_equal_ones(self) -> None:
+        """Say that the first episodes are equal, while it can still save real steps."""
+        over = [tally for tally in self._tallies if tally.over]
+        if self._remark is None or len(over) < FEW_EQUAL or len(self._tallies) == self.settings.episodes:
+            return
+        remark, self._remark = self._remark, None
+        first = over[0].trace
+        if all(_is_equal(first, tally.trace) for tally in over[1:]):
+            remark(
+                f"the first {len(over)} of {self.settings.episodes} episodes are equal in every number: if nothing is "
+                "random, all will be; --episodes takes fewer"
+            )
+
+    def _tell(self) -> None:
+        if self._progress is not None:
+            shares = (1.0 if tally.over else tally.length / tally.limit for tally in self._tallies)
+            terminated = sum(tally.moment.terminated for tally in self._tallies)
+            self._progress(sum(shares) / self.settings.episodes, terminated)
+
+
+def _start(episode: Episode, settings: EvaluationSettings, index: int) -> Moment:
+    seed = settings.first_seed + index
+    rng = np.random.default_rng(seed)
+    if settings.perturb > 0:
+        episode.perturb(rng, settings.perturb)
+    if settings.wide or settings.start_scale != 1:
+        return episode.place(draw(episode.spec, rng, wide=settings.wide, scale=settings.start_scale))
+    return episode.reset(seed)
+
+
+def _reset(episode: Episode, settings: EvaluationSettings) -> Array | None:
+    """Reset with the first seed, once more than there are episodes, and return the coordinates (C,). None where no
+    reset chooses the start."""
+    if settings.wide or settings.start_scale != 1:
+        return None
+    return episode.reset(settings.first_seed).coordinates
+
+
+def _same_start(spec: EnvironmentSpec, one: Array, other: Array) -> bool:
+    """Whether two starts are equal but for rounding."""
+    return all(abs(b - a) <= ROUNDING * span(c) for c, a, b in zip(spec.coordinates, one, other, strict=True))
+
+
+def _limit(tallies: Sequence[_Tally]) -> int | None:
+    """The time limit of the episodes: the specification's, or a shorter one that the environment kept by itself."""
+    declared = tallies[0].episode.spec.time_limit
+    own = [t.length for t in tallies if t.moment.truncated and t.length < t.limit]
+    return min(own) if own else declared
+
+
+def _account(tallies: Sequence[_Tally]) -> Evaluation:
+    spec = tallies[0].episode.spec
+    criterion = spec.success
+    return Evaluation(
+        returns=np.array([t.total for t in tallies]),
+        lengths=np.array([t.length for t in tallies], dtype=np.int64),
+        success=None if criterion is None else np.array([_succeeds(criterion, t) for t in tallies]),
+        traces=tuple(tally.trace for tally in tallies),
+        varied=_varied(spec, tallies),
+        limit=_limit(tallies),
+    )
+
+
+def span(coordinate: Coordinate) -> float:
+    """Width of a coordinate's sampling range."""
+    low, high = limits(coordinate.sampling)
+    return high - low
+
+
+def _varied(spec: EnvironmentSpec, tallies: Sequence[_Tally]) -> tuple[str, ...]:
+    """Return the names of constants that changed within an episode, such as setpoints of a schedule."""
+    names = []
+    for i, coordinate in enumerate(spec.coordinates):
+        moved = max(float(np.ptp(np.stack(t.path)[:, i])) for t in tallies)
+        if coordinate.kind == "constant" and moved > ROUNDING * span(coordinate):
+            names.append(coordinate.name)
+    return tuple(names)
+
+
+def _holds(spec: EnvironmentSpec, coordinates: Array) -> bool:
+    if spec.success is None:
+        return False
+    return all(bool(holds(spec, inequality, coordinates[None])[0]) for inequality in spec.success.hold)
+
+
+def _succeeds(success: Success, tally: _Tally) -> bool:
+    """Whether the episode meets every criterion that the specification has."""
+    return (
+        (not success.hold or tally.held >= success.hold_steps)
+        and (success.min_steps is None or tally.length >= success.min_steps)
+        and (success.terminated is None or tally.moment.terminated == success.terminated)
+        and (success.min_return is None or tally.total >= success.min_return)
+    )

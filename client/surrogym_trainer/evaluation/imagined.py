@@ -1,0 +1,168 @@
+"""Run policies in the surrogate without training: imagined returns, and statistics of observations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.environments.acting import ActingLanes
+from surrogym_client.environments.lanes import Lanes, session_request
+from surrogym_sampler.original.protocol import LONGEST_EPISODE
+from surrogym_shared.acting import ActingPolicy
+from surrogym_shared.network import Network, bounds_of, counts_of
+from surrogym_shared.port import PolicyPort, PolicyRollout, StepResult, SurrogatePort
+
+DECLARED = {"start_box": 0.0, "start_visited": 0.0}  # all episodes begin as declared
+WHOLE = {**DECLARED, "trust": None}  # a shortened episode would earn more if rewards are costs
+PAID_OUTSIDE = DECLARED  # an episode that leaves the trusted range gets a penalty for its missing steps
+STATISTICS_LANES = 1_024
+STEPS_AT_ONCE = 1_000  # steps of an imagined episode in one reply; an episode may be longer
+
+
+@dataclass(frozen=True)
+class Imagined:
+    """Result of whole virtual episodes."""
+
+    returns: NDArray[np.float64]  # (episodes,) undiscounted, any penalty included
+    penalty_share: float  # size of the penalty as a share of the reward's size
+    episode_penalty: float | None  # mean penalty of an episode; None in a session without a penalty
+
+
+def imagined_returns(
+    port: SurrogatePort,
+    predict: Callable[[NDArray[Any]], NDArray[Any]],
+    episodes: int,
+    seed: int | Sequence[int],
+    **options: Any,
+) -> NDArray[np.float64]:
+    """Return the returns (episodes,) of ``imagine``.
+
+    The imagined return of a policy is their mean: from the declared starts, without exploration.
+    """
+    return imagine(port, predict, episodes, seed, **options).returns
+
+
+def imagine(
+    port: SurrogatePort,
+    predict: Callable[[NDArray[Any]], NDArray[Any]],
+    episodes: int,
+    seed: int | Sequence[int],
+    **options: Any,
+) -> Imagined:
+    """Run a policy through whole virtual episodes side by side, from the declared starts.
+
+    If the server loses the session, all episodes begin again, because shortened ones would earn more if rewards are
+    costs. A ``Network`` acts on the surrogate's side if that is supported, with the same returns.
+
+    Args:
+        port: the surrogate.
+        predict: function from observations (N, D) to actions.
+        episodes: number of episodes.
+        seed: seed of their starts, or one for each episode; the same seed compares policies on the same starts.
+        options: further fields of ``OpenSession``.
+    """
+    whole = WHOLE if port.spec().outside_reward is None else PAID_OUTSIDE
+    lanes = Lanes(port, session_request(episodes, "same_step", options | whole))
+    sums, limit = _Sums(episodes), port.spec().time_limit or LONGEST_EPISODE
+    policy = _as_arrays(predict, port)
+    try:
+        taken = _stepped(lanes, predict, seed) if policy is None else _rolled(lanes, policy, seed, sums)
+        for part in taken:
+            if part is None:
+                return imagine(port, predict, episodes, seed, **options)
+            sums.add(part)
+            if sums.steps >= limit or not sums.running.any():
+                break
+    finally:
+        lanes.close()
+    penalised = lanes.penalised
+    share = float(np.abs(sums.penalties).sum()) / sums.size if penalised and sums.size else 0.0
+    return Imagined(sums.returns, share, float(sums.penalties.mean()) if penalised else None)
+
+
+class _Sums:
+    """Sums over the first episode of each lane so far."""
+
+    def __init__(self, episodes: int) -> None:
+        self.returns, self.penalties = np.zeros(episodes), np.zeros(episodes)
+        self.running = np.ones(episodes, dtype=bool)
+        self.size = 0.0
+        self.steps = 0
+
+    def add(self, taken: _Rewards) -> None:
+        ended = np.logical_or.accumulate(taken.ended)
+        running = self.running & np.concatenate([np.ones_like(ended[:1]), ~ended[:-1]])
+        self.returns = _added(self.returns, np.where(running, taken.reward, 0.0))
+        self.penalties = _added(self.penalties, np.where(running, taken.mean - taken.reward, 0.0))
+        self.size += float(np.abs(taken.mean[running]).sum())
+        self.running = self.running & ~ended[-1]
+        self.steps += len(ended)
+
+
+class _Rewards(NamedTuple):
+    """Rewards of T steps, (T, N) each."""
+
+    reward: NDArray[np.floating[Any]]
+    mean: NDArray[np.floating[Any]]
+    ended: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, result: StepResult | PolicyRollout) -> Self:
+        ended = result.terminated | result.truncated
+        return cls(np.atleast_2d(result.reward), np.atleast_2d(result.reward_mean), np.atleast_2d(ended))
+
+
+def _stepped(
+    lanes: Lanes, predict: Callable[[NDArray[Any]], NDArray[Any]], seed: int | Sequence[int]
+) -> Iterator[_Rewards | None]:
+    """Step until all first episodes have ended. Returns None if the session was lost."""
+    observation = lanes.reset(seed).observation
+    while True:
+        step = lanes.step(predict(observation))
+        observation = step.result.observation
+        yield _Rewards.of(step.result) if step.lost is None else None
+
+
+def _rolled(lanes: Lanes, policy: ActingPolicy, seed: int | Sequence[int], sums: _Sums) -> Iterator[_Rewards | None]:
+    """Take as many steps as an episode has in one request. Returns None if the session was lost."""
+    acting, limit = ActingLanes(lanes), lanes.port.spec().time_limit or LONGEST_EPISODE
+    acting.reset(seed)
+    while True:
+        taken = acting.take(policy, min(limit - sums.steps, STEPS_AT_ONCE), until=sums.running)
+        yield None if taken.cut.any() else _Rewards.of(taken.rollout)
+
+
+def _as_arrays(predict: Callable[[NDArray[Any]], NDArray[Any]], port: SurrogatePort) -> ActingPolicy | None:
+    """Return the policy in the form of arrays, with which the surrogate's side can act; None if it has no such form
+    or acts within other bounds."""
+    if not isinstance(predict, Network) or not isinstance(port, PolicyPort):
+        return None
+    spec = port.spec()
+    same = all(map(np.array_equal, (predict.low, predict.high), bounds_of(spec)))
+    if predict.counts != counts_of(spec) or not (same or predict.counts):
+        return None
+    try:
+        return ActingPolicy.of(predict)
+    except ValueError:
+        return None  # several policies at once, or a policy beyond the limits
+
+
+def _added(sums: NDArray[np.float64], rows: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Add rows (T, N) to sums (N,) one row at a time, so that rounding does not depend on T."""
+    added: NDArray[np.float64] = np.cumsum(np.concatenate([sums[None], rows]), axis=0)[-1]
+    return added
+
+
+def observation_statistics(port: SurrogatePort, seed: int) -> tuple[list[float], list[float]]:
+    """Return mean and standard deviation, (D,) each, of observations over the sampling range."""
+    lanes = Lanes(port, session_request(STATISTICS_LANES, "same_step", {"start_box": 1.0}))
+    try:
+        observation = np.asarray(lanes.reset(seed).observation, dtype=np.float64)
+    finally:
+        lanes.close()
+    deviation = observation.std(0)
+    return observation.mean(0).tolist(), np.where(deviation > 1e-6, deviation, 1.0).tolist()

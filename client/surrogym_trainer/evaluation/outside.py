@@ -1,0 +1,99 @@
+"""Measure how much of a policy's way lies where a log has no data. Pure.
+
+Shapes: n logged steps, m steps of the way, C coordinates, F action entries.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.evaluation.audit import on_one_scale
+
+USUAL = 0.99  # quantile of the distances from each logged step to its nearest one, as the log's own spacing
+FARTHER = 2.0  # a step is outside if no logged step is within this many times that distance
+LITTLE = 0.05  # share of a way that may lie outside
+MOST = 2_000  # most logged steps, and most steps of the way, to compare
+AT_ONCE = 256  # rows of a table of distances
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Outside:
+    """How far a policy's way leaves a log.
+
+    Attributes:
+        share: share of the way's steps that are far from every logged one.
+        name: the coordinate that leaves the log in at least half of these steps; empty if there is none.
+        way: its smallest and largest value in these steps.
+        log: its smallest and largest logged value.
+    """
+
+    share: float
+    name: str = ""
+    way: tuple[float, float] = (0.0, 0.0)
+    log: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def much(self) -> bool:
+        return self.share > LITTLE
+
+    def words(self) -> str:
+        """Describe in a sentence where the way leaves the log."""
+        where = ""
+        if self.name:
+            where = (
+                f", with {self.name} between {self.way[0]:.4g} and {self.way[1]:.4g} "
+                f"(the log: {self.log[0]:.4g} to {self.log[1]:.4g})"
+            )
+        return f"{100 * self.share:.0f} % of the policy's steps lie outside the log{where}"
+
+
+def outside_of(spec: EnvironmentSpec, q: Array, u: Array, way_q: Array, way_u: Array) -> Outside:
+    """Compare a policy's way with a log.
+
+    Args:
+        spec: specification of the environment.
+        q, u: logged states (n, C) and actions (n, F).
+        way_q, way_u: states (m, C) and actions (m, F) of the policy.
+    """
+    kept, walked = _thinned(len(q)), _thinned(len(way_q))
+    logged_q, passed_q = q[kept], way_q[walked]
+    scaled = on_one_scale(
+        spec, np.concatenate([logged_q, passed_q]), np.concatenate([u[kept], way_u[walked]]), len(kept)
+    )
+    logged, passed = scaled[: len(kept)], scaled[len(kept) :]
+    limit = FARTHER * float(np.quantile(_nearest(logged, logged, itself=True), USUAL))
+    far = _nearest(passed, logged) > limit
+    if not far.any():
+        return Outside(0.0)
+    low, high = logged_q.min(0), logged_q.max(0)
+    beyond = ((passed_q[far] < low) | (passed_q[far] > high)).sum(0)
+    worst = int(np.argmax(beyond))
+    share = float(far.mean())
+    if beyond[worst] < far.sum() / 2:
+        return Outside(share)  # no single coordinate leaves the log: a gap, several coordinates together, or the action
+    values = passed_q[far, worst]
+    ends = (float(values.min()), float(values.max()))
+    return Outside(share, spec.coordinate_names[worst], ends, (float(low[worst]), float(high[worst])))
+
+
+def _thinned(count: int) -> NDArray[np.intp]:
+    """Return at most ``MOST`` of ``count`` row numbers, evenly spaced."""
+    return np.unique(np.linspace(0, count - 1, min(count, MOST)).astype(np.intp))
+
+
+def _nearest(points: Array, to: Array, *, itself: bool = False) -> Array:
+    """Distance from each point to the nearest of ``to``, (points,). With ``itself`` both are the same points."""
+    found = np.empty(len(points))
+    for first in range(0, len(points), AT_ONCE):
+        rows = points[first : first + AT_ONCE]
+        squares = (rows**2).sum(1)[:, None] + (to**2).sum(1) - 2 * rows @ to.T
+        if itself:
+            squares[np.arange(len(rows)), first + np.arange(len(rows))] = np.inf
+        found[first : first + len(rows)] = np.sqrt(np.maximum(squares.min(1), 0.0))
+    return found

@@ -1,0 +1,95 @@
+"""The promise: the interval of the return that the surrogate predicts for a policy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from statistics import NormalDist
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.wire import OF_PARTICLES
+from surrogym_trainer.evaluation.imagined import imagine
+from surrogym_trainer.policies.evidence import Promise
+from surrogym_trainer.policies.predict import Predict
+
+FUNCTIONS = 32  # drawn from the posterior
+STARTS = 8  # starts along each function
+EVALUATION_STARTS = 100  # number of real starts whose mean return is promised
+LOW, HIGH = 0.05, 0.95
+UNNOTICED = 0.02  # share of the policy's gain: an audit does not notice errors that change the return by less
+NORMAL_POINTS = 201  # quantiles of a normal distribution, at equal probabilities
+
+Array = NDArray[np.float64]
+
+
+def promise_of(
+    port: SurrogatePort,
+    predict: Predict,
+    seed: int,
+    session: Mapping[str, Any] | None = None,
+    floor: float | None = None,
+) -> Promise:
+    """Compute a policy's promise along functions drawn from the posterior, each from several starts, without any
+    penalty.
+
+    Args:
+        port: the surrogate.
+        predict: the policy; function from observations (N, D) to actions.
+        seed: seed of functions and starts.
+        session: fields of ``OpenSession`` that the policy was trained with. Its variant with its options, penalty and
+            caution are ignored.
+        floor: return of an untrained policy; None if it was not measured.
+    """
+    left_out = {"variant", "penalty", "caution", *OF_PARTICLES}
+    options = {name: value for name, value in (session or {}).items() if name not in left_out}
+    options |= {"variant": "pathwise", "functions": FUNCTIONS, "penalty": 0.0}
+    returns = imagine(port, predict, FUNCTIONS * STARTS, seed, **options).returns
+    return interval(returns.reshape(STARTS, FUNCTIONS), floor)  # lane i follows function i modulo FUNCTIONS
+
+
+def interval(returns: Array, floor: float | None = None) -> Promise:
+    """Compute the promise from episodes' returns, (starts, functions).
+
+    The functions' mean returns also differ by chance, because each is over a few starts. So they are shrunk towards
+    their common mean until their variance is what the functions alone explain (one-way analysis of variance). Then the
+    uncertainty of 100 real starts, and that of the virtual starts, is added.
+
+    All functions share the errors of the model's form: a kink is smooth in each of them. So an error of the return that
+    an audit does not notice is allowed for: ``UNNOTICED`` of the gain over ``floor``, as the 5 % and 95 % quantiles of
+    a normal distribution. No mean return lies beyond the returns of single episodes.
+    """
+    parts = _parts(returns)
+    starts, functions = returns.shape
+    chance = parts.within * np.sqrt(1 / EVALUATION_STARTS + 1 / returns.size)
+    allowed = UNNOTICED * abs(float(returns.mean()) - (floor or 0.0)) / NormalDist().inv_cdf(HIGH)
+    samples = parts.functions[:, None] + np.hypot(chance, allowed) * _normal_points()
+    low, median, high = np.quantile(samples.clip(returns.min(), returns.max()), [LOW, 0.5, HIGH]).tolist()
+    return Promise(median=median, low=low, high=high, functions=functions, episodes=starts * functions)
+
+
+class _Parts(NamedTuple):
+    """Variation of returns, split into that of functions and that of starts."""
+
+    functions: Array  # (functions,) mean returns, with the variance that the functions explain
+    within: float  # standard deviation between starts of the returns along one function
+
+
+def _parts(returns: Array) -> _Parts:
+    means = returns.mean(0)
+    within = float(returns.var(0, ddof=1).mean())
+    observed = float(means.var(ddof=1))
+    explained = max(observed - within / len(returns), 0.0)
+    scale = np.sqrt(explained / observed) if observed > 0 else 0.0
+    scale *= 1 + 1.5 / len(means)  # first-order correction to Student's t, for one further function than those drawn
+    return _Parts(means.mean() + scale * (means - means.mean()), float(np.sqrt(within)))
+
+
+@cache
+def _normal_points() -> Array:
+    """Return standard normal quantiles at equal probabilities."""
+    standard = NormalDist()
+    return np.array([standard.inv_cdf((i + 0.5) / NORMAL_POINTS) for i in range(NORMAL_POINTS)])

@@ -1,0 +1,113 @@
+"""The card beside a policy's file: what the policy was trained for, and with which result."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError
+
+from surrogym_client.errors import SurrogymClientError
+from surrogym_shared.checks import first_fault
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import CurvePoint, SurrogateName
+from surrogym_trainer.policies.evidence import Audit, Promise
+
+DEFAULT_ALGORITHM = "PPO"
+MAX_CARD_BYTES = 1024 * 1024
+
+
+class UnusablePolicy(SurrogymClientError):
+    """The file is not a policy of the algorithm, or its card is invalid."""
+
+
+class NotedAddress(RootModel[str]):
+    """Address of a server that a file names.
+
+    It is not a ``str``, so that no code connects to it by mistake. Only a person chooses the address that receives a
+    token.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    def __str__(self) -> str:
+        return self.root
+
+
+class PolicyCard(BaseModel):
+    """Card of a policy: what it was trained for, its settings and its results.
+
+    It is stored in a JSON file of the same name beside the policy.
+    """
+
+    model_config = ConfigDict(extra="ignore", frozen=True)  # the file has fields that are not read here
+
+    algorithm: str = DEFAULT_ALGORITHM
+    surrogate: SurrogateName | None = None
+    server: NotedAddress | None = None
+    spec: EnvironmentSpec | None = None
+    seed: int | None = None
+    virtual_steps: int | None = None
+    seconds: float | None = None
+    imagined_return: float | None = None
+    visited_confidence: tuple[float | None, ...] = ()
+    untrained: float | None = None  # imagined return of a network that has learned nothing
+    promise: Promise | None = None
+    audit: Audit | None = None
+    trusted: bool | None = None  # None: the promise was not judged
+    reason: str = ""  # why the promise is trusted, or not
+    curve: tuple[CurvePoint, ...] = ()  # training curve
+    networks: int = 1  # networks of the last training
+    settings: dict[str, Any] = Field(default_factory=dict)
+    versions: dict[str, str] = Field(default_factory=dict)
+
+
+def card_path(policy: Path) -> Path:
+    """Return the path of a policy's card."""
+    return policy.with_suffix(".json")
+
+
+def require_card_or_none(policy: Path) -> None:
+    """Refuse a path whose card would replace another kind of file, such as a specification.
+
+    Raises:
+        UnusablePolicy: there is a JSON file of this name that is no card.
+    """
+    path = card_path(policy)
+    if not path.exists():
+        return
+    try:
+        known = path.stat().st_size <= MAX_CARD_BYTES and "virtual_steps" in json.loads(path.read_bytes())
+    except (ValueError, TypeError, RecursionError):
+        known = False
+    if not known:
+        raise UnusablePolicy(f"the card of {policy} would replace {path}, which is no card: choose another file")
+
+
+def write_card(policy: Path, card: PolicyCard) -> None:
+    """Write the card beside the policy."""
+    card_path(policy).write_text(card.model_dump_json(indent=2) + "\n", encoding="utf-8")
+
+
+def read_card(policy: Path) -> PolicyCard:
+    """Read the card of a policy. Without a card, return an empty one.
+
+    Raises:
+        UnusablePolicy: the card is invalid, or has more than ``MAX_CARD_BYTES``.
+        FileNotFoundError: there is no such policy.
+    """
+    if not policy.is_file():
+        raise FileNotFoundError(2, "no such policy file", str(policy))
+    if not card_path(policy).exists():
+        return PolicyCard()
+    with card_path(policy).open("rb") as file:
+        content = file.read(MAX_CARD_BYTES + 1)
+    if len(content) > MAX_CARD_BYTES:
+        raise UnusablePolicy(
+            f"{card_path(policy)} is not the card of a policy: expected at most {MAX_CARD_BYTES} bytes"
+        )
+    try:
+        return PolicyCard.model_validate_json(content)
+    except ValidationError as error:
+        raise UnusablePolicy(f"{card_path(policy)} is not the card of a policy: {first_fault(error)}") from error

@@ -1,0 +1,175 @@
+"""Read policy files without running code from them: those of Stable-Baselines3, networks of arrays, and ONNX."""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_shared.network import Network
+from surrogym_trainer.policies.card import DEFAULT_ALGORITHM, PolicyCard, UnusablePolicy, read_card
+from surrogym_trainer.policies.normalisation import (
+    Normalisation,
+    is_normalised,
+    missing_statistics,
+    statistics_path,
+)
+from surrogym_trainer.policies.onnx_files import load_onnx
+from surrogym_trainer.policies.predict import Predict
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+BUFFERLESS = {"n_envs": 1, "n_steps": 1, "buffer_size": 1}  # a policy that only acts needs no memory for experience
+ONNX = ".onnx"
+
+
+def require_policy(path: Path) -> None:
+    """Refuse a file that can't be a policy, by its first bytes, before anything is done for it.
+
+    Raises:
+        UnusablePolicy: it is neither a ZIP file nor called ``.onnx``.
+        FileNotFoundError: there is no such file.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(2, "no such policy file", str(path))
+    if path.suffix.lower() != ONNX and not zipfile.is_zipfile(path):
+        raise UnusablePolicy(
+            f"{path} is not a policy: expected a ZIP file of surrogym train or Stable-Baselines3, or a file ending in "
+            f"{ONNX}"
+        )
+
+
+def card_of_policy(path: Path) -> PolicyCard:
+    """Read the card of a file that may be a policy. Raises as ``require_policy`` and ``read_card``."""
+    require_policy(path)
+    return read_card(path)
+
+
+def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM, *, trust: bool = False) -> Predict:
+    """Load a policy as a function from observations to the most probable actions. Nothing is unpickled without
+    ``trust``.
+
+    Args:
+        path: file from ``surrogym train``, ``Network.save`` or ``surrogym export-policy``; or, with ``trust``, from
+            ``save`` of a Stable-Baselines3 algorithm.
+        algorithm: name of the Stable-Baselines3 class; a network of arrays and ONNX need none.
+        trust: unpickle a policy's objects, which runs any code that is in them.
+
+    Raises:
+        UnusablePolicy: the algorithm is unknown, the file is not one of its policies, it needs ``trust``, or it learned
+            in a ``VecNormalize`` whose statistics are not beside it.
+        UnusableOnnx: the file is not a policy in ONNX, or it could need more memory than a policy should.
+    """
+    if Network.is_at(path):
+        return load_network(path)
+    if path.suffix.lower() == ONNX:
+        return load_onnx(path)
+    model = _learner(path, algorithm, trust, {})
+    normalise = _normalisation(path, model)
+
+    def predict(observations: NDArray[np.float32]) -> NDArray[Any]:
+        shown = observations if normalise is None else normalise(observations)
+        actions: NDArray[Any] = model.predict(shown, deterministic=True)[0]
+        return actions
+
+    return predict
+
+
+def save_policy(learner: BaseAlgorithm, path: Path) -> None:
+    """Save a policy as ``learner.save`` does, with a description from which ``load_learner`` reads it without
+    unpickling."""
+    from surrogym_trainer.policies.structure import save
+
+    save(learner, path)
+
+
+def load_learner(
+    path: Path, algorithm: str = DEFAULT_ALGORITHM, /, *, trust: bool = False, **changes: Any
+) -> BaseAlgorithm:
+    """Load an algorithm of Stable-Baselines3 from its file. Nothing is unpickled without ``trust``.
+
+    Args:
+        path: file from ``save_policy``; or, with ``trust``, from ``save`` of the algorithm.
+        algorithm: name of its class.
+        trust: unpickle its objects, which runs any code that is in them.
+        changes: environment, seed and hyperparameters that replace the saved ones; the algorithm can only learn with an
+            environment.
+
+    Raises:
+        UnusablePolicy: the algorithm is unknown, the file is not one of its policies, it needs ``trust``, or it learned
+            in a ``VecNormalize``.
+    """
+    model = _learner(path, algorithm, trust, changes)
+    if is_normalised(model):
+        raise UnusablePolicy(
+            f"expected a policy that sees observations as they are, got {path}, which learned in a VecNormalize: "
+            "surrogym evaluate can run it, with the statistics beside it"
+        )
+    return model
+
+
+def _normalisation(path: Path, model: BaseAlgorithm) -> Normalisation | None:
+    """How the policy's observations are normalised; None if they are not."""
+    if not is_normalised(model):
+        return None
+    if not statistics_path(path).is_file():
+        raise missing_statistics(path)
+    return Normalisation(statistics_path(path))
+
+
+def _learner(path: Path, algorithm: str, trust: bool, changes: dict[str, Any]) -> BaseAlgorithm:
+    """Load an algorithm from its file. Arguments and errors as of ``load_learner``."""
+    import stable_baselines3
+
+    kind = getattr(stable_baselines3, algorithm.upper(), None)
+    if kind is None or not hasattr(kind, "load"):
+        raise UnusablePolicy(f"Stable-Baselines3 has no algorithm {algorithm!r}: expected for instance PPO, SAC or DQN")
+    try:
+        return _loaded(kind, path, trust, changes if "env" in changes else BUFFERLESS | changes)
+    except UnusablePolicy:
+        raise
+    except pickle.UnpicklingError as error:
+        raise UnusablePolicy(f"{path}: expected weights that are numbers, got other pickled objects") from error
+    except Exception as error:  # a malformed file can raise anything
+        if changes:
+            _learner(path, algorithm, trust, {})
+            given = [f"{name}={value!r}" for name, value in changes.items() if name not in ("env", "seed")]
+            raise UnusablePolicy(f"{path} does not fit {', '.join([*given, 'this surrogate'])}: {error}") from error
+        raise UnusablePolicy(f"{path} is not a policy of {algorithm}: {error}") from error
+
+
+def _loaded(kind: type[BaseAlgorithm], path: Path, trust: bool, changes: dict[str, Any]) -> BaseAlgorithm:
+    from surrogym_trainer.policies.structure import PickledObjects, read
+
+    if trust:
+        return kind.load(path, device="cpu", **changes)
+    try:
+        file, objects = read(path, num_envs=_num_envs(changes.get("env")), replaced=set(changes))
+    except PickledObjects as error:
+        raise UnusablePolicy(
+            f"{path} holds pickled objects ({', '.join(error.names)}), and reading them would run any code that is in "
+            "them: give --trust-policy (trust=True in Python) if you trust who made the file"
+        ) from None
+    return kind.load(file, device="cpu", custom_objects=objects, **changes)
+
+
+def _num_envs(env: object) -> int:
+    """Return the number of environments that step at once; 0 without an environment."""
+    return 0 if env is None else getattr(env, "num_envs", 1)
+
+
+def load_network(path: Path) -> Network:
+    """Load a network of arrays.
+
+    Raises:
+        UnusablePolicy: the file is none.
+    """
+    try:
+        return Network.load(path)
+    except ValueError as error:
+        raise UnusablePolicy(str(error)) from error

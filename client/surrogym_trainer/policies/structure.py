@@ -1,0 +1,262 @@
+"""Description of a policy as data, from which a policy of ``surrogym train`` is rebuilt without unpickling.
+
+Stable-Baselines3 pickles what JSON can't represent: spaces, classes, schedules. The file of a policy gets an entry that
+describes them, and reading rebuilds them from it. Weights are read as plain numbers. Nothing is unpickled.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from gymnasium import Space, spaces
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.type_aliases import TrainFreq
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule
+from stable_baselines3.dqn.policies import DQNPolicy
+from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.td3.policies import TD3Policy
+from torch.optim import RMSprop
+
+from surrogym_client.environments.spaces import space
+from surrogym_shared.archives import read_entries, stored
+from surrogym_shared.checks import first_fault
+from surrogym_shared.wire import ActionSpace, BoxSpace, DiscreteSpace, MultiDiscreteSpace
+from surrogym_trainer.policies.defaults import decaying
+from surrogym_trainer.policies.networks import PaperPolicy, Standardise
+from surrogym_trainer.policies.saved_settings import PolicySettings
+
+ENTRY = "surrogym-policy.json"
+MAX_BYTES = 256 * 1024 * 1024  # largest contents of a file
+WEIGHTS = ".pth"
+PICKLED = ":serialized:"
+DECAYING = "decaying"
+POLICIES = {kind.__name__: kind for kind in (PaperPolicy, SACPolicy, TD3Policy, DQNPolicy)}
+EXTRACTOR = {"features_extractor_class", "features_extractor_kwargs"}
+OPTIMIZER = {"optimizer_class", "optimizer_kwargs"}
+DESCRIBED = EXTRACTOR | OPTIMIZER | {"net_arch", "n_critics", "use_sde"}
+NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
+REMADE = (  # Stable-Baselines3 makes these when it builds the algorithm, and when learning begins
+    *("lr_schedule", "exploration_schedule", "rollout_buffer_class", "replay_buffer_class"),
+    *("_last_obs", "_last_original_obs", "_last_episode_starts", "ep_info_buffer", "ep_success_buffer"),
+)
+VARIABLES = {"log_ent_coef"}  # SAC's
+IDLE = {"learning_rate": 0.0, "clip_range": 0.2, "clip_range_vf": None, "train_freq": 1, "action_noise": None}
+
+Layers = Annotated[list[Annotated[int, Field(ge=1)]], Field(max_length=64)]
+
+
+class PickledObjects(ValueError):
+    """The file contains pickled objects without a description. ``names`` lists them."""
+
+    def __init__(self, names: list[str]) -> None:
+        super().__init__(names)
+        self.names = names
+
+
+class Structure(BaseModel):
+    """Description of what Stable-Baselines3 needs besides the weights. The last four fields are for learning only;
+    None means not described."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    version: Literal[1] = 1
+    policy: Literal["PaperPolicy", "SACPolicy", "TD3Policy", "DQNPolicy"]
+    observation_space: BoxSpace
+    action_space: ActionSpace
+    net_arch: Layers | dict[Literal["pi", "vf", "qf"], Layers]
+    n_critics: Annotated[int, Field(ge=1, le=8)] | None = None
+    use_sde: bool | None = None
+    rmsprop: dict[Literal["alpha", "eps", "weight_decay"], float] | None = None  # A2C's optimizer; others have Adam
+    learning_rate: Literal["decaying"] | None = None
+    clip_range: float | None = None
+    clip_range_vf: float | None = None
+    train_freq: tuple[int, Literal["step", "episode"]] | None = None
+
+    def objects(self) -> dict[str, Any]:
+        """Attributes of the algorithm that the description contains."""
+        chosen = {
+            "features_extractor_class": Standardise,
+            "net_arch": self.net_arch,
+            "n_critics": self.n_critics,
+            "use_sde": self.use_sde,
+            "optimizer_class": None if self.rmsprop is None else RMSprop,
+            "optimizer_kwargs": self.rmsprop,
+        }
+        found = {
+            "policy_class": POLICIES[self.policy],
+            "policy_kwargs": _given(chosen),
+            "observation_space": space(self.observation_space),
+            "action_space": space(self.action_space),
+            "learning_rate": decaying if self.learning_rate == DECAYING else None,
+            "clip_range": self.clip_range,
+            "clip_range_vf": self.clip_range_vf,
+            "train_freq": self.train_freq,
+        }
+        return _given(found)
+
+    @property
+    def weights(self) -> int:
+        """Number of weights that a network with the described layers needs at least, without biases."""
+        inputs, arch = len(self.observation_space.low), self.net_arch
+        parts = {"pi": arch} if isinstance(arch, list) else dict(arch)
+        actor, others = parts.pop("pi", []), parts.values()
+        chains = [(inputs, *actor, _outputs(self.action_space)), *((inputs, *layers) for layers in others)]
+        return sum(a * b for chain in chains for a, b in pairwise(chain))
+
+
+def save(learner: BaseAlgorithm, path: Path) -> None:
+    """Save a policy as ``learner.save`` does, and add the description if the policy can be described."""
+    file = io.BytesIO()
+    learner.save(file, exclude=["_last_original_obs"])  # by which ``normalisation`` tells policies of other programs
+    if (structure := describe(learner)) is not None:
+        with zipfile.ZipFile(file, "a") as archive:
+            archive.writestr(ENTRY, structure.model_dump_json())
+    path.write_bytes(file.getvalue())
+
+
+def describe(learner: BaseAlgorithm) -> Structure | None:
+    """Describe a policy made by ``surrogym train``; None for any other."""
+    kwargs, kind = learner.policy_kwargs, type(learner.policy)
+    if POLICIES.get(kind.__name__) is not kind or set(kwargs) - DESCRIBED:
+        return None
+    if kwargs.get("features_extractor_class") is not Standardise:
+        return None
+    if kwargs.get("optimizer_class", RMSprop) is not RMSprop:
+        return None
+    observed, acted = _wire(learner.observation_space), _wire(learner.action_space)
+    if not isinstance(observed, BoxSpace) or acted is None:
+        return None
+    return Structure(
+        policy=kind.__name__,
+        observation_space=observed,
+        action_space=acted,
+        net_arch=learner.policy.net_arch,
+        n_critics=kwargs.get("n_critics"),
+        use_sde=kwargs.get("use_sde"),
+        rmsprop=kwargs.get("optimizer_kwargs"),
+        learning_rate=DECAYING if learner.learning_rate is decaying else None,
+        clip_range=_constant(learner, "clip_range"),
+        clip_range_vf=_constant(learner, "clip_range_vf"),
+        train_freq=_frequency(getattr(learner, "train_freq", None)),
+    )
+
+
+def read(path: Path, *, num_envs: int, replaced: set[str]) -> tuple[io.BytesIO, dict[str, Any]]:
+    """Read a policy's file without its pickled objects, and rebuild these from the description.
+
+    Both results are arguments for ``load`` of a Stable-Baselines3 algorithm: the file, and ``custom_objects``.
+
+    Args:
+        path: file from ``save``.
+        num_envs: number of environments on which the algorithm continues to learn; 0 if it only acts, which leaves out
+            the objects that only learning needs.
+        replaced: attributes that the caller sets, so that the file's are not needed.
+
+    Raises:
+        PickledObjects: a needed object is neither described nor replaced.
+        OSError: the file can't be read.
+        ValueError: the file does not have this form.
+    """
+    entries = read_entries(path, MAX_BYTES)
+    data = dict(json.loads(_entry(entries, "data")))
+    pickled = [name for name, value in data.items() if isinstance(value, dict) and PICKLED in value]
+    structure = Structure.model_validate_json(entries[ENTRY]) if ENTRY in entries else None
+    objects: dict[str, Any] = dict.fromkeys((*REMADE, *replaced)) | ({} if num_envs else IDLE)
+    if structure is not None:
+        _require_weights(structure, _entry(entries, "policy" + WEIGHTS))
+        objects |= structure.objects()
+    if unknown := [name for name in pickled if name not in objects]:
+        raise PickledObjects(unknown)
+    settings = _settings(data, {*objects, *pickled, *NEEDED})
+    if num_envs and structure is not None:
+        settings.require_memory(num_envs, objects["observation_space"], objects["action_space"])
+    placeholders = dict.fromkeys(({*pickled} - replaced) | {*NEEDED})  # load replaces them by the objects
+    data = {"verbose": 0, **settings.attributes, **placeholders}
+    weights = {name: _plain(content) for name, content in entries.items() if name.endswith(WEIGHTS)}
+    _require_variables(weights.get("pytorch_variables" + WEIGHTS))
+    return io.BytesIO(stored({"data": json.dumps(data).encode(), **weights})), objects
+
+
+def _settings(data: Mapping[str, Any], replaced: set[str]) -> PolicySettings:
+    """Return the settings in a policy's file, except those that the caller or the description replaces."""
+    try:
+        return PolicySettings.model_validate({name: value for name, value in data.items() if name not in replaced})
+    except ValidationError as error:
+        raise ValueError(f"data: {first_fault(error, got=True)}") from error
+
+
+def _entry(entries: Mapping[str, bytes], name: str) -> bytes:
+    if name not in entries:
+        raise ValueError(f"expected an entry {name!r}, got {', '.join(sorted(entries)[:5]) or 'none'}")
+    return entries[name]
+
+
+def _plain(weights: bytes) -> bytes:
+    """Repack the zip that ``torch.save`` wrote, so that torch only inflates what was counted here."""
+    return stored(read_entries(weights, len(weights)))
+
+
+def _require_weights(structure: Structure, file: bytes) -> None:
+    """Refuse layers that are far larger than the weights in the file: they would fill the memory before torch
+    compares them."""
+    came = len(file) // np.dtype(np.float32).itemsize
+    if structure.weights > came:
+        raise ValueError(f"expected weights for layers of {structure.weights} numbers, got {came} numbers at most")
+
+
+def _require_variables(file: bytes | None) -> None:
+    """Refuse unknown tensors, because Stable-Baselines3 sets each one wherever in the algorithm its name points to."""
+    found = {} if file is None else torch.load(io.BytesIO(file), map_location="cpu", weights_only=True)
+    if unknown := {*(found or {})} - VARIABLES:
+        raise ValueError(f"expected no variables but {', '.join(VARIABLES)}, got {', '.join(map(str, unknown))}")
+
+
+def _given(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _outputs(action: BoxSpace | DiscreteSpace | MultiDiscreteSpace) -> int:
+    match action:
+        case BoxSpace():
+            return len(action.low)
+        case DiscreteSpace():
+            return action.n
+        case MultiDiscreteSpace():
+            return sum(action.nvec)
+
+
+def _wire(given: Space[Any]) -> BoxSpace | DiscreteSpace | MultiDiscreteSpace | None:
+    """Return the space as data; None if it can't be rebuilt exactly."""
+    described: BoxSpace | DiscreteSpace | MultiDiscreteSpace
+    match given:
+        case spaces.Box(shape=(_,)):
+            low, high = ([float(x) if np.isfinite(x) else None for x in limits] for limits in (given.low, given.high))
+            described = BoxSpace(low=low, high=high)
+        case spaces.Discrete():
+            described = DiscreteSpace(n=int(given.n))
+        case spaces.MultiDiscrete():
+            described = MultiDiscreteSpace(nvec=given.nvec.tolist())
+        case _:
+            return None
+    return described if space(described) == given else None
+
+
+def _constant(learner: BaseAlgorithm, name: str) -> float | None:
+    match getattr(learner, name, None):
+        case FloatSchedule(value_schedule=ConstantSchedule(val=value)):
+            return float(value)
+        case _:
+            return None
+
+
+def _frequency(given: object) -> tuple[int, Any] | None:
+    return (given.frequency, given.unit.value) if isinstance(given, TrainFreq) else None

@@ -1,0 +1,168 @@
+"""The first part of the report, for decisions: cost, result, prediction, doubts, and what to do next.
+
+A section with missing data says what is missing, and shows the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from surrogym_client.surrogates.advice import verdict
+from surrogym_shared.wire import EvaluationDetail, OutputFidelity
+from surrogym_shared.words import counted
+from surrogym_trainer.report.comparisons import beside, in_short
+from surrogym_trainer.report.cost import cost, tests
+from surrogym_trainer.report.doubts import next_steps, tested, untested
+from surrogym_trainer.report.episodes import draw_episodes, turns
+from surrogym_trainer.report.figures import svg
+from surrogym_trainer.report.html import bullets, moving, on_screen, paragraph, picture, section, table
+from surrogym_trainer.report.known import Known
+from surrogym_trainer.report.maps import Cut
+from surrogym_trainer.report.prediction import prediction
+from surrogym_trainer.report.wording import (
+    criterion,
+    mean,
+    number,
+    original,
+    share,
+    starts,
+    starts_of,
+    steps,
+    successes,
+)
+
+NO_CRITERION = "Nobody declared what a success is, so this report can't tell how many episodes failed."
+RETURN = "The return of an episode is the sum of its rewards. Higher is better."
+
+
+def decision(known: Known, cuts: Sequence[Cut]) -> str:
+    """All sections of this part, as HTML."""
+    parts = [
+        _in_short(known),
+        cost(known),
+        _result(known),
+        beside(known),
+        prediction(known),
+        _unsure(known, cuts),
+        section("What was not tested", paragraph(tested(known)) + bullets(untested(known))),
+        section("What to do next", bullets(next_steps(known))),
+    ]
+    if known.missing:
+        parts.append(section("What could not be read", bullets(known.missing)))
+    return "".join(parts)
+
+
+def _in_short(known: Known) -> str:
+    """The result in at most four sentences."""
+    view, real = known.view, known.real
+    if known.policy is None:
+        said = f"There is a model of {view.name} from {steps(view.ledger.total)}, and no controller yet."
+        return paragraph(
+            said if known.models else f"There is neither a model nor a controller of {view.name} yet.", "short"
+        )
+    if real is None:
+        said = "A controller was trained in the model. It has not been tested in the original environment."
+        return paragraph(said, "short")
+    sentences = [f"In {counted(real.episodes, 'real episode')} the controller earned {mean(real)} on average."]
+    if real.success_rate is not None:
+        sentences.append(f"{successes(real)} succeeded.")
+    sentences += [in_short(real, other) for other in (known.without, known.reference) if other is not None]
+    before, testing = view.ledger.total + view.ledger.audit, sum(count for _, count in tests(known))
+    sentences.append(f"Learning and checking it took {steps(before)}, and testing took {testing:,} more.")
+    return paragraph(" ".join(sentences), "short") + paragraph(" ".join(_meanings(known)))
+
+
+def _meanings(known: Known) -> list[str]:
+    """The words of the summary that a reader may not know, each in a sentence."""
+    success = known.view.spec.success
+    said = [original(known.view.environment), RETURN]
+    said.append(NO_CRITERION if success is None else criterion(success))
+    said.append("In brackets: the interval that contains the true value with 95 % certainty.")
+    return said
+
+
+def _result(known: Known) -> str:
+    real = known.real
+    if real is None:
+        why = "There is no controller yet." if known.policy is None else "It has not been tested in reality."
+        return section("What it gives", paragraph(why) + _further(known))
+    rows = [
+        ("average return", mean(real)),
+        ("episodes that succeeded", "no criterion was declared" if real.success_rate is None else successes(real)),
+        ("best, median and worst return", " / ".join(number(one) for one in (real.most, real.median, real.least))),
+        ("real episodes", f"{real.episodes} ({starts_of(real)})"),
+        *([("an episode begins at", starts(known.view.spec))] if real.declared else []),
+        ("real steps that this took", f"{real.steps:,}"),
+    ]
+    said = table(("", ""), rows, "In the original environment; in brackets, 95 % intervals")
+    return section("What it gives", said + _best_to_worst(known, real) + _video(known) + _further(known))
+
+
+def _best_to_worst(known: Known, real: EvaluationDetail) -> str:
+    """The picture of three episodes; nothing where they are not known."""
+    returns = {"best": real.most, "median": real.median, "worst": real.least}
+    traces = {trace.rank: trace for trace in real.traces}
+    shown = [(f"{rank}, return {number(value)}", traces[rank]) for rank, value in returns.items() if rank in traces]
+    if not shown:
+        return ""
+    spec = known.view.spec
+    alt = f"Coordinates and actions over the steps of {', '.join(name for name, _ in shown)}"
+    words = "The best, the median and the worst of these episodes: half of all went at least as well as the median."
+    return picture(svg(draw_episodes(spec, shown)), alt) + paragraph(f"{words} {turns(spec)}".rstrip())
+
+
+def _further(known: Known) -> str:
+    """The policy's other real episodes, such as those in other environments; nothing without any."""
+    evaluations = [] if known.policy is None else known.policy.evaluations
+    shown = None if known.real is None else known.real.id
+    others = [one for one in evaluations if one.controller == "policy" and one.id != shown]
+    if not others:
+        return ""
+    rows = [(starts_of(one), one.episodes, mean(one), successes(one)) for one in others]
+    return table(("starts", "real episodes", "average return", "succeeded"), rows, "Further tests of this controller")
+
+
+def _video(known: Known) -> str:
+    """The video of the best, the median and the worst episode; nothing where there is none."""
+    if known.video is None:
+        return ""
+    alt = "Video: the best, the median and the worst real episode beside each other"
+    words = "The video shows the best, the median and the worst episode beside each other, drawn from their states."
+    return on_screen(moving(*known.video, alt) + paragraph(words))
+
+
+def _unsure(known: Known, cuts: Sequence[Cut]) -> str:
+    view = known.view
+    title = "Where the model is unsure"
+    if view.fidelity is None:
+        return section(title, paragraph("There is no model yet, so nothing is known."))
+    units = {coordinate.name: coordinate.unit for coordinate in view.spec.coordinates}
+    rows = [
+        (one.name, units.get(one.name) or "-", share(one.coverage), one.tolerance, _of_allowed(one))
+        for one in view.fidelity.outputs
+    ]
+    heading = ("what is predicted", "unit", "known well enough in", "error allowed", "typical error, of that")
+    said = table(heading, rows, "Over the whole range of states and actions that was declared")
+    sentence = verdict(view)
+    said += paragraph(f"The model is {sentence}." if sentence else "")
+    if cuts:
+        said += paragraph(_on_maps(cuts))
+    return section(title, said)
+
+
+def _of_allowed(output: OutputFidelity) -> str:
+    """The typical error as a share of the tolerance."""
+    error = output.leave_one_out_error
+    if error is None:
+        return "-"
+    ratio = error / output.tolerance
+    return "less than 1 %" if ratio < 0.01 else f"{100 * ratio:.0f} %" if ratio < 10 else f"{ratio:.0f} times"
+
+
+def _on_maps(cuts: Sequence[Cut]) -> str:
+    """The part of the maps on which the model is unsure."""
+    parts = [float((cut.uncertainty > 1).mean()) for cut in cuts]
+    where = "with the other coordinates and the action in the middle of their ranges"
+    if not any(parts):
+        return f"The maps under Details show no region where the model is unsure ({where})."
+    return f"The maps under Details show where: in up to {share(max(parts))} of a map ({where})."

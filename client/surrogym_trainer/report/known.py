@@ -1,0 +1,174 @@
+"""The data of a report: everything that a server knows of a surrogate and of one of its policies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from surrogym_client.errors import NotInstalled, SurrogymClientError, UnknownPolicy
+from surrogym_client.transport import Api
+from surrogym_shared.checks import trace_fault
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import (
+    Controller,
+    EvaluationDetail,
+    EvaluationView,
+    ModelView,
+    PolicyDetail,
+    PolicyForm,
+    PolicyView,
+    SampleView,
+    SurrogateView,
+)
+from surrogym_trainer.report.maps import Cut, cuts
+
+PREFERRED = "production"
+VIDEOS: dict[PolicyForm, str] = {"mp4": "video/mp4", "gif": "image/gif"}
+MOST_VIDEO_BYTES = 8 * 1024 * 1024  # inside a report
+
+
+@dataclass(frozen=True)
+class Known:
+    """A surrogate, and a policy with its real episodes.
+
+    Attributes:
+        view: the surrogate.
+        models: all fits, oldest first.
+        samples: all real steps.
+        server: its address and version.
+        policy: the policy of the report; None if there is none.
+        real: its newest real episodes in the surrogate's own environment from the declared starts.
+        without: real episodes without the policy, from the same starts.
+        reference: real episodes of a reference controller, from the same starts.
+        video: its form and content, as a browser plays it; None: there is none.
+        others: the other versions of the surrogate's policies.
+        missing: sentences about what could not be read.
+    """
+
+    view: SurrogateView
+    models: list[ModelView]
+    samples: list[SampleView]
+    server: str
+    policy: PolicyDetail | None = None
+    real: EvaluationDetail | None = None
+    without: EvaluationDetail | None = None
+    reference: EvaluationDetail | None = None
+    video: tuple[str, bytes] | None = None
+    others: tuple[PolicyView, ...] = ()
+    missing: tuple[str, ...] = ()
+
+
+def collect(api: Api, name: str, which: str | None = None) -> Known:
+    """Collect the data of a report. It names data that can't be read.
+
+    Args:
+        api: the server.
+        name: of the surrogate.
+        which: version or alias of the policy. None: the one in production, otherwise the newest.
+
+    Raises:
+        UnknownSurrogate, UnknownPolicy: there is none of this name.
+    """
+    view, models, samples = api.surrogate(name), api.models(name), list(api.samples(name))
+    server = f"{api.url}, surrogym {api.health().version}"
+    policy, missing = _policy(api, name, which), list[str]()
+    if policy is None:
+        return Known(view, models, samples, server)
+    real = chosen_real(policy)
+    chosen = (real, chosen_without(policy, real), chosen_reference(policy, real))
+    details: list[EvaluationDetail | None] = []
+    for evaluation in chosen:
+        detail = None if evaluation is None else api.policies.evaluation(name, policy.version, evaluation.id)
+        if detail is not None and detail.missing:
+            missing.append(f"the single episodes of evaluation {detail.id} are missing: {detail.missing}")
+        details.append(detail and with_whole_traces(detail, view.spec, missing))
+    video, lacks = _video(api, name, policy)
+    missing += lacks
+    others = tuple(one for one in api.policies.list(name) if one.version != policy.version)
+    return Known(
+        view, models, samples, server, policy, details[0], details[1], details[2], video, others, tuple(missing)
+    )
+
+
+def with_whole_traces(detail: EvaluationDetail, spec: EnvironmentSpec, missing: list[str]) -> EvaluationDetail:
+    """Leave out the traces that don't have the shape of this specification. Earlier servers took them."""
+    whole = [
+        trace
+        for trace in detail.traces
+        if not trace_fault(trace.coordinates, trace.action, trace.reward, c=len(spec.coordinates), f=spec.action.size)
+    ]
+    if beyond := len(detail.traces) - len(whole):
+        missing.append(
+            f"{beyond} traces of evaluation {detail.id} are left out: they have another shape than its steps"
+        )
+    return detail.model_copy(update={"traces": whole})
+
+
+def _video(api: Api, name: str, policy: PolicyDetail) -> tuple[tuple[str, bytes] | None, list[str]]:
+    """The video of a policy, and a sentence about each one that could not be read."""
+    missing = []
+    for form, kind in VIDEOS.items():
+        file = next((one for one in policy.files if one.form == form), None)
+        if file is None:
+            continue
+        if not file.stored:
+            missing.append(f"the video ({form}) is missing: it never came, or it made room for newer files")
+        elif file.bytes > MOST_VIDEO_BYTES:
+            missing.append(
+                f"the video has {file.bytes / 1e6:.0f} MB, too much for one page: surrogym policy get "
+                f"{name}@{policy.version} --out video.{form}"
+            )
+        else:
+            try:
+                return (kind, api.policies.file(name, policy.version, form)), missing
+            except SurrogymClientError as error:
+                missing.append(f"the video ({form}) can't be read: {error}")
+    return None, missing
+
+
+def cuts_of(api: Api, known: Known) -> tuple[list[Cut], str]:
+    """The latest model's maps over two coordinates, or the reason why there are none."""
+    try:
+        return cuts(known.view, partial(api.query_uncertainty, known.view.name)), ""
+    except NotInstalled as error:
+        return [], str(error)
+
+
+def chosen_real(policy: PolicyView) -> EvaluationView | None:
+    """The newest evaluation of the policy in the surrogate's own environment: from the declared starts, or else from
+    others."""
+    own = [one for one in policy.evaluations if one.controller == "policy" and one.own]
+    return next((one for one in reversed(own) if one.declared), own[-1] if own else None)
+
+
+def chosen_without(policy: PolicyDetail, real: EvaluationView | None) -> EvaluationView | None:
+    """The newest evaluation without the policy in the same environment that has the same starts."""
+    return _beside(policy, real, ("zero", "random"))
+
+
+def chosen_reference(policy: PolicyDetail, real: EvaluationView | None) -> EvaluationView | None:
+    """The newest evaluation of a reference controller in the same environment that has the same starts."""
+    return _beside(policy, real, ("reference",))
+
+
+def _beside(
+    policy: PolicyDetail, real: EvaluationView | None, controllers: Sequence[Controller]
+) -> EvaluationView | None:
+    if real is None or not real.seeded:
+        return None
+    starts = (real.own, real.first_seed, real.note)
+    among = [one for one in policy.evaluations if one.controller in controllers and one.seeded]
+    same = [one for one in among if (one.own, one.first_seed, one.note) == starts]
+    return same[-1] if same else None
+
+
+def _policy(api: Api, name: str, which: str | None) -> PolicyDetail | None:
+    if which is not None:
+        return api.policies.get(name, which)
+    for wanted in (PREFERRED, "latest"):
+        try:
+            return api.policies.get(name, wanted)
+        except UnknownPolicy:
+            continue
+    return None

@@ -1,0 +1,167 @@
+"""The page of the report: embedded pictures, tables, and a content security policy that lets it load nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from surrogym_client.runtime.versions import versions
+from surrogym_client.surrogates.phases import IN_WORDS
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import ModelView, OutputFidelity, Phase, SampleView, SurrogateView
+from surrogym_trainer.report.coverage import coverage_of
+from surrogym_trainer.report.decision import decision
+from surrogym_trainer.report.figures import draw_coverage, draw_fidelity, draw_maps, draw_samples, svg
+from surrogym_trainer.report.html import document, picture, rows, section, table
+from surrogym_trainer.report.known import Known
+from surrogym_trainer.report.maps import Cut
+
+FIDELITY = {
+    "output": "name",
+    "confidence index": "confidence_index",
+    "as in the paper": "confidence_index_paper",
+    "tolerance": "tolerance",
+    "coverage": "coverage",
+    "leave-one-out error": "leave_one_out_error",
+    "within 1 deviation": "leave_one_out_within_one",
+    "within 2": "leave_one_out_within_two",
+    "noise": "noise",
+}
+PREQUENTIAL = {
+    "output": "name",
+    "new samples": "predictions",
+    "in 50 %": "within_50",
+    "in 80 %": "within_80",
+    "in 90 %": "within_90",
+    "interval score": "interval_score",
+}
+LEDGER = ("initial", "adaptive", "manual", "total", "audit", "logged", "evaluation", "unresolved")
+
+PHASES: dict[Phase, str] = {
+    **IN_WORDS,
+    "collecting": "the first real steps are being taken",
+    "fitting": "the model is learning from new real steps",
+    "sampling": "further real steps are being taken where the model is unsure",
+}
+
+
+def page(known: Known, cuts: Sequence[Cut] = ()) -> str:
+    """The whole page of a surrogate, HTML in one file: first the part for decisions, then the details.
+
+    Args:
+        known: what the server knows of the surrogate and of one of its policies.
+        cuts: the latest model's maps over two coordinates.
+    """
+    view, now = known.view, datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    packages = ", ".join(f"{name} {number}" for name, number in versions().items())
+    about = f"{view.environment or 'own environment'}, at {known.server}, {now}"
+    details = "".join(_details(known, cuts))
+    return document(
+        f"Report on {view.name}",
+        f'<h1>{escape(view.name)}</h1><p class="about">{escape(about)}</p>{decision(known, cuts)}'
+        f'<h1 class="part">Details</h1>{details}<footer><p>Written with {escape(packages)}.</p></footer>',
+    )
+
+
+def _details(known: Known, cuts: Sequence[Cut]) -> list[str]:
+    view, models, samples = known.view, known.models, known.samples
+    sections = [_summary(view), _spent(view)]
+    if models:
+        sections.append(_fidelity(view, models))
+    if samples:
+        figure = picture(svg(draw_samples(view, samples)), "Where the real steps began, two coordinates a picture")
+        sections.append(section("Samples", figure + _covered(view, samples)))
+    if cuts:
+        sections.append(_maps(view, cuts))
+    if models:
+        sections += [_structure(models[-1], view.spec), _history(models)]
+    specification = escape(view.spec.model_dump_json(indent=2))
+    sections.append(section("Specification", f"<details><summary>JSON</summary><pre>{specification}</pre></details>"))
+    return sections
+
+
+def _covered(view: SurrogateView, samples: Sequence[SampleView]) -> str:
+    """The coverage of the log; nothing without logged steps."""
+    logged = [sample for sample in samples if sample.purpose == "logged"]
+    if not logged:
+        return ""
+    q, u = np.array([sample.coordinates for sample in logged]), np.array([sample.action for sample in logged])
+    coverage = coverage_of(view.spec, q, u)
+    shown = picture(svg(draw_coverage(coverage)), "How often the log was in each cell of two columns")
+    return f"{shown}<p>{escape(coverage.words())}</p>"
+
+
+def _summary(view: SurrogateView) -> str:
+    index = "no model yet" if view.confidence_index is None else f"{view.confidence_index:.4f}"
+    facts = [
+        ("phase", f"{PHASES[view.phase]}, paused" if view.paused else PHASES[view.phase]),
+        ("confidence index", f"{index}, target {view.target:g}"),
+        ("real steps", f"{view.ledger.total} taken, {view.budget} allowed"),
+        ("model", view.model_version),
+        ("queries", ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in view.queries)),
+        *([("last error", view.error)] if view.error else []),
+    ]
+    return section("State of the design", rows(facts))
+
+
+def _spent(view: SurrogateView) -> str:
+    counted = table(LEDGER, [[getattr(view.ledger, name) for name in LEDGER]], "Real steps by purpose")
+    return section("Ledger", counted)
+
+
+def _fidelity(view: SurrogateView, models: Sequence[ModelView]) -> str:
+    outputs = models[-1].fidelity.outputs
+    judged = table(
+        tuple(FIDELITY), [[getattr(o, field) for field in FIDELITY.values()] for o in outputs], "The latest model"
+    )
+    alt = "Confidence index and leave-one-out error of every output against the number of real samples"
+    return section("Fidelity", picture(svg(draw_fidelity(models, view.target)), alt) + judged + _predicted(outputs))
+
+
+def _predicted(outputs: Sequence[OutputFidelity]) -> str:
+    """The table of samples that were predicted before the model learned from them; nothing without any."""
+    scored = [{"name": o.name, **o.prequential.model_dump()} for o in outputs if o.prequential is not None]
+    said = "New samples, predicted before the model learned from them: shares in intervals, or within the tolerance"
+    return table(tuple(PREQUENTIAL), [[one[f] for f in PREQUENTIAL.values()] for one in scored], said) if scored else ""
+
+
+def _maps(view: SurrogateView, cuts: Sequence[Cut]) -> str:
+    alt = "Uncertainty in tolerances, occupancy, and the index, over two coordinates a row"
+    note = "<p>The worst output; the other coordinates and the action are in the middle of their ranges.</p>"
+    return section("Maps", picture(svg(draw_maps(view, cuts)), alt) + note)
+
+
+def _structure(model: ModelView, spec: EnvironmentSpec) -> str:
+    angles = any(coordinate.kind == "angle" for coordinate in spec.coordinates)
+    described = dict(model.description if angles else _without_angles(model.description))
+    parts = [
+        f"<h3>{escape(str(output.get('name')))}</h3>{rows((k, v) for k, v in output.items() if k != 'name')}"
+        for output in described.pop("outputs", [])
+    ]
+    details = "".join(parts) + rows(described.items())
+    return section(f"Structure and hyperparameters of model {model.version}", details)
+
+
+def _without_angles(described: Any) -> Any:
+    """Replace the encoding of angles in the names of input maps, for an environment that has none."""
+    if isinstance(described, str):
+        return described.replace("cos_sin", "coordinates")
+    if isinstance(described, dict):
+        return {_without_angles(key): _without_angles(value) for key, value in described.items()}
+    return [_without_angles(one) for one in described] if isinstance(described, list) else described
+
+
+def _history(models: Sequence[ModelView]) -> str:
+    heading = ("version", "samples", "confidence index", "seconds", "fitted", "hash of its data")
+    fits = [
+        (
+            *(m.version, m.samples, m.fidelity.confidence_index, m.fit_seconds),
+            *(datetime.fromtimestamp(m.created_at, UTC).strftime("%Y-%m-%d %H:%M:%S"), m.data_hash[:12]),
+        )
+        for m in models
+    ]
+    return section("Models", table(heading, fits, "Every fit, oldest first"))

@@ -1,0 +1,6 @@
+"""Train a policy in a surrogate. Importing this package needs no torch; each search imports its own libraries."""
+
+from surrogym_trainer.training.settings import TrainingInterrupted, TrainProgress, TrainResult, TrainSettings
+from surrogym_trainer.training.trainer import train
+
+__all__ = ["TrainProgress", "TrainResult", "TrainSettings", "TrainingInterrupted", "train"]

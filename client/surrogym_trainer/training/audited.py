@@ -1,0 +1,171 @@
+"""A training that audits its policy, and continues if the audit fails or lowers the promise clearly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from surrogym_client.surrogates.waiting import wait_for_design
+from surrogym_client.transport.api import Api
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.wire import SurrogateView
+from surrogym_trainer.evaluation.audit import AUDIT_STEPS, UNSURE, disappointed, wider
+from surrogym_trainer.policies.evidence import Audit
+from surrogym_trainer.policies.files import load_policy
+from surrogym_trainer.training.candidates import Candidates
+from surrogym_trainer.training.closed_loop import ClosedLoop, LoopSettings, visit
+from surrogym_trainer.training.course import after
+from surrogym_trainer.training.handover import MOST_AUDITS, AuditSettings, Handover, Subject, hand_over
+from surrogym_trainer.training.search import search_for, with_algorithm
+from surrogym_trainer.training.settings import (
+    TrainingInterrupted,
+    TrainProgress,
+    TrainResult,
+    TrainSettings,
+    chosen_for,
+    prolongs,
+)
+from surrogym_trainer.training.trainer import train
+
+
+@dataclass
+class AuditedTraining:
+    """Train a policy, audit it, and hand it over.
+
+    If an audit fails and the budget has steps left, or rounds that the model seemed not to need, their steps are
+    taken where the policy goes, the training continues, and the policy is audited again. Such a round is also taken
+    after a passed audit if the promise is wide, or if the model that has learned from it is no longer certain
+    there. The training also continues if the model that has learned from an audit promises clearly less than the
+    training imagined, or than the model before, unless the user limited the virtual steps. This takes no step of
+    the budget. In all other cases the policy is handed over, also with a failed audit.
+
+    Attributes:
+        api: the server.
+        name: name of the surrogate.
+        port: the surrogate.
+        out: file to write the policy to.
+        settings: settings of each training.
+        rounds: settings of the closed loop; None trains without one.
+        audit: settings of the audit; None takes no audit.
+        progress: called after every rollout.
+        waiting: called each time the surrogate is polled, while a sampler answers queries.
+    """
+
+    api: Api
+    name: str
+    port: SurrogatePort
+    out: Path
+    settings: TrainSettings
+    rounds: LoopSettings | None = None
+    audit: AuditSettings | None = None
+    progress: Callable[[TrainProgress], None] | None = None
+    waiting: Callable[[SurrogateView], None] | None = None
+    candidates: Candidates = field(default_factory=Candidates, init=False)
+    _unspent: int = field(default=0, init=False)  # rounds of the closed loop that took no real step
+
+    def train(self) -> tuple[TrainResult, Handover]:
+        """Train and audit, and train further if the audit fails or lowers the promise clearly.
+
+        Raises:
+            DesignUnfinished: queries were not answered in time.
+            TrainingInterrupted: Ctrl-C was pressed when there was a policy already.
+            ValueError, SurrogymClientError: as ``train``.
+        """
+        result = self._first()
+        self.candidates.keep(result)
+        try:
+            for number in range(1, MOST_AUDITS + 1):
+                taken = self.api.surrogate(self.name).ledger.total
+                handover = hand_over(self._subject(result), self.audit, self.waiting)
+                if number == MOST_AUDITS or not self._to_be_trained_on(handover.audit, result, taken, number):
+                    break
+                result = self._train_on(result)
+        except TrainingInterrupted as interruption:
+            raise TrainingInterrupted(_joined(result, interruption.result)) from None
+        except KeyboardInterrupt:
+            raise TrainingInterrupted(result) from None
+        return result, handover
+
+    def _first(self) -> TrainResult:
+        if self.rounds is None:
+            return train(self.port, self.out, self._chosen, self.progress)
+        loop = ClosedLoop(
+            self.api, self.name, self.port, self.out, self.settings, self.rounds, self.progress, self.waiting
+        )
+        loop.candidates = self.candidates
+        result = loop.train()
+        self._unspent = loop.unspent
+        return self._best(result)
+
+    def _best(self, result: TrainResult) -> TrainResult:
+        """Return the policy that is best in the model of all real steps so far."""
+        return self.candidates.best(self.port, result, self._chosen)
+
+    @property
+    def _chosen(self) -> TrainSettings:
+        settings = with_algorithm(self.settings, self.port.spec())
+        return chosen_for(self.api.surrogate(self.name), settings, by_mean=search_for(settings).by_mean)
+
+    def _subject(self, result: TrainResult) -> Subject:
+        predict, settings = load_policy(result.path, result.algorithm), self.settings
+        session = chosen_for(self.api.surrogate(self.name), settings).judging
+        return Subject(self.api, self.name, self.port, predict, dict(session), result.untrained, settings.seed)
+
+    def _to_be_trained_on(self, audit: Audit | None, result: TrainResult, taken: int, number: int) -> bool:
+        if audit is None:
+            return False
+        needed = not audit.passed or (self._unspent > 0 and wider(audit.after, UNSURE, result.untrained))
+        if (needed or self._unspent) and self._asked_more(result, taken, number, needed=needed):
+            return True
+        longer = prolongs(self.settings, self.port.spec())
+        return longer and disappointed(audit, result.untrained, result.imagined_return)
+
+    def _asked_more(self, result: TrainResult, taken: int, number: int, *, needed: bool) -> bool:
+        """Spend the rest of the budget, or a round that took no real step, where the policy goes.
+
+        Unless they are ``needed`` anyway, the steps are only taken if the model is not certain there. Only a token of
+        role admin may raise the budget for such a round. Returns whether the budget's real steps are now more than
+        ``taken``.
+        """
+        view = self.api.surrogate(self.name)
+        if not needed and view.phase == "ready" and (view.confidence_index or 0.0) >= view.target:
+            return False
+        round_ = self.rounds.queries if self.rounds else AUDIT_STEPS
+        left = round_ if self._unspent and self.api.access().role == "admin" else view.budget_left
+        wanted = min(round_, left)
+        if wanted > 0:
+            checkpoint = f"seed {self.settings.seed}, audit {number}, round {view.round}"
+            _, index = visit(self.port, result, self.settings, checkpoint)
+            if not needed and (index is None or index >= view.target):
+                return False
+            self._unspent = max(self._unspent - 1, 0)
+            self.api.improve(self.name, wanted, checkpoint=checkpoint)
+            patience = LoopSettings(wanted).patience_seconds
+            view = wait_for_design(self.api, self.name, patience, self.waiting, after_round=view.round)
+        return view.ledger.total > taken
+
+    def _train_on(self, result: TrainResult) -> TrainResult:
+        """Train further, from the present policy, in the model that includes the audit's samples."""
+        now = self._chosen
+        if search_for(self.settings).resumable:
+            now = replace(now, start_from=self.out, trust_policy=False)
+        later = train(self.port, self.out, now, self._shifted(result.virtual_steps))
+        self.candidates.keep(later)
+        return self._best(_joined(result, later))
+
+    def _shifted(self, done: int) -> Callable[[TrainProgress], None] | None:
+        """The progress of a training after ``done`` virtual steps."""
+        progress = self.progress
+        return None if progress is None else lambda now: progress(after(now, done))
+
+
+def _joined(before: TrainResult, after: TrainResult) -> TrainResult:
+    """Return the later result, with the steps and seconds of both trainings."""
+    return replace(
+        after,
+        virtual_steps=before.virtual_steps + after.virtual_steps,
+        seconds=before.seconds + after.seconds,
+        lost_episodes=before.lost_episodes + after.lost_episodes,
+        visited_confidence=before.visited_confidence,
+    )

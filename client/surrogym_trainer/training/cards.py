@@ -1,0 +1,53 @@
+"""The card of a policy that a training has made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from surrogym_client.runtime.versions import versions
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import CurvePoint
+from surrogym_trainer.policies.card import NotedAddress, PolicyCard
+from surrogym_trainer.policies.pushing import thinned
+from surrogym_trainer.training.handover import Handover
+from surrogym_trainer.training.settings import TrainResult
+
+
+def card_of(
+    result: TrainResult,
+    handover: Handover | None = None,
+    *,
+    surrogate: str,
+    spec: EnvironmentSpec,
+    url: str,
+    seed: int,
+    curve: Sequence[CurvePoint],
+) -> PolicyCard:
+    """Return the card of a policy.
+
+    Args:
+        result: result of the training.
+        handover: promise and audit; None if the training was interrupted before.
+        surrogate: name of the surrogate.
+        spec: its specification.
+        url: address of its server.
+        seed: seed of the training.
+        curve: points of the training's curve, of which the card keeps some.
+    """
+    return PolicyCard(
+        algorithm=result.algorithm,
+        surrogate=surrogate,
+        server=NotedAddress(url),
+        spec=spec,
+        seed=seed,
+        virtual_steps=result.virtual_steps,
+        seconds=result.seconds,
+        imagined_return=result.imagined_return,
+        visited_confidence=result.visited_confidence,
+        networks=result.networks,
+        curve=thinned(curve),
+        untrained=result.untrained,
+        **({} if handover is None else vars(handover)),
+        settings=result.settings,
+        versions=versions(),
+    )

@@ -1,0 +1,228 @@
+"""The closed loop: train for a while, query where the policy goes, fit again, and train further."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from surrogym_client.sb3 import SurrogateVecEnv
+from surrogym_client.surrogates.waiting import wait_for_design
+from surrogym_client.transport.api import Api
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.wire import SurrogateView
+from surrogym_trainer.training.candidates import Candidates
+from surrogym_trainer.training.course import after
+from surrogym_trainer.training.search import is_prolonged, planned_steps, search_for, with_algorithm
+from surrogym_trainer.training.settings import (
+    SUGGESTED_STEPS,
+    TrainingInterrupted,
+    TrainProgress,
+    TrainResult,
+    TrainSettings,
+    chosen_for,
+)
+from surrogym_trainer.training.trainer import train
+
+ROUND_SHARE = 0.25  # virtual steps of each round before the last, as a share of a whole training
+VISIT_LANES = 32
+VISIT_STEPS = 1_000  # length of a visit if the specification has no time limit
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """Number of rounds, and of queries in each.
+
+    The rounds end early if the design is ready, or if the confidence index over the states that the policy visits
+    reaches the design's target.
+    """
+
+    queries: int  # real steps of one round
+    rounds: int = 3
+    patience_seconds: float = 3_600.0  # longest time that the sampler may take for one round
+
+
+@dataclass
+class ClosedLoop:
+    """Learn a policy in rounds, with queries where it goes, until the model is certain there or the design is ready.
+
+    Each round submits the states that the policy visits from the declared starts, as a checkpoint that no other
+    training shares. So the queries of a round depend on this training alone, and the same seeds choose the same
+    queries. The rounds end once the confidence index over
+    these states reaches the target that the design has for the whole range. In the rounds, lanes move by the mean, so
+    that a policy goes where the model predicts the highest return. The settings of the last training are ``chosen_for``
+    the phase that the design then has. Only the last training may be prolonged, because a later round makes up for a
+    short earlier one.
+
+    Attributes:
+        api: the server.
+        name: name of the surrogate.
+        port: the surrogate.
+        out: file to write the policy to, after every round.
+        settings: settings of each training.
+        rounds: number of rounds, and of queries in each.
+        progress: called after every rollout, with steps summed over the rounds.
+        waiting: called each time the surrogate is polled, while a sampler answers a round's queries.
+        trained: results of the trainings so far.
+        candidates: policies of these trainings.
+    """
+
+    api: Api
+    name: str
+    port: SurrogatePort
+    out: Path
+    settings: TrainSettings
+    rounds: LoopSettings
+    progress: Callable[[TrainProgress], None] | None = None
+    waiting: Callable[[SurrogateView], None] | None = None
+    trained: list[TrainResult] = field(default_factory=list, init=False)
+    candidates: Candidates = field(default_factory=Candidates)
+    _visited: int = field(default=0, init=False)  # virtual steps that collected occupancies
+    _known: list[float | None] = field(
+        default_factory=list, init=False
+    )  # confidence index over each round's visited states
+    _region_known: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        self.settings = with_algorithm(self.settings, self.port.spec())
+        if not search_for(self.settings).resumable:
+            raise ValueError(
+                f"{self.settings.algorithm} can't start from a policy: expected no rounds, or another algorithm"
+            )
+        self._whole, self._part = shares(self.settings, self.rounds.rounds)
+        self._prolong = is_prolonged(self.settings, self.port.spec())
+
+    def train(self) -> TrainResult:
+        """Run the rounds and the last training.
+
+        Raises:
+            DesignUnfinished: the queries of a round were not answered in time.
+            TrainingInterrupted: Ctrl-C was pressed when there was a policy already.
+            ValueError, SurrogymClientError: as ``train``.
+        """
+        try:
+            for _ in range(self.rounds.rounds):
+                if not self.round():
+                    break
+            self.last()
+        except TrainingInterrupted as interruption:
+            self.trained.append(interruption.result)
+            raise TrainingInterrupted(self.result()) from None
+        except KeyboardInterrupt:
+            if self.trained:
+                raise TrainingInterrupted(self.result()) from None
+            raise
+        return self.result()
+
+    def round(self) -> bool:
+        """Run one round: train for a while, submit the visited states, and query there. Returns whether another
+        round may follow."""
+        view = self.api.surrogate(self.name)
+        if view.phase == "ready":
+            return False
+        self._learn(self._part, self._whole, replace(self.settings, prolong=False))
+        checkpoint = f"seed {self.settings.seed}, round {view.round}"
+        steps, index = visit(self.port, self.trained[-1], self.settings, checkpoint)
+        self._visited += steps
+        self._known.append(index)
+        self._region_known = index is not None and index >= view.target
+        if self._region_known:
+            return False
+        self.api.improve(self.name, self.rounds.queries, checkpoint=checkpoint)
+        patience = self.rounds.patience_seconds
+        wait_for_design(self.api, self.name, patience, self.waiting, after_round=view.round)
+        return True
+
+    def last(self) -> None:
+        """Train the policy to hand over, with settings that depend on the design's phase."""
+        settings, taken = self.settings, self._steps
+        left = self._whole - taken
+        left = max(left if settings.total_steps else min(planned_steps(settings), left), 1)
+        last = _for_use(self.api.surrogate(self.name), settings, region_known=self._region_known)
+        self._learn(left, taken + self._visited + left, replace(last, prolong=self._prolong))
+
+    def result(self) -> TrainResult:
+        """Return the last training's result, with the steps and seconds of all trainings."""
+        return replace(
+            self.trained[-1],
+            virtual_steps=self._steps + self._visited,
+            seconds=sum(result.seconds for result in self.trained),
+            lost_episodes=sum(result.lost_episodes for result in self.trained),
+            visited_confidence=tuple(self._known),
+        )
+
+    @property
+    def unspent(self) -> int:
+        """Number of rounds that took no real step, because the design was ready, or the model was certain where the
+        policy went."""
+        return self.rounds.rounds - len(self._known) + int(self._region_known)
+
+    @property
+    def _steps(self) -> int:
+        return sum(result.virtual_steps for result in self.trained)
+
+    def _learn(self, steps: int, whole: int, settings: TrainSettings) -> None:
+        now = replace(settings, total_steps=steps)
+        if self.trained:
+            now = replace(now, start_from=self.out, trust_policy=False)
+        known = self._known[-1] if self._known else None
+        progress = _shifted(self.progress, self._steps + self._visited, whole, known)
+        self.trained.append(train(self.port, self.out, now, progress))
+        self.candidates.keep(self.trained[-1])
+
+
+def _for_use(view: SurrogateView, settings: TrainSettings, *, region_known: bool) -> TrainSettings:
+    """Return the settings of the last training.
+
+    If the model is certain where the last round's policy goes, training continues from that policy. Otherwise it begins
+    with a new network and the variant of draws, because a network that has learned from wrong models keeps what they
+    taught it.
+    """
+    last = chosen_for(view, settings, by_mean=search_for(settings).by_mean)
+    anew = last is not settings and settings.start_from is None and not region_known
+    return replace(last, anew=anew)
+
+
+def shares(settings: TrainSettings, rounds: int) -> tuple[int, int]:
+    """Return the virtual steps of the whole training, all rounds included, and of each round.
+
+    Steps that collect occupancies are not included. Requested steps limit the whole training. Suggested steps are those
+    of the last training; the rounds add to them, up to the paper's maximum. In both cases a round has the same share of
+    the last training.
+    """
+    planned, share = planned_steps(settings), min(ROUND_SHARE, 1 / (rounds + 1))
+    if settings.total_steps is not None:
+        return planned, max(1, int(planned * share / (1 + rounds * share)))
+    part = max(1, int(share * planned))
+    return min(planned + rounds * part, SUGGESTED_STEPS), part
+
+
+def visit(
+    port: SurrogatePort, learned: TrainResult, settings: TrainSettings, checkpoint: str
+) -> tuple[int, float | None]:
+    """Run the policy of a round from the declared starts, and submit the visited states.
+
+    Returns the number of virtual steps that this took, and the confidence index over the visited states.
+    """
+    spec = port.spec()
+    act = search_for(settings).explorer(learned.path, learned.algorithm, VISIT_LANES)
+    options = {**settings.session, "occupancy": True}
+    env = SurrogateVecEnv.from_port(port, VISIT_LANES, seed=settings.seed, **options)
+    steps = min(spec.time_limit or VISIT_STEPS, VISIT_STEPS)
+    try:
+        observation: Any = env.reset()
+        for _ in range(steps):
+            observation, _, _, _ = env.step(act(observation))
+        submitted = env.submit_occupancy(checkpoint)
+    finally:
+        env.close()
+    return steps * VISIT_LANES, submitted.confidence_index
+
+
+def _shifted(
+    progress: Callable[[TrainProgress], None] | None, done: int, total: int, known: float | None
+) -> Callable[[TrainProgress], None] | None:
+    if progress is None:
+        return None
+    return lambda now: progress(after(replace(now, visited_confidence=known), done, total))

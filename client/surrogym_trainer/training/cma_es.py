@@ -1,0 +1,144 @@
+"""CMA-ES on the lanes of a session: it searches the parameters of a small network by the returns of virtual episodes.
+
+This is the approach of Black-DROPS (Chatzilygeroudis et al., 2017): a policy of few parameters, no gradient, no value
+function. All candidates of a generation are stepped together, each from the same starts.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from cmaes import CMA, SepCMA
+from numpy.typing import NDArray
+
+from surrogym_sampler.original.protocol import LONGEST_EPISODE
+from surrogym_shared.network import Network
+from surrogym_shared.port import SurrogatePort
+from surrogym_trainer.evaluation.imagined import (
+    Imagined,
+    imagine,
+    observation_statistics,
+)
+from surrogym_trainer.training.search import Found, PolicySearch, SearchTask
+from surrogym_trainer.training.settings import CHECKS, TrainProgress, TrainSettings
+from surrogym_trainer.training.verdicts import checked
+
+FULL_COVARIANCE = 200  # most parameters with a full covariance; beyond, it is diagonal (separable CMA-ES)
+
+
+@dataclass(frozen=True)
+class CmaEs(PolicySearch):
+    """Policy search by CMA-ES over the parameters of a network. Returns the distribution's mean with the best
+    imagined return."""
+
+    population: int = 24  # candidates of each generation
+    starts: int = 16  # episodes of each candidate
+    units: int = 10  # hidden units of the network; 0 for a policy without a hidden layer
+    sigma: float = 1.0  # initial standard deviation of a parameter
+
+    suggested_steps = 10_000_000
+    most_steps = None  # no limit: CMA-ES takes far more steps than PPO, but each is far cheaper
+
+    def search(self, task: SearchTask) -> Found:
+        run = _Run(task, self)
+        with suppress(KeyboardInterrupt):
+            for number in range(1, run.generations + 1):
+                run.generation(number)
+        return run.found()
+
+
+class _Run:
+    """Generations of one search, and the best mean so far."""
+
+    def __init__(self, task: SearchTask, choices: CmaEs) -> None:
+        self._task, self._choices = task, choices
+        self._distribution = _Distribution(task.port, task.settings, choices)
+        limit = task.port.spec().time_limit or LONGEST_EPISODE
+        self._cost = choices.population * choices.starts * limit  # virtual steps of a generation
+        self.generations = max(task.steps // self._cost, 1)
+        self._done = 0
+        self._kept: Network | None = None
+        self._best = -np.inf
+        self._latest: float | None = None
+        self._penalty: float | None = None
+
+    def generation(self, number: int) -> None:
+        """Run one generation. The mean is evaluated ``CHECKS`` times in a search."""
+        seen = self._distribution.generation(number)
+        self._done, self._penalty = number, seen.episode_penalty
+        if number * CHECKS // self.generations > (number - 1) * CHECKS // self.generations:
+            self._check()
+        steps, total = number * self._cost, self.generations * self._cost
+        self._task.progress(TrainProgress(steps, total, self._latest, seen.penalty_share, self._penalty))
+
+    def found(self) -> Found:
+        """Return the best mean of the generations so far."""
+        return Found(
+            self._kept or self._distribution.policy,
+            self._done * self._cost,
+            None if self._latest is None else self._best,
+            {**asdict(self._choices), "total_steps": self.generations * self._cost},
+            whole=self._done == self.generations,
+            episode_penalty=self._penalty,
+        )
+
+    def _check(self) -> None:
+        self._latest = self._distribution.imagined()
+        if self._latest >= self._best:
+            self._best, self._kept = self._latest, self._distribution.policy
+
+
+class _Distribution:
+    """Distribution of parameters, and the virtual episodes that evaluate them."""
+
+    def __init__(self, port: SurrogatePort, settings: TrainSettings, choices: CmaEs) -> None:
+        self.choices = choices
+        self._port, self._settings, self._spec = port, settings, port.spec()
+        mean, deviation = observation_statistics(port, settings.seed)
+        self._mean, self._deviation = np.array(mean), np.array(deviation)
+        size = Network.size(self._spec, choices.units)
+        kind = CMA if size <= FULL_COVARIANCE else SepCMA
+        self._cma = kind(_first(settings, size), choices.sigma, population_size=choices.population, seed=settings.seed)
+
+    @property
+    def policy(self) -> Network:
+        """Return the network at the mean of the distribution."""
+        return self._network(np.array(self._cma.mean))
+
+    def generation(self, number: int) -> Imagined:
+        """Draw a population, run each candidate from the same starts, and update the distribution from their mean
+        returns."""
+        choices = self.choices
+        drawn = [self._cma.ask() for _ in range(choices.population)]
+        everyone = self._network(np.stack(drawn))
+
+        def predict(observation: NDArray[Any]) -> NDArray[Any]:
+            actions = everyone(observation.reshape(choices.population, choices.starts, -1))
+            return actions.reshape(len(observation), *actions.shape[2:])
+
+        lanes = choices.population * choices.starts
+        starts = np.random.default_rng([self._settings.seed, number]).integers(2**62, size=choices.starts)
+        seeds = [int(seed) for seed in np.tile(starts, choices.population)]
+        seen = imagine(self._port, predict, lanes, seeds, **self._settings.session)
+        scores = seen.returns.reshape(choices.population, choices.starts).mean(1)
+        self._cma.tell([(x, -float(score)) for x, score in zip(drawn, scores, strict=True)])
+        return seen
+
+    def imagined(self) -> float:
+        """Imagined return of the mean."""
+        return checked(self._port, self.policy, self._settings).mean
+
+    def _network(self, vector: NDArray[np.float64]) -> Network:
+        return Network.of(self._spec, self._mean, self._deviation, self.choices.units, vector)
+
+
+def _first(settings: TrainSettings, size: int) -> NDArray[np.float64]:
+    if settings.start_from is None:
+        return np.zeros(size)
+    vector = Network.load(settings.start_from).vector
+    if len(vector) != size:
+        raise ValueError(f"{settings.start_from}: expected a network of {size} parameters, got {len(vector)}")
+    return vector

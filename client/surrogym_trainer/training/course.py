@@ -1,0 +1,49 @@
+"""How much of a training is done, as a bar shows it: a share that never falls, and the time left."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from surrogym_trainer.training.settings import TrainProgress
+
+
+class Course:
+    """Share of a training that is done.
+
+    A training may be extended: by a round, after an audit, or because it still gains. The rest of the bar then stands
+    for the steps that are left, so that the share never falls.
+    """
+
+    def __init__(self) -> None:
+        self._share = self._base = 0.0  # done, and done when the total last changed
+        self._steps = self._begun = 0  # virtual steps so far, and when the total last changed
+        self._total = 0
+
+    def share(self, steps: int, total: int) -> float:
+        """Return the share that is done, in [0, 1], after ``steps`` virtual steps of ``total``."""
+        if total != self._total:
+            self._begun, self._base, self._total = self._steps, self._share, total
+        self._steps = max(self._steps, steps)
+        left = max(total - self._begun, 1)
+        done = self._base + (1 - self._base) * min((self._steps - self._begun) / left, 1.0)
+        self._share = max(self._share, done)
+        return self._share
+
+
+def words_of_time_left(steps: int, total: int, seconds: float) -> str:
+    """Estimate in words how long a training of ``total`` virtual steps still takes; empty before its first step.
+
+    Args:
+        steps: virtual steps taken.
+        total: virtual steps of the whole training, as far as is known.
+        seconds: duration so far.
+    """
+    if steps <= 0 or seconds <= 0 or steps >= total:
+        return ""
+    left = (total - steps) * seconds / steps
+    return f", about {f'{left:.0f} s' if left < 90 else f'{left / 60:.0f} min'} left"
+
+
+def after(now: TrainProgress, done: int, total: int = 0) -> TrainProgress:
+    """Return the progress of a training that follows ``done`` virtual steps, of ``total`` planned in all."""
+    return replace(now, steps=done + now.steps, total_steps=max(total, done + now.total_steps))

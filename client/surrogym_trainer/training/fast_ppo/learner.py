@@ -1,0 +1,304 @@
+"""Actor, critic and Adam: one update of proximal policy optimisation.
+
+Loss of a batch, with ratio r = p(a) / p_old(a) and advantages A of mean 0 and deviation 1 in the batch:
+
+    -mean(min(r A, clip(r, 1 - c, 1 + c) A)) + v mean((V - R)^2)
+
+References: Schulman et al. (2017), arXiv 1707.06347, eq. 7; Kingma and Ba (2015). Constants are those of
+Stable-Baselines3, whose update this is but for rounding.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import astuple, dataclass, fields
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_shared.acting import ActingPolicy
+from surrogym_shared.archives import Header, read_arrays, read_entries
+from surrogym_shared.compiled import available
+from surrogym_shared.network import MAX_BYTES, Layer, Network, bounds_of, counts_of
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.policies.card import UnusablePolicy
+from surrogym_trainer.policies.defaults import CRITIC
+from surrogym_trainer.policies.files import load_network
+from surrogym_trainer.policies.predict import Predict
+from surrogym_trainer.training.fast_ppo.actions import distribution_of
+from surrogym_trainer.training.fast_ppo.adam import EPSILON, FIRST_DECAY, SECOND_DECAY
+from surrogym_trainer.training.fast_ppo.mlp import Array, Mlp, orthogonal
+
+HIDDEN_GAIN, ACTION_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0
+NARROWEST = 0.1  # smallest new deviation of an input, as a share of the one before
+LEARNER = "learner.npz"  # entry of a policy's file from which training can continue
+VECTORS = ("parameters", "first", "second")
+
+
+Update = Callable[..., None]
+
+
+@cache
+def compiled_update() -> Update | None:
+    """Return the update in compiled code; None if this installation can't compile it."""
+    if not available():
+        return None
+    try:
+        from surrogym_trainer.training.fast_ppo.compiled import update
+    except ImportError:  # no SciPy, or a NumPy that numba does not know
+        return None
+    return update
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Constants of the loss and of one optimiser step."""
+
+    clip_range: float = 0.2
+    vf_coef: float = 0.5
+    max_grad_norm: float = 0.5
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Transitions to learn from."""
+
+    observations: Array  # (B, D) standardised
+    actions: Array  # (B, F)
+    log_probabilities: Array  # (B,) at the time of acting
+    advantages: Array  # (B,)
+    returns: Array  # (B,) targets of the critic, from scaled rewards
+
+    def at(self, rows: NDArray[np.int64] | slice) -> Batch:
+        """Return the batch of the selected rows."""
+        return Batch(*(getattr(self, one.name)[rows] for one in fields(self)))
+
+
+class Learner:
+    """Actor, critic and Adam, with all parameters in one vector so that each update is a few operations."""
+
+    def __init__(
+        self,
+        spec: EnvironmentSpec,
+        mean: NDArray[np.float64],
+        deviation: NDArray[np.float64],
+        units: tuple[int, ...],
+        rng: np.random.Generator,
+        *,
+        compiled: bool = True,
+    ) -> None:
+        """
+        Args:
+            compiled: update in compiled code, where this installation can.
+        """
+        self._spec = spec
+        self.mean, self.deviation = mean.astype(np.float32), deviation.astype(np.float32)
+        self.distribution = distribution_of(counts_of(spec), *bounds_of(spec))
+        inputs, further = len(spec.observation), self.distribution.further()
+        actor, critic = (inputs, *units, self.distribution.outputs), (inputs, *CRITIC, 1)
+        ends = np.cumsum([Mlp.count(actor), Mlp.count(critic), len(further)])
+        self.parameters = np.zeros(ends[-1], dtype=np.float32)
+        self._gradient = np.zeros_like(self.parameters)
+        self._first, self._second = np.zeros_like(self.parameters), np.zeros_like(self.parameters)
+        self._updates = 0
+        activation, first, second = self.distribution.activation, slice(0, ends[0]), slice(ends[0], ends[1])
+        self.actor = Mlp(actor, activation, self.parameters[first], self._gradient[first])
+        self.critic = Mlp(critic, activation, self.parameters[second], self._gradient[second])
+        self.further, self._further_gradient = self.parameters[ends[1] :], self._gradient[ends[1] :]
+        self.further[:] = further
+        counts, centre, reach = self.distribution.arrays()
+        sizes = (np.array(one, dtype=np.int64) for one in (actor, critic, ends, counts))
+        self._fixed = *sizes, activation == "relu", centre, reach
+        self._update = compiled_update() if compiled else None
+        _initialise(self.actor, ACTION_GAIN, rng)
+        _initialise(self.critic, VALUE_GAIN, rng)
+
+    def standardised(self, observation: NDArray[Any]) -> Array:
+        x: Array = ((observation - self.mean) / self.deviation).astype(np.float32, copy=False)
+        return x
+
+    def acting(self) -> ActingPolicy:
+        """Return the actor and its noise as arrays, which are views of the parameters."""
+        layers = tuple(Layer(*layer) for layer in self.actor.layers)
+        log_deviations = self.further if len(self.further) else None
+        return ActingPolicy(self.mean, self.deviation, layers, self.distribution.activation, log_deviations)
+
+    def values(self, x: Array) -> Array:
+        """Return the critic's values (B,) of standardised observations (B, D)."""
+        return self.critic.forward(x)[:, 0].copy()
+
+    def update(self, batch: Batch, objective: Objective, rate: float) -> None:
+        """Take one step of Adam on the loss of a batch."""
+        self._updates += 1
+        if self._update is not None:
+            moments = self._first, self._second
+            rows = batch.observations, batch.actions, batch.log_probabilities, batch.advantages, batch.returns
+            self._update(self.parameters, *moments, *self._fixed, *rows, self._updates, *astuple(objective), rate)
+            return
+        size = len(batch.returns)
+        outputs = self.actor.forward(batch.observations)
+        advantages = batch.advantages
+        if size > 1:
+            advantages = (advantages - advantages.mean()) / (advantages.std(ddof=1) + np.float32(1e-8))
+        log = self.distribution.log_probability(outputs, self.further, batch.actions)
+        ratio = np.exp(log - batch.log_probabilities)
+        clip = np.float32(objective.clip_range)
+        free = np.where(advantages > 0, ratio <= 1 + clip, ratio >= 1 - clip)  # elsewhere the loss is flat
+        by = -(advantages * ratio * free) / np.float32(size)
+        by_outputs, self._further_gradient[:] = self.distribution.slopes(outputs, self.further, batch.actions, by)
+        self.actor.backward(by_outputs)
+        error = self.critic.forward(batch.observations)[:, 0] - batch.returns
+        self.critic.backward((error * np.float32(2 * objective.vf_coef / size))[:, None])
+        self._adam(objective.max_grad_norm, rate)
+
+    def keep_noise(self, share: float) -> None:
+        """Raise the standard deviations of continuous actions to at least this share of their first values."""
+        if share > 0:
+            np.maximum(self.further, self.distribution.further() + np.float32(np.log(share)), out=self.further)
+
+    def limit_noise(self, logarithms: Array, share: float) -> None:
+        """Lower the standard deviations of continuous actions to at most this share of others, given by their
+        logarithms."""
+        np.minimum(self.further, logarithms + np.float32(np.log(share)), out=self.further)
+
+    def _adam(self, largest: float, rate: float) -> None:
+        gradient = self._gradient
+        norm = float(np.sqrt(gradient @ gradient))
+        gradient *= np.float32(min(1.0, largest / (norm + 1e-6)))
+        self._first *= np.float32(FIRST_DECAY)
+        self._first += np.float32(1 - FIRST_DECAY) * gradient
+        gradient *= gradient
+        self._second *= np.float32(SECOND_DECAY)
+        self._second += np.float32(1 - SECOND_DECAY) * gradient
+        root = np.sqrt(self._second)
+        root *= np.float32((1 - SECOND_DECAY**self._updates) ** -0.5)
+        root += np.float32(EPSILON)
+        step = np.float32(rate / (1 - FIRST_DECAY**self._updates))
+        self.parameters -= step * self._first / root
+
+    def take_up(self, learned: LearnedNetwork) -> None:
+        """Take the place of another learner of the same network."""
+        self.mean, self.deviation = learned.policy.mean.astype(np.float32), learned.policy.deviation.astype(np.float32)
+        self.restore(learned.state)
+
+    def standardise_anew(self, x: Array, rng: np.random.Generator) -> None:
+        """Standardise inputs by other observations, without a change of the actor's outputs.
+
+        The critic and Adam's moments begin anew.
+
+        Args:
+            x: these observations (B, D), standardised as before. The new deviations are at least ``NARROWEST`` of those
+                before.
+            rng: generator of the critic's initial parameters.
+        """
+        middle, spread = x.mean(0), np.maximum(x.std(0), NARROWEST)
+        weights, bias = self.actor.layers[0]
+        bias += middle @ weights
+        weights *= spread[:, None]
+        self.mean, self.deviation = self.mean + middle * self.deviation, self.deviation * spread
+        _initialise(self.critic, VALUE_GAIN, rng)
+        self._first[:], self._second[:], self._updates = 0, 0, 0
+
+    def policy(self) -> Network:
+        """Return the policy of the actor's most probable actions, with the present parameters."""
+        layers = self.actor.layers
+        return Network(
+            self.mean.astype(np.float64),
+            self.deviation.astype(np.float64),
+            tuple(Layer(weights.astype(np.float64), bias.astype(np.float64)) for weights, bias in layers),
+            *bounds_of(self._spec),
+            counts_of(self._spec),
+            self.distribution.activation,
+        )
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays that a later training needs besides the policy: all parameters, and the moments of Adam."""
+        vectors = zip(VECTORS, (self.parameters, self._first, self._second), strict=True)
+        return {"updates": np.array(self._updates), **{name: vector.copy() for name, vector in vectors}}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Restore the arrays that ``state`` returned."""
+        for name, vector in zip(VECTORS, (self.parameters, self._first, self._second), strict=True):
+            vector[:] = state[name]
+        self._updates = int(state["updates"])
+
+    def require(self, headers: Mapping[str, Header]) -> None:
+        """Check that arrays, given by their headers, are a state of this network.
+
+        Raises:
+            ValueError: an array is missing, or has another shape or type.
+        """
+        shapes = {**dict.fromkeys(VECTORS, self.parameters.shape), "updates": ()}
+        found = {name: header.shape for name, header in headers.items()}
+        if found != shapes:
+            raise ValueError(f"expected a network of {self.parameters.size} parameters, got arrays of shapes {found}")
+
+
+@dataclass(frozen=True)
+class LearnedNetwork:
+    """A policy together with the state of its learner."""
+
+    policy: Network
+    state: Mapping[str, NDArray[Any]]
+
+    def save(self, path: Path) -> None:
+        """Write the policy and the learner's state to one file."""
+        self.policy.save(path)
+        file = io.BytesIO()
+        arrays: dict[str, Any] = dict(self.state)
+        np.savez(file, **arrays)
+        with zipfile.ZipFile(path, "a") as archive:
+            archive.writestr(LEARNER, file.getvalue())
+
+
+def restored(path: Path, spec: EnvironmentSpec, units: tuple[int, ...]) -> Learner:
+    """Restore the learner from a policy's file.
+
+    Raises:
+        UnusablePolicy: the file contains no learner, or one of another network.
+    """
+    policy = load_network(path)
+    learner = Learner(spec, policy.mean, policy.deviation, units, np.random.default_rng(0))
+    learner.restore(_state(path, learner.require))
+    return learner
+
+
+def noisy(path: Path) -> Predict:
+    """Load a policy that acts with its noise. The noise is the same each time the file is read. Raises as
+    ``restored``."""
+    policy = load_network(path)
+    distribution = distribution_of(policy.counts, policy.low, policy.high)
+    parameters, rng = _state(path, _require_parameters)["parameters"], np.random.default_rng(0)
+    further = parameters[len(parameters) - len(distribution.further()) :]
+    return lambda observation: distribution.sent(
+        distribution.sample(policy.outputs(observation).astype(np.float32), further, rng)[0]
+    )
+
+
+def _require_parameters(headers: Mapping[str, Header]) -> None:
+    if "parameters" not in headers or len(headers["parameters"].shape) != 1:
+        raise ValueError("expected a vector of parameters")
+
+
+def _state(path: Path, require: Callable[[Mapping[str, Header]], None]) -> dict[str, NDArray[Any]]:
+    try:
+        entries = read_entries(path, MAX_BYTES)
+        if LEARNER not in entries:
+            raise ValueError(
+                "expected a file that this algorithm saved, got a policy without the state of its training"
+            )
+        return read_arrays(entries[LEARNER], MAX_BYTES, require)
+    except (OSError, ValueError) as error:
+        raise UnusablePolicy(f"training can't continue from {path}: {error}") from error
+
+
+def _initialise(network: Mlp, last_gain: float, rng: np.random.Generator) -> None:
+    for number, (weights, bias) in enumerate(network.layers):
+        bias[:] = 0
+        last = number == len(network.layers) - 1
+        weights[:] = orthogonal(rng, len(weights), weights.shape[1], last_gain if last else HIDDEN_GAIN)

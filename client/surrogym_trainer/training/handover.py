@@ -1,0 +1,395 @@
+"""Handover of a policy: its promise, its audit, and whether the promise is to be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.environments.lanes import Lanes, session_request
+from surrogym_client.errors import BeyondBudget
+from surrogym_client.surrogates.phases import COMPLETED
+from surrogym_client.surrogates.waiting import NobodyAnswers, wait_for_answers, wait_for_design
+from surrogym_client.transport.api import Api
+from surrogym_sampler.original.actions import decode_actions
+from surrogym_sampler.original.protocol import LONGEST_EPISODE
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.wire import QueryView, SampleView, SurrogateView
+from surrogym_trainer.evaluation.audit import (
+    AUDIT_STEPS,
+    MOST_STEPS,
+    MOST_UNTESTED,
+    SLACK,
+    Compared,
+    Consequence,
+    earned,
+    gaps,
+    judge,
+    missed,
+    places,
+    unanswered,
+    untested,
+    wider,
+)
+from surrogym_trainer.evaluation.comparing import compared, steady, steps_of
+from surrogym_trainer.evaluation.consequences import DRAWS, changes_of
+from surrogym_trainer.evaluation.evaluator import Evaluation
+from surrogym_trainer.evaluation.imagined import WHOLE
+from surrogym_trainer.evaluation.outside import Outside, outside_of
+from surrogym_trainer.evaluation.promise import UNNOTICED, promise_of
+from surrogym_trainer.evaluation.ranges import range_left, untestable
+from surrogym_trainer.evaluation.systematic import Inputs
+from surrogym_trainer.evaluation.uncontrolled import baseline
+from surrogym_trainer.policies.evidence import Audit, Promise
+from surrogym_trainer.policies.predict import Predict
+
+LEAST_AUDITED = 128  # real steps of audits that every surrogate may take
+MOST_AUDITS = 3  # audits of one training at most, which share these steps
+WAY_LANES = 16  # virtual episodes whose states an audit chooses from
+MOST_OF_A_WAY = 200  # steps of an episode that are compared with a log
+ELSEWHERE = 4  # an audit of a ready design takes one of every four steps in a gap of the samples
+ANYWHERE = 1_024  # points of the sampling range that such steps are chosen from
+WIDE = 0.5  # share of the gain over an untrained policy: a promise with a wider lower half is not trusted
+NO_SAMPLER = "no sampler is connected"
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Handover:
+    """A policy's promise, with the evidence for it.
+
+    Attributes:
+        promise: promise of the latest model; None if the policy goes where the log has no data.
+        audit: audit of the policy; None without one.
+        trusted: whether the promise is to be trusted.
+        reason: why it is trusted or not, in one sentence.
+    """
+
+    promise: Promise | None
+    audit: Audit | None
+    trusted: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class AuditSettings:
+    """Settings of an audit."""
+
+    steps: int = AUDIT_STEPS
+    patience_seconds: float = 3_600.0  # longest time that a sampler may take
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A policy to hand over, with the session and the seed that it was trained with."""
+
+    api: Api
+    name: str  # of the surrogate
+    port: SurrogatePort
+    predict: Predict
+    session: dict[str, Any] = field(default_factory=dict)  # fields of ``OpenSession``
+    floor: float | None = None  # imagined return of an untrained policy
+    seed: int = 0
+
+    def promise(self) -> Promise:
+        """Compute the policy's promise in the latest model."""
+        return promise_of(self.port, self.predict, self.seed, self.session, self.floor)
+
+
+def hand_over(
+    subject: Subject, audit: AuditSettings | None, progress: Callable[[SurrogateView], None] | None = None
+) -> Handover:
+    """Compute the promise of a policy, audit it if a sampler is connected, and decide whether to trust it.
+
+    Args:
+        subject: the policy.
+        audit: settings of the audit; None takes no audit.
+        progress: called each time the surrogate is polled, while a sampler works.
+
+    Raises:
+        DesignUnfinished: the audit's queries were not answered in time.
+        SurrogymClientError: the server refused.
+    """
+    before = subject.promise()
+    if audit is None or (why := _not_possible(subject)) is not None:
+        return _unaudited(subject, before, "none was requested" if audit is None else str(why))
+    try:
+        found = take(subject, audit, before, progress)
+    except NobodyAnswers:
+        return _unaudited(subject, before, NO_SAMPLER)
+    if found is None:
+        return _unaudited(subject, before, "none of its queries was answered")
+    trusted, reason = _verdict(found, subject.floor)
+    return Handover(found.after, found, trusted, reason)
+
+
+def _left_the_log(subject: Subject) -> Outside | None:
+    """Return how much of a policy's way lies outside the log; None if the model is not of a log alone."""
+    view, spec = subject.api.surrogate(subject.name), subject.port.spec()
+    if view.phase != "from_log":
+        return None
+    logged = [sample for sample in subject.api.samples(subject.name) if sample.purpose == "logged"]
+    q, u = np.array([sample.coordinates for sample in logged]), np.array([sample.action for sample in logged])
+    way_q, way_u = way_of(subject, WAY_LANES, min(spec.time_limit or MOST_OF_A_WAY, MOST_OF_A_WAY))
+    return outside_of(spec, q, u, way_q, way_u)
+
+
+def take(
+    subject: Subject, settings: AuditSettings, before: Promise, progress: Callable[[SurrogateView], None] | None
+) -> Audit | None:
+    """Take the real steps of an audit, fit the model to them, and judge.
+
+    It takes more steps, up to ``MOST_STEPS``, as long as the errors so far may be shared by all steps and cost the
+    promise, while no test has failed. Returns None if there was no step to take. An audit whose steps the original
+    environment all failed to take has failed.
+    """
+    api, name, spec = subject.api, subject.name, subject.port.spec()
+    view = api.surrogate(name)
+    q, u = way_of(subject, WAY_LANES, spec.time_limit or LONGEST_EPISODE)
+    matters = UNNOTICED * earned(before, subject.floor) * WAY_LANES / len(q)
+    wanted, elsewhere = _asked(subject, settings, q, u, claims=view.phase == "ready")
+    while True:
+        answers, failed = _answers(subject, settings, wanted, progress)
+        samples = [sample for sample in answers if spec.known(sample.coordinates)]
+        if not samples:
+            faults = (unanswered(len(failed), len(wanted)),)
+            none = Audit(steps=0, unanswered=len(failed), passed=False, faults=faults, before=before, after=before)
+            return none if failed else None
+        samples.sort(key=lambda sample: sample.query_id in elsewhere)
+        off_way = sum(sample.query_id in elsewhere for sample in samples)
+        beside = replace(compared(api, spec, view, samples, matters), elsewhere=off_way)
+        found = _consequence(subject, beside, before, view, Inputs.over(spec, q, u))
+        doubt = found is not None and found.undecided and judge(beside, before, before, subject.floor, found).passed
+        more = min(settings.steps, MOST_STEPS - len(samples)) if doubt else 0
+        if not (added := _asked_more(subject, replace(settings, steps=more, seed=len(wanted)), q, u)):
+            break
+        wanted |= added
+    wait_for_design(api, name, settings.patience_seconds, progress, after_round=view.round)
+    far = untested(spec, q, beside.states) if spec.query == "rollout" else 0.0
+    beside = replace(beside, unanswered=sum(query.id not in elsewhere for query in failed))
+    about: dict[str, Any] = {"unanswered": len(failed), "untestable": untestable(spec, q)}
+    about |= {"range_left": range_left(spec, q), "untested": far}
+    return judge(beside, before, subject.promise(), subject.floor, found).model_copy(update=about)
+
+
+def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
+    """Judge a policy's promise by whole real episodes: by their steps, and by their returns.
+
+    This tests what single steps can't reach where no state can be set: the goal, and what happens on the way to it. The
+    model does not learn from the steps.
+
+    Raises:
+        SurrogymClientError: the server refused, or has no model yet.
+    """
+    api, spec = subject.api, subject.port.spec()
+    view, before = api.surrogate(subject.name), subject.promise()
+    steps = steady(spec, [step for step in steps_of(result.traces) if spec.known(step.coordinates)])
+    q, u = np.array([step.coordinates for step in steps]), np.array([step.action for step in steps])
+    beside = compared(api, spec, view, steps, UNNOTICED * earned(before, subject.floor) / float(result.lengths.mean()))
+    found = _consequence(subject, beside, before, view, Inputs.over(spec, q, u))
+    audit = missed(judge(beside, before, before, subject.floor, found), result.returns, subject.floor)
+    about = {"steps": result.steps, "episodes": len(result.returns), "range_left": range_left(spec, q)}
+    audit = audit.model_copy(update=about)
+    trusted, reason = _verdict(audit, subject.floor)
+    return Handover(audit.after, audit, trusted, reason)
+
+
+def _answers(
+    subject: Subject,
+    settings: AuditSettings,
+    wanted: set[int],
+    progress: Callable[[SurrogateView], None] | None,
+) -> tuple[list[SampleView], list[QueryView]]:
+    """Wait for the answers to queries. Returns their samples, and the queries that have none."""
+    api, name = subject.api, subject.name
+    try:
+        wait_for_answers(api, name, wanted, settings.patience_seconds, progress)
+    except BaseException:
+        api.withdraw_audit(name, sorted(wanted))
+        raise
+    failed = [query for query in api.queries(name) if query.id in wanted and query.status in ("set_aside", "refused")]
+    return [sample for sample in api.samples(name) if sample.query_id in wanted], failed
+
+
+def _consequence(
+    subject: Subject, beside: Compared, before: Promise, view: SurrogateView, inputs: Inputs
+) -> Consequence | None:
+    """Test the errors on the policy's way together, and compute what they would change in the return.
+
+    Returns None without a step on the way.
+    """
+    if len(beside.errors) == beside.elsewhere or view.model_version is None:
+        return None
+    shifted = beside.together(subject.port.spec(), inputs)
+    weights = shifted.draws(DRAWS, np.random.default_rng(subject.seed))
+    changes = changes_of(
+        subject.port, subject.predict, subject.seed, subject.session, view.model_version, shifted, weights
+    )
+    return Consequence(shifted, changes, before, SLACK * earned(before, subject.floor))
+
+
+def _asked_more(subject: Subject, settings: AuditSettings, q: Array, u: Array) -> set[int]:
+    """Add further queries of an audit on the policy's way. Returns their numbers; none if the surrogate's audits have
+    taken as many steps as they may, or if states can't be set."""
+    if settings.steps < 1 or subject.port.spec().query == "rollout":
+        return set()
+    try:
+        return _asked(subject, settings, q, u, claims=False)[0]
+    except BeyondBudget:
+        return set()
+
+
+def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, claims: bool) -> tuple[set[int], set[int]]:
+    """Add the queries of an audit, at some of the states q (m, C) of the policy's way with their actions u (m, F).
+
+    If the design ``claims`` to know the whole sampling range, one query in ``ELSEWHERE`` is in a gap of its samples
+    instead: what the model got wrong there may have kept the policy away. If the environment can't be set to a state,
+    the query is the sequence of actions of one imagined episode, whole if the surrogate's audits may take that many
+    steps. Returns the queries' numbers, and those off the policy's way.
+    """
+    spec, rng = subject.port.spec(), np.random.default_rng(settings.seed)
+    if spec.query == "rollout":
+        steps = length_of_rollout(subject.api.surrogate(subject.name), settings.steps)
+        _, actions = way_of(subject, 1, steps)
+        queries = subject.api.add_queries(subject.name, rollouts=[actions.tolist()], audit=True)
+        return {query.id for query in queries}, set()
+    elsewhere = settings.steps // ELSEWHERE if claims else 0
+    chosen = places(spec, q, u, settings.steps - elsewhere, rng)
+    if not len(chosen):
+        return set(), set()
+    points = [(q[chosen], u[chosen])]
+    if elsewhere:
+        points.append(_in_gaps(subject, elsewhere))
+    states, actions = (np.concatenate(parts) for parts in zip(*points, strict=True))
+    queries = subject.api.add_queries(subject.name, states.tolist(), actions.tolist(), audit=True)
+    numbers = [query.id for query in queries]
+    return set(numbers), set(numbers[len(chosen) :])
+
+
+def length_of_rollout(view: SurrogateView, steps: int) -> int:
+    """Number of real steps of an audit from a reset: those of a whole episode, or its share of what audits may take, at
+    least ``steps``."""
+    spec = view.spec
+    longest = min(spec.time_limit or LONGEST_EPISODE, spec.max_rollout or LONGEST_EPISODE)
+    share = max(view.budget, LEAST_AUDITED) // MOST_AUDITS
+    return min(longest, max(min(share, _left_for_audits(view)), steps + spec.unknown_steps))
+
+
+def _left_for_audits(view: SurrogateView) -> int:
+    """Number of real steps that the surrogate's audits may still take."""
+    return max(view.budget, LEAST_AUDITED) - view.ledger.audit
+
+
+def _in_gaps(subject: Subject, count: int) -> tuple[Array, Array]:
+    """Return states (count, C) and actions (count, F) of the ranges, in the widest gaps of the samples."""
+    spec = subject.port.spec()
+    random = replace(subject, predict=baseline(spec, "random", subject.seed))
+    q, u = way_of(random, ANYWHERE, 1, start_box=1.0)
+    known = [sample for sample in subject.api.samples(subject.name) if spec.known(sample.coordinates)]
+    samples = np.array([s.coordinates for s in known]), np.array([s.action for s in known])
+    chosen = gaps(spec, q, u, samples, count)
+    return q[chosen], u[chosen]
+
+
+def way_of(subject: Subject, episodes: int, steps: int, start_box: float = 0.0) -> tuple[Array, Array]:
+    """Return the states (m, C) and actions (m, F) of a policy in whole virtual episodes.
+
+    They begin at the declared starts; a share ``start_box`` of them begins anywhere in the sampling range.
+
+    Each episode follows a drawn function of its own. Actions are in the original environment's units.
+    """
+    spec = subject.port.spec()
+    options = {**subject.session, **WHOLE, "start_box": start_box, "variant": "pathwise", "seed": subject.seed}
+    lanes = Lanes(subject.port, session_request(episodes, "same_step", options))
+    states, actions, running = [], [], np.ones(episodes, dtype=bool)
+    try:
+        observation = lanes.reset(subject.seed).observation
+        for _ in range(steps):
+            action = subject.predict(observation)
+            states.append(np.array(subject.api.session_coordinates(lanes.view.id))[running])
+            actions.append(decode_actions(spec, action, episodes)[running])
+            step = lanes.step(action)
+            if step.lost is not None:
+                return way_of(subject, episodes, steps, start_box)
+            observation = step.result.observation
+            running &= ~(step.result.terminated | step.result.truncated)
+            if not running.any():
+                break
+    finally:
+        lanes.close()
+    return np.concatenate(states), np.concatenate(actions)
+
+
+def _not_possible(subject: Subject) -> str | None:
+    """Return why no audit is possible; None if one is."""
+    view = subject.api.surrogate(subject.name)
+    if view.spec.design.preset == "paper":
+        return "preset paper has no audits"
+    if not view.samplers:
+        return NO_SAMPLER
+    return "the design is paused" if view.paused else None
+
+
+def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
+    if not audit.passed:
+        return False, f"the audit failed: {audit.faults[0]}"
+    if (doubt := _doubtful(audit.after, floor)) is not None:
+        return False, doubt
+    if audit.untestable is not None:
+        name, share = audit.untestable
+        return False, (
+            f"{100 * share:.0f} % of the policy's states have a {name!r} beyond what the original environment can be "
+            "set to, so no audit tests them: register under a new name with a wider range or bounds"
+        )
+    if audit.untested > MOST_UNTESTED:
+        return False, (
+            f"the audit's {audit.steps} real steps from a reset reached {100 * (1 - audit.untested):.0f} % of the "
+            "policy's states, and the others are untested: surrogym audit POLICY --env ENVIRONMENT takes whole episodes"
+        )
+    if audit.episodes:
+        return (
+            True,
+            f"the return and the {audit.steps} real steps of {audit.episodes} whole episodes agree with the model",
+        )
+    where = f"{audit.steps - audit.elsewhere} real steps on the policy's way"
+    if audit.elsewhere:
+        where += f" and {audit.elsewhere} in the widest gaps of the samples"
+    missing = f"; {audit.unanswered} in the gaps could not be taken" if audit.unanswered else ""
+    return True, f"{where} agree with the model{missing}"
+
+
+def _unaudited(subject: Subject, promise: Promise, why: str) -> Handover:
+    """Return a handover whose promise no real step supports."""
+    if (left := _left_the_log(subject)) is not None and left.much:
+        return Handover(None, None, False, f"{left.words()}: no promise can be made for them")
+    return _without(subject.api.surrogate(subject.name), promise, subject.floor, why)
+
+
+def _without(view: SurrogateView, promise: Promise, floor: float | None, why: str) -> Handover:
+    """Return a handover without an audit. It is trusted only if the design is ready."""
+    if (doubt := _doubtful(promise, floor)) is not None:
+        return Handover(promise, None, False, f"{doubt}; not audited: {why}")
+    if view.phase == "ready":
+        return Handover(promise, None, True, f"the design is ready; not audited: {why}")
+    state = "is not certain of its model" if view.phase in COMPLETED else "has not ended"
+    return Handover(promise, None, False, f"the design {state}, and there was no audit: {why}")
+
+
+def _doubtful(promise: Promise, floor: float | None) -> str | None:
+    """Return why a promise can't be trusted by its numbers alone; None if it can."""
+    if floor is not None and promise.high <= floor:
+        return (
+            f"the promise is no more than the return of an untrained policy, {floor:.4g}: perhaps no policy can change "
+            "the return within the sampling ranges"
+        )
+    if floor is None or not wider(promise, WIDE, floor):
+        return None
+    return (
+        f"the promise, from {promise.low:.4g} to {promise.high:.4g}, is too wide compared with the gain over an "
+        f"untrained policy, whose return is {floor:.4g}"
+    )

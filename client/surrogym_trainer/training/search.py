@@ -1,0 +1,191 @@
+"""PolicySearch: the port of policy searches, and the names of the installed ones.
+
+The laws of a search, which ``surrogym_trainer.testing`` checks:
+
+1. The same surrogate, settings and seed give the same policy, bit for bit.
+2. It takes at most ``task.steps`` virtual steps, rounded to whole units of its own work (a rollout, a generation), and
+   at least one unit. Steps that only compare policies are not counted.
+3. It reports progress with steps that never decrease and never exceed their total.
+4. On Ctrl-C it returns the best policy so far, with ``whole=False``. It raises ``KeyboardInterrupt`` only if there is
+   no policy yet.
+5. It closes every session that it opens, also after errors. It writes no file; the policy's ``save`` does.
+6. ``load_policy`` reads the saved policy without trust, and the policy gives actions of the surrogate's action space.
+7. Impossible settings raise ``ValueError`` with what was expected and what came, before the first virtual step.
+8. It starts from the policy of ``settings.start_from`` if that is set. A search that can't has ``resumable = False``.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, cast
+
+from surrogym_shared.network import Network
+from surrogym_shared.plugins import Registry
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.policies import load_policy
+from surrogym_trainer.policies.predict import Predict
+from surrogym_trainer.training.settings import TrainProgress, TrainSettings, prolongs
+
+MAX_STEPS = 10_000_000  # most virtual steps of a training: hours of PPO
+ALGORITHMS = ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3")  # of Stable-Baselines3
+FAST = "FASTPPO"  # default
+REFERENCE = "PPO"  # of Stable-Baselines3
+
+Progress = Callable[[TrainProgress], None]
+
+
+@dataclass(frozen=True)
+class SearchTask:
+    """Task of a policy search."""
+
+    port: SurrogatePort
+    settings: TrainSettings
+    steps: int  # virtual steps at most
+    out: Path  # where the policy will be saved; names the run to trackers
+    prolong: bool = False  # whether to take as many steps again while the return rises, and to fine-tune
+    progress: Progress = lambda _: None
+    patient: bool = False  # whether to keep a network that has learned nothing in the first quarter of the steps
+    gamma: float | None = None  # discount; None: as the time limit suggests
+    noise: float = 0.0  # least standard deviation of a continuous action in a training, as a share of its first one
+
+
+class Saved(Protocol):
+    """A policy that can be saved: a ``Network`` of arrays, or a ``LearnedPolicy`` of Stable-Baselines3."""
+
+    def save(self, path: Path) -> None:
+        """Write the file that ``load_policy`` reads."""
+        ...
+
+
+@dataclass(frozen=True)
+class Found:
+    """Result of a policy search."""
+
+    policy: Saved
+    virtual_steps: int
+    imagined_return: float | None  # of the policy; None if it was not measured
+    settings: Mapping[str, Any] = field(default_factory=dict)  # settings of the search, defaults included
+    algorithm: str | None = None  # class of Stable-Baselines3 that reads the file; None if the file needs none
+    whole: bool = True  # False after Ctrl-C
+    episode_penalty: float | None = None
+    lost_episodes: int = 0
+    networks: int = 1
+    gaining: bool = False
+    untrained: float | None = None  # imagined return of a network that has learned nothing; None: not measured
+
+
+class PolicySearch(ABC):
+    """One way to find a policy. Its hyperparameters are the arguments of its class.
+
+    Examples:
+        >>> @dataclass(frozen=True)
+        ... class Guess(PolicySearch):
+        ...     units: int = 8
+        ...
+        ...     def search(self, task):
+        ...         spec = task.port.spec()
+        ...         zeros, ones = np.zeros(len(spec.observation)), np.ones(len(spec.observation))
+        ...         vector = np.random.default_rng(task.settings.seed).normal(size=Network.size(spec, self.units))
+        ...         return Found(Network.of(spec, zeros, ones, self.units, vector), 0, None)
+    """
+
+    suggested_steps: ClassVar[int] = 600_000  # virtual steps by default
+    most_steps: ClassVar[int | None] = MAX_STEPS  # None: no limit, for a search whose steps are cheap
+    prolongable: ClassVar[bool] = False  # supports ``task.prolong``
+    tracked: ClassVar[bool] = False  # logs its curves to ``settings.tracker``
+    by_mean: ClassVar[bool] = False  # moves by the mean without noise, whatever the session's variant
+    resumable: ClassVar[bool] = True  # can start from a policy, and so learn in rounds
+
+    @abstractmethod
+    def search(self, task: SearchTask) -> Found:
+        """Find a policy. The laws are at the top of this module."""
+
+    def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:  # noqa: ARG002  for those that have noise
+        """Load a saved policy that explores as in training; a policy without noise takes its most probable actions."""
+        return load_policy(policy, algorithm)
+
+
+SEARCHES = Registry[PolicySearch](
+    "algorithm",
+    "surrogym.policy_searches",
+    PolicySearch,
+    {
+        **{name: f"surrogym_trainer.training.stable_baselines.algorithms:{name}" for name in ALGORITHMS},
+        FAST: "surrogym_trainer.training.fast_ppo.search:FastPpo",
+        "CMAES": "surrogym_trainer.training.cma_es:CmaEs",
+        "GRADIENT": "surrogym_trainer.training.gradients:Gradients",
+    },
+)
+
+
+def name_of(settings: TrainSettings) -> str:
+    """Return the registered name of the settings' search.
+
+    Raises:
+        ValueError: no search has this name.
+    """
+    return SEARCHES.name_of(settings.algorithm or FAST)
+
+
+def with_algorithm(settings: TrainSettings, spec: EnvironmentSpec) -> TrainSettings:
+    """Return the settings with a search. If they name none, it is ``FAST``, or ``REFERENCE`` if only that one serves.
+
+    Only ``REFERENCE`` has trackers and some of the hyperparameters, and can continue a policy of Stable-Baselines3. It
+    is also the search of the paper's preset.
+    """
+    if settings.algorithm is not None:
+        return settings
+    start, known = settings.start_from, {field.name for field in fields(cast("Any", SEARCHES.get(FAST)))}
+    by_reference = (
+        settings.tracker is not None
+        or not known.issuperset(settings.hyperparameters)
+        or spec.design.preset == "paper"
+        or (start is not None and not Network.is_at(start))
+    )
+    return replace(settings, algorithm=REFERENCE if by_reference else FAST)
+
+
+def search_for(settings: TrainSettings) -> PolicySearch:
+    """Return the search that the settings name, with its hyperparameters.
+
+    Raises:
+        ValueError: the settings name no search, the name or a hyperparameter is unknown, or the search can't be
+            prolonged, tracked or started from a policy, or chooses no starts and horizon, as the settings require.
+    """
+    name, kind = name_of(settings), SEARCHES.get(name_of(settings))
+    if settings.prolong and not kind.prolongable:
+        raise ValueError(f"{name} trains for a fixed number of steps: expected no prolonging, or another algorithm")
+    if not kind.prolongable and (settings.start_visited is not None or settings.horizon is not None):
+        raise ValueError(f"{name} runs whole episodes: expected no start_visited or horizon, or another algorithm")
+    if settings.tracker is not None and not kind.tracked:
+        raise ValueError(f"{name} supports no tracker: expected none, or another algorithm, got {settings.tracker}")
+    if settings.start_from is not None and not kind.resumable:
+        raise ValueError(f"{name} always begins with a new network: expected no policy to start from")
+    try:
+        return kind(**settings.hyperparameters)
+    except TypeError as error:
+        known = ", ".join(getattr(kind, "__dataclass_fields__", ())) or "other hyperparameters"
+        raise ValueError(f"{name} takes {known}, got {', '.join(settings.hyperparameters)}") from error
+
+
+def planned_steps(settings: TrainSettings) -> int:
+    """Return the virtual steps of a training.
+
+    Raises:
+        ValueError: the steps exceed the maximum, or the algorithm is unknown.
+    """
+    kind = SEARCHES.get(name_of(settings))
+    total = kind.suggested_steps if settings.total_steps is None else settings.total_steps
+    if total < 1 or (kind.most_steps is not None and total > kind.most_steps):
+        raise ValueError(f"virtual steps: expected 1 to {kind.most_steps or 'any number'}, got {total}")
+    return total
+
+
+def is_prolonged(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
+    """Whether a training takes as many steps again if its imagined return still rises at the end. Raises as
+    ``search_for``."""
+    return search_for(settings).prolongable and prolongs(settings, spec)

@@ -1,0 +1,93 @@
+"""Policy searches by the algorithms of Stable-Baselines3.
+
+Their defaults depend on properties of an algorithm (on-policy or not, kind of action), never on a task's name.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import stable_baselines3
+from stable_baselines3.common.vec_env import VecNormalize
+
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.policies.defaults import LANES, decaying
+from surrogym_trainer.policies.networks import WIDER, PaperPolicy
+from surrogym_trainer.training.proportions import even_batch, explores_further
+from surrogym_trainer.training.stable_baselines.search import StableBaselinesSearch
+
+
+class OnPolicySearch(StableBaselinesSearch):
+    """Policy search by an on-policy algorithm: many lanes, and the paper's policy networks."""
+
+    suggested_steps = 600_000
+    lanes = LANES
+    policy = PaperPolicy
+
+    def network(self, spec: EnvironmentSpec) -> dict[str, Any]:
+        return {"net_arch": WIDER} if spec.design.preset == "default" else {}
+
+
+class OffPolicySearch(StableBaselinesSearch):
+    """Policy search by an off-policy algorithm. It updates after each step of all lanes, so each step takes far
+    longer."""
+
+    suggested_steps = 50_000
+    lanes = 4
+    policy = "MlpPolicy"
+
+
+class PPO(OnPolicySearch):
+    """PPO with large batches and a decreasing learning rate: docs/decisions/0011."""
+
+    algorithm = stable_baselines3.PPO
+
+    def defaults(self, env: VecNormalize) -> dict[str, Any]:
+        steps = 128
+        rollout = env.num_envs * self.hyperparameters.get("n_steps", steps)
+        return {
+            "n_steps": steps,
+            "n_epochs": 10,
+            "learning_rate": decaying,
+            "gae_lambda": 0.97,
+            "batch_size": even_batch(rollout),
+        }
+
+    def exploring_by_state(self, spec: EnvironmentSpec) -> dict[str, Any]:
+        """Return the hyperparameters of gSDE, which explores by a function of the state (Raffin et al. 2022).
+
+        Noise drawn anew at every step may never reach a goal that takes many steps in one direction. A noise function
+        that stays for a whole rollout pushes each lane its own way. It is for continuous actions, and for PPO alone,
+        because the rollouts of other algorithms are too short.
+        """
+        return {"use_sde": True} if explores_further(spec) else {}
+
+
+class A2C(OnPolicySearch):
+    """A2C of Stable-Baselines3."""
+
+    algorithm = stable_baselines3.A2C
+
+
+class SAC(OffPolicySearch):
+    """SAC of Stable-Baselines3."""
+
+    algorithm = stable_baselines3.SAC
+
+
+class TD3(OffPolicySearch):
+    """TD3 of Stable-Baselines3."""
+
+    algorithm = stable_baselines3.TD3
+
+
+class DDPG(OffPolicySearch):
+    """DDPG of Stable-Baselines3."""
+
+    algorithm = stable_baselines3.DDPG
+
+
+class DQN(OffPolicySearch):
+    """DQN of Stable-Baselines3."""
+
+    algorithm = stable_baselines3.DQN

@@ -1,0 +1,243 @@
+"""Training by an algorithm of Stable-Baselines3: networks are tried one after another, and the best policy is kept."""
+
+from __future__ import annotations
+
+import inspect
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+from surrogym_client.sb3 import SurrogateVecEnv
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.evaluation.imagined import observation_statistics
+from surrogym_trainer.policies.defaults import ATTEMPT_SEED
+from surrogym_trainer.policies.files import load_learner, save_policy
+from surrogym_trainer.policies.networks import Standardise
+from surrogym_trainer.policies.predict import Predict
+from surrogym_trainer.training.proportions import suggested_gamma
+from surrogym_trainer.training.search import Found, PolicySearch, SearchTask
+from surrogym_trainer.training.settings import TrainSettings
+from surrogym_trainer.training.stable_baselines.early_stopping import Checks
+from surrogym_trainer.training.stable_baselines.tracking import tracking
+from surrogym_trainer.training.verdicts import Imagined, checked
+
+Statistics = tuple[Sequence[float], Sequence[float]]  # mean and deviation of observations, (D,) each
+
+
+@dataclass(frozen=True)
+class LearnedPolicy:
+    """Policy of a Stable-Baselines3 algorithm."""
+
+    learner: BaseAlgorithm
+
+    def save(self, path: Path) -> None:
+        """Write the zip of Stable-Baselines3, with a description from which it can be read without unpickling."""
+        save_policy(self.learner, path)
+
+
+class StableBaselinesSearch(PolicySearch):
+    """Policy search by one algorithm. Its hyperparameters go to the algorithm's constructor and replace its
+    defaults."""
+
+    algorithm: ClassVar[type[BaseAlgorithm]]
+    policy: ClassVar[type[BasePolicy] | str]
+    lanes: ClassVar[int]  # default number of lanes
+    prolongable = True
+    tracked = True
+
+    def __init__(self, **hyperparameters: Any) -> None:
+        self.hyperparameters = hyperparameters
+
+    def search(self, task: SearchTask) -> Found:
+        torch.set_num_threads(task.settings.threads)
+        gamma = self.hyperparameters.get("gamma", suggested_gamma(task.port.spec()))
+        with self._environment(task, gamma) as env:
+            return _Training(self, task, env, gamma).run()
+
+    def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:
+        learner = load_learner(policy, algorithm)
+        if learner.use_sde:
+            noisy: Any = learner.policy
+            noisy.reset_noise(num_envs)  # each lane explores its own way
+        return lambda observation: learner.predict(observation, deterministic=False)[0]
+
+    def defaults(self, env: VecNormalize) -> dict[str, Any]:  # noqa: ARG002  for algorithms that have some
+        """Return the hyperparameters that replace Stable-Baselines3's own defaults."""
+        return {}
+
+    def network(self, spec: EnvironmentSpec) -> dict[str, Any]:  # noqa: ARG002
+        """Return keywords of the policy network, except those of standardisation."""
+        return {}
+
+    def exploring_by_state(self, spec: EnvironmentSpec) -> dict[str, Any]:  # noqa: ARG002
+        """Return hyperparameters that replace the usual ones in the network that follows an abandoned one."""
+        return {}
+
+    @contextmanager
+    def _environment(self, task: SearchTask, gamma: float) -> Iterator[VecNormalize]:
+        settings = task.settings
+        lanes = settings.num_envs or self.lanes
+        env = SurrogateVecEnv.from_port(task.port, lanes, **settings.learning)
+        wrapped = VecNormalize(VecMonitor(env), norm_obs=False, norm_reward=True, gamma=gamma)
+        try:
+            yield wrapped
+        finally:
+            wrapped.close()
+
+
+class _Training:
+    """Networks of one training, and the checks that compare them."""
+
+    def __init__(self, search: StableBaselinesSearch, task: SearchTask, env: VecNormalize, gamma: float) -> None:
+        self._search, self._task, self._env, self._gamma = search, task, env, gamma
+        settings, self._spec = task.settings, task.port.spec()
+        self._statistics = observation_statistics(task.port, settings.seed)
+        self._saved = None if settings.start_from is None else self._made(0, settings.start_from)
+        self._untrained = self._made(0)
+        self._total = _whole_rollouts(self._untrained, task.steps)
+        self._checks = Checks(
+            self._total,
+            task.progress,
+            lambda learner: imagined_return(task.port, learner, settings),
+            self._untrained,
+            self._saved if settings.anew else None,
+        )
+
+    def run(self) -> Found:
+        """Train networks one after another until one completes its steps, or Ctrl-C is pressed."""
+        settings, checks, verdicts = self._task.settings, self._checks, self._checks.verdicts
+        with tracking(settings, self._task.out) as callbacks:
+            last, whole = self._learned(callbacks)
+        learner = checks.best_of(last)
+        ran_with = {"num_envs": self._env.num_envs, "total_steps": self._total, **effective(learner)}
+        return Found(
+            LearnedPolicy(learner),
+            verdicts.steps,
+            verdicts.best,
+            ran_with,
+            type(learner).__name__,
+            whole,
+            checks.episode_penalty,
+            checks.lost,
+            verdicts.networks,
+            verdicts.gaining,
+            verdicts.floor,
+        )
+
+    def _learned(self, callbacks: Sequence[BaseCallback]) -> tuple[BaseAlgorithm, bool]:
+        """Return the last network, and whether the training was completed rather than interrupted."""
+        verdicts = self._checks.verdicts
+        learner: BaseAlgorithm | None = None
+        for attempt in itertools.count():
+            try:
+                learner = self._network(attempt)
+                if learner.tensorboard_log is None:  # otherwise a temporary folder is made
+                    learner.set_logger(Logger(folder=None, output_formats=[]))
+                self._learn(learner, callbacks)
+                if self._task.prolong and not verdicts.given_up and verdicts.prolong():
+                    self._learn(learner, callbacks)
+            except KeyboardInterrupt:
+                if learner is None:
+                    raise
+                return learner, False
+            if not verdicts.given_up:
+                return learner, True
+        raise AssertionError("unreachable")
+
+    def _learn(self, learner: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> None:
+        """Let the algorithm learn for the training's remaining virtual steps.
+
+        If the training was prolonged, the learning rate continues from the middle of its schedule.
+        """
+        verdicts = self._checks.verdicts
+        steps = _whole_rollouts(learner, verdicts.left)
+        learner.learn(steps, callback=[self._checks, *callbacks], reset_num_timesteps=not verdicts.prolonged)
+
+    def _network(self, attempt: int) -> BaseAlgorithm:
+        """Return a new network, or in its turn the saved policy if it earns more than an untrained one."""
+        saved, anew = self._saved, self._task.settings.anew
+        if saved is not None and attempt == int(anew) and self._checks.worth_keeping(saved):
+            return saved
+        return self._made(attempt) if attempt else self._untrained
+
+    def _made(self, attempt: int, start_from: Path | None = None) -> BaseAlgorithm:
+        settings = self._task.settings
+        asked = replace(settings, seed=settings.seed + ATTEMPT_SEED * attempt, start_from=start_from)
+        if attempt and start_from is None:
+            by_state = self._search.exploring_by_state(self._spec)
+            asked = replace(asked, hyperparameters=by_state | asked.hyperparameters)
+        return make_learner(self._search, self._env, asked, self._spec, self._statistics, self._gamma)
+
+
+def make_learner(
+    search: StableBaselinesSearch,
+    env: VecNormalize,
+    settings: TrainSettings,
+    spec: EnvironmentSpec,
+    statistics: Statistics,
+    gamma: float,
+) -> BaseAlgorithm:
+    """Make a new network, or load the policy of ``settings.start_from``.
+
+    Raises:
+        ValueError: the algorithm does not support this surrogate.
+        UnusablePolicy: the saved policy can't be read, or does not fit the surrogate.
+    """
+    algorithm, tensorboard = search.algorithm, None if settings.tensorboard is None else str(settings.tensorboard)
+    if settings.start_from is not None:
+        changes = {**settings.hyperparameters, "env": env, "seed": settings.seed}
+        learner = load_learner(settings.start_from, algorithm.__name__, trust=settings.trust_policy, **changes)
+        learner.tensorboard_log = tensorboard
+        return learner
+    extractor = {"mean": statistics[0], "deviation": statistics[1]}
+    try:
+        return algorithm(
+            search.policy,
+            env,
+            seed=settings.seed,
+            device="cpu",
+            policy_kwargs={
+                "features_extractor_class": Standardise,
+                "features_extractor_kwargs": extractor,
+                **search.network(spec),
+            },
+            tensorboard_log=tensorboard,
+            **({"gamma": gamma} | search.defaults(env) | settings.hyperparameters),
+        )
+    except (AssertionError, TypeError) as error:
+        raise ValueError(f"{settings.algorithm} can't be trained here: {error}") from error
+
+
+def imagined_return(port: SurrogatePort, learner: BaseAlgorithm, settings: TrainSettings) -> Imagined:
+    """Measure the present policy without exploration, on the same starts at every check."""
+
+    def predict(observation: Any) -> Any:
+        return learner.predict(observation, deterministic=True)[0]
+
+    return checked(port, predict, settings)
+
+
+def effective(learner: BaseAlgorithm) -> dict[str, Any]:
+    """Return the algorithm's settings that are numbers or text, defaults included, and those of the network."""
+    names = inspect.signature(type(learner).__init__).parameters
+    given = {name: getattr(learner, name, None) for name in names if name not in ("self", "seed", "verbose")}
+    plain = {name: value for name, value in given.items() if isinstance(value, bool | int | float | str)}
+    return {**plain, "net_arch": learner.policy_kwargs.get("net_arch")}
+
+
+def _whole_rollouts(learner: BaseAlgorithm, total: int) -> int:
+    """Round the steps down to whole rollouts, at least one. Stable-Baselines3 would round up."""
+    rollout = learner.n_envs * (learner.n_steps if isinstance(learner, OnPolicyAlgorithm) else 1)
+    return max(total // rollout, 1) * rollout

@@ -1,0 +1,78 @@
+"""One training: run a policy search, save the policy, and write the settings beside it."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+from surrogym_shared.port import SurrogatePort
+from surrogym_trainer.policies.card import card_path, require_card_or_none
+from surrogym_trainer.training.search import (
+    Found,
+    Progress,
+    SearchTask,
+    is_prolonged,
+    name_of,
+    planned_steps,
+    search_for,
+    with_algorithm,
+)
+from surrogym_trainer.training.settings import TrainingInterrupted, TrainResult, TrainSettings, with_folder
+
+
+def train(
+    port: SurrogatePort,
+    out: Path,
+    settings: TrainSettings | None = None,
+    progress: Progress | None = None,
+) -> TrainResult:
+    """Train a policy in the surrogate behind a port, and save it.
+
+    Args:
+        port: the surrogate.
+        out: file to write the policy to; its settings go to the file with suffix .json beside it.
+        settings: settings of the training, which name the search.
+        progress: called after every rollout, generation or other unit of the search.
+
+    Raises:
+        ValueError: an unknown algorithm, one that does not support the action space, or too many steps.
+        SurrogymClientError: the surrogate can't be reached, or has no model yet.
+        UnusablePolicy: the file to start from is not a policy of the algorithm, or the card would replace another
+            kind of file.
+        TrainingInterrupted: Ctrl-C was pressed; the policy with the best imagined return so far is saved.
+    """
+    require_card_or_none(out)
+    settings = with_algorithm(settings or TrainSettings(), port.spec())
+    search = search_for(settings)
+    if search.tracked:
+        settings = with_folder(settings, out)
+    prolong = is_prolonged(settings, port.spec())
+    task = SearchTask(port, settings, planned_steps(settings), out, prolong, progress or (lambda _: None))
+    started = time.perf_counter()
+    found = search.search(task)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    card_path(out).unlink(missing_ok=True)  # no promise of an earlier policy stands beside this one
+    found.policy.save(out)
+    result = _result(found, settings, out, time.perf_counter() - started)
+    card_path(out).write_text(json.dumps(asdict(result), indent=2, default=str) + "\n")
+    if not found.whole:
+        raise TrainingInterrupted(result)
+    return result
+
+
+def _result(found: Found, settings: TrainSettings, out: Path, seconds: float) -> TrainResult:
+    return TrainResult(
+        path=out,
+        algorithm=found.algorithm or name_of(settings),
+        virtual_steps=found.virtual_steps,
+        seconds=seconds,
+        imagined_return=found.imagined_return,
+        lost_episodes=found.lost_episodes,
+        settings={**asdict(settings), "start_box": settings.learning["start_box"], **found.settings},
+        episode_penalty=found.episode_penalty,
+        networks=found.networks,
+        gaining=found.gaining,
+        untrained=found.untrained,
+    )

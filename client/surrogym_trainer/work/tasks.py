@@ -1,0 +1,230 @@
+"""What a worker does for a job, with the code of ``surrogym train`` and ``surrogym evaluate``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from uuid import uuid4
+
+from surrogym_client.environments.pictures import NotRenderable
+from surrogym_client.transport import HttpSurrogate
+from surrogym_client.transport.api import Api
+from surrogym_sampler.original.episodes import Episode
+from surrogym_sampler.original.errors import EvaluationFailed
+from surrogym_shared import wire
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.words import counted
+from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationInterrupted, EvaluationSettings, evaluate
+from surrogym_trainer.evaluation.reporting import as_reported, paired_start, words_of
+from surrogym_trainer.evaluation.uncontrolled import baseline
+from surrogym_trainer.evaluation.videos import record
+from surrogym_trainer.policies.card import write_card
+from surrogym_trainer.policies.files import load_policy
+from surrogym_trainer.policies.predict import Acting, Predict
+from surrogym_trainer.training.audited import AuditedTraining
+from surrogym_trainer.training.cards import card_of
+from surrogym_trainer.training.handover import AuditSettings, Handover
+from surrogym_trainer.training.search import SEARCHES, name_of, with_algorithm
+from surrogym_trainer.training.settings import TrainingInterrupted, TrainResult, TrainSettings
+from surrogym_trainer.work.reporter import Reporter
+
+QUICK = 4  # a quick training takes this part of the steps that the algorithm suggests
+
+
+@dataclass(frozen=True)
+class Environment:
+    """The original environment of a worker, which evaluates in it.
+
+    Attributes:
+        spec: its specification.
+        opener: opens an episode in it.
+        most_episodes: real episodes of one job at most.
+        name: name by which its states are drawn; empty without pictures.
+        reference: loads the reference controller of one job; None: there is none.
+    """
+
+    spec: EnvironmentSpec
+    opener: Callable[[], Episode]
+    most_episodes: int
+    name: str = ""
+    reference: Callable[[], Acting] | None = None
+
+
+@dataclass
+class Gathered:
+    """What a job has given so far, also if it is stopped or fails."""
+
+    policy: Path | None = None
+    version: int | None = None
+    video: Path | None = None
+    lacks: str | None = None  # why there is no video that was asked for
+    evaluations: list[wire.AddEvaluation] = field(default_factory=list)
+    steps: list[wire.ReportSteps] = field(default_factory=list)
+
+
+def settings_of(task: wire.TrainTask, spec: EnvironmentSpec) -> TrainSettings:
+    """Return the settings of a training. Raises ``ValueError`` if the algorithm is not installed."""
+    asked = TrainSettings(algorithm=task.algorithm, total_steps=task.steps, seed=task.seed)
+    settings = with_algorithm(asked, spec)
+    if task.preset != "quick":
+        return settings
+    return replace(settings, total_steps=SEARCHES.get(name_of(settings)).suggested_steps // QUICK, prolong=False)
+
+
+def train(
+    api: Api, port: HttpSurrogate, task: wire.TrainTask, out: Path, reporter: Reporter, gathered: Gathered
+) -> None:
+    """Train a policy, and write it with its card.
+
+    Raises:
+        KeyboardInterrupt: the training was stopped. If there was a policy by then, it is in ``gathered``.
+        ValueError, SurrogymClientError: as ``AuditedTraining``.
+    """
+    name, spec = port.surrogate, port.spec()
+
+    def keep(result: TrainResult, handover: Handover | None = None) -> None:
+        curve = reporter.stand.curve
+        card = card_of(result, handover, surrogate=name, spec=spec, url=api.url, seed=task.seed, curve=curve)
+        write_card(result.path, card)
+        gathered.policy = result.path
+
+    training = AuditedTraining(
+        api,
+        name,
+        port,
+        out,
+        settings_of(task, spec),
+        audit=AuditSettings(seed=task.seed) if task.audit else None,
+        progress=reporter.trained,
+        waiting=lambda _: reporter.at("auditing"),
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        keep(*training.train())
+    except TrainingInterrupted as interruption:
+        keep(interruption.result)
+        raise
+
+
+def run_episodes(
+    api: Api,
+    surrogate: str,
+    task: wire.EvaluateTask,
+    environment: Environment,
+    folder: Path,
+    reporter: Reporter,
+    gathered: Gathered,
+) -> None:
+    """Run real episodes of a stored policy, and those of its comparisons. Then draw a video, if the task asks for one.
+
+    The real steps are in ``gathered`` even if the episodes fail or are stopped.
+
+    Raises:
+        ValueError: the task has more episodes than the worker takes, or asks for a reference controller that it lacks.
+        PolicyMisfit: the environment is not that of the surrogate, whose policies learned for it; it was not reset.
+        UnusablePolicy: the file can't be read without running code in it.
+        KeyboardInterrupt: the evaluation was stopped.
+        EvaluationFailed: the environment or the policy raised an error after real steps.
+    """
+    if task.real_episodes > environment.most_episodes:
+        raise ValueError(
+            f"expected at most {counted(environment.most_episodes, 'real episode')}, got {task.real_episodes}"
+        )
+    found = api.policies.get(surrogate, task.policy)
+    gathered.version = found.version
+    settings = EvaluationSettings(task.episodes, task.first_seed, task.wide)
+    controllers = _controllers(task, environment, _loaded(api, surrogate, found, folder))
+    trained_for = api.surrogate(surrogate).spec
+    results: dict[wire.Controller, Evaluation] = {}
+    for done, (controller, predict) in enumerate(controllers.items()):
+
+        def tell(share: float, _: int, done: int = done) -> None:
+            reporter.at("evaluating", (done + share) / len(controllers))
+
+        results[controller] = _counted(predict, environment, settings, controller, tell, gathered, trained_for)
+    paired = paired_start(results["policy"], settings.episodes)
+    gathered.evaluations = [
+        as_reported(
+            result,
+            settings,
+            uuid4().hex,
+            environment=environment.name,
+            trained_for=trained_for,
+            controller=controller,
+            paired=paired,
+        )
+        for controller, result in results.items()
+    ]
+    if task.video:
+        path = folder / f"{surrogate}-{found.version}-{uuid4().hex[:8]}"
+        gathered.video, gathered.lacks = _filmed(environment, results["policy"], settings, path)
+
+
+def _controllers(task: wire.EvaluateTask, environment: Environment, policy: Predict) -> dict[wire.Controller, Acting]:
+    """What chooses the actions, the policy first."""
+    controllers: dict[wire.Controller, Acting] = {"policy": policy}
+    if task.compare is not None:
+        controllers[task.compare] = baseline(environment.spec, task.compare)
+    if task.reference:
+        if environment.reference is None:
+            raise ValueError("this worker has no reference controller: start it with --reference")
+        controllers["reference"] = environment.reference()
+    return controllers
+
+
+def _filmed(
+    environment: Environment, result: Evaluation, settings: EvaluationSettings, path: Path
+) -> tuple[Path | None, str | None]:
+    """Write a video, and return its file, or the reason why there is none: it must not spoil an evaluation."""
+    try:
+        video = record(environment.spec, environment.name, result, words_of(settings))
+    except NotRenderable as error:
+        return None, f"no video: {error}"
+    except Exception as error:  # one's own environment may raise anything when it is drawn
+        return None, f"no video: {type(error).__name__}: {error}"
+    file = path.with_name(f"{path.name}.{video.form}")
+    file.write_bytes(video.content)
+    return file, None
+
+
+def _counted(
+    predict: Acting,
+    environment: Environment,
+    settings: EvaluationSettings,
+    controller: wire.Controller,
+    tell: Callable[[float, int], None],
+    gathered: Gathered,
+    trained_for: EnvironmentSpec,
+) -> Evaluation:
+    """Run the episodes of one controller, and note their real steps."""
+
+    def note(steps: int, episodes: int, what: str) -> None:
+        if steps:
+            acting = "the reference controller" if controller == "reference" else f"{controller} actions"
+            said = what if controller == "policy" else f"{what}, {acting}"
+            gathered.steps.append(
+                wire.ReportSteps(steps=steps, episodes=episodes, note=said, idempotency_key=uuid4().hex)
+            )
+
+    try:
+        result = evaluate(predict, environment.opener, settings, tell, trained_for=trained_for)
+    except EvaluationFailed as failure:
+        note(failure.steps, 0, "failed")
+        raise
+    except EvaluationInterrupted as interruption:
+        note(interruption.steps, 0, "interrupted")
+        raise
+    note(result.steps, settings.episodes, f"{counted(settings.episodes, 'episode')} from seed {settings.first_seed}")
+    return result
+
+
+def _loaded(api: Api, surrogate: str, found: wire.PolicyDetail, folder: Path) -> Predict:
+    """Fetch a policy's file, and load it without unpickling anything."""
+    forms: list[wire.PolicyForm] = [file.form for file in found.files if file.stored and file.form in ("zip", "onnx")]
+    if not forms:
+        raise ValueError(f"{surrogate}@{found.version} has no file that can act: expected zip or onnx")
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{surrogate}-{found.version}.{forms[0]}"
+    path.write_bytes(api.policies.file(surrogate, found.version, forms[0]))
+    return load_policy(path, found.algorithm or "PPO")
