@@ -69,7 +69,7 @@ def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM, *, trust: bool =
         return load_network(path)
     if path.suffix.lower() == ONNX:
         return load_onnx(path)
-    model = _learner(path, algorithm, trust, {})
+    model = read_learner(path, algorithm, trust, {})
     normalise = _normalisation(path, model)
 
     def predict(observations: NDArray[np.float32]) -> NDArray[Any]:
@@ -104,7 +104,7 @@ def load_learner(
         UnusablePolicy: the algorithm is unknown, the file is not one of its policies, it needs ``trust``, or it learned
             in a ``VecNormalize``.
     """
-    model = _learner(path, algorithm, trust, changes)
+    model = read_learner(path, algorithm, trust, changes)
     if is_normalised(model):
         raise UnusablePolicy(
             f"expected a policy that sees observations as they are, got {path}, which learned in a VecNormalize: "
@@ -122,7 +122,7 @@ def _normalisation(path: Path, model: BaseAlgorithm) -> Normalisation | None:
     return Normalisation(statistics_path(path))
 
 
-def _learner(path: Path, algorithm: str, trust: bool, changes: dict[str, Any]) -> BaseAlgorithm:
+def read_learner(path: Path, algorithm: str, trust: bool, changes: dict[str, Any]) -> BaseAlgorithm:
     """Load an algorithm from its file. Arguments and errors as of ``load_learner``."""
     import stable_baselines3
 
@@ -137,7 +137,7 @@ def _learner(path: Path, algorithm: str, trust: bool, changes: dict[str, Any]) -
         raise UnusablePolicy(f"{path}: expected weights that are numbers, got other pickled objects") from error
     except Exception as error:  # a malformed file can raise anything
         if changes:
-            _learner(path, algorithm, trust, {})
+            read_learner(path, algorithm, trust, {})
             given = [f"{name}={value!r}" for name, value in changes.items() if name not in ("env", "seed")]
             raise UnusablePolicy(f"{path} does not fit {', '.join([*given, 'this surrogate'])}: {error}") from error
         raise UnusablePolicy(f"{path} is not a policy of {algorithm}: {error}") from error

@@ -49,14 +49,14 @@ class Normalisation:
         """Read the statistics. Raises ``UnusablePolicy`` if the file does not hold them."""
         try:
             with np.load(path, allow_pickle=False) as file:
-                self._mean, variance, epsilon, self._clip = (
+                self.mean, variance, epsilon, self.clip = (
                     np.asarray(file[name], dtype=np.float64) for name in ("mean", "var", "epsilon", "clip")
                 )
         except (OSError, ValueError, KeyError) as error:
             raise UnusablePolicy(f"{path}: expected the arrays mean, var, epsilon and clip ({error})") from error
-        self._spread = np.sqrt(variance + epsilon)
+        self.spread = np.sqrt(variance + epsilon)
 
     def __call__(self, observations: Floats) -> Floats:
         """Return normalised observations (N, D)."""
-        scaled = (observations - self._mean) / self._spread
-        return np.clip(scaled, -self._clip, self._clip).astype(np.float32)
+        scaled = (observations - self.mean) / self.spread
+        return np.clip(scaled, -self.clip, self.clip).astype(np.float32)

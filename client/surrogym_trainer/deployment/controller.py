@@ -1,0 +1,320 @@
+"""What a controller computes, as data: from raw measurements to actions. Every target is written from this.
+
+Shapes: C coordinates, R measurements, D observation entries, A outputs of the network, F action entries. A place is the
+index of a coordinate among all C.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.errors import SurrogymClientError
+from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, Lag, Term, limits
+from surrogym_shared.spec.actions import Action
+
+Array = NDArray[np.float64]
+Activation = Literal["none", "tanh", "relu"]
+
+NOT_FINITE, OUT_OF_RANGE, LATE, NO_ACTION = 1, 2, 4, 8  # bits of a status; 0: the action is the policy's
+TURNS = 100  # turns of an angle that a sensor may count, as wrapping loses digits
+
+
+class NotDeployable(SurrogymClientError):
+    """The policy can't become a controller of this target."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A coordinate that the caller measures.
+
+    Attributes:
+        place: its coordinate.
+        angle: whether it is wrapped to [-pi, pi).
+        low, high: bounds that it is clipped to; infinite without bounds.
+        lowest, highest: a reading outside of these leads to the fallback.
+    """
+
+    name: str
+    unit: str
+    place: int
+    angle: bool
+    low: float
+    high: float
+    lowest: float
+    highest: float
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """A coordinate that the controller keeps itself: a lag.
+
+    Attributes:
+        place: its coordinate.
+        source: place of the coordinate that it repeats; entry of the action for kind ``action``; -1 for ``steps``.
+        angle: whether the source is an angle, so that a change is at most half a turn.
+        of_action: whether it repeats actions. Other lags begin anew after a fault, because a measurement is missing.
+        start: its value when nothing has been measured yet.
+        low, high: bounds that it is clipped to; infinite without bounds.
+    """
+
+    name: str
+    place: int
+    kind: Literal["change", "value", "action", "steps"]
+    source: int
+    angle: bool
+    of_action: bool
+    start: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Part:
+    """coefficient * phi(sum of weight * q[place]), with phi = 1, the identity, sin or cos."""
+
+    function: Literal["one", "linear", "sin", "cos"]
+    coefficient: float
+    weights: tuple[tuple[int, float], ...]
+
+
+@dataclass(frozen=True)
+class Observed:
+    """An entry of the observation: the sum of its parts, clipped to [low, high], which are infinite without a clip.
+
+    ``smallest`` and ``largest`` are its limits in the observation space. Nothing is clipped to them.
+    """
+
+    name: str
+    unit: str
+    parts: tuple[Part, ...]
+    low: float
+    high: float
+    smallest: float
+    largest: float
+
+
+@dataclass(frozen=True, eq=False)
+class Dense:
+    """A layer: activation(x @ weights + bias)."""
+
+    weights: Array  # (I, O)
+    bias: Array  # (O,)
+    activation: Activation
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """The policy's network.
+
+    x = clip((o - mean) / deviation, -clip, clip), y = layers(x). A discrete action is the index of the largest output
+    of each group of ``counts``. A continuous one is centre + reach * tanh(y), or without the tanh if not ``squash``.
+    """
+
+    mean: Array  # (D,)
+    deviation: Array  # (D,)
+    clip: float  # infinite without a clip
+    layers: tuple[Dense, ...]
+    counts: tuple[int, ...]  # choices of each entry of a discrete action; empty for a continuous one
+    squash: bool
+    centre: Array  # (F,); empty for a discrete action
+    reach: Array  # (F,); empty for a discrete action
+
+
+@dataclass(frozen=True, eq=False)
+class Controller:
+    """A policy with everything around it: one call per sampling period, from R measurements to F action entries.
+
+    One decision: judge the measurements; on a fault return ``fallback``. Else place the wrapped and clipped
+    measurements and the lags among the C coordinates, observe, let the network decide, and clip to [low, high]. Index i
+    of n choices becomes low + i * (high - low) / (n - 1), which is i itself for a discrete action.
+    ``surrogym_trainer.deployment.reference`` is this in NumPy.
+
+    Observations, and the actions that lags remember, are rounded to float32, as in training and evaluation.
+
+    Attributes:
+        name: of the surrogate; part of file names.
+        coordinates: names of all C coordinates.
+        measurements: in the order of the specification.
+        lags: the other coordinates.
+        low, high: limits (F,) of the action; of a discrete one its first and last number.
+        fallback: action (F,) on a fault.
+        timeout: largest age of a measurement in seconds; infinite without one.
+        period: seconds between decisions; None if nobody declared it.
+        digests: SHA-256 of ``policy`` and ``specification``, and ``model`` where it is known.
+    """
+
+    name: str
+    coordinates: tuple[str, ...]
+    measurements: tuple[Measurement, ...]
+    lags: tuple[Remembered, ...]
+    observation: tuple[Observed, ...]
+    decision: Decision
+    low: Array
+    high: Array
+    fallback: Array
+    timeout: float
+    period: float | None
+    digests: dict[str, str]
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        return self.decision.counts
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What a person chooses of a controller. None takes the default.
+
+    Attributes:
+        fallback: action (F,) on a fault. Default: the continuous action nearest to 0. A discrete one has no default.
+        timeout: largest age of a measurement in seconds. Default: the sampling period, or none if it is not declared.
+        ranges: readings that a sensor can give, by measurement. Default: the range of the specification, widened by its
+            own width at each end; 100 turns for an angle.
+    """
+
+    fallback: tuple[float, ...] | None = None
+    timeout: float | None = None
+    ranges: dict[str, tuple[float, float]] | None = None
+
+
+def controller_from(
+    spec: EnvironmentSpec, decision: Decision, name: str, digests: dict[str, str], choices: Choices
+) -> Controller:
+    """Return the controller of a network and the specification that it was trained for.
+
+    Raises:
+        NotDeployable: they don't fit, or a choice does not.
+    """
+    low, high = _limits(spec.action)
+    outputs = sum(_counts(spec.action)) or len(low)
+    shape, expected = (len(decision.mean), len(decision.layers[-1].bias)), (len(spec.observation), outputs)
+    if shape != expected or decision.counts != _counts(spec.action):
+        raise NotDeployable(
+            f"expected a network of {expected[0]} inputs and {expected[1]} outputs for this specification, got "
+            f"{shape[0]} and {shape[1]}"
+        )
+    return Controller(
+        name=name,
+        coordinates=spec.coordinate_names,
+        measurements=_measurements(spec, dict(choices.ranges or {})),
+        lags=tuple(_remembered(spec, i, c, c.lag) for i, c in enumerate(spec.coordinates) if c.lag is not None),
+        observation=tuple(_observed(spec, i) for i in range(len(spec.observation))),
+        decision=decision,
+        low=low,
+        high=high,
+        fallback=_fallback(spec.action, low, high, choices.fallback),
+        timeout=_timeout(spec, choices.timeout),
+        period=spec.sampling_period,
+        digests=digests,
+    )
+
+
+def _measurements(spec: EnvironmentSpec, ranges: dict[str, tuple[float, float]]) -> tuple[Measurement, ...]:
+    names = [c.name for c in spec.coordinates if c.lag is None]
+    if unknown := sorted(set(ranges) - set(names)):
+        raise NotDeployable(f"expected the range of a measurement ({', '.join(names)}), got {', '.join(unknown)}")
+    found = []
+    for place, c in enumerate(spec.coordinates):
+        if c.lag is not None:
+            continue
+        lowest, highest = ranges.get(c.name) or _readable(c)
+        if not lowest < highest:
+            raise NotDeployable(f"expected a range of {c.name} that rises, got {lowest:g} to {highest:g}")
+        found.append(Measurement(c.name, c.unit, place, c.kind == "angle", *_bounds(c), lowest, highest))
+    return tuple(found)
+
+
+def _readable(coordinate: Coordinate) -> tuple[float, float]:
+    """Readings that a sensor is believed: far more than where the model was learned, as leaving that is no fault."""
+    if coordinate.kind == "angle":
+        return -2 * np.pi * TURNS, 2 * np.pi * TURNS
+    low, high = coordinate.settable
+    return low - (high - low), high + (high - low)
+
+
+def _bounds(coordinate: Coordinate) -> tuple[float, float]:
+    bounds = coordinate.bounds
+    low = None if bounds is None else bounds.low
+    high = None if bounds is None else bounds.high
+    return -np.inf if low is None else low, np.inf if high is None else high
+
+
+def _remembered(spec: EnvironmentSpec, place: int, coordinate: Coordinate, lag: Lag) -> Remembered:
+    names = spec.coordinate_names
+    source = {"action": lag.entry or 0, "steps": -1}.get(lag.kind, names.index(lag.of) if lag.of else -1)
+    root: Lag | None = lag
+    while root is not None and root.kind == "value":
+        root = spec.coordinates[names.index(root.of or "")].lag
+    return Remembered(
+        name=coordinate.name,
+        place=place,
+        kind=lag.kind,
+        source=source,
+        angle=lag.kind == "change" and spec.coordinates[source].kind == "angle",
+        of_action=root is not None and root.kind == "action",
+        start=0.0 if coordinate.counted else sum(limits(spec.start[coordinate.name])) / 2,
+        low=_bounds(coordinate)[0],
+        high=_bounds(coordinate)[1],
+    )
+
+
+def _observed(spec: EnvironmentSpec, index: int) -> Observed:
+    entry, names = spec.observation[index], spec.coordinate_names
+    parts = tuple(
+        Part(p.function, p.coefficient, tuple((names.index(n), w) for n, w in p.weights.items()))
+        for p in entry.term.parts
+    )
+    limited = [(-np.inf if a is None else a, np.inf if b is None else b) for a, b in _clips(entry.term, entry)]
+    return Observed(entry.name, _unit(spec, entry.term), parts, *limited[0], *limited[1])
+
+
+def _clips(term: Term, entry: Any) -> tuple[tuple[float | None, float | None], ...]:
+    return (term.low, term.high), (entry.low, entry.high)
+
+
+def _unit(spec: EnvironmentSpec, term: Term) -> str:
+    """Unit of a term: that of its coordinate, if it is one coordinate; else none is known."""
+    if len(term.parts) != 1 or term.parts[0].function != "linear" or len(term.parts[0].weights) != 1:
+        return ""
+    (name,) = term.parts[0].weights
+    return spec.coordinates[spec.coordinate_names.index(name)].unit
+
+
+def _limits(action: Action) -> tuple[Array, Array]:
+    if isinstance(action, BoxAction):
+        return np.array(action.low, dtype=np.float64), np.array(action.high, dtype=np.float64)
+    counts = np.array(_counts(action), dtype=np.float64)
+    return np.zeros(len(counts)), counts - 1
+
+
+def _counts(action: Action) -> tuple[int, ...]:
+    if isinstance(action, BoxAction):
+        return action.bins or ()
+    return (action.n,) if action.kind == "discrete" else action.nvec
+
+
+def _fallback(action: Action, low: Array, high: Array, chosen: tuple[float, ...] | None) -> Array:
+    if chosen is None:
+        if not isinstance(action, BoxAction):
+            raise NotDeployable(
+                f"a discrete action has no rest: expected --fallback with {len(low)} of the numbers "
+                f"{low.astype(int).tolist()} to {high.astype(int).tolist()}, which the controller takes on a fault"
+            )
+        return np.clip(np.zeros(len(low)), low, high)
+    given = np.array(chosen, dtype=np.float64)
+    whole = isinstance(action, BoxAction) or (given == np.round(given)).all()
+    if given.shape != low.shape or not whole or not ((given >= low) & (given <= high)).all():
+        raise NotDeployable(
+            f"expected a fallback of {len(low)} entries from {low.tolist()} to {high.tolist()}, got {given.tolist()}"
+        )
+    return given
+
+
+def _timeout(spec: EnvironmentSpec, chosen: float | None) -> float:
+    if chosen is not None and not chosen > 0:
+        raise NotDeployable(f"expected a timeout of more than 0 s, got {chosen:g}")
+    return chosen if chosen is not None else spec.sampling_period or np.inf

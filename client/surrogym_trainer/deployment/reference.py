@@ -1,0 +1,147 @@
+"""A controller in NumPy: what every target must compute.
+
+Shapes: N controllers at once, C coordinates, R measurements, D observation entries, A outputs, F action entries.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_trainer.deployment.controller import (
+    LATE,
+    NO_ACTION,
+    NOT_FINITE,
+    OUT_OF_RANGE,
+    Array,
+    Controller,
+    Decision,
+    Observed,
+)
+
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+TURN = 2 * np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """What N controllers remember of the step before."""
+
+    coordinates: Array  # (N, C)
+    action: Array  # (N, F)
+    acted: Bools  # (N,) whether there was a step before
+    measured: Bools  # (N,) whether the measurements of the step before had no fault
+
+
+class Decided(NamedTuple):
+    """Result of one decision."""
+
+    memory: Memory
+    action: Array  # (N, F)
+    status: Ints  # (N,) 0, or the bits of what was wrong
+
+
+def begin(controller: Controller, number: int = 1) -> Memory:
+    """Return the memory of controllers that have not acted yet."""
+    coordinates = np.zeros((number, len(controller.coordinates)))
+    return Memory(coordinates, np.zeros((number, len(controller.low))), *np.zeros((2, number), dtype=np.bool_))
+
+
+def decide(controller: Controller, memory: Memory, measurements: Array, age: Array | float = 0.0) -> Decided:
+    """Take one decision for measurements (N, R) of an age (N,) in seconds."""
+    read = np.asarray(measurements, dtype=np.float64)
+    status = judged(controller, read, np.broadcast_to(np.asarray(age, dtype=np.float64), len(read)))
+    sound = np.where((status == 0)[:, None], read, 0.0)  # a fault's numbers go nowhere
+    coordinates = _placed(controller, memory, sound, status == 0)
+    action, wrong = act(controller, observe(controller, coordinates))
+    status = np.where((status == 0) & wrong, NO_ACTION, status)
+    action = np.where((status == 0)[:, None], action, controller.fallback)
+    remembered = action.astype(np.float32).astype(np.float64)
+    return Decided(Memory(coordinates, remembered, np.ones_like(wrong), (status & ~NO_ACTION) == 0), action, status)
+
+
+def judged(controller: Controller, read: Array, age: Array) -> Ints:
+    """Return what is wrong (N,) with measurements (N, R) of an age (N,); 0 if nothing is."""
+    lowest, highest = (np.array([getattr(m, n) for m in controller.measurements]) for n in ("lowest", "highest"))
+    finite = np.isfinite(read)
+    outside = finite & ((read < lowest) | (read > highest))
+    late = ~((age >= 0) & (age <= controller.timeout))
+    bits = np.where(~finite.all(1), NOT_FINITE, 0) | np.where(outside.any(1), OUT_OF_RANGE, 0)
+    return np.asarray(bits | np.where(late, LATE, 0), dtype=np.int64)
+
+
+def observe(controller: Controller, coordinates: Array) -> Array:
+    """Return observations (N, D), rounded to float32, at coordinates (N, C)."""
+    rows = np.stack([_entry(one, coordinates) for one in controller.observation], axis=1)
+    return rows.astype(np.float32).astype(np.float64)
+
+
+def act(controller: Controller, observation: Array) -> tuple[Array, Bools]:
+    """Return actions (N, F) for observations (N, D), and whether (N,) the network's outputs are not finite."""
+    y = scores(controller.decision, observation)
+    wrong: Bools = np.logical_not(np.isfinite(y).all(1))
+    y = np.where(wrong[:, None], 0.0, y)
+    low, high, decision = controller.low, controller.high, controller.decision
+    if not decision.counts:
+        shown = np.tanh(y) if decision.squash else y
+        return np.clip(decision.centre + decision.reach * shown, low, high), wrong
+    groups = np.split(y, np.cumsum(decision.counts)[:-1], axis=1)
+    chosen = np.stack([group.argmax(1) for group in groups], axis=1)
+    return low + chosen * (high - low) / (np.array(decision.counts) - 1), wrong
+
+
+def scores(decision: Decision, observation: Array) -> Array:
+    """Return the network's outputs (N, A) for observations (N, D)."""
+    x = np.clip((observation - decision.mean) / decision.deviation, -decision.clip, decision.clip)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for layer in decision.layers:
+            x = x @ layer.weights + layer.bias
+            if layer.activation != "none":
+                x = np.tanh(x) if layer.activation == "tanh" else np.maximum(x, 0)
+    return x
+
+
+def _placed(controller: Controller, memory: Memory, read: Array, sound: Bools) -> Array:
+    """Return coordinates (N, C): measurements (N, R), where they are sound, and lags."""
+    after = memory.coordinates.copy()
+    for i, one in enumerate(controller.measurements):
+        after[:, one.place] = wrapped(read[:, i]) if one.angle else np.clip(read[:, i], one.low, one.high)
+    known = memory.acted & memory.measured & sound
+    for lag in controller.lags:
+        match lag.kind:
+            case "action":
+                value = memory.action[:, lag.source]
+            case "steps":
+                value = memory.coordinates[:, lag.place] + 1
+            case "value":
+                value = memory.coordinates[:, lag.source]
+            case "change":
+                change = after[:, lag.source] - memory.coordinates[:, lag.source]
+                value = wrapped(change) if lag.angle else change
+        kept = np.where(memory.acted if lag.of_action else known, value, lag.start)
+        after[:, lag.place] = np.clip(kept, lag.low, lag.high)
+    return after
+
+
+def wrapped(angle: Array) -> Array:
+    """Wrap angles to [-pi, pi)."""
+    return (angle + np.pi) % TURN - np.pi
+
+
+def _entry(entry: Observed, coordinates: Array) -> Array:
+    total = np.zeros(len(coordinates))
+    for part in entry.parts:
+        inner = sum((weight * coordinates[:, place] for place, weight in part.weights), np.zeros(len(coordinates)))
+        match part.function:
+            case "one":
+                inner = np.ones_like(inner)
+            case "sin":
+                inner = np.sin(inner)
+            case "cos":
+                inner = np.cos(inner)
+        total = total + part.coefficient * inner
+    return np.clip(total, entry.low, entry.high)

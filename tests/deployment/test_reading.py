@@ -1,0 +1,147 @@
+"""A controller decides as its policy does, and a policy that can't become one is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import stable_baselines3
+
+from support.controllers import LEARNERS, Idle, learner, network, plant
+from surrogym_sampler.original.actions import decode_actions
+from surrogym_sampler.original.lags import begun, followed, read_names
+from surrogym_shared.spec import DiscreteAction
+from surrogym_shared.terms import observe as declared
+from surrogym_trainer.deployment.controller import LATE, NOT_FINITE, OUT_OF_RANGE, Choices, NotDeployable
+from surrogym_trainer.deployment.reading import controller_of
+from surrogym_trainer.deployment.reference import begin, decide, observe
+from surrogym_trainer.policies import UnusablePolicy, load_policy
+from surrogym_trainer.policies.card import PolicyCard, write_card
+
+ANY = Choices(fallback=(0.0,))
+HISTORY = {"changes": 2, "actions": 2, "largest": {"angle": 0.5, "slide": 0.2}, "at_start": {"angle": 0.3}}
+
+
+def readings(spec, steps, seed=0):
+    """Measurements (T, R) of a walk that turns round and passes the slide's bounds."""
+    rng = np.random.default_rng(seed)
+    return np.cumsum(rng.normal(0, [0.8, 0.4, 0.0], (steps, 3)), axis=0).clip([-50, -2.0, 0], [50, 3.0, 1])
+
+
+@pytest.mark.parametrize("case", LEARNERS)
+def test_a_controller_decides_as_its_policy_in_every_step(tmp_path: Path, case: str):
+    spec = plant(LEARNERS[case][2], **HISTORY)
+    path = learner(tmp_path, case, spec)
+    fallback = None if spec.action.kind == "box" else (0.0,) * spec.action.size
+    controller = controller_of(path, trust=True, choices=Choices(fallback=fallback))
+    policy, memory, q, last = load_policy(path, LEARNERS[case][0], trust=True), begin(controller), None, None
+    chosen = []
+    for read in readings(spec, 60):
+        q = begun(spec, read) if q is None else followed(spec, q, last, read)
+        decided = decide(controller, memory, read[None])
+        expected = decode_actions(spec, policy(declared(spec, q[None]).astype(np.float32)), 1)[0]
+        assert decided.status == 0
+        np.testing.assert_array_equal(decided.memory.coordinates[0], q)
+        np.testing.assert_allclose(decided.action[0], expected, atol=1e-4 * np.ptp([controller.low, controller.high]))
+        memory, last = decided.memory, decided.action[0].astype(np.float32).astype(np.float64)
+        chosen.append(expected)
+    assert len(np.unique(chosen)) > 1, "a policy that always does the same shows nothing"
+    np.testing.assert_array_equal(observe(controller, q[None]), declared(spec, q[None]).astype(np.float32))
+    assert [m.name for m in controller.measurements] == list(read_names(spec))
+
+
+def test_a_linear_policy_and_a_network_of_arrays_become_controllers(tmp_path: Path):
+    for units in (0, (8,), (64, 64)):
+        spec = plant()
+        path = network(tmp_path, spec, units)
+        controller, read = controller_of(path), readings(spec, 1)
+        decided = decide(controller, begin(controller), read)
+        policy = load_policy(path)
+        np.testing.assert_allclose(
+            decided.action, decode_actions(spec, policy(declared(spec, begun(spec, read[0])[None])), 1), atol=1e-6
+        )
+        assert controller.timeout == 0.05
+        assert len(controller.decision.layers) == (len(units) if units else 0) + 1
+
+
+@pytest.mark.parametrize(
+    ("read", "age", "status"),
+    [
+        ([np.nan, 0, 0], 0, NOT_FINITE),
+        ([0, np.inf, 0], 0, NOT_FINITE),
+        ([0, 5.1, 0], 0, OUT_OF_RANGE),
+        ([0, 0, -1.1], 0.051, OUT_OF_RANGE | LATE),
+        ([0, 0, 0], 0.051, LATE),
+        ([0, 0, 0], np.nan, LATE),
+        ([0, 0, 0], -0.001, LATE),
+        ([700.0, 0, 0], 0, OUT_OF_RANGE),
+        ([600.0, 4.9, 1.9], 0.05, 0),
+    ],
+)
+def test_a_measurement_that_is_not_sound_leads_to_the_fallback(tmp_path: Path, read, age, status):
+    controller = controller_of(network(tmp_path, plant()), choices=Choices(fallback=(0.5, 1.5)))
+    decided = decide(controller, begin(controller), np.array([read]), age)
+    assert decided.status == status
+    assert (decided.action.tolist() == [[0.5, 1.5]]) == (status != 0)
+
+
+def test_after_a_fault_lags_of_measurements_begin_anew_and_those_of_actions_go_on(tmp_path: Path):
+    spec = plant(**HISTORY)
+    controller = controller_of(network(tmp_path, spec))
+    names, memory = spec.coordinate_names, begin(controller)
+    walk = readings(spec, 6)
+    walk[3] = np.nan
+    rows, actions = [], []
+    for read in walk:
+        decided = decide(controller, memory, read[None])
+        memory = decided.memory
+        rows.append(dict(zip(names, memory.coordinates[0], strict=True)))
+        actions.append(memory.action[0])
+    assert actions[3].tolist() == [0.0, 0.0], "the fallback"
+    assert rows[4]["slide.change1"] == rows[4]["steps since reset"] == 0
+    assert rows[5]["slide.change1"] == pytest.approx(rows[5]["slide"] - rows[4]["slide"])
+    assert [rows[4]["action1.lag1"], rows[4]["action1.lag2"]] == [actions[3][1], actions[2][1]]
+    assert rows[2]["action1.lag1"] == actions[1][1] != 0
+
+
+def test_policies_without_a_feed_forward_network_are_refused_with_what_can(tmp_path: Path):
+    spec = plant()
+    path = network(tmp_path, spec)
+    (tmp_path / "policy.onnx").write_bytes(b"x")
+    with pytest.raises(NotDeployable, match="feed-forward network can"):
+        controller_of(tmp_path / "policy.onnx", spec)
+    made = stable_baselines3.PPO("MlpPolicy", Idle(spec), device="cpu", policy_kwargs={"activation_fn": _elu()})
+    made.save(path)
+    write_card(path, PolicyCard(algorithm="PPO", spec=spec))
+    with pytest.raises(NotDeployable, match="got ELU; a deterministic feed-forward network can"):
+        controller_of(path, trust=True)
+    with pytest.raises(UnusablePolicy, match="pickled objects"):
+        controller_of(path)
+    with pytest.raises(NotDeployable, match=r"RECURRENTPPO.*feed-forward network can"):
+        controller_of(path, algorithm="RECURRENTPPO", trust=True)
+
+
+def _elu():
+    import torch
+
+    return torch.nn.ELU
+
+
+def test_choices_that_do_not_fit_are_refused(tmp_path: Path):
+    path = network(tmp_path, plant())
+    for wrong, words in [
+        (Choices(fallback=(0.0,)), "fallback of 2 entries"),
+        (Choices(fallback=(0.0, 11.0)), r"got \[0.0, 11.0\]"),
+        (Choices(timeout=0.0), "more than 0 s"),
+        (Choices(ranges={"speed": (0.0, 1.0)}), r"angle, slide, target\), got speed"),
+        (Choices(ranges={"slide": (1.0, 1.0)}), "that rises, got 1 to 1"),
+    ]:
+        with pytest.raises(NotDeployable, match=words):
+            controller_of(path, choices=wrong)
+    discrete = network(tmp_path, plant(DiscreteAction(n=3)))
+    with pytest.raises(NotDeployable, match="expected --fallback with 1 of the numbers"):
+        controller_of(discrete)
+    assert controller_of(discrete, choices=Choices(fallback=(2.0,))).fallback == 2
+    with pytest.raises(NotDeployable, match="network of 4 inputs and 3 outputs for this specification, got 4 and 2"):
+        controller_of(network(tmp_path, plant()), plant(DiscreteAction(n=3)), choices=ANY)
