@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+from collections.abc import Iterator
+from pathlib import Path
 
 os.environ.setdefault("RAY_AUTH_MODE", "disabled")  # a token in the home folder would change it between two clusters
 if "DISPLAY" not in os.environ:
     os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported, so before everything else
 
-from collections.abc import Iterator
-
 import hypothesis
 import pytest
 import torch
 
+from support.long import TESTS, lines, unknown
 from support.server import ServerProcess, running_server
 from support.teaching import teach
 from surrogym_client.transport import Api
@@ -32,6 +34,11 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("surrogym")
 
 
+# Thousands of databases flush each commit, which costs nothing in memory.
+MEMORY, ROOM = Path("/dev/shm"), 4 * 2**30  # bytes that must be free in it
+if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > ROOM:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
+
 # A run in a shell's background ignores Ctrl-C, and one under nohup ignores hang-ups. So would every program that a test
 # starts and signals.
 for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
@@ -41,8 +48,17 @@ for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHU
 LASTING = ("slow", "e2e", "timeout")  # marks; a limit of its own is one of more time
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with tests that take long come first. One that begins last leaves the other workers with nothing to do."""
+@pytest.hookimpl(tryfirst=True)  # before marks select
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark what ``long.toml`` lists. Files with tests that take long come first: one that begins last leaves the other
+    workers with nothing to do."""
+    nodes = {item: item.path.relative_to(TESTS).as_posix() + item.nodeid[item.nodeid.index("::") :] for item in items}
+    listed = lines()
+    for item, node in nodes.items():
+        if any(line.names(node) for line in listed):
+            item.add_marker(pytest.mark.long)
+    if [Path(argument).resolve() for argument in config.args] == [TESTS] and (missing := unknown(nodes.values())):
+        raise pytest.UsageError(f"tests/long.toml: expected tests, got lines that name none: {missing}")
     lasting = {item.path for item in items if any(item.get_closest_marker(mark) for mark in LASTING)}
     items.sort(key=lambda item: item.path not in lasting)
 

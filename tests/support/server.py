@@ -12,6 +12,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from support.nursery import Forked, nursery
+
+COLD = ("-m", "surrogym_server")
 STARTING_SECONDS = 400.0  # of a machine on which much else runs
 STOPPING_SECONDS = 60.0
 
@@ -21,7 +24,7 @@ class ServerProcess:
     """A running server. ``url`` is where it listens, ``log`` what it has said."""
 
     url: str
-    process: subprocess.Popen[bytes]
+    process: subprocess.Popen[bytes] | Forked
     folder: Path
 
     @property
@@ -36,23 +39,23 @@ class ServerProcess:
 
 
 def start_server(
-    folder: Path, *options: str, program: Sequence[str] = ("-m", "surrogym_server"), **environment: str
+    folder: Path, *options: str, program: Sequence[str] | None = None, **environment: str
 ) -> ServerProcess:
     """Start ``surrogym serve`` on the database of a folder, and wait until it accepts requests.
+
+    It is a fork of a process that has imported the server, where that makes no difference; see ``support.nursery``.
 
     Args:
         folder: holds database and log; starting again in it goes on with its database.
         options: further options of the command.
-        program: arguments of Python before the command ``serve``.
+        program: arguments of Python before the command ``serve``; they start the server cold. See ``COLD``.
         environment: further environment variables.
     """
     ready = folder / "ready"
     ready.unlink(missing_ok=True)
     defaults = ["--port", "0", "--database", str(folder / "surrogym.db"), "--ready-file", str(ready)]
-    command = [sys.executable, *program, "serve", *defaults, *options]
     kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
-    with (folder / "server.log").open("ab") as log:
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=kept | environment)
+    process = _process(folder / "server.log", program, ["serve", *defaults, *options], kept | environment)
     deadline = time.monotonic() + STARTING_SECONDS
     while not ready.exists():
         if process.poll() is not None or time.monotonic() > deadline:
@@ -60,6 +63,25 @@ def start_server(
             raise AssertionError(f"the server did not start: {(folder / 'server.log').read_text()}")
         time.sleep(0.02)
     return ServerProcess(ready.read_text(), process, folder)
+
+
+def refusal(folder: Path, *options: str, **environment: str) -> str:
+    """The one sentence with which ``surrogym serve`` refuses to start."""
+    log = folder / "refusal.log"
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
+    assert _process(log, None, ["serve", *options], kept | environment).wait(STARTING_SECONDS) == 1
+    (line,) = log.read_text().strip().splitlines()
+    return line
+
+
+def _process(
+    path: Path, program: Sequence[str] | None, arguments: list[str], environment: dict[str, str]
+) -> subprocess.Popen[bytes] | Forked:
+    with path.open("ab") as log:
+        if program is None and (forking := nursery()) is not None and forking.can_start_in(environment):
+            return forking.start(arguments, log, environment)
+        command = [sys.executable, *(program or COLD), *arguments]
+        return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
 
 
 @contextmanager
@@ -84,7 +106,7 @@ class RestartingServer:
         self.url = self._server.url
 
     @property
-    def process(self) -> subprocess.Popen[bytes]:
+    def process(self) -> subprocess.Popen[bytes] | Forked:
         return self._server.process
 
     @property

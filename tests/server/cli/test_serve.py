@@ -19,35 +19,21 @@ import pytest
 import torch
 
 from support import pendulum
-from support.server import STARTING_SECONDS, running_server, start_server
+from support.server import COLD, STARTING_SECONDS, refusal, running_server, start_server
 
 SERVE = [sys.executable, "-m", "surrogym_server", "serve"]
 PATIENCE = 60.0
 WITHOUT_CUDA = pytest.mark.skipif(torch.cuda.is_available(), reason="torch has CUDA here")
 
 
-def serve(*options: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a server that is expected to refuse."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
-    return subprocess.run([*SERVE, *options], env=kept | environment, capture_output=True, text=True, timeout=PATIENCE)
-
-
-def refused(result: subprocess.CompletedProcess[str]) -> str:
-    """The one sentence of a refusal."""
-    assert result.returncode == 1
-    assert "Traceback" not in result.stderr
-    (line,) = result.stderr.strip().splitlines()
-    return line
-
-
-def test_a_taken_database_is_one_sentence(server_process: Any):
+def test_a_taken_database_is_one_sentence(server_process: Any, tmp_path: Path):
     database = str(server_process.folder / "surrogym.db")
-    assert "surrogym.db" in refused(serve("--port", "0", "--database", database))
+    assert "surrogym.db" in refusal(tmp_path, "--port", "0", "--database", database)
 
 
 def test_a_taken_port_is_one_sentence(server_process: Any, tmp_path: Path):
     port = server_process.url.rpartition(":")[2]
-    assert f"port {port}" in refused(serve("--port", port, "--database", str(tmp_path / "other.db")))
+    assert f"port {port}" in refusal(tmp_path, "--port", port, "--database", str(tmp_path / "other.db"))
 
 
 @pytest.mark.parametrize(
@@ -64,12 +50,14 @@ def test_a_taken_port_is_one_sentence(server_process: Any, tmp_path: Path):
         pytest.param([], {"SURROGYM_DEVICE": "cuda"}, "setting device: expected cpu, got cuda", marks=WITHOUT_CUDA),
     ],
 )
-def test_invalid_settings_are_refused_at_start(options: list[str], environment: dict[str, str], said: str):
-    assert said in refused(serve(*options, **environment))
+def test_invalid_settings_are_refused_at_start(
+    tmp_path: Path, options: list[str], environment: dict[str, str], said: str
+):
+    assert said in refusal(tmp_path, *options, **environment)
 
 
 def test_help_has_an_example():
-    result = serve("--help")
+    result = subprocess.run([*SERVE, "--help"], capture_output=True, text=True, timeout=PATIENCE)
     assert result.returncode == 0
     assert "surrogym serve --port" in result.stdout
 
@@ -98,7 +86,7 @@ def test_under_nohup_a_terminal_that_closes_ends_nothing(tmp_path: Path):
     """Who starts a server with SIGHUP ignored wants it to stay."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        server = start_server(tmp_path)
+        server = start_server(tmp_path, program=COLD)
     finally:
         signal.signal(signal.SIGHUP, before)
     server.process.send_signal(signal.SIGHUP)
@@ -151,7 +139,7 @@ def test_a_clean_end_does_not_wait_for_long_polls_and_streams(tmp_path: Path):
 
 
 def test_killed_in_a_fit_leaves_no_process_behind(tmp_path: Path):
-    server = start_server(tmp_path)
+    server = start_server(tmp_path, program=COLD)
     children = _wait_for_children(server.process.pid)
     server.stop(signal.SIGKILL)
     deadline = time.monotonic() + PATIENCE

@@ -1,0 +1,179 @@
+"""Start servers as forks of a process that has imported them already.
+
+A server imports torch, FastAPI and SQLAlchemy, and the process of its fits does so again: some nine seconds of a core
+for each of a hundred servers. Tests of what a start does start their server cold.
+"""
+
+from __future__ import annotations
+
+import atexit
+import gc
+import json
+import os
+import runpy
+import select
+import selectors
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from functools import cache
+from importlib import import_module
+from multiprocessing import context, forkserver
+from typing import IO, Any
+
+MODULES = (
+    "surrogym_server.cli.optimise",
+    "surrogym_server.cli.runner",
+    "surrogym_server.cli.serve",
+    "surrogym_server.models.gaussian_process.prediction.compiled.regions",
+    "surrogym_server.models.gaussian_process.prediction.compiled.step",
+    "surrogym_server.models.registry",
+    "surrogym_server.virtual.compiled.step",
+    "surrogym_server.virtual.words",
+    "scipy.linalg.lapack",
+    "scipy.optimize",
+    "scipy.spatial.distance",
+    "uvicorn.lifespan.on",
+)
+LONGEST = 1 << 18  # bytes of a request
+
+
+class Forked:
+    """A forked program, with what tests use of ``subprocess.Popen``."""
+
+    def __init__(self, pid: int, status: int) -> None:
+        self.pid = pid
+        self.returncode: int | None = None
+        self._status = status
+
+    def __del__(self) -> None:
+        os.close(self._status)
+
+    def poll(self) -> int | None:
+        with suppress(subprocess.TimeoutExpired):
+            self.wait(0.0)
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        if self.returncode is None:
+            if not select.select([self._status], [], [], timeout)[0]:
+                raise subprocess.TimeoutExpired(f"process {self.pid}", timeout or 0.0)
+            self.returncode = int(os.read(self._status, 100) or -signal.SIGKILL)  # nothing: the nursery has died
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+
+class Nursery:
+    """A process that forks servers. It ends with this process, and its children with it."""
+
+    def __init__(self) -> None:
+        self._environment = dict(os.environ)
+        self._asked, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._asked.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, LONGEST)
+        command = [sys.executable, "-P", __file__, str(theirs.fileno())]
+        with theirs:
+            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
+        atexit.register(self._end)
+
+    def can_start_in(self, environment: Mapping[str, str]) -> bool:
+        """Whether imported modules fit this environment: but for settings of the server it is that of the nursery."""
+        differing = {name for name, _ in self._environment.items() ^ environment.items()}
+        return all(name.startswith(("SURROGYM_", "PYTEST_")) for name in differing)
+
+    def start(self, arguments: Sequence[str], log: IO[bytes], environment: Mapping[str, str]) -> Forked:
+        """Run ``python -m surrogym_server ARGUMENTS`` in this folder, with its output in ``log``."""
+        request = {"arguments": arguments, "environment": dict(environment), "folder": os.getcwd()}
+        status, theirs = os.pipe()
+        socket.send_fds(self._asked, [json.dumps(request).encode()], [log.fileno(), theirs])
+        os.close(theirs)
+        return Forked(int(self._asked.recv(100)), status)
+
+    def _end(self) -> None:
+        self._asked.close()
+        self._process.wait()
+
+
+@cache
+def nursery() -> Nursery | None:
+    """The nursery of this process, None on a system where forks are not safe."""
+    return Nursery() if sys.platform == "linux" else None
+
+
+def main(asked: socket.socket) -> None:
+    """Fork a child for each request, until the socket closes."""
+    for name in MODULES:
+        import_module(name)
+    _fork_fits()
+    gc.freeze()
+    children: dict[int, tuple[int, int]] = {}  # by a descriptor that is readable at its end: its process, its status
+    with selectors.DefaultSelector() as waiting:
+        waiting.register(asked, selectors.EVENT_READ)
+        while True:
+            for key, _ in waiting.select():
+                if key.fd in children:
+                    waiting.unregister(key.fd)
+                    _tell(key.fd, *children.pop(key.fd))
+                    continue
+                message, descriptors, _, _ = socket.recv_fds(asked, LONGEST, 2)
+                if not message:
+                    for pid, _ in children.values():
+                        os.kill(pid, signal.SIGKILL)
+                    return
+                log, status = descriptors
+                if not (pid := os.fork()):
+                    for inherited in (status, *children, *(pipe for _, pipe in children.values())):
+                        os.close(inherited)
+                    _run(log, **json.loads(message))
+                    return
+                os.close(log)
+                children[end := os.pidfd_open(pid)] = pid, status
+                waiting.register(end, selectors.EVENT_READ)
+                asked.send(str(pid).encode())
+
+
+def _fork_fits() -> None:
+    """Let processes of fits be forks as well, of a second process that has imported what they need."""
+    forkserver.set_forkserver_preload([*MODULES])
+    forkserver.ensure_running()
+    server: Any = forkserver._forkserver  # type: ignore[attr-defined]
+    server.ensure_running = lambda: None  # it is no child of the forks, which therefore can't ask for its state
+    contexts: Any = context._concrete_contexts  # type: ignore[attr-defined]
+    contexts["spawn"] = contexts["forkserver"]
+
+
+def _tell(end: int, pid: int, status: int) -> None:
+    """Send the exit status of a child that has ended."""
+    _, code = os.waitpid(pid, 0)
+    with suppress(BrokenPipeError):
+        os.write(status, str(os.waitstatus_to_exitcode(code)).encode())
+    os.close(status)
+    os.close(end)
+
+
+def _run(log: int, arguments: list[str], environment: dict[str, str], folder: str) -> None:
+    os.environ.clear()
+    os.environ.update(environment)
+    os.chdir(folder)
+    for stream in (1, 2):
+        os.dup2(log, stream)
+    os.close(log)
+    sys.path.insert(0, folder)
+    sys.argv = ["surrogym_server", *arguments]
+    runpy.run_module("surrogym_server", run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    with socket.socket(fileno=int(sys.argv[1])) as opened:
+        main(opened)
