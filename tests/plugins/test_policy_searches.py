@@ -98,7 +98,7 @@ def test_an_unknown_or_broken_search_is_one_sentence(name: str, said: str):
 
 @pytest.mark.usefixtures("installed")
 def test_no_package_takes_the_name_of_a_built_in_search():
-    assert SEARCHES.get("ppo").__module__.startswith("surrogym_client.")
+    assert SEARCHES.get("ppo").__module__.startswith("surrogym_trainer.")
     assert "expected a name that differs from the built-in" in SEARCHES.broken["ppo"]
 
 
