@@ -206,6 +206,11 @@ def test_an_angle_is_known_by_its_unit(pendulum: Path) -> None:
     assert spec.time_limit == 100
 
 
+def test_a_description_declares_the_seconds_of_a_step(tanks: Path, tmp_path: Path) -> None:
+    assert describe(f"fmu:{tanks}", steps=20).spec.sampling_period == 10.0
+    assert describe(mapping(tmp_path, fmu=str(tanks), step=5.0), steps=20).spec.sampling_period == 5.0
+
+
 def test_rewards_starts_and_ends_are_the_specifications(tanks: Path) -> None:
     name = f"fmu:{tanks}"
     full = Inequality(term=Term.linear(upper=1), relation=">", value=0.9)

@@ -61,7 +61,7 @@ class Fmu(SavingSimulator):
         outputs = archive.of_causality("output") or state
         self._state, self._size = state, len(state)
         self.has_snapshots = archive.snapshots
-        step = step_of(archive, choices)
+        step = self.period = step_of(archive, choices)
         self._process = Process(archive, inputs, [*state, *outputs], step, start_values(archive, choices))
         try:
             self.variables = _variables(state)
