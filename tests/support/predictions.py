@@ -8,11 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from support.steps_in_c import check_in_c
 from surrogym_server.models.abilities import PredictedSteps
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.lookahead import process_inputs
 
-WAYS = ("mean", "particles", "functions")
+WAYS = ("mean", "particles", "functions", "in C")
 
 
 def check_processes(model: GaussianProcessModel, points: tuple[Tensor, Tensor]) -> None:
@@ -28,6 +29,9 @@ def check_processes(model: GaussianProcessModel, points: tuple[Tensor, Tensor]) 
 
 def check_compiled(model: GaussianProcessModel, points: tuple[Tensor, Tensor], how: str) -> None:
     """Compiled steps from q (m, C) under u (m, F) are the model's own, in one of ``WAYS``."""
+    if how == "in C":
+        check_in_c(model, points, loose=True)
+        return
     compiled = model.compiled()
     if compiled is None:
         pytest.skip("steps can't be compiled here")

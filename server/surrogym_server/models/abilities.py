@@ -8,7 +8,7 @@ Shapes as in ``models.port``; r reference points, b paths of T steps, N lanes, W
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -309,6 +309,26 @@ class CompiledSteps(ABC):
     @abstractmethod
     def compiled_pays(self, *, deviations: bool) -> bool:
         """Whether compiled steps are faster, with deviations in every step or without."""
+
+
+@dataclass(frozen=True)
+class StepSource:
+    """C99 source of ``transition``, its deviations and ``terminated``: the functions that its ``step.h`` declares."""
+
+    files: Mapping[str, str]  # content by name; step.c is what a compiler takes
+    numbers: int  # float64 constants in it
+
+
+class WrittenInC(ABC):
+    """Ability to write the mean step as C source, for programs that have no Python.
+
+    Fallback of ``deployment``: the model is refused, with the families that have this ability.
+    """
+
+    @abstractmethod
+    def step_source(self) -> StepSource | None:
+        """Return the source; None if this installation lacks numba, which lays out the tables, or if the model is on
+        another device. Its steps are those of ``transition``, except for the last bits."""
 
 
 class Differentiable:

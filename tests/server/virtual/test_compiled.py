@@ -3,7 +3,6 @@ none."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any
 
@@ -11,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from support.kinds import ENVIRONMENTS
 from support.models import gaussian_processes
 from support.real_steps import random_steps
-from surrogym_sampler.original.classic import acrobot, cartpole, pendulum
-from surrogym_sampler.original.swingup import swing_up, swing_up_narrow
+from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import NotReset
 from surrogym_server.models.gaussian_process import model as gaussian_process_model
@@ -22,7 +21,7 @@ from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.testing.cases import model_cases
 from surrogym_server.virtual import LaneState, LaneTransition, VirtualSettings, create, in_fastest_form, reset, step
 from surrogym_shared import compiled
-from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Quantity, RewardTerm, Term
+from surrogym_shared.spec import EnvironmentSpec
 
 needs_numba = pytest.mark.skipif(not compiled.available(), reason="numba is not installed, or switched off")
 LANES, STEPS = 7, 5
@@ -50,27 +49,6 @@ CHOICES: dict[str, dict[str, Any]] = {
     "caution": {"caution": 2.0, "penalty": 1.0, "autoreset_mode": "same_step", "time_limit": 3},
     "draws with caution": {"variant": "probabilistic", "particles": 1, "spread": 0.0, "caution": 2.0},
     "noise, trust, box": {"process_noise": True, "trust": 0.05, "start_box": 0.5, "time_limit": 2},
-}
-
-
-def paper(spec: EnvironmentSpec) -> EnvironmentSpec:
-    return spec.model_copy(update={"design": spec.design.model_copy(update={"preset": "paper"})})
-
-
-def paid_in_a_ball(spec: EnvironmentSpec) -> EnvironmentSpec:
-    across, up = (Quantity(term=2.0 * term) for term in (Term.sin(theta=1), Term.cos(theta=1) + Term.constant(0.5)))
-    term = RewardTerm(shape="ball", weight=3, of=(across, up))
-    return spec.model_copy(update={"reward": DeclaredReward(kind="declared", timing="after", terms=(term,))})
-
-
-ENVIRONMENTS: dict[str, Callable[[], EnvironmentSpec]] = {
-    "cart-pole": cartpole,
-    "acrobot": acrobot,
-    "swing-up": swing_up,
-    "narrow swing-up": swing_up_narrow,
-    "paper": lambda: paper(pendulum()),
-    "paid in a ball": lambda: paid_in_a_ball(pendulum()),
-    "learned ending": lambda: cartpole().model_copy(update={"termination": "learned"}),
 }
 CASES = {f"case: {case}": case for case in model_cases("gaussian_process")}
 

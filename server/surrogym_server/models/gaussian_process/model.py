@@ -31,7 +31,9 @@ from surrogym_server.models.abilities import (
     RewardEdges,
     RewardPeaks,
     SampledFunctions,
+    StepSource,
     UncertainHyperparameters,
+    WrittenInC,
 )
 from surrogym_server.models.gaussian_process.censoring import usable
 from surrogym_server.models.gaussian_process.prediction.description import describe, structure
@@ -65,6 +67,7 @@ class GaussianProcessModel(
     RewardPeaks,
     Differentiable,
     CompiledSteps,
+    WrittenInC,
 ):
     """One process for each output, and regions in which an episode ends or the reward jumps."""
 
@@ -220,6 +223,14 @@ class GaussianProcessModel(
     def compiled_pays(self, *, deviations: bool) -> bool:
         points = max((len(o.posterior.x) for o in self.outputs if o.posterior is not None), default=0)
         return not deviations or points <= COMPILED_SOLVES
+
+    def step_source(self) -> StepSource | None:
+        if self._compiled is None:
+            return None
+        from surrogym_server.models.gaussian_process.prediction.compiled.source import step_source
+        from surrogym_server.models.gaussian_process.prediction.compiled.step import tables_of
+
+        return step_source(self.definition, tables_of(self._predictor, self.ending))
 
     def _learns(self, column: int, q_next: Tensor) -> Tensor:
         """Which samples that end at q_next (m, C) an output would learn from, (m,) bool."""

@@ -12,6 +12,7 @@ import torch
 
 from support.models import learn
 from support.real_steps import random_steps
+from support.steps_in_c import check_in_c
 from surrogym_lab.unseen.machine import Array, Machine
 from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
@@ -181,6 +182,11 @@ def test_large_steps_are_divided_between_threads_to_the_same_bits(monkeypatch):
     divided = move(unseen.q.numpy(), unseen.u.numpy(), noise=noise, **wanted)
     for field in fields(whole):
         np.testing.assert_array_equal(getattr(divided, field.name), getattr(whole, field.name))
+
+
+def test_the_step_in_c_reads_the_inducing_points():
+    unseen = steps(50, seed=6)
+    check_in_c(model(), (unseen.q, unseen.u))
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import torch
 
 from support.models import learn
 from support.plane import drifting, plane
+from support.steps_in_c import check_in_c
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.files import from_bytes, to_bytes
@@ -51,6 +52,11 @@ def test_a_jump_is_found_with_its_size_and_its_edge(pay, sizes, wrong):
     assert sorted(abs(jump.size) for jump in model.jumps) == pytest.approx(sorted(map(abs, sizes)), abs=0.05)
     assert error(model, pay) < wrong
     assert len(model.description["jumps"]) == len(sizes)
+
+
+def test_the_step_in_c_jumps_where_the_model_does():
+    unseen = drifting(three_levels, 200, seed=1)
+    check_in_c(learn(definition_from_spec(plane()), drifting(three_levels, 60)).model, (unseen.q, unseen.u))
 
 
 def test_a_plain_process_is_worse():

@@ -7,6 +7,7 @@ import torch
 
 from support.models import gaussian_processes
 from support.plane import Pay, drifting, plane
+from support.steps_in_c import check_in_c
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.features import encode
 from surrogym_server.errors import InvalidInput
@@ -50,6 +51,13 @@ def test_bump_is_known_from_samples_that_it_hardly_paid():
     assert model.description["outputs"][-1]["learned"] == "log(reward)"
     assert float(around(bump, model).abs().max()) < 0.02
     assert float(around(bump, without_peaks()).abs().max()) > 0.5
+
+
+def test_the_step_in_c_pays_the_bump():
+    near = PLACE + 0.1 * torch.randn(50, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    check_in_c(
+        gaussian_processes(DEFINITION, drifting(bump, 12)), (near, torch.zeros(50, 1, dtype=torch.float64)), loose=True
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,161 @@
+"""A surrogate as an FMU of FMI 3.0: a digital twin, with the uncertainty of each step.
+
+The FMU steps like a session in the variant ``deterministic``: by the mean, with the deviations beside it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from importlib.resources import files
+from pathlib import Path
+
+import torch
+
+from surrogym_server.convert import stored_definition
+from surrogym_server.engine.core import limits_rewards
+from surrogym_server.environment.definition import CoordinateDefinition, EnvironmentDefinition
+from surrogym_server.errors import InvalidInput
+from surrogym_server.models.abilities import StepSource, WrittenInC, offers
+from surrogym_server.models.files import from_bytes
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.virtual import reward_limits
+from surrogym_shared.fmu import Block, Causality, Variable, WrittenFmu, write_fmu
+from surrogym_shared.surrogate_file import SurrogateFile
+
+MOST_NUMBERS = 4_000_000  # constants in the source: a compiler needs about a minute and 1 GB for as many
+ANYWHERE = (-math.inf, math.inf)
+
+
+def write_twin(data: bytes, out: Path, period: float | None = None) -> WrittenFmu:
+    """Write a surrogate's file, from ``surrogym export``, as an FMU.
+
+    Args:
+        out: file to write.
+        period: seconds of one step; None: the sampling period of the specification.
+
+    Raises:
+        NotASurrogateFile: other bytes.
+        InvalidInput: a model that can't be written in C; or no period that is above 0.
+        CannotCompile: the C compiler of this machine refused the sources.
+        OSError: the file can't be written.
+    """
+    return write_fmu(twin_of(SurrogateFile.from_bytes(data), period), out)
+
+
+def twin_of(file: SurrogateFile, period: float | None = None) -> Block:
+    """The block of a surrogate: variables, and C source. Raises ``InvalidInput``."""
+    definition = stored_definition(file.spec)
+    model = from_bytes(definition, file.model)
+    seconds = _period(file.spec.sampling_period if period is None else period)
+    source = _source_of(model)
+    limits = ANYWHERE
+    if limits_rewards(definition) and 0 < model.samples <= len(file.samples):
+        limits = reward_limits(float(file.samples.reward.min()), float(file.samples.reward.max()))
+    own = {"twin.c": (files(__package__) / "twin.c").read_text(encoding="utf-8")}
+    own["twin.h"] = "\n".join(_header(definition, model, limits))
+    return Block(
+        name=file.name,
+        description=f"Surrogate {file.name}: {model.samples} real steps, model {model.digest[:16]}",
+        variables=tuple(_variables(definition, [c.unit for c in file.spec.coordinates])),
+        period=seconds,
+        stop=None if definition.time_limit is None else definition.time_limit * seconds,
+        sources={**source.files, **own},
+    )
+
+
+def _period(seconds: float | None) -> float:
+    if seconds is None:
+        raise InvalidInput("period: expected the seconds of one step, because the specification has no sampling_period")
+    if not 0 < seconds < math.inf:
+        raise InvalidInput(f"period: expected the seconds of one step, above 0, got {seconds}")
+    return seconds
+
+
+def _source_of(model: DynamicsModel) -> StepSource:
+    family = model.definition.learning.model.name
+    able = offers(model, WrittenInC)
+    if able is None:
+        raise InvalidInput(
+            f"model: expected a family that can be written in C, gaussian_process or sparse_gaussian_process, got "
+            f"{family!r}"
+        )
+    source = able.step_source()
+    if source is None:
+        raise InvalidInput("model: expected numba, which lays out the tables, got an installation without it")
+    if source.numbers > MOST_NUMBERS:
+        raise InvalidInput(
+            f"model: expected at most {MOST_NUMBERS:,} numbers, got {source.numbers:,}: the family "
+            "sparse_gaussian_process needs fewer"
+        )
+    return source
+
+
+def _variables(definition: EnvironmentDefinition, units: Sequence[str]) -> Iterator[Variable]:
+    """All variables, in the order of the values in ``twin.c``. A name that is taken is preceded by its kind."""
+    taken: set[str] = set()
+
+    def free(name: str, kind: str) -> str:
+        chosen = f"{kind}.{name}" if name in taken else name
+        taken.add(chosen)
+        return chosen
+
+    action, count = definition.action, definition.action.size
+    for entry in range(count):
+        name = free("action" if count == 1 else f"action_{entry}", "input")
+        if action.nvec:
+            yield Variable(name, "Int32", "input", 0, 0, action.nvec[entry] - 1)
+        else:
+            low, high = action.low[entry], action.high[entry]
+            yield Variable(name, "Float64", "input", min(max(0.0, low), high), low, high)
+    for index, coordinate in enumerate(definition.coordinates):
+        yield _coordinate(coordinate, free(coordinate.name, "state"), units[index], _start(definition, index))
+    for name in definition.observation_names:
+        yield Variable(free(name, "observation"), "Float64", "output", description="observation")
+    for name in definition.outputs:
+        about = f"standard deviation of what the model does not know of {name} in the last step"
+        yield Variable(free(f"deviation.{name}", "twin"), "Float64", "output", description=about)
+    yield Variable(free("reward", "twin"), "Float64", "output", description="mean reward of the last step")
+    about = "whether an episode ends here; the next step starts here all the same"
+    yield Variable(free("terminated", "twin"), "Boolean", "output", description=about)
+
+
+def _coordinate(coordinate: CoordinateDefinition, name: str, unit: str, start: float) -> Variable:
+    low, high = (limit if math.isfinite(limit) else None for limit in (coordinate.low, coordinate.high))
+    unit = unit or ("rad" if coordinate.kind == "angle" else "")
+    causality: Causality = "parameter" if coordinate.kind == "constant" else "output"
+    return Variable(name, "Float64", causality, start, low, high, unit, "coordinate of the state")
+
+
+def _start(definition: EnvironmentDefinition, index: int) -> float:
+    """Start value of a coordinate: of the first declared state, or the median of its distribution."""
+    if definition.starts:
+        return definition.starts[0][index]
+    middle = torch.tensor(0.5, dtype=torch.float64)
+    return float(definition.coordinates[index].start.quantile(middle))
+
+
+def _header(definition: EnvironmentDefinition, model: DynamicsModel, rewards: tuple[float, float]) -> Iterator[str]:
+    action, coordinates = definition.action, definition.coordinates
+    low, high = (action.low, action.high) if action.low else ([0.0] * len(action.nvec), [n - 1 for n in action.nvec])
+    yield "/* Sizes and limits of a surrogate. */"
+    yield f"enum {{ COORDINATES = {len(coordinates)}, ACTIONS = {action.size} }};"
+    yield f"enum {{ OBSERVATIONS = {len(definition.observation_names)}, OUTPUTS = {len(definition.outputs)} }};"
+    yield f"#define TERMINAL_REWARD {_written(model.terminal_reward)}"
+    yield f"#define REWARD_LOW {_written(rewards[0])}"
+    yield f"#define REWARD_HIGH {_written(rewards[1])}"
+    yield _array("action_low", low)
+    yield _array("action_high", high)
+    yield _array("state_low", [max(one.low, -_LARGEST) for one in coordinates])
+    yield _array("state_high", [min(one.high, _LARGEST) for one in coordinates]) + "\n"
+
+
+_LARGEST = torch.finfo(torch.float64).max  # so that an infinite start is refused
+
+
+def _array(name: str, values: Sequence[float]) -> str:
+    return f"static const double {name}[] = {{{', '.join(map(_written, values))}}};"
+
+
+def _written(value: float) -> str:
+    return repr(float(value)).replace("inf", "INFINITY")

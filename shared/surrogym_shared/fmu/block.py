@@ -1,0 +1,118 @@
+"""What an FMU computes: variables, a period, and C source of its step."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from surrogym_shared.checks import require, require_unique
+
+Kind = Literal["Float64", "Int32", "Boolean"]
+Causality = Literal["input", "output", "parameter"]
+KINDS: tuple[Kind, ...] = ("Float64", "Int32", "Boolean")
+NEVER, AT_START, ALWAYS = range(3)  # when a value may be set
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One value of a block.
+
+    Attributes:
+        start: value at the start. None for an output that ``block_start`` calculates.
+        unit: of the value; empty if it is unknown.
+    """
+
+    name: str
+    kind: Kind
+    causality: Causality
+    start: float | None = None
+    low: float | None = None
+    high: float | None = None
+    unit: str = ""
+    description: str = ""
+
+    @property
+    def settable(self) -> int:
+        if self.causality == "input":
+            return ALWAYS
+        return NEVER if self.start is None else AT_START
+
+
+@dataclass(frozen=True)
+class Block:
+    """A step of a fixed period in C99.
+
+    ``sources`` define the two functions of ``block.h``, which is generated (see ``header``). Both return 0, or 1 + the
+    index of a value that they can't use.
+
+    - ``int block_start(double *values, double *memory)`` calculates the outputs at the start. It may be called again
+      after a start value has changed.
+    - ``int block_step(double *values, const double *held, double *memory)`` reads the inputs from ``held``, and
+      everything else from ``values``, and writes the outputs to ``values``.
+
+    Attributes:
+        variables: all values, in the order of the arrays ``values`` and ``held``.
+        period: seconds between two steps.
+        stop: default end of a simulation, in seconds; None for none.
+        sources: contents of C files and headers by name. Each file that ends in .c is compiled.
+        memory: number of float64 that a block keeps from step to step besides its values.
+        acts_first: whether it acts at the beginning of a period, as a controller does, or shows the result at its end.
+
+    Raises:
+        ValueError: two variables have the same name, or the period is not above 0.
+    """
+
+    name: str
+    description: str
+    variables: tuple[Variable, ...]
+    period: float
+    stop: float | None
+    sources: Mapping[str, str]
+    memory: int = 0
+    acts_first: bool = False
+
+    def __post_init__(self) -> None:
+        require_unique("variable", [one.name for one in self.variables])
+        require(self.period > 0, f"expected a period above 0 s, got {self.period}")
+
+    @property
+    def identifier(self) -> str:
+        """The name as a C identifier."""
+        plain = re.sub(r"\W", "_", self.name, flags=re.ASCII)
+        return plain if plain[:1].isalpha() else f"fmu_{plain}"
+
+    @property
+    def token(self) -> str:
+        """Token that binds description and native code: equal for equal blocks, and only for these."""
+        parts = [self.name, self.description, repr(self.variables), repr((self.period, self.memory, self.acts_first))]
+        parts += [part for name in sorted(self.sources) for part in (name, self.sources[name])]
+        return "{" + hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32] + "}"
+
+    def header(self) -> str:
+        """Content of ``block.h``."""
+        return "\n".join(self._header())
+
+    def _header(self) -> Iterator[str]:
+        count = len(self.variables)
+        yield "/* Values of the block, its two functions and its period. */"
+        yield f'#define BLOCK_TOKEN "{self.token}"'
+        yield f"#define BLOCK_PERIOD {self.period!r} /* s */"
+        yield f"#define BLOCK_ACTS_FIRST {int(self.acts_first)}"
+        yield f"#define BLOCK_VALUES {count}"
+        yield f"#define BLOCK_MEMORY {max(self.memory, 1)}"
+        yield "int block_start(double *values, double *memory);"
+        yield "int block_step(double *values, const double *held, double *memory);"
+        yield "#ifdef BLOCK_TABLES"
+        yield _array("char *const", "block_names", [json.dumps(one.name) for one in self.variables])
+        yield _array("double", "block_starts", [repr(float(one.start or 0.0)) for one in self.variables])
+        yield _array("unsigned char", "block_kinds", [str(KINDS.index(one.kind)) for one in self.variables])
+        yield _array("unsigned char", "block_settable", [str(one.settable) for one in self.variables])
+        yield "#endif\n"
+
+
+def _array(of: str, name: str, values: list[str]) -> str:
+    return f"static const {of} {name}[{len(values)}] = {{{', '.join(values)}}};"
