@@ -16,6 +16,7 @@ ELSEWHERE = {
     "audit": "tests/training/test_handover.py",
     "conformance": "tests/diagnosis/test_conformance.py",
     "demo": "tests/demo/test_demo.py",
+    "deploy": "tests/deployment/test_command.py",
     "describe": "test_describe.py",
     "evaluate": "test_commands.py",
     "export-policy": "tests/policies/test_export.py",

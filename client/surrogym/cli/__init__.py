@@ -33,6 +33,7 @@ COMMANDS = (
     "export",
     "import",
     "export-policy",
+    "deploy",
     "delete",
     "doctor",
     "conformance",

@@ -14,13 +14,14 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     "Start": ("demo", "serve", "doctor"),
     "Loop": ("describe", "register", "sample", "train", "audit", "evaluate", "status"),
     "After": (
-        *("report", "policies", "policy", "improve", "change", "export", "import", "export-policy", "delete"),
+        *("report", "policies", "policy", "improve", "change", "export", "import", "export-policy", "deploy", "delete"),
         "optimise",
     ),
     "Operate": ("work", "jobs", "conformance"),
 }
 REST = "More"  # heading of the commands of no group, such as those of other packages
 ADVANCED: Mapping[str, frozenset[str]] = {  # options that a first reader does not need, by command
+    "deploy": frozenset({"--algorithm", "--trust-policy", "--spec", "--episodes"}),
     "evaluate": frozenset(
         {"--wide", "--start-scale", "--perturb", "--explore", "--parallel", "--algorithm", "--where", "--learn"}
         | {"--learn-all", "--compare", "--reference", "--video"}

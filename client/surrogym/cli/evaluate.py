@@ -153,10 +153,10 @@ def command(
     differences.check(settings)
     beside.check(settings)
     opener = opener_for_policy(env, read_spec(spec), card, quiet=output.quiet)
-    ledger = _ledger(surrogate, service.server, card, policy, quiet=output.quiet)
+    ledger = ledger_of(surrogate, service.server, card, policy, quiet=output.quiet)
     if learning := differences.learning(ledger, service.server, token):
         opener = learning.checked(opener)
-    enter = partial(_enter, ledger, service.server, token, quiet=output.quiet)
+    enter = partial(enter_steps, ledger, service.server, token, quiet=output.quiet)
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
     reports = _reports(beside.controllers(policy, card, reading, opener), card.spec, run, enter, settings, policy)
     result = reports[0][1]
@@ -362,7 +362,7 @@ def _telling(update: Update, episodes: int) -> Progress:
     return lambda share, terminated: update(share, f"{counted(episodes, 'real episode')}, {terminated} terminated")
 
 
-def _ledger(surrogate: str | None, server: str | None, card: PolicyCard, policy: Path, *, quiet: bool) -> str | None:
+def ledger_of(surrogate: str | None, server: str | None, card: PolicyCard, policy: Path, *, quiet: bool) -> str | None:
     """Return the name of the surrogate whose ledger counts the real steps; None if no server may be contacted.
 
     An address that only the policy's card names is never contacted, unless it is the default one of this machine.
@@ -381,7 +381,7 @@ def _ledger(surrogate: str | None, server: str | None, card: PolicyCard, policy:
     return None
 
 
-def _enter(
+def enter_steps(
     surrogate: str | None,
     server: str | None,
     token: str | None,

@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 from surrogym.cli.groups import Output, Service, add
 
 if TYPE_CHECKING:
+    from surrogym_client.transport import Api
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import EvaluationView, PolicyDetail
     from surrogym_trainer.policies.card import PolicyCard
@@ -54,7 +55,7 @@ def show(context: typer.Context, policy: Named, *, service: Service, output: Out
 
     Example: surrogym policy show pendulum@3
     """
-    name, which = _parsed(policy)
+    name, which = parsed(policy)
     with service.connect(context) as api:
         found = api.policies.get(name, which)
     output.give(found.model_dump(mode="json"), lambda: _words(name, found))
@@ -116,12 +117,11 @@ def get(
     from surrogym_client.errors import UnknownPolicy
     from surrogym_trainer.policies.card import require_card_or_none, write_card
 
-    name, which = _parsed(policy)
+    name, which = parsed(policy)
     form: Any = out.suffix.lower().removeprefix(".")
     require_card_or_none(out)
     with service.connect(context) as api:
-        found, spec = api.policies.get(name, which), api.surrogate(name).spec
-        card = _card(name, found, spec if found.differs is None else None)
+        found, card = stored_card(api, name, which)
         try:
             content = api.policies.file(name, found.version, form)
         except UnknownPolicy:
@@ -149,7 +149,7 @@ def alias(
 
     Example: surrogym policy alias pendulum@3 production
     """
-    surrogate, which = _parsed(policy)
+    surrogate, which = parsed(policy)
     with service.connect(context) as api:
         version = api.policies.get(surrogate, which).version
         if remove:
@@ -167,17 +167,23 @@ def delete(context: typer.Context, policy: Named, *, service: Service, output: O
 
     Example: surrogym policy delete pendulum@3
     """
-    name, which = _parsed(policy)
+    name, which = parsed(policy)
     with service.connect(context) as api:
         version = api.policies.get(name, which).version
         api.policies.delete(name, version)
     output.give({"surrogate": name, "deleted": version}, lambda: f"{name}@{version} is deleted")
 
 
-def _parsed(policy: str) -> tuple[str, str]:
+def parsed(policy: str) -> tuple[str, str]:
     """Split ``NAME@WHICH`` into surrogate and version. The version is ``latest`` if the text has none."""
     name, _, which = policy.partition("@")
     return name, which or "latest"
+
+
+def stored_card(api: Api, name: str, which: str) -> tuple[PolicyDetail, PolicyCard]:
+    """Return a policy that the server stores, and its card, with the specification if it is still the surrogate's."""
+    found, spec = api.policies.get(name, which), api.surrogate(name).spec
+    return found, _card(name, found, spec if found.differs is None else None)
 
 
 def _card(name: str, found: PolicyDetail, spec: EnvironmentSpec | None) -> PolicyCard:

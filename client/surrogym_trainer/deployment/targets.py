@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from surrogym_trainer.deployment.c import running as running_c
+from surrogym_trainer.deployment.c import write as write_c
+from surrogym_trainer.deployment.c import write_arduino
 from surrogym_trainer.deployment.controller import Controller, NotDeployable
+from surrogym_trainer.deployment.running import Running
+
+Runner = Callable[[Controller], AbstractContextManager[Running]]
+"""Run a controller as the target does, for ``surrogym deploy --check``."""
 
 Writer = Callable[[Controller, Path], None]
 """Write the files of a controller into an empty folder."""
 
-TARGETS: dict[str, Writer] = {}
+TARGETS: dict[str, Writer] = {"c": write_c, "arduino": write_arduino}
+RUNNERS: dict[str, Runner] = {"c": running_c, "arduino": running_c}
 
 
 def deploy(controller: Controller, target: str, out: Path) -> list[Path]:

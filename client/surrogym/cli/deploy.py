@@ -1,0 +1,247 @@
+"""``surrogym deploy``: write a policy as a controller that runs without Python."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from surrogym.cli.groups import Output, PolicyReading, Service, add
+from surrogym.cli.options import NAMES, SpecFile
+
+if TYPE_CHECKING:
+    from surrogym_sampler.original.episodes import Episode
+    from surrogym_trainer.deployment.controller import Choices
+    from surrogym_trainer.deployment.running import Checked, Comparison
+    from surrogym_trainer.policies.card import PolicyCard
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``surrogym deploy`` to the app."""
+    add(app, "deploy", command)
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Options of what a controller does when a measurement is missing or wrong."""
+
+    fallback: Annotated[
+        list[float] | None,
+        typer.Option(
+            help="Action on a fault, one option for each entry. [default: the continuous action nearest to 0]"
+        ),
+    ] = None
+    timeout: Annotated[
+        float | None,
+        typer.Option(help="Largest age of a measurement in seconds. [default: the sampling period, if declared]"),
+    ] = None
+    ranges: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--range",
+            help="Readings that a sensor can give, such as level=0:2; others are faults. May be given several times. "
+            "[default: the specification's range, widened by its width at each end]",
+        ),
+    ] = None
+
+    def choices(self) -> Choices:
+        """Return the choices.
+
+        Raises:
+            CommandError: a range has another form.
+        """
+        from surrogym_trainer.deployment.controller import Choices
+
+        fallback = tuple(self.fallback) if self.fallback else None
+        return Choices(fallback, self.timeout, dict(map(_range, self.ranges or ())))
+
+
+@dataclass(frozen=True)
+class Checking:
+    """Options of the check."""
+
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check",
+            help="Compile the controller, and run it beside the policy in the virtual environment, or in --env.",
+        ),
+    ] = False
+    env: Annotated[str | None, typer.Option(help=f"Original environment of --check: {NAMES}.")] = None
+    episodes: Annotated[int, typer.Option(min=1, help="Number of episodes of --check.")] = 10
+
+    def require_possible(self, target: str, card: PolicyCard) -> None:
+        """Refuse a check that can't be made, before anything is written.
+
+        Raises:
+            CommandError: the target does not run on this machine, or no environment is known.
+        """
+        from surrogym.cli.errors import CommandError
+        from surrogym_trainer.deployment.targets import RUNNERS
+
+        if self.check and target not in RUNNERS:
+            raise CommandError(f"expected --check with a target that runs here ({', '.join(RUNNERS)}), got {target}")
+        if self.check and self.env is None and card.surrogate is None:
+            raise CommandError("--check needs --env, because no card beside the policy names its surrogate")
+
+    @contextmanager
+    def episode(self, context: typer.Context, card: PolicyCard, service: Service, output: Output) -> Iterator[Episode]:
+        """Open the original environment, or the virtual one if none is named."""
+        from surrogym.cli.opening import opener_for_policy
+        from surrogym_client.transport.http_surrogate import HttpSurrogate
+        from surrogym_trainer.deployment.virtual import VirtualEpisode
+
+        with ExitStack() as stack:
+            if self.env is not None:
+                episode = opener_for_policy(self.env, None, card, quiet=output.quiet)()
+            else:
+                api = stack.enter_context(service.connect(context))
+                port = stack.enter_context(HttpSurrogate(api.url, str(card.surrogate), service.token_for(context)))
+                episode = VirtualEpisode(port, api)
+            stack.callback(episode.close)
+            yield episode
+
+    def run(self, comparison: Comparison, output: Output) -> Checked:
+        """Run the episodes."""
+        from surrogym_shared.terminal import progress
+        from surrogym_trainer.evaluation.evaluator import FIRST_SEED
+
+        seeds = range(FIRST_SEED, FIRST_SEED + self.episodes)
+        with progress("check", quiet=output.quiet) as update:
+            return comparison.over(seeds, lambda share: update(share, f"{self.episodes} episodes of each"))
+
+
+def command(
+    context: typer.Context,
+    policy: Annotated[
+        str, typer.Argument(metavar="POLICY", help="Policy file, or a stored policy such as pendulum@production.")
+    ],
+    target: Annotated[str, typer.Option(help="What to write: c, arduino.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write, new or empty.")],
+    spec: SpecFile = None,
+    *,
+    faults: Faults,
+    checking: Checking,
+    reading: PolicyReading,
+    service: Service,
+    output: Output,
+) -> None:
+    """Write a policy as a controller for another machine.
+
+    The controller computes the observation from raw measurements, with lags, limits, a timeout and a fallback. Test
+    vectors are written beside it.
+
+    Example: surrogym deploy policy.zip --target c --out controller --check
+
+    Example: surrogym deploy pendulum@production --target arduino --out pendulum_controller
+    """
+    from surrogym.cli.options import read_spec
+    from surrogym_trainer.deployment.reading import controller_of
+    from surrogym_trainer.deployment.running import Comparison
+    from surrogym_trainer.deployment.targets import RUNNERS, deploy
+    from surrogym_trainer.policies.card import read_card
+
+    with _local(context, policy, service) as path:
+        card = read_card(path)
+        checking.require_possible(target, card)
+        controller = controller_of(
+            path, read_spec(spec), reading.algorithm, trust=reading.trust_policy, choices=faults.choices()
+        )
+        written = deploy(controller, target, out)
+        result: dict[str, Any] = {"target": target, "files": [str(file) for file in written]}
+        words = [f"{out}: {', '.join(str(file.relative_to(out)) for file in written)}"]
+        if checking.check:
+            with checking.episode(context, card, service, output) as episode, RUNNERS[target](controller) as running:
+                comparison = Comparison(controller, running, reading.load(path, card), episode)
+                try:
+                    checked = checking.run(comparison, output)
+                finally:
+                    if checking.env is not None:
+                        _enter(context, comparison.begun, checking, card, path, service, output)
+            result["check"] = _as_json(checked)
+            words += _in_words(checked)
+    output.give(result, lambda: "\n".join(words))
+
+
+@contextmanager
+def _local(context: typer.Context, policy: str, service: Service) -> Iterator[Path]:
+    """Yield the path of a policy file. A stored policy is downloaded for as long as the command runs."""
+    from tempfile import TemporaryDirectory
+
+    from surrogym.cli.policy import parsed, stored_card
+    from surrogym_trainer.policies.card import write_card
+
+    if Path(policy).is_file() or "@" not in policy:
+        yield Path(policy)
+        return
+    name, which = parsed(policy)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "policy.zip"
+        with service.connect(context) as api:
+            found, card = stored_card(api, name, which)
+            path.write_bytes(api.policies.file(name, found.version, "zip"))
+        write_card(path, card)
+        yield path
+
+
+def _enter(
+    context: typer.Context,
+    steps: int,
+    checking: Checking,
+    card: PolicyCard,
+    policy: Path,
+    service: Service,
+    output: Output,
+) -> None:
+    """Enter the real steps of the check into the surrogate's ledger."""
+    from surrogym.cli.evaluate import enter_steps, ledger_of
+
+    ledger = ledger_of(None, service.server, card, policy, quiet=output.quiet)
+    note = "check of a deployed controller, beside its policy"
+    enter_steps(
+        ledger, service.server, service.token_for(context), steps, 2 * checking.episodes, note, quiet=output.quiet
+    )
+
+
+def _range(text: str) -> tuple[str, tuple[float, float]]:
+    """Parse ``name=low:high``."""
+    from surrogym.cli.errors import CommandError
+
+    name, _, ends = text.partition("=")
+    low, _, high = ends.partition(":")
+    try:
+        return name, (float(low), float(high))
+    except ValueError as error:
+        raise CommandError(f"--range: expected NAME=LOW:HIGH, such as level=0:2, got {text!r}") from error
+
+
+def _as_json(checked: Checked) -> dict[str, Any]:
+    return {
+        "episodes": len(checked.returns),
+        "steps": checked.steps,
+        "largest_difference": checked.largest,
+        "different_actions": checked.different,
+        "faults": checked.faults,
+        "mean_return": float(checked.returns.mean()),
+        "mean_return_of_policy": float(checked.policy_returns.mean()),
+        "microseconds": checked.microseconds,
+    }
+
+
+def _in_words(checked: Checked) -> list[str]:
+    from surrogym_shared.words import counted
+
+    lines = [
+        f"{counted(len(checked.returns), 'episode')}, {checked.steps} steps: mean return "
+        f"{checked.returns.mean():.6g}, of the policy {checked.policy_returns.mean():.6g}",
+        f"actions differ by at most {checked.largest:.1g} of their range",
+    ]
+    if checked.faults:
+        lines.append(f"the controller took its fallback in {counted(checked.faults, 'step')}: --range widens a sensor")
+    if checked.microseconds is not None:
+        lines.append(f"a decision takes {checked.microseconds:.2g} µs on this machine")
+    return lines

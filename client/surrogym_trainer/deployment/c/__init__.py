@@ -1,0 +1,6 @@
+"""Controllers in C99: a header, a source, and a program that runs test vectors."""
+
+from surrogym_trainer.deployment.c.compiling import running
+from surrogym_trainer.deployment.c.files import write, write_arduino
+
+__all__ = ["running", "write", "write_arduino"]

@@ -1,0 +1,142 @@
+"""The files of a controller in C99, and the layout in which Arduino and PlatformIO find them."""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from surrogym_trainer.deployment.c import source
+from surrogym_trainer.deployment.controller import Array, Controller
+from surrogym_trainer.deployment.vectors import Vector, vectors_of
+
+
+def prefix_of(controller: Controller) -> str:
+    """Return the prefix of all names in C: the surrogate's name with letters that an identifier may have."""
+    name = re.sub(r"[^A-Za-z0-9]+", "_", controller.name).strip("_").lower() or "policy"
+    return f"p{name}" if name[0].isdigit() else name
+
+
+def write(controller: Controller, folder: Path) -> None:
+    """Write the header, the source and the program that runs test vectors."""
+    _write_sources(controller, folder)
+    prefix = prefix_of(controller)
+    (folder / f"{prefix}_main.c").write_text(main_of(controller, vectors_of(controller)), encoding="utf-8")
+
+
+def write_arduino(controller: Controller, folder: Path) -> None:
+    """Write a library for the Arduino IDE and PlatformIO: the same header and source, and a sketch that uses them."""
+    prefix = prefix_of(controller)
+    (folder / "src").mkdir()
+    _write_sources(controller, folder / "src")
+    name = f"{prefix}_controller"
+    library = {
+        "name": name,
+        "version": "1.0.0",
+        "description": _title(controller),
+        "frameworks": "*",
+        "platforms": "*",
+        "headers": f"{name}.h",
+        "build": {"flags": f"-D{prefix.upper()}_FLOAT"},
+    }
+    (folder / "library.json").write_text(json.dumps(library, indent=2) + "\n", encoding="utf-8")
+    properties = {
+        "name": name,
+        "version": "1.0.0",
+        "author": "surrogym deploy",
+        "maintainer": "surrogym deploy",
+        "sentence": _title(controller),
+        "paragraph": "One call per sampling period.",
+        "category": "Device Control",
+        "url": "",
+        "architectures": "*",
+        "includes": f"{name}.h",
+    }
+    lines = (f"{key}={value}" for key, value in properties.items())
+    (folder / "library.properties").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    sketch = folder / "examples" / "control"
+    sketch.mkdir(parents=True)
+    content = _template("sketch.ino").substitute(_names(controller), period_ms=_milliseconds(controller))
+    (sketch / "control.ino").write_text(content, encoding="utf-8")
+
+
+def main_of(controller: Controller, vectors: list[Vector]) -> str:
+    """Return the program that runs test vectors."""
+    rows = [
+        f"    {{{int(v.first)}, {{{_joined(v.measurement)}}}, {source.number(v.age)}, {v.status}, "
+        f"{{{_joined(v.action)}}}}},"
+        for v in vectors
+    ]
+    ranges = _joined(controller.high - controller.low)
+    return _template("main.c").substitute(_names(controller), vectors="\n".join(rows), ranges=ranges)
+
+
+def _write_sources(controller: Controller, folder: Path) -> None:
+    names, prefix = _names(controller), prefix_of(controller)
+    for ending, parts in (("h", _header(controller)), ("c", source.parts_of(controller))):
+        content = _template(f"controller.{ending}").substitute(names, **parts)
+        content = re.sub(r"\n{3,}", "\n\n", content)
+        (folder / f"{prefix}_controller.{ending}").write_text(content, encoding="utf-8")
+
+
+def _header(controller: Controller) -> dict[str, Any]:
+    measured = [
+        f"measurement[{i}]  {m.name}{_in(m.unit)}, from {m.lowest:.6g} to {m.highest:.6g}"
+        f"{', wrapped to a turn' if m.angle else ''}"
+        for i, m in enumerate(controller.measurements)
+    ]
+    choices = controller.counts or (0,) * len(controller.low)
+    acted = [
+        f"action[{i}]  from {low:.6g} to {high:.6g}{f', one of {n} values' if n else ''}"
+        for i, (low, high, n) in enumerate(zip(controller.low, controller.high, choices, strict=True))
+    ]
+    observed = [f"observation[{i}]  {o.name}{_in(o.unit)}" for i, o in enumerate(controller.observation)]
+    late = f"{controller.timeout:g} s" if np.isfinite(controller.timeout) else "any time (no timeout was given)"
+    return {
+        "digests": "\n".join(f" *   {value}  {name}" for name, value in sorted(controller.digests.items())),
+        "measured": _comment(measured),
+        "acted": _comment(acted),
+        "observed": _comment(observed),
+        "period": "sampling period" if controller.period is None else f"{controller.period:g} s",
+        "timeout": late,
+        "fallback": ", ".join(f"{a:g}" for a in controller.fallback),
+        "numbers": source.stack_of(controller),
+        "R": len(controller.measurements),
+        "F": len(controller.low),
+        "D": len(controller.observation),
+        "C": len(controller.coordinates),
+    }
+
+
+def _names(controller: Controller) -> dict[str, str]:
+    prefix = prefix_of(controller)
+    return {"prefix": prefix, "PREFIX": prefix.upper(), "title": source.plain(_title(controller))}
+
+
+def _title(controller: Controller) -> str:
+    return f"Controller of {controller.name}"
+
+
+def _milliseconds(controller: Controller) -> str:
+    return "10" if controller.period is None else f"{max(1, round(1000 * controller.period))}"
+
+
+def _in(unit: str) -> str:
+    return f" in {unit}" if unit else ""
+
+
+def _comment(lines: list[str]) -> str:
+    return "\n".join(f" *   {source.plain(line)}" for line in lines)
+
+
+def _joined(values: Array) -> str:
+    return ", ".join(source.number(value) for value in values)
+
+
+def _template(name: str) -> Template:
+    return Template(files(__package__).joinpath(f"{name}.txt").read_text(encoding="utf-8"))

@@ -1,0 +1,105 @@
+"""A deployed controller that runs beside the policy that it was made from: actions and returns are compared.
+
+Shapes: R measurements, F action entries.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from surrogym_sampler.original.actions import decode_actions
+from surrogym_sampler.original.episodes import Episode, Moment
+from surrogym_sampler.original.protocol import LONGEST_EPISODE
+from surrogym_trainer.deployment.controller import Array, Controller
+from surrogym_trainer.policies.predict import Predict
+
+NEGLIGIBLE = 1e-6  # difference of actions, as a share of their range
+
+
+class Running(ABC):
+    """A running controller."""
+
+    microseconds: float | None = None  # of one decision; None if it was not measured
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Begin an episode."""
+
+    @abstractmethod
+    def step(self, measurement: Array, age: float = 0.0) -> tuple[int, Array]:
+        """Return the status and the action (F,) for measurements (R,) of an age in seconds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """A controller and its policy, over the same N starts."""
+
+    returns: Array  # (N,) of the controller
+    policy_returns: Array  # (N,)
+    steps: int  # of the controller
+    largest: float  # largest difference of their actions in the states of the controller, as a share of the range
+    different: int  # steps with another choice, or a difference above 1e-6 of the range
+    faults: int  # steps in which the controller took its fallback
+    microseconds: float | None
+
+
+class Comparison:
+    """Episodes of a controller and of its policy, each from the same starts.
+
+    Args:
+        controller: what was deployed.
+        running: the deployed controller.
+        policy: the original policy.
+        episode: an instance of the environment.
+    """
+
+    def __init__(self, controller: Controller, running: Running, policy: Predict, episode: Episode) -> None:
+        self.begun = 0  # steps of the environment, of both
+        self._running, self._policy, self._episode = running, policy, episode
+        self._places = [m.place for m in controller.measurements]
+        self._width = controller.high - controller.low
+        self._differences: list[float] = []
+        self._faults = 0
+
+    def over(self, seeds: range, progress: Callable[[float], None]) -> Checked:
+        """Run an episode of each for every reset seed. ``progress`` is called with the share that is done."""
+        returns: list[tuple[float, float]] = []
+        for seed in seeds:
+            returns.append((self._run(seed, deployed=False), self._run(seed, deployed=True)))
+            progress(len(returns) / len(seeds))
+        differences = np.array(self._differences)
+        return Checked(
+            returns=np.array([deployed for _, deployed in returns]),
+            policy_returns=np.array([original for original, _ in returns]),
+            steps=len(differences),
+            largest=float(differences.max()),
+            different=int((differences > NEGLIGIBLE).sum()),
+            faults=self._faults,
+            microseconds=self._running.microseconds,
+        )
+
+    def _run(self, seed: int, *, deployed: bool) -> float:
+        """Run one episode, and return its return."""
+        moment, total = self._episode.reset(seed), 0.0
+        self._running.reset()
+        for _ in range(self._episode.spec.time_limit or LONGEST_EPISODE):
+            action = decode_actions(self._episode.spec, self._policy(moment.observation[None].astype(np.float32)), 1)[0]
+            if deployed:
+                action = self._decided(moment, action)
+            self.begun += 1
+            moment = self._episode.step(action)
+            total += moment.reward
+            if moment.terminated or moment.truncated:
+                break
+        return total
+
+    def _decided(self, moment: Moment, expected: Array) -> Array:
+        """Return the controller's action (F,), and note how far it is from the policy's."""
+        status, action = self._running.step(moment.coordinates[self._places])
+        self._faults += status != 0
+        self._differences.append(float((np.abs(action - expected) / self._width).max()) if status == 0 else 0.0)
+        return action

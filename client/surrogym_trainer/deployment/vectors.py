@@ -1,0 +1,107 @@
+"""Test vectors of a controller: steps of episodes, and what the controller must answer.
+
+Shapes: R measurements, F action entries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from surrogym_trainer.deployment.controller import Array, Controller
+from surrogym_trainer.deployment.reference import Memory, begin, decide
+
+EPISODES, STEPS, TRIES = 3, 16, 20
+ROUNDING = 1e-6  # share of a measurement
+STEADY = 2e-5  # share of an action's range by which rounding a measurement may change the action
+
+
+@dataclass(frozen=True, eq=False)
+class Vector:
+    """One step, and its answer."""
+
+    first: bool  # whether an episode begins
+    measurement: Array  # (R,)
+    age: float  # s
+    status: int
+    action: Array  # (F,)
+
+
+def vectors_of(controller: Controller, seed: int = 0) -> list[Vector]:
+    """Return vectors: random walks, ends of the sensors, and each kind of fault, with steps after it.
+
+    A measurement whose rounding to float32 would change the action is left out, such as one at half a turn.
+    """
+    rng = np.random.default_rng(seed)
+    low, high = sensors_of(controller)
+    inside = low + ROUNDING * (high - low), high - ROUNDING * (high - low)
+    vectors: list[Vector] = []
+    for _ in range(EPISODES):
+        memory, first = begin(controller), True
+        walk = rng.uniform(low, high)
+        for step in range(STEPS):
+            for _ in range(TRIES):
+                drawn = np.clip(walk + rng.normal(0, 0.05, len(low)) * (high - low), *inside)
+                read = drawn.astype(np.float32).astype(np.float64)
+                if step == 5:
+                    read = (low if rng.random() < 0.5 else high).copy()
+                if _is_steady(controller, memory, read):
+                    walk = read
+                    memory, vector = _answered(controller, memory, first, read, 0.0)
+                    vectors.append(vector)
+                    first = False
+                    break
+    memory, first = begin(controller), True
+    for read, age in _faults(controller, rng, low, high):
+        if age != 0 or not np.isfinite(read).all() or _is_steady(controller, memory, read):
+            memory, vector = _answered(controller, memory, first, read, age)
+            vectors.append(vector)
+            first = False
+    return vectors
+
+
+def sensors_of(controller: Controller) -> tuple[Array, Array]:
+    """Return the smallest and the largest reading (R,) of each sensor."""
+    measurements = controller.measurements
+    return np.array([m.lowest for m in measurements]), np.array([m.highest for m in measurements])
+
+
+def _faults(controller: Controller, rng: np.random.Generator, low: Array, high: Array) -> Iterator[tuple[Array, float]]:
+    """Yield measurements and their ages: faults, each with two sound steps after it."""
+    middle = (low + high) / 2
+
+    def sound() -> tuple[Array, float]:
+        read = middle + rng.uniform(-0.1, 0.1, len(low)) * (high - low)
+        return read.astype(np.float32).astype(np.float64), 0.0
+
+    for wrong in (np.nan, np.inf, -np.inf):
+        for place in range(len(low)):
+            read, _ = sound()
+            read[place] = wrong
+            yield read, 0.0
+            yield sound()
+            yield sound()
+    for end, sign in ((low, -1), (high, 1)):
+        yield end + sign * 0.01 * (high - low), 0.0
+        yield sound()
+    ages = [np.nan, -1.0, np.inf] + ([] if np.isinf(controller.timeout) else [1.01 * controller.timeout])
+    for age in ages:
+        if not (age == np.inf and np.isinf(controller.timeout)):
+            yield sound()[0], age
+            yield sound()
+
+
+def _answered(controller: Controller, memory: Memory, first: bool, read: Array, age: float) -> tuple[Memory, Vector]:
+    decided = decide(controller, memory, read[None], age)
+    return decided.memory, Vector(first, read, age, int(decided.status[0]), decided.action[0])
+
+
+def _is_steady(controller: Controller, memory: Memory, read: Array) -> bool:
+    """Whether the action stays when the measurements are rounded."""
+    both = np.stack([read, read * (1 + ROUNDING), read * (1 - ROUNDING)]).clip(*sensors_of(controller))
+    repeated = Memory(*(np.repeat(part, 3, axis=0) for part in vars(memory).values()))
+    action = decide(controller, repeated, both).action
+    middle = action[0]
+    return bool((np.abs(action - middle) <= STEADY * (controller.high - controller.low)).all())

@@ -1,0 +1,173 @@
+"""A controller in C decides as its policy does, with nothing but a stack, and says so when a measurement is wrong."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.compilers import NEEDS_C, SANITIZED, Compiled, called_by_name, calls, compile_c, recursive, run
+from support.controllers import LEARNERS, learner, network, plant
+from surrogym_sampler.original.actions import decode_actions
+from surrogym_sampler.original.lags import begun, followed
+from surrogym_shared.spec import DiscreteAction, MultiDiscreteAction
+from surrogym_shared.terms import observe as declared
+from surrogym_trainer.deployment.c import write, write_arduino
+from surrogym_trainer.deployment.controller import Choices, Controller, NotDeployable
+from surrogym_trainer.deployment.reading import controller_of
+from surrogym_trainer.deployment.reference import begin, decide
+from surrogym_trainer.deployment.targets import deploy
+from surrogym_trainer.deployment.vectors import sensors_of
+from surrogym_trainer.policies import load_policy
+
+pytestmark = NEEDS_C
+HISTORY = {"changes": 2, "actions": 2, "largest": {"angle": 0.5, "slide": 0.2}, "at_start": {"angle": 0.3}}
+ALLOWED = {"sin", "cos", "exp", "fmod", "memcpy", "memset"}
+PLANTS = {
+    "history": (plant(**HISTORY), (64, 64), None),
+    "linear": (plant(), 0, None),
+    "choices": (plant(MultiDiscreteAction(nvec=(2, 5)), actions=1), (16,), (1.0, 3.0)),
+}
+
+
+def made(folder: Path, case: str) -> Controller:
+    spec, units, fallback = PLANTS[case]
+    return controller_of(network(folder, spec, units), choices=Choices(fallback=fallback))
+
+
+@pytest.mark.parametrize("flags", [(), ("-DARM_FLOAT",)], ids=["double", "float"])
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize("case", PLANTS)
+def test_vectors_pass_under_sanitizers_without_a_warning(tmp_path: Path, case: str, compiler: str, flags):
+    if shutil.which(compiler) is None:
+        pytest.skip(f"{compiler} is not on this machine")
+    folder = tmp_path / "c"
+    folder.mkdir()
+    write(made(tmp_path, case), folder)
+    program = compile_c(compiler, sorted(folder.glob("*.c")), tmp_path / "vectors", *SANITIZED, *flags)
+    assert re.fullmatch(r"(\d+) of \1 vectors passed\n", run(program))
+
+
+def test_a_wrong_weight_fails_the_vectors(tmp_path: Path):
+    folder = tmp_path / "c"
+    folder.mkdir()
+    write(made(tmp_path, "history"), folder)
+    source = folder / "arm_controller.c"
+    text = source.read_text()
+    source.write_text(text.replace("a[i] = (observation[i] - MEAN[i])", "a[i] = (observation[i] + MEAN[i])"))
+    assert source.read_text() != text
+    program = compile_c("cc", sorted(folder.glob("*.c")), tmp_path / "vectors")
+    assert subprocess.run([program], capture_output=True, check=False).returncode == 1
+
+
+@pytest.mark.parametrize(("single", "tolerance"), [(False, 1e-6), (True, 1e-4)], ids=["double", "float"])
+@pytest.mark.parametrize("case", PLANTS)
+def test_random_measurements_give_the_actions_of_the_reference(tmp_path: Path, case: str, single: bool, tolerance):
+    controller = made(tmp_path, case)
+    compiled, rng = Compiled(controller, tmp_path / "c", single=single), np.random.default_rng(1)
+    low, high = sensors_of(controller)
+    reads = rng.uniform(low, high, (500, len(low))).astype(np.float32).astype(np.float64)
+    reads[::50, 0], reads[25::50, 1], reads[13::50] = np.nan, np.inf, high
+    memory, close = begin(controller), []
+    for read in reads:
+        decided = decide(controller, memory, read[None])
+        status, action = compiled.step(read)
+        assert status == decided.status
+        close.append((np.abs(action - decided.action[0]) <= tolerance * (controller.high - controller.low)).all())
+        memory = decided.memory
+    # in float the two best choices may be equal up to rounding, and an angle may lie at half a turn
+    assert np.mean(close) >= (0.98 if single else 1.0)
+
+
+def test_a_closed_loop_has_the_lags_exactly_and_the_same_actions_as_the_policy(tmp_path: Path):
+    spec = plant(**HISTORY)
+    path = network(tmp_path, spec)
+    compiled, policy = Compiled(controller_of(path), tmp_path / "c"), load_policy(path)
+    rng, state, q, last = np.random.default_rng(0), np.array([3.0, 0.5, 0.2]), None, None
+    for _ in range(300):
+        q = begun(spec, state) if q is None else followed(spec, q, last, state)
+        status, action = compiled.step(state)
+        assert status == 0
+        np.testing.assert_array_equal(compiled.coordinates, q)
+        shown = declared(spec, q[None]).astype(np.float32)
+        np.testing.assert_array_max_ulp(compiled.observed().astype(np.float32), shown[0], maxulp=2)
+        np.testing.assert_allclose(action, decode_actions(spec, policy(shown), 1)[0], atol=1e-5)
+        last = action.astype(np.float32).astype(np.float64)
+        state += [0.3 * last[0] + rng.normal(0, 0.1), 0.05 * (last[1] - 5), 0.0]
+        state[1] = np.clip(state[1], -1.2, 2.2)
+
+
+@pytest.mark.parametrize("case", ["SAC", "DQN", "PPO, bins"])
+def test_stable_baselines3_policies_run_in_c(tmp_path: Path, case: str):
+    spec = plant(LEARNERS[case][2])
+    fallback = (0.0,) if spec.action.kind == "discrete" else None
+    path = learner(tmp_path, case, spec)
+    compiled = Compiled(controller_of(path, trust=True, choices=Choices(fallback=fallback)), tmp_path / "c")
+    policy = load_policy(path, LEARNERS[case][0], trust=True)
+    for read in np.random.default_rng(0).uniform([-3, -1, 0], [3, 2, 1], (100, 3)):
+        shown = declared(spec, begun(spec, read)[None]).astype(np.float32)
+        np.testing.assert_allclose(compiled.step(read)[1], decode_actions(spec, policy(shown), 1)[0], atol=1e-3)
+
+
+@pytest.mark.parametrize("case", PLANTS)
+def test_the_source_has_no_heap_no_recursion_and_a_bounded_stack(tmp_path: Path, case: str):
+    if shutil.which("gcc") is None:
+        pytest.skip("gcc is not on this machine")
+    folder = tmp_path / "c"
+    folder.mkdir()
+    write(made(tmp_path, case), folder)
+    out = folder / "controller.o"
+    compile_c("gcc", [folder / "arm_controller.c"], out, "-c", "-fstack-usage", "-fcallgraph-info=su")
+    assert called_by_name(out) <= ALLOWED
+    graph = calls(next(folder.glob("*.ci")))
+    assert recursive(graph) == set()
+    assert recursive({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == {"b", "c"}, "the look finds what it looks for"
+    usage = [line.split("\t") for line in next(folder.glob("*.su")).read_text().splitlines()]
+    assert {kind for _, _, kind in usage} == {"static"}
+    stated = re.search(r"_STACK \((\d+) \* sizeof\(arm_real\) \+ 256\)", (folder / "arm_controller.h").read_text())
+    assert sum(int(size) for _, size, _ in usage) <= int(stated.group(1)) * 8 + 256
+
+
+def test_names_that_would_end_a_comment_do_no_harm(tmp_path: Path):
+    spec = plant()
+    text = spec.model_dump_json().replace('"slide"', r'"*/ int x; /* ??/\n\\"')
+    path = network(tmp_path, type(spec).model_validate_json(text))
+    (tmp_path / "c").mkdir()
+    write(controller_of(path), tmp_path / "c")
+    run(compile_c("cc", sorted((tmp_path / "c").glob("*.c")), tmp_path / "vectors"))
+
+
+def test_a_folder_with_other_files_is_left_alone(tmp_path: Path):
+    controller = made(tmp_path, "linear")
+    written = deploy(controller, "c", tmp_path / "out")
+    assert deploy(controller, "c", tmp_path / "out") == written, "the same files again change nothing"
+    (tmp_path / "out" / "arm_controller.c").write_text("mine")
+    before = {path: path.read_bytes() for path in written}
+    with pytest.raises(NotDeployable, match=r"arm_controller\.c: nothing was written"):
+        deploy(controller, "c", tmp_path / "out")
+    assert {path: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
+    with pytest.raises(NotDeployable, match=r"expected the target c, arduino, .*got 'plc'"):
+        deploy(controller, "plc", tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_arduino_layout_has_what_its_tools_read_and_a_sketch_that_compiles(tmp_path: Path):
+    controller = controller_of(network(tmp_path, plant(DiscreteAction(n=3))), choices=Choices(fallback=(0.0,)))
+    folder = tmp_path / "library"
+    folder.mkdir()
+    write_arduino(controller, folder)
+    assert json.loads((folder / "library.json").read_text())["headers"] == "arm_controller.h"
+    properties = dict(line.split("=", 1) for line in (folder / "library.properties").read_text().splitlines())
+    assert properties["includes"] == "arm_controller.h"
+    if shutil.which("g++") is None:
+        pytest.skip("g++ is not on this machine")
+    stub = tmp_path / "Arduino.h"
+    stub.write_text("unsigned long millis();\n")
+    sketch = folder / "examples" / "control" / "control.ino"
+    strict = ["-Wall", "-Wextra", "-Werror", "-include", stub, f"-I{folder / 'src'}"]
+    subprocess.run(["g++", *strict, "-x", "c++", "-c", sketch, "-o", tmp_path / "sketch.o"], check=True)

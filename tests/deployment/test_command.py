@@ -1,0 +1,84 @@
+"""``surrogym deploy`` writes a controller and runs it beside its policy."""
+
+from __future__ import annotations
+
+import shutil
+import uuid
+from pathlib import Path
+
+import pytest
+
+from support.compilers import NEEDS_C
+from support.controllers import network
+from support.saying import speaker
+from surrogym.cli import main
+from surrogym_client.transport import Api
+from surrogym_sampler.original.classic import cartpole, pendulum
+from surrogym_trainer.policies.card import read_card, write_card
+from surrogym_trainer.policies.pushing import push
+
+
+@pytest.fixture
+def surrogym(capsys, monkeypatch, tmp_path):
+    return speaker(main, capsys, monkeypatch, tmp_path)
+
+
+def policy_for(folder: Path, spec, surrogate: str | None) -> Path:
+    path = network(folder, spec, (32,))
+    write_card(path, read_card(path).model_copy(update={"surrogate": surrogate}))
+    return path
+
+
+def test_a_stored_policy_is_deployed_by_its_name_and_checked_in_the_virtual_environment(
+    surrogym, pendulum_server, tmp_path
+):
+    with Api(pendulum_server.url) as api:
+        path = policy_for(tmp_path, api.surrogate("pendulum").spec, "pendulum")
+        version = push(api, path).policy.version
+    check = ["--check", "--episodes", "2"] if shutil.which("cc") else []
+    deploy = ["deploy", f"pendulum@{version}", "--target", "c", "--out", "c", *check]
+    said = surrogym(*deploy, "--server", pendulum_server.url, "--json")
+    assert said.code == 0, said.err
+    names = [Path(file).name for file in said.json["files"]]
+    assert names == ["pendulum_controller.c", "pendulum_controller.h", "pendulum_main.c"]
+    if check:
+        checked = said.json["check"]
+        assert checked["steps"] == 2 * pendulum().time_limit
+        assert (checked["faults"], checked["different_actions"]) == (0, 0)
+        assert checked["mean_return"] == pytest.approx(checked["mean_return_of_policy"], rel=1e-3)
+
+
+@NEEDS_C
+def test_a_check_in_the_original_environment_enters_its_real_steps(surrogym, server_process, tmp_path):
+    name = f"deploy-{uuid.uuid4().hex[:8]}"
+    path = policy_for(tmp_path, cartpole(), name)
+    deploy = ["deploy", str(path), "--target", "c", "--out", "c", "--fallback", "0", "--check", "--episodes", "3"]
+    with Api(server_process.url) as api:
+        api.create_surrogate(name, cartpole())
+        said = surrogym(*deploy, "--env", "CartPole-v1", "--server", server_process.url, "--json")
+        assert said.code == 0, said.err
+        entered = api.surrogate(name).ledger.evaluation
+    assert entered == 2 * said.json["check"]["steps"] > 0, "steps of the policy and of the controller"
+
+
+def test_what_can_not_be_written_or_checked_is_refused_and_nothing_is_written(surrogym, tmp_path):
+    path = policy_for(tmp_path, pendulum(), None)
+    to = ["--target", "c", "--out", "c"]
+    for arguments, words in [
+        ([str(path), *to, "--range", "speed"], "expected NAME=LOW:HIGH"),
+        (["nowhere.zip", *to], "no such policy file"),
+        ([str(path), "--target", "plc", "--out", "c"], "expected the target c, arduino"),
+        ([str(path), *to, "--fallback", "3"], "expected a fallback of 1 entries"),
+        ([str(path), *to, "--check"], "--check needs --env"),
+    ]:
+        said = surrogym("deploy", *arguments)
+        assert (said.code, words in said.err.replace("\n", " ")) == (1, True), said.err
+        assert not (tmp_path / "c").exists()
+
+
+def test_a_check_without_a_compiler_says_what_is_missing(surrogym, tmp_path, monkeypatch):
+    path = policy_for(tmp_path, pendulum(), None)
+    monkeypatch.setenv("PATH", "/nonexistent")
+    said = surrogym("deploy", str(path), "--target", "c", "--out", "c", "--check", "--env", "Pendulum-v1")
+    assert (said.code, "expected a C compiler (cc, gcc, clang)" in said.err) == (1, True)
+    assert (tmp_path / "c" / "policy_controller.h").exists(), "what was written stays"

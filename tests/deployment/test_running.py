@@ -1,0 +1,53 @@
+"""A deployed controller earns what its policy earns, also where it has to remember."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.compilers import NEEDS_C
+from support.controllers import network
+from surrogym_sampler.original.episodes import RolloutEpisode
+from surrogym_sampler.original.rollouts import answering
+from surrogym_trainer.deployment.controller import Choices
+from surrogym_trainer.deployment.reading import controller_of
+from surrogym_trainer.deployment.running import Comparison
+from surrogym_trainer.deployment.targets import RUNNERS
+from surrogym_trainer.policies import load_policy
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+pytestmark = NEEDS_C
+
+
+def vessel():
+    sys.path.insert(0, str(EXAMPLES))
+    try:
+        from dead_time import Vessel
+    finally:
+        sys.path.remove(str(EXAMPLES))
+    return RolloutEpisode(answering(Vessel()))
+
+
+@pytest.mark.parametrize("target", RUNNERS)
+def test_a_controller_with_lags_earns_the_returns_of_its_policy(tmp_path: Path, target: str):
+    episode = vessel()
+    path = network(tmp_path, episode.spec, (32,), 0.5)
+    controller, shares = controller_of(path), []
+    with RUNNERS[target](controller) as running:
+        checked = Comparison(controller, running, load_policy(path), episode).over(range(5), shares.append)
+    assert shares == [0.2, 0.4, 0.6, 0.8, 1.0]
+    assert (checked.steps, checked.faults, checked.different) == (250, 0, 0)
+    np.testing.assert_allclose(checked.returns, checked.policy_returns, rtol=1e-6)
+    assert len(set(checked.returns)) == 5
+
+
+def test_a_reading_outside_of_its_range_is_counted_as_a_fault(tmp_path: Path):
+    episode = vessel()
+    path = network(tmp_path, episode.spec, (32,), 0.5)
+    controller = controller_of(path, choices=Choices(ranges={"level": (-0.01, 0.01)}))
+    with RUNNERS["c"](controller) as running:
+        checked = Comparison(controller, running, load_policy(path), episode).over(range(1), [].append)
+    assert checked.faults > 0
