@@ -126,7 +126,7 @@ def test_an_error_of_one_sign_is_found_with_its_region_and_cost_where_no_step_di
     found = disagreements(steps, beside)
     assert not found.found
     first, *_, last = Differing(found, 0, effects=(effect,), broken=True).in_words(SPEC)
-    assert first == "no single step shows why the promise was broken"
+    assert first == "no single step shows why the return is below the promise"
     assert "x is +0.1" in last
     assert "where action 0 is between" in last
     explaining = [steps[i] for i in np.argsort(-share)]
@@ -139,4 +139,4 @@ def test_a_right_model_has_no_effects_and_a_broken_promise_is_never_no_differenc
     assert not effects
     assert not share.any()
     (said,) = Differing(Disagreements(120, (), {}), 0, broken=True).in_words(SPEC)
-    assert said.startswith("the compared steps do not explain why the promise was broken")
+    assert said.startswith("the compared steps do not explain why the return is below the promise")

@@ -279,15 +279,15 @@ class Differing:
         return [*lines, *self._together(), *self._left_out(), *self._learned()]
 
     def _none(self) -> list[str]:
-        """Say that no single step differs. That alone is no answer where the promise was broken."""
+        """Say that no single step differs. That alone is no answer where the return is below the promise."""
         none = f"none of {self.found.compared} real steps differs from the model by more than the model's uncertainty"
         if not self.broken:
             return [] if self.effects else [none]
         if self.effects:
-            return ["no single step shows why the promise was broken"]
+            return ["no single step shows why the return is below the promise"]
         return [
-            f"the compared steps do not explain why the promise was broken: {none}, and together they show no error "
-            "either; a hidden state or other starts would"
+            f"the compared steps do not explain why the return is below the promise: {none}, and together they show no "
+            "error either; a hidden state or other starts would"
         ]
 
     def _together(self) -> list[str]:

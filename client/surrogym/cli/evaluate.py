@@ -161,7 +161,8 @@ def command(
     reports = _reports(beside.controllers(policy, card, reading, opener), card.spec, run, enter, settings, policy)
     result = reports[0][1]
     promise = card.promise if is_promised(settings, result, card.spec) else None
-    judged = promise if _judges(settings.episodes) else None
+    expected = promise if _judges(settings.episodes) else None
+    elsewhere = _elsewhere(env, card, promise)
     with kept(learning, policy, result, quiet=output.quiet) as steps:
         if stored := keeping.push and ledger is not None:
             _keep(policy, reports, settings, _named(env, card), card.spec, quiet=output.quiet)
@@ -169,7 +170,7 @@ def command(
         version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
         imagining = Imagining(partial(reading.load, policy, card), card, token)
         found = differences.between(
-            ledger, service.server, token, result, settings, judged, steps, imagining, quiet=output.quiet
+            ledger, service.server, token, result, settings, expected, steps, imagining, quiet=output.quiet
         )
     summary = {
         "policy": str(policy),
@@ -177,11 +178,12 @@ def command(
         **_settings(settings),
         **_summary(reports, beside.reference),
     }
-    summary |= {"promise_kept": _kept(judged, result), "version": version, "disagreements": found and found.as_json()}
+    summary |= {"promise_kept": None if elsewhere else _kept(expected, result)}
+    summary |= {"version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
-    more = [*_elsewhere(env, card), *(found.in_words(card.spec) if found else [])]
+    more = [*elsewhere, *(found.in_words(card.spec) if found else [])]
     more += [*_why_not_judged(card, settings, result), *_unseeded(reports), *_repeated(result)]
-    give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
+    give(summary, lambda: "\n".join([_words(reports, None if elsewhere else promise), *more]), as_json=output.as_json)
     if steps is not None:
         steps.require_stored()
 
@@ -191,14 +193,19 @@ def _named(env: str | None, card: PolicyCard) -> str:
     return env or (card.spec.environment if card.spec else "")
 
 
-def _elsewhere(env: str | None, card: PolicyCard) -> list[str]:
-    """Say that the episodes ran in another environment than the policy's own. Nothing if that is not known."""
+def _elsewhere(env: str | None, card: PolicyCard, promise: Promise | None) -> list[str]:
+    """Say that the episodes ran in another environment than the policy's own, whose promise is not judged there.
+    Nothing if they did not, or if the policy's own is not known."""
     from surrogym_shared.environments import is_name, is_same
 
     own = card.spec.environment if card.spec else ""
     if env is None or not is_name(own) or is_same(env, own):
         return []
-    return [f"these episodes ran in {env}, and the policy is for {own}: the server shows them apart"]
+    ran = f"these episodes ran in {env}"
+    if promise is None:
+        return [f"{ran}, and the policy is for {own}: the server shows them apart"]
+    promised = f"the promise of {promise.low:.4g} to {promise.high:.4g} is for {own}"
+    return [f"{ran}, and {promised}: it is not judged, and the server shows them apart"]
 
 
 def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Evaluation) -> list[str]:
