@@ -13,16 +13,14 @@ is kept in rows.csv in the folder, so that the same command goes on after Ctrl-C
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import get_type_hints
 from uuid import uuid4
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
@@ -36,6 +34,7 @@ from surrogym_client.errors import UnknownSurrogate
 from surrogym_client.runtime.versions import commit
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_lab.reproduce.rows import read_records, write_records
 from surrogym_lab.reproduce.statistics import exact_interval
 from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_shared.spec import Design, EnvironmentSpec
@@ -75,14 +74,14 @@ def main() -> None:
     options = _options()
     torch.set_num_threads(1)
     path: Path = options.out / "rows.csv"
-    rows = read(path)
+    rows = read_records(path, Row)
     done = {(row.machine, row.mechanism, row.seed) for row in rows}
     with TemporaryDirectory() as folder, running_server(Path(folder)) as server:
         for machine, mechanism, seed in cases(options.first_seed, options.right, options.wrong):
             if (machine.name, mechanism, seed) in done:
                 continue
             rows.append(audited(server.url, machine, mechanism, seed, Path(folder)))
-            write(path, rows)
+            write_records(path, Row, rows)
             print(rows[-1], flush=True)
     print(table(rows))
 
@@ -204,25 +203,6 @@ def _share(count: int, of: int) -> str:
         return "-"
     low, high = exact_interval(count, of)
     return f"{100 * count / of:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
-
-
-def read(path: Path) -> list[Row]:
-    if not path.exists():
-        return []
-    kinds = get_type_hints(Row)
-    with path.open(encoding="utf-8", newline="") as lines:
-        return [
-            Row(**{name: text == "True" if kinds[name] is bool else kinds[name](text) for name, text in line.items()})
-            for line in csv.DictReader(lines)
-        ]
-
-
-def write(path: Path, rows: Sequence[Row]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8", newline="") as lines:
-        writer = csv.DictWriter(lines, [field.name for field in fields(Row)])
-        writer.writeheader()
-        writer.writerows(asdict(row) for row in rows)
 
 
 def _options() -> argparse.Namespace:

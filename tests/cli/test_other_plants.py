@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from support.machine import SettableMachine, diary_in
-from surrogym_client.policies import PolicyCard
-from surrogym_client.policies.evidence import Promise
 from surrogym_shared.archives import stored
+from surrogym_trainer.policies import PolicyCard
+from surrogym_trainer.policies.evidence import Promise
 
 OWN, OTHER = "support.machine:SettableMachine", "support.moody:Line"
 EVALUATE = ("evaluate", "policy.zip", "--episodes", "30", "--no-push", "--server", "http://127.0.0.1:9")
@@ -23,7 +23,7 @@ def promised(request, tmp_path, monkeypatch):
     spec = SettableMachine.spec(None).model_copy(update={"environment": OWN})
     (tmp_path / "policy.zip").write_bytes(stored({}))
     (tmp_path / "policy.json").write_text(PolicyCard(spec=spec, promise=promise).model_dump_json())
-    monkeypatch.setattr("surrogym_client.policies.files.load_policy", lambda *_, **__: lambda o: np.ones((len(o), 1)))
+    monkeypatch.setattr("surrogym_trainer.policies.files.load_policy", lambda *_, **__: lambda o: np.ones((len(o), 1)))
     with diary_in(tmp_path, monkeypatch):
         yield promise
 

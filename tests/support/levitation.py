@@ -44,12 +44,15 @@ def _pendulum(q: Array, u: Array, p: Parameters) -> tuple[Array, Array]:
 
 
 def _tanks(q: Array, u: Array, p: Parameters) -> tuple[Array, Array]:
-    """A pump fills an upper tank, which drains into a lower one, whose level is to be 10 cm. Levels in cm about it."""
+    """A pump fills an upper tank, which drains into a lower one, whose level is to be 10 cm. Levels in cm about it.
+
+    Half of the pump's power is not enough to hold the level.
+    """
     upper, lower = np.maximum(q[..., 0] + 10, 0), np.maximum(q[..., 1] + 10, 0)
-    inflow = 3.0 * p["pump"] * (1 + u[..., 0])
+    inflow = 2.2 * p["pump"] * (1 + u[..., 0])
     out, down = (3 * p["drain"] * np.sqrt(level / 10) for level in (upper, lower))
     after = upper + 0.5 * (inflow - out), lower + 0.5 * (out - down)
-    return np.stack([np.maximum(level, 0) - 10 for level in after], -1), 1 - (q[..., 1] / 3) ** 2
+    return np.stack([np.maximum(level, 0) - 10 for level in after], -1), np.exp(-0.5 * q[..., 1] ** 2)
 
 
 LEVITATION = Machine(
@@ -60,7 +63,7 @@ LEVITATION = Machine(
     {"mass": 1.0, "pump": 1.0},
     {
         **{f"mass {mass:g}": (lambda _, mass=mass: {"mass": mass}) for mass in (0.7, 0.85, 1.15, 1.3, 1.5)},
-        "pump 0.8": lambda _: {"pump": 0.8},
+        **{f"pump {pump:g}": (lambda _, pump=pump: {"pump": pump}) for pump in (0.7, 0.8, 1.2)},
         "delay 1": lambda _: {"delay": 1.0},
         "offset 2 %": lambda _: {"shift": 0.02 * 12},
     },
