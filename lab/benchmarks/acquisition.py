@@ -37,7 +37,8 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
-from surrogym_server.sampling.design import DesignState, Request, advance, initial_design
+from surrogym_server.sampling.design import advance, initial_design
+from surrogym_server.sampling.state import DesignState, Request
 from surrogym_shared.spec import Design, EnvironmentSpec
 from surrogym_trainer.evaluation.evaluator import interquartile_mean
 

@@ -37,8 +37,9 @@ from surrogym_server.environment.samples import Samples, increments, saturated
 from surrogym_server.models.gaussian_process.learning import learn as learning
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
-from surrogym_server.sampling.design import DesignState, Request, advance, initial_design
+from surrogym_server.sampling.design import advance, initial_design
 from surrogym_server.sampling.latin_hypercube import latin_hypercube
+from surrogym_server.sampling.state import DesignState, Request
 from surrogym_shared.spec import Bounds, Design, EnvironmentSpec
 
 SIZES, UNSEEN, EPISODES, LENGTH, BUDGET = (12, 24, 50, 100), 1_500, 10, 100, 100

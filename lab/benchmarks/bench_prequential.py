@@ -36,9 +36,10 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.several import FunctionsOfSeveral
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.design import Decision, DesignState, Request, advance, initial_design
+from surrogym_server.sampling.design import Decision, advance, initial_design
 from surrogym_server.sampling.latin_hypercube import random_points
 from surrogym_server.sampling.prequential import Prediction, Predictions, continued, half_width, predicted, scores_of
+from surrogym_server.sampling.state import DesignState, Request
 from surrogym_shared.spec import EnvironmentSpec
 
 TASKS = ("pendulum", "cartpole", "mountaincar", "stick-slip", "swingup", "acrobot")

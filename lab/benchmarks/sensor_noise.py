@@ -28,9 +28,10 @@ from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.guard import learn
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.design import DesignState, Request, advance, initial_rollouts
+from surrogym_server.sampling.design import advance, initial_rollouts
 from surrogym_server.sampling.rollouts import random_sequences
 from surrogym_server.sampling.serial import SensorNoise, sensor_noise
+from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
 from surrogym_server.virtual import VirtualSettings, create, reset, step
 from surrogym_shared.spec import Design

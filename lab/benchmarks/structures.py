@@ -24,9 +24,10 @@ from surrogym_server.gp.search import Evidence, minimum
 from surrogym_server.models.gaussian_process.censoring import usable
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
-from surrogym_server.sampling.design import DesignState, Request, advance, initial_design
+from surrogym_server.sampling.design import advance, initial_design
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.sampling.prequential import half_width
+from surrogym_server.sampling.state import DesignState, Request
 from surrogym_shared.spec import Design, Reward
 
 UNSEEN, UNSEEN_SEED, BUDGET = 500, 99, 100

@@ -9,7 +9,7 @@ import torch
 import surrogym
 from surrogym_sampler import original
 from surrogym_server.environment.points import Points
-from surrogym_server.sampling.design import monte_carlo
+from surrogym_server.sampling.judging import monte_carlo
 
 
 def design_of(name: str, seed: int, budget: int) -> surrogym.Design:

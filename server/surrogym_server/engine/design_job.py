@@ -23,19 +23,12 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.guard import plugin_calls
-from surrogym_server.sampling.design import (
-    Decision,
-    DesignState,
-    Request,
-    Verdict,
-    advance,
-    initial_design,
-    initial_rollouts,
-    judge_model,
-)
+from surrogym_server.sampling.design import Decision, advance, initial_design, initial_rollouts
+from surrogym_server.sampling.judging import judge_model
 from surrogym_server.sampling.limits import reached_limits
 from surrogym_server.sampling.prequential import KEPT, Predictions, continued, predicted
 from surrogym_server.sampling.rollouts import Rollout
+from surrogym_server.sampling.state import DesignState, Request, Verdict
 from surrogym_server.sampling.tolerances import usual_tolerances
 
 Array = NDArray[np.float64]
@@ -154,7 +147,7 @@ def judge_stored(job: DesignJob, stored: bytes) -> DesignResult:
     model, samples = from_bytes(job.definition, stored), _samples(job)
     usual = job.state.get("usual") or usual_tolerances(job.definition, model.scales.tolist())
     state = DesignState.from_json(job.state)
-    judged = judge_model(model, samples, usual, _request(job), state.round, state.predictions)
+    judged = judge_model(model, samples, usual, _request(job), state)
     return DesignResult(
         model=stored,
         description=model.description,

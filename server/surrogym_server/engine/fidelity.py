@@ -9,7 +9,7 @@ from typing import Any
 from surrogym_server.environment.points import Points
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
-from surrogym_server.sampling.design import monte_carlo
+from surrogym_server.sampling.judging import monte_carlo
 from surrogym_server.sampling.limits import Limit
 from surrogym_server.sampling.tolerances import usual_tolerances
 

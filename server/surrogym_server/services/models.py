@@ -16,7 +16,7 @@ from surrogym_server.errors import Damaged, InvalidInput, PluginFailed
 from surrogym_server.models.files import from_bytes
 from surrogym_server.models.guard import POINTS, plugin_calls, require_sound
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.design import monte_carlo
+from surrogym_server.sampling.judging import monte_carlo
 from surrogym_server.sampling.uncertainty import UncertaintyResult, query_uncertainty
 from surrogym_server.services.definitions import Definitions, check_coordinates, check_points
 from surrogym_server.services.notices import Notices

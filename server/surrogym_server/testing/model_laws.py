@@ -20,7 +20,8 @@ from surrogym_server.environment.step_rules import placed, settle, with_lags
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.files import METADATA, from_bytes, to_bytes
 from surrogym_server.models.port import DynamicsModel, Transition
-from surrogym_server.sampling.design import DesignState, Request, advance
+from surrogym_server.sampling.design import advance
+from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.tensors import CPU
 from surrogym_server.testing.cases import ModelCase, close
 from surrogym_server.virtual import VirtualSettings, create, reset, step

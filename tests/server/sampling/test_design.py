@@ -17,16 +17,10 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.sampling import batch
 from surrogym_server.sampling.batch import NEAR, nearest
 from surrogym_server.sampling.confidence import OutputConfidence
-from surrogym_server.sampling.design import (
-    Decision,
-    DesignState,
-    Request,
-    advance,
-    initial_design,
-    judge,
-    monte_carlo,
-)
+from surrogym_server.sampling.design import Decision, advance, initial_design
+from surrogym_server.sampling.judging import judge, monte_carlo
 from surrogym_server.sampling.prequential import Prediction
+from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import sizes_of, usual_tolerances
 from surrogym_shared.spec import Design, EnvironmentSpec
 

@@ -10,8 +10,9 @@ from surrogym_sampler.original.classic import cartpole
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.sampling.design import DesignState, Request, advance, initial_design
+from surrogym_server.sampling.design import advance, initial_design
 from surrogym_server.sampling.endings import ending, in_doubt
+from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.virtual.environment import VirtualSettings, create, reset, step
 
 LEARNED = cartpole().model_copy(update={"termination": "learned"})

@@ -16,9 +16,10 @@ from surrogym_server.environment.features import distances
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
-from surrogym_server.sampling.design import DesignState, Request, advance
+from surrogym_server.sampling.design import advance
 from surrogym_server.sampling.excursions import FAR, excursion
 from surrogym_server.sampling.rollouts import predict_paths, random_sequences
+from surrogym_server.sampling.state import DesignState, Request
 from surrogym_shared.spec import EnvironmentSpec
 
 STILL = {"kind": "uniform", "low": -0.01, "high": 0.01}  # resets lead to the top, nearly at rest

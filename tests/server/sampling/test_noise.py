@@ -13,7 +13,7 @@ from support.exact_models import ExactModel, exact_pendulum
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import LearnedNoise
-from surrogym_server.sampling.design import DesignState, Request, advance
+from surrogym_server.sampling.design import advance
 from surrogym_server.sampling.noise import (
     ENOUGH,
     LEVEL,
@@ -24,6 +24,7 @@ from surrogym_server.sampling.noise import (
     to_repeat,
     widened,
 )
+from surrogym_server.sampling.state import DesignState, Request
 
 TOLERANCES = (0.01, 0.01, 0.01)
 

@@ -13,9 +13,12 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.guard import learn
-from surrogym_server.sampling.design import LONGER, DesignState, Judged, Request, advance, judge_model
+from surrogym_server.sampling.design import advance
+from surrogym_server.sampling.judging import Judged, judge_model
 from surrogym_server.sampling.noise import repeats
 from surrogym_server.sampling.past import EXPLAINED, pairs_lacking
+from surrogym_server.sampling.rules.past import LENGTH as LONGER
+from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import usual_tolerances
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
@@ -74,7 +77,7 @@ def judged(follow: Next, seed: int = 0) -> Judged:
     taken = Samples(q, u, q_next, -(q[:, 0] ** 2), torch.zeros(len(rows), dtype=torch.bool))
     model = learn(DEFINITION, taken, {}).model
     usual = usual_tolerances(DEFINITION, model.scales.tolist())
-    return judge_model(model, taken, usual, Request(COUNT, 0.9, Points(taken.q[:0], taken.u[:0])), 0)
+    return judge_model(model, taken, usual, Request(COUNT, 0.9, Points(taken.q[:0], taken.u[:0])), DesignState())
 
 
 def longer_dead_time(s: np.ndarray, u: float, before: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:

@@ -10,7 +10,6 @@ from support.real_steps import random_steps
 from surrogym_sampler.original.swingup import swing_up
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples, increments, saturated
-from surrogym_server.sampling.design import DesignState
 from surrogym_server.sampling.prequential import (
     KEPT,
     Prediction,
@@ -19,6 +18,7 @@ from surrogym_server.sampling.prequential import (
     predicted,
     scores_of,
 )
+from surrogym_server.sampling.state import DesignState
 from surrogym_shared.spec import DeclaredReward, Quantity, RewardTerm, Term
 
 

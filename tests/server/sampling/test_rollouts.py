@@ -21,7 +21,7 @@ from surrogym_server.models.abilities import PredictedSteps
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.lookahead import process_inputs
 from surrogym_server.sampling.confidence import deviations
-from surrogym_server.sampling.design import DesignState, Request, advance, initial_rollouts
+from surrogym_server.sampling.design import advance, initial_rollouts
 from surrogym_server.sampling.rollouts import (
     Aim,
     Rollout,
@@ -34,6 +34,7 @@ from surrogym_server.sampling.rollouts import (
     random_sequences,
     start_points,
 )
+from surrogym_server.sampling.state import DesignState, Request
 from surrogym_shared.spec import EnvironmentSpec, Uniform
 
 NOTHING = Points(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 1, dtype=torch.float64))

@@ -11,8 +11,9 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples, preceding
 from surrogym_server.models.guard import learn
-from surrogym_server.sampling.design import Request, judge_model
+from surrogym_server.sampling.judging import judge_model
 from surrogym_server.sampling.serial import CRITICAL, MAINLY, best_share, sensor_noise, sensor_pattern
+from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import usual_tolerances
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
@@ -90,7 +91,7 @@ def test_a_learned_model_tells_the_sensors_noise_and_allows_for_it(seed: int) ->
     model = learn(DEFINITION, taken, {}).model
     usual = usual_tolerances(DEFINITION, model.scales.tolist())
     request = Request(budget=COUNT, target=0.9, pending=Points(taken.q[:0], taken.u[:0]))
-    position, _ = judge_model(model, taken, usual, request, 0).confidences
+    position, _ = judge_model(model, taken, usual, request, DesignState()).confidences
     assert position.sensor_noise == pytest.approx(0.04, rel=0.35)
     assert position.noise == pytest.approx(0.04 * np.hypot(1, SLOPE), rel=0.35)
 

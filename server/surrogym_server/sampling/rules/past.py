@@ -1,0 +1,32 @@
+"""Take consecutive steps that show whether an error is noise or follows from the steps before."""
+
+from __future__ import annotations
+
+import torch
+
+from surrogym_server.sampling.judging import agrees
+from surrogym_server.sampling.past import pairs_lacking
+from surrogym_server.sampling.rollouts import Rollout, random_sequences
+from surrogym_server.sampling.round import Round
+from surrogym_server.sampling.rules.rule import Chosen
+
+LENGTH = 8  # steps of a rollout
+
+
+def see_the_past(round: Round) -> Chosen | None:
+    """Take random rollouts that give enough consecutive steps for the test, if an error exceeds its tolerance. With
+    snapshots none are needed, because they keep the past."""
+    definition, judged = round.definition, round.judged
+    if not round.may_examine or definition.snapshots or round.request.pending_rollouts:
+        return None
+    if all(agrees(c, t) for c, t in zip(judged.confidences[:-1], judged.tolerances, strict=False)):
+        return None
+    length = min(LENGTH, definition.max_rollout or 1)
+    if length < 2:
+        return None
+    lacking = pairs_lacking(definition, round.samples)
+    count = min(-(-lacking // (length - 1)), round.room // length)
+    if not count:
+        return None
+    sequences = random_sequences(definition, count, length, round.generator())
+    return Chosen(rollouts=tuple(Rollout(torch.from_numpy(sequence)) for sequence in sequences))

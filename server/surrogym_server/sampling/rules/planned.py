@@ -1,0 +1,38 @@
+"""Plan rollouts in the model, by the acquisition's value along their paths."""
+
+from __future__ import annotations
+
+from surrogym_server.sampling.rollouts import Aim, plan_round
+from surrogym_server.sampling.round import Round
+from surrogym_server.sampling.rules.rule import Chosen
+
+SHORTEST = 4  # real steps of a round
+
+
+def plan_rollouts(round: Round) -> Chosen:
+    """Plan rollouts for the outputs below their target."""
+    request, judged = round.request, round.judged
+    aim = Aim(
+        columns=round.below_target,
+        tolerances=judged.tolerances,
+        longest=round.definition.max_rollout or 1,
+        snapshots=request.snapshots,
+        states=request.states,
+        ending=judged.reserved is not None,
+        ended=bool(round.samples.terminated.any()),
+    )
+    steps = min(round.room, steps_of_a_round(round)) if round.continues else request.extra
+    unanswered = (*request.pending_rollouts, *request.refused_rollouts)
+    return Chosen(rollouts=tuple(plan_round(round.model, aim, steps, unanswered, round.generator())))
+
+
+def steps_of_a_round(round: Round) -> int:
+    """Return a quarter as many real steps as there are samples, so that plans become longer and fits are few.
+
+    With snapshots, which need no way from a reset, it is half as many, and at least one for each output below its
+    target, as with single steps.
+    """
+    samples = len(round.samples)
+    if round.definition.snapshots:
+        return max(len(round.below_target), samples // 8)
+    return max(SHORTEST, samples // 4)

@@ -1,0 +1,20 @@
+"""Repeat steps, to tell noise from misfit."""
+
+from __future__ import annotations
+
+from surrogym_server.models.guard import plugin_calls
+from surrogym_server.sampling.noise import to_repeat
+from surrogym_server.sampling.round import Round
+from surrogym_server.sampling.rules.rule import Chosen
+
+
+def repeat_steps(round: Round) -> Chosen | None:
+    """Repeat the steps with the largest errors, if they were not repeated yet."""
+    if not round.may_examine:
+        return None
+    with plugin_calls(round.definition):
+        limits = round.definition.tolerances_over(round.default_tolerances)
+        again = to_repeat(round.model, round.samples, limits)
+    if again is None or not round.room:
+        return None
+    return Chosen(again[: round.room])

@@ -1,0 +1,22 @@
+"""Ask the candidates that the acquisition values most (eq. 13)."""
+
+from __future__ import annotations
+
+from surrogym_server.environment.points import Points
+from surrogym_server.sampling.batch import choose
+from surrogym_server.sampling.round import Round
+from surrogym_server.sampling.rules.rule import Chosen
+
+
+def ask_best_candidates(round: Round) -> Chosen:
+    """Choose one query for each output below its target, the least confident first. The first query is a reserved
+    candidate, if there is one."""
+    below, judged, assumed = round.below_target, round.judged, round.request.assumed
+    if round.continues:
+        outputs = below[: round.room]
+    else:
+        outputs = [below[i % len(below)] for i in range(round.request.extra)]
+    taken = Points.joined([Points(round.samples.q, round.samples.u), assumed])
+    candidates = judged.candidates
+    picks = choose(round.model, candidates, taken, assumed, outputs, judged.tolerances, judged.reserved)
+    return Chosen(candidates.points[picks])

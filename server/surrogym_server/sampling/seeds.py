@@ -1,0 +1,12 @@
+"""Random numbers of a design: one independent stream for each purpose, from the design's seed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+
+
+def generator_for(definition: EnvironmentDefinition, purpose: str) -> np.random.Generator:
+    """Return the generator of a purpose. The same seed and purpose give the same numbers."""
+    return np.random.default_rng([definition.design.seed, *purpose.encode()])

@@ -1,0 +1,88 @@
+"""What a round of the design takes: the state that the round before passed on, and what is asked of this one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from surrogym_server.environment.points import Points
+from surrogym_server.sampling.prequential import Predictions, from_pairs, pairs_of
+from surrogym_server.sampling.rollouts import Rollout
+
+Verdict = Literal["continue", "ready", "over_budget", "unsure", "from_log"]
+
+
+@dataclass(frozen=True)
+class DesignState:
+    """State that one round passes to the next; can be written as JSON."""
+
+    round: int = 0
+    usual: tuple[float, ...] = ()  # default tolerances, per output; see ``tolerances``
+    warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # what a fit passes to the next one
+    ended_with: tuple[float, ...] = ()  # steps of the budget, budget, target and tolerances at the end of the design
+    ended_as: str = ""  # the verdict at that end; "" while the design continues
+    ranges: tuple[float, ...] = ()  # of the targets, from which each tolerance was computed
+    predictions: Predictions = ()  # the last ones of each output, of samples that were then learned from
+    tested_at: int = 0  # number of samples when the model became sure and an excursion was planned; 0: it is not sure
+
+    def to_json(self) -> dict[str, Any]:
+        warm = {key: array.tolist() for key, array in self.warm.items()}
+        ended, ranges = list(self.ended_with), list(self.ranges)
+        fields = {"round": self.round, "usual": list(self.usual), "ranges": ranges, "warm": warm, "ended_with": ended}
+        fields["ended_as"] = self.ended_as
+        return fields | {"predictions": pairs_of(self.predictions), "tested_at": self.tested_at}
+
+    @classmethod
+    def from_json(cls, state: dict[str, Any]) -> DesignState:
+        warm = {key: np.array(array) for key, array in state.get("warm", {}).items()}
+        usual, ended, ranges = (tuple(state.get(name, ())) for name in ("usual", "ended_with", "ranges"))
+        predictions, tested_at = from_pairs(state.get("predictions", [])), state.get("tested_at", 0)
+        ended_as = state.get("ended_as", "")
+        return cls(state.get("round", 0), usual, warm, ended, ended_as, ranges, predictions, tested_at)
+
+
+@dataclass(frozen=True)
+class Request:
+    """Input of a round.
+
+    Pending queries, open or set aside, are treated as answered. They count towards the budget, so that a design whose
+    queries all fail comes to an end, and in the acquisition, so that the next queries go elsewhere. Queries that the
+    environment refused count in the acquisition alone, because no real step was taken.
+    """
+
+    budget: int
+    target: float
+    pending: Points  # p
+    extra: int = 0  # real steps to choose even if the design has ended
+    states: Tensor | None = None  # (v, C) visited by policies
+    pending_rollouts: tuple[Rollout, ...] = ()
+    snapshots: Tensor | None = None  # (s, C) states to which the environment can return
+    logged: int = 0  # of the samples, from a log
+    audited: int = 0  # of the samples, steps of audits
+    unlearned: int = 0  # further real steps, whose lags were not known
+    open: int = 0  # real steps of the pending queries that may still be answered
+    refused: Points | None = None  # queries that the environment refused
+    refused_rollouts: tuple[Rollout, ...] = ()
+    surprises: Predictions = ()  # predictions of the samples that the last model had not learned from
+
+    @property
+    def free(self) -> int:
+        """Number of samples that don't count towards the budget, less the real steps that are no samples."""
+        return self.logged + self.audited - self.unlearned
+
+    @property
+    def assumed(self) -> Points:
+        """Queries without an answer, which the acquisition treats as answered."""
+        return self.pending if self.refused is None else Points.joined([self.pending, self.refused])
+
+    def is_mostly_refused(self, spent: float) -> bool:
+        """Whether the environment refused as many steps as it has taken, ``spent``, and the budget has in addition.
+
+        Without this limit, a design whose queries are all refused would never end.
+        """
+        steps = (0 if self.refused is None else len(self.refused)) + sum(map(len, self.refused_rollouts))
+        return steps >= self.budget + spent
