@@ -120,7 +120,7 @@ def command(
     policy: Annotated[
         str, typer.Argument(metavar="POLICY", help="Policy file, or a stored policy such as pendulum@production.")
     ],
-    target: Annotated[str, typer.Option(help="What to write: c, arduino.")],
+    target: Annotated[str, typer.Option(help="What to write: c, arduino, onnx.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write, new or empty.")],
     spec: SpecFile = None,
     *,

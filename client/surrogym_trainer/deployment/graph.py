@@ -1,0 +1,168 @@
+"""A controller's network in ONNX, with a description inside: names, order, units, scales and limits.
+
+Shapes: N rows, D observation entries, A outputs, F action entries.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_trainer.deployment.c.files import prefix_of
+from surrogym_trainer.deployment.controller import Controller, Observed, Remembered
+from surrogym_trainer.policies.onnx_files import INPUT, OUTPUT
+
+OPSET = 17
+IR_VERSION = 9  # onnxruntime 1.20 reads it
+KEY = "surrogym"  # of the metadata
+
+
+def write(controller: Controller, folder: Path) -> None:
+    """Write ``NAME.onnx``: observation (N, D) to action (N, F), float32, or int64 for a discrete action.
+
+    Raises:
+        ModuleNotFoundError: the extra ``export`` is missing.
+    """
+    import onnx
+
+    model = _model(controller)
+    onnx.checker.check_model(model)
+    (folder / f"{prefix_of(controller)}.onnx").write_bytes(model.SerializeToString())
+
+
+def description(controller: Controller) -> dict[str, Any]:
+    """Return what a program must know to use the network, as JSON."""
+    names, decision = controller.coordinates, controller.decision
+    choices: tuple[int | None, ...] = decision.counts or (None,) * len(controller.low)
+    return {
+        "measurements": [
+            {"name": m.name, "unit": m.unit, "angle": m.angle, "low": _finite(m.low), "high": _finite(m.high)}
+            for m in controller.measurements
+        ],
+        "lags": [{"name": lag.name, "is": _lag(lag, names), "start": lag.start} for lag in controller.lags],
+        "observation": [
+            {"name": o.name, "unit": o.unit, "is": _term(o, names), "low": _finite(o.smallest)}
+            | {"high": _finite(o.largest), "mean": float(mean), "deviation": float(deviation)}
+            for o, mean, deviation in zip(controller.observation, decision.mean, decision.deviation, strict=True)
+        ],
+        "action": [
+            {"low": float(low), "high": float(high), "choices": n, "fallback": float(fallback)}
+            for low, high, n, fallback in zip(
+                controller.low, controller.high, choices, controller.fallback, strict=True
+            )
+        ],
+        "scaling": "inside: give observations in their units; actions come in theirs, within low and high",
+        "sampling_period": controller.period,
+        "timeout": _finite(controller.timeout),
+        "sha256": controller.digests,
+    }
+
+
+def _model(controller: Controller) -> Any:
+    from onnx import TensorProto, helper, numpy_helper
+
+    decision, graph = controller.decision, _Graph()
+    x = graph.add("Div", graph.add("Sub", INPUT, decision.mean), decision.deviation)
+    if np.isfinite(decision.clip):
+        x = graph.add("Clip", x, np.array(-decision.clip), np.array(decision.clip))
+    for layer in decision.layers:
+        x = graph.add("Add", graph.add("MatMul", x, layer.weights), layer.bias)
+        if layer.activation != "none":
+            x = graph.add({"tanh": "Tanh", "relu": "Relu"}[layer.activation], x)
+    if decision.counts:
+        x, kind = _chosen(graph, x, controller)
+    else:
+        shown = graph.add("Tanh", x) if decision.squash else x
+        scaled = graph.add("Add", graph.add("Mul", shown, decision.reach), decision.centre)
+        x, kind = graph.add("Min", graph.add("Max", scaled, controller.low), controller.high), TensorProto.FLOAT
+    graph.nodes.append(helper.make_node("Identity", [x], [OUTPUT]))
+    about = description(controller)
+    order = ", ".join(entry["name"] for entry in about["observation"])
+    d, f = len(controller.observation), len(controller.low)
+    made = helper.make_graph(
+        graph.nodes,
+        "controller",
+        [helper.make_tensor_value_info(INPUT, TensorProto.FLOAT, ["N", d], doc_string=order)],
+        [helper.make_tensor_value_info(OUTPUT, kind, ["N", f])],
+        [numpy_helper.from_array(array, name) for name, array in graph.arrays.items()],
+    )
+    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", OPSET)], producer_name=KEY)
+    model.ir_version = IR_VERSION
+    model.doc_string = f"Controller of {controller.name}. Metadata {KEY!r} has order, units, scales and limits as JSON."
+    helper.set_model_props(model, {KEY: json.dumps(about)})
+    return model
+
+
+def _chosen(graph: _Graph, scores: str, controller: Controller) -> tuple[str, int]:
+    """Add the choice of each group of outputs. Bins become continuous values, numbers stay."""
+    from onnx import TensorProto
+
+    counts, first, chosen = controller.decision.counts, 0, []
+    for count in counts:
+        where = [np.array([i], dtype=np.int64) for i in (first, first + count, 1)]  # starts, ends, axes
+        group = graph.add("Slice", scores, *where)
+        chosen.append(graph.add("ArgMax", group, axis=1, keepdims=1))
+        first += count
+    index = graph.add("Concat", *chosen, axis=1)
+    step = (controller.high - controller.low) / (np.array(counts) - 1)
+    if (controller.low == 0).all() and (step == 1).all():
+        return index, TensorProto.INT64
+    scaled = graph.add("Mul", graph.add("Cast", index, to=TensorProto.FLOAT), step)
+    return graph.add("Add", scaled, controller.low), TensorProto.FLOAT
+
+
+class _Graph:
+    """Nodes and arrays of a graph that grows."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Any] = []
+        self.arrays: dict[str, NDArray[Any]] = {}
+
+    def add(self, operator: str, *inputs: str | NDArray[Any], **attributes: Any) -> str:
+        """Add a node, and return the name of its output. Floats are stored as float32."""
+        from onnx import helper
+
+        names = [given if isinstance(given, str) else self._array(given) for given in inputs]
+        output = f"{operator.lower()}{len(self.nodes)}"
+        self.nodes.append(helper.make_node(operator, names, [output], **attributes))
+        return output
+
+    def _array(self, array: NDArray[Any]) -> str:
+        name = f"array{len(self.arrays)}"
+        self.arrays[name] = array if array.dtype.kind == "i" else array.astype(np.float32)
+        return name
+
+
+def _term(entry: Observed, names: tuple[str, ...]) -> str:
+    """Return how an entry of the observation is computed, in words: "cos(angle)"."""
+    parts = []
+    for part in entry.parts:
+        inner = " + ".join(names[place] if w == 1 else f"{w!r} * {names[place]}" for place, w in part.weights)
+        value = {"one": "", "linear": inner, "sin": f"sin({inner})", "cos": f"cos({inner})"}[part.function]
+        factor = repr(part.coefficient)
+        parts.append(factor if not value else value if part.coefficient == 1 else f"{factor} * ({value})")
+    total = " + ".join(parts)
+    if np.isinf(entry.low) and np.isinf(entry.high):
+        return total
+    return f"clip({total}, {entry.low!r}, {entry.high!r})"
+
+
+def _lag(lag: Remembered, names: tuple[str, ...]) -> str:
+    """Return what a lag repeats, in words."""
+    match lag.kind:
+        case "action":
+            return f"entry {lag.source} of the last action"
+        case "steps":
+            return "steps since the reset"
+        case "value":
+            return f"{names[lag.source]} one step before"
+        case "change":
+            return f"change of {names[lag.source]} in the last step" + (", by at most half a turn" if lag.angle else "")
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
