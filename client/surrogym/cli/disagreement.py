@@ -192,8 +192,9 @@ def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, imag
     if not steps:
         return Differing(Disagreements(0, (), {}), first_seed, changed=result.varied, left_out=left_out)
     beside = compared(api, view.spec, view, steps)
-    changes = None if view.spec.design.preset == "paper" else partial(imagining.changes, api, view)
-    effects, share = effects_of(view.spec, beside, changes)  # preset paper moves observations, which take no residual
+    takes_residual = view.spec.preset.moves == "coordinates"  # moved observations take none
+    changes = partial(imagining.changes, api, view) if takes_residual else None
+    effects, share = effects_of(view.spec, beside, changes)
     explaining = tuple(steps[i] for i in np.argsort(-share).tolist() if share[i] > 0)
     found = replace(disagreements(steps, beside), shared=explaining)
     return Differing(found, first_seed, effects=tuple(effects), changed=result.varied, left_out=left_out)

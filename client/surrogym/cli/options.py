@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -87,7 +87,6 @@ Tolerances = Annotated[
     ),
 ]
 StepLimit = Annotated[float, typer.Option(min=0.001, help="Seconds that one real step, or one reset, may take.")]
-Preset = Literal["default", "paper"]
 DESCRIBED = ("real_steps", "resets", "found", "asked", "specification")  # entries of what surrogym describe writes
 
 

@@ -15,13 +15,13 @@ import typer
 from surrogym.cli.groups import Output, Service, add
 from surrogym.cli.options import (
     NAMES,
-    Preset,
     SpecFile,
     Tolerances,
     Wait,
     read_spec_file,
     read_tolerances,
 )
+from surrogym_shared.presets import PresetName
 
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
@@ -39,7 +39,7 @@ class DesignChoices:
     """Options that replace parts of the environment's own specification; None keeps a part."""
 
     preset: Annotated[
-        Preset | None,
+        PresetName | None,
         typer.Option(
             help="Settings of the method: default, or paper for the method as published. [default: from the "
             "specification]"

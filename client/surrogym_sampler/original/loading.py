@@ -8,7 +8,7 @@ import shlex
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 from surrogym_sampler.original.actions import require_same_action
 from surrogym_sampler.original.adapters import adapter_of, is_trusted, open_simulator
@@ -23,9 +23,9 @@ from surrogym_sampler.original.protocol import LONGEST_EPISODE, Environment
 from surrogym_sampler.original.rollouts import answering
 from surrogym_sampler.original.simulator import Simulated
 from surrogym_shared.environments import is_name, is_same
+from surrogym_shared.presets import PresetName
 from surrogym_shared.spec import Access, BoxAction, EnvironmentSpec
 
-Preset = Literal["default", "paper"]
 Choose = Callable[[EnvironmentSpec], EnvironmentSpec]
 ACCESS: dict[Access, dict[str, Any]] = {  # fields of a specification
     "any": {"query": "step", "snapshots": False},
@@ -43,7 +43,7 @@ def make(
     name: str,
     *,
     spec: EnvironmentSpec | None = None,
-    preset: Preset | None = None,
+    preset: PresetName | None = None,
     budget: int | None = None,
     initial: int | None = None,
     target: float | None = None,

@@ -328,8 +328,8 @@ def way_of(subject: Subject, episodes: int, steps: int, start_box: float = 0.0) 
 def _not_possible(subject: Subject) -> str | None:
     """Return why no audit is possible; None if one is."""
     view = subject.api.surrogate(subject.name)
-    if view.spec.design.preset == "paper":
-        return "preset paper has no audits"
+    if not view.spec.preset.audits:
+        return f"preset {view.spec.preset.name} has no audits"
     if not view.samplers:
         return NO_SAMPLER
     return "the design is paused" if view.paused else None

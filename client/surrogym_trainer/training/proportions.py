@@ -17,7 +17,7 @@ def suggested_gamma(spec: EnvironmentSpec) -> float:
 
 def explores_further(spec: EnvironmentSpec) -> bool:
     """Whether a network that follows an abandoned one explores by noise that lasts: for continuous actions."""
-    return not counts_of(spec) and spec.design.preset != "paper"
+    return not counts_of(spec) and spec.preset.adapts_training
 
 
 def even_batch(rollout: int) -> int:

@@ -143,7 +143,7 @@ def with_algorithm(settings: TrainSettings, spec: EnvironmentSpec) -> TrainSetti
     by_reference = (
         settings.tracker is not None
         or not known.issuperset(settings.hyperparameters)
-        or spec.design.preset == "paper"
+        or spec.preset.algorithm == REFERENCE
         or (start is not None and not Network.is_at(start))
     )
     return replace(settings, algorithm=REFERENCE if by_reference else FAST)

@@ -93,7 +93,7 @@ def chosen_for(view: SurrogateView, settings: TrainSettings, *, by_mean: bool = 
         settings: settings that the user chose.
         by_mean: whether the search moves by the mean without noise, whatever the session's variant.
     """
-    if view.spec.design.preset == "paper":
+    if not view.spec.preset.adapts_training:
         return settings
     if view.spec.outside_reward is not None and settings.start_box is None:
         settings = replace(settings, start_box=0.0)
@@ -120,7 +120,7 @@ def prolongs(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
     """
     if settings.prolong is not None:
         return settings.prolong
-    return settings.total_steps is None and spec.design.preset != "paper"
+    return settings.total_steps is None and spec.preset.adapts_training
 
 
 def with_folder(settings: TrainSettings, out: Path) -> TrainSettings:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 from surrogym_server.environment import conditions, declared_reward, distributions, terms
 from surrogym_server.environment import definition as core
@@ -14,9 +13,7 @@ from surrogym_server.plugins import Choice
 from surrogym_server.sampling.acquisition import check_acquisition
 from surrogym_shared import spec as wire
 
-PENALTY = {"default": 0.0, "paper": 3.0}  # k of eq. 14
 MONTE_CARLO = 1024
-HYPERCUBE_TRIES = 50
 LONGEST_ROLLOUT = 200  # if the specification has none
 
 
@@ -67,66 +64,46 @@ def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
 
 
 def default_budget(spec: wire.EnvironmentSpec) -> int:
-    """Default for the design's real steps.
-
-    In preset default ten for each dimension, or twenty if the environment can't be set to a state. In preset paper
-    three times the initial design (the paper needed 125 and 120 in all after 40 and 50).
-    """
+    """Return the budget of the design: the specification's, or the preset's."""
     if spec.design.budget is not None:
         return spec.design.budget
     initial = _design(spec).initial
-    if spec.design.preset == "paper":
-        return 3 * initial
-    per_dimension = 10 if spec.query == "step" else 20
-    return max(per_dimension * (len(spec.coordinates) + spec.action.size), initial)
+    return spec.preset.budget(initial, len(spec.coordinates), spec.action.size, spec.query == "step")
 
 
 def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
-    design, paper = spec.design, spec.design.preset == "paper"
-    if paper:  # 10 (D + F), section 3.1
-        initial = 10 * (len(spec.observation) + spec.action.size)
-    elif spec.query == "step" or spec.snapshots:
-        initial = max(4, len(spec.coordinates) + spec.action.size)
-    else:
-        initial = 4 * (len(spec.coordinates) + spec.action.size)
-    if design.initial is not None:
-        initial = design.initial
+    design, preset = spec.design, spec.preset
+    by_steps = spec.query == "step" or spec.snapshots
+    initial = design.initial
+    if initial is None:
+        sizes = len(spec.coordinates), len(spec.observation), spec.action.size
+        initial = preset.initial_steps(*sizes, by_steps)
     if design.budget:
         initial = min(initial, design.budget)
     return core.DesignDefinition(
         initial=initial,
-        hypercube_tries=1 if paper else HYPERCUBE_TRIES,
-        acquisition=_choice(design.acquisition, "uncertainty_index" if paper else "integrated_variance"),
-        tolerance=design.tolerance or ("raw" if paper else "relative"),
+        hypercube_tries=preset.hypercube_tries,
+        acquisition=_choice(design.acquisition, preset.acquisition),
+        tolerance=design.tolerance or preset.tolerance,
         monte_carlo=design.monte_carlo or MONTE_CARLO,
-        visited_candidates=not paper,
-        input_probability="predicted" if paper else "uniform",
-        stopping="confidence" if paper else "tested_confidence",
+        visited_candidates=preset.visited_candidates,
+        input_probability=preset.input_probability,
+        stopping=preset.stopping,
         seed=design.seed,
     )
 
 
 def _learning(spec: wire.EnvironmentSpec) -> core.LearningDefinition:
-    moves: Literal["observation", "coordinates"] = "observation" if spec.design.preset == "paper" else "coordinates"
-    return core.LearningDefinition(_model(spec.design), moves, limits_rewards=spec.design.preset != "paper")
+    return core.LearningDefinition(_model(spec), spec.preset.moves, limits_rewards=spec.preset.limits_rewards)
 
 
-def _model(design: wire.Design) -> Choice:
+def _model(spec: wire.EnvironmentSpec) -> Choice:
     """The family of models. The preset chooses the settings of Gaussian processes that the specification
     leaves open."""
-    choice, paper = in_full(_choice(design.model, GAUSSIAN_PROCESS)), design.preset == "paper"
+    choice = in_full(_choice(spec.design.model, GAUSSIAN_PROCESS))
     if choice.name == GAUSSIAN_PROCESS:
-        kernel = "squared_exponential" if paper else "composite"
-        preset: dict[str, float | bool | str] = {
-            "kernel": kernel,
-            "reward_jumps": not paper,
-            "reward_peaks": not paper,
-            "rates": not paper,
-            "drop_inputs": not paper,
-            "repeated_parts": not paper,
-            "symmetry": design.symmetry,
-        }
-        choice = Choice(choice.name, tuple({**preset, **dict(choice.settings)}.items()))
+        settings = {**spec.preset.gaussian_process, "symmetry": spec.design.symmetry, **dict(choice.settings)}
+        choice = Choice(choice.name, tuple(settings.items()))
     return choice
 
 
@@ -183,7 +160,7 @@ def _term(term: wire.Term, names: tuple[str, ...]) -> terms.Term:
 def _penalty(spec: wire.EnvironmentSpec) -> float:
     if isinstance(spec.reward, wire.DeclaredReward):
         return 0.0
-    return _or(spec.reward.penalty, PENALTY[spec.design.preset])
+    return _or(spec.reward.penalty, spec.preset.penalty)
 
 
 def _declared_reward(spec: wire.EnvironmentSpec) -> declared_reward.DeclaredReward | None:

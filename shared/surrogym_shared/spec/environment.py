@@ -9,6 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BeforeValidator, Field, StrictBool, StrictFloat, StrictInt, StrictStr, model_validator
 
 from surrogym_shared.checks import SHOWN, Number, Positive, require, require_known, require_unique
+from surrogym_shared.presets import PRESETS, Preset, PresetName
 from surrogym_shared.spec.actions import Action
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, MAX_STARTS, REWARD, Frozen, Name
 from surrogym_shared.spec.coordinates import Coordinate, StartDistribution, limits
@@ -72,7 +73,7 @@ class Design(Frozen):
     ``monte_carlo``: number of points that estimate the confidence index (eq. 8).
     """
 
-    preset: Literal["default", "paper"] = "default"
+    preset: PresetName = "default"
     budget: Annotated[int, Field(ge=0, le=100_000, strict=True)] | None = None
     initial: Annotated[int, Field(ge=2, le=100_000, strict=True)] | None = None
     target: Annotated[float, Field(gt=0.5, lt=1, strict=True)] = 0.999
@@ -152,6 +153,11 @@ class EnvironmentSpec(Frozen):
         """Number of first steps of an episode that a model does not learn from, because lags are not known yet."""
         return max(c.counted for c in self.coordinates)
 
+    @property
+    def preset(self) -> Preset:
+        """The preset that chooses what is left open."""
+        return PRESETS[self.design.preset]
+
     def known(self, coordinates: Sequence[float]) -> bool:
         """Whether the lags of coordinates (C,) are known, so that a model learns from a step that begins there."""
         return all(q >= c.counted for c, q in zip(self.coordinates, coordinates, strict=True) if c.counted)
@@ -161,7 +167,7 @@ class EnvironmentSpec(Frozen):
         names = self.coordinate_names
         require_unique("coordinate", names)
         require_unique("observation", self.observation_names)
-        outputs = names if self.design.preset == "default" else (*names, *self.observation_names)
+        outputs = names if self.preset.moves == "coordinates" else (*names, *self.observation_names)
         require(REWARD not in outputs, f"a coordinate or observation entry must not be called {REWARD!r}")
         require_known("start", self.start, names)
         missing = [n for n in names if n not in self.start]
@@ -169,7 +175,7 @@ class EnvironmentSpec(Frozen):
         moving = [c.name for c in self.coordinates if c.moves]
         require(bool(moving), "expected at least one coordinate that moves (linear or angle)")
         self._require_lags()
-        learned = moving if self.design.preset == "default" else self.observation_names
+        learned = moving if self.preset.moves == "coordinates" else self.observation_names
         require_known("tolerances", self.tolerances, (*learned, REWARD))
         for c in self.coordinates:
             if c.bounds is not None:
@@ -206,8 +212,8 @@ class EnvironmentSpec(Frozen):
             f"snapshots need query 'rollout', got {self.query!r}: any state can be set",
         )
         require(
-            self.query == "step" or self.design.preset != "paper",
-            "preset 'paper' starts from a Latin hypercube over states: expected query 'step', got 'rollout'",
+            self.query == "step" or self.preset.takes_rollouts,
+            f"preset {self.preset.name!r} starts at a Latin hypercube of states: expected query 'step', got 'rollout'",
         )
         require(self.design.budget != 1, "design: expected a budget of 2 or more real steps, or 0 for none, got 1")
         if self.design.budget and self.design.initial is not None:
@@ -264,7 +270,8 @@ class EnvironmentSpec(Frozen):
             f"reward: expected {self.action.size} weights of the action, got {sorted(lengths)}",
         )
         require(
-            self.design.preset == "default", "preset 'paper' learns its reward: expected a reward of kind 'learned'"
+            self.preset.takes_declared_rewards,
+            f"preset {self.preset.name!r} learns its reward: expected a reward of kind 'learned'",
         )
 
     def _require_stoppable(self, name: str, stopped: str) -> None:

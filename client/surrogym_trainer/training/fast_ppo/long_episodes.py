@@ -37,7 +37,7 @@ def with_short_episodes(task: SearchTask, rollout: int) -> SearchTask:
     ways = settings.start_box, settings.start_visited, settings.horizon
     chosen = any(way is not None for way in ways) or not {"time_limit", "start_box"}.isdisjoint(settings.session)
     limit = spec.time_limit or 0
-    if chosen or spec.termination != () or limit <= LONG * rollout or spec.design.preset == "paper":
+    if chosen or spec.termination != () or limit <= LONG * rollout or not spec.preset.adapts_training:
         return task
     length = limit // SHORTER
     session = {**settings.session, "time_limit": length}

@@ -356,8 +356,8 @@ def _starts_from_reference(settings: TrainSettings) -> bool:
 
 
 def units_of(spec: EnvironmentSpec) -> tuple[int, ...]:
-    """Return the numbers of units in the actor's hidden layers: the paper's for its preset, else two wider layers."""
-    return WIDER if spec.design.preset == "default" else (HIDDEN,)
+    """Return the numbers of units in the actor's hidden layers: two wider layers, or the paper's one."""
+    return WIDER if spec.preset.wide_networks else (HIDDEN,)
 
 
 def _saved(learner: Learner) -> LearnedNetwork:

@@ -25,7 +25,7 @@ class OnPolicySearch(StableBaselinesSearch):
     policy = PaperPolicy
 
     def network(self, spec: EnvironmentSpec) -> dict[str, Any]:
-        return {"net_arch": WIDER} if spec.design.preset == "default" else {}
+        return {"net_arch": WIDER} if spec.preset.wide_networks else {}
 
 
 class OffPolicySearch(StableBaselinesSearch):
