@@ -52,7 +52,7 @@ LASTING = ("slow", "e2e", "timeout")  # marks; a limit of its own is one of more
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark what ``long.toml`` lists. Files with tests that take long come first: one that begins last leaves the other
     workers with nothing to do."""
-    nodes = {item: item.path.relative_to(TESTS).as_posix() + item.nodeid[item.nodeid.index("::") :] for item in items}
+    nodes = {item: os.path.relpath(item.path, TESTS) + item.nodeid[item.nodeid.index("::") :] for item in items}
     listed = lines()
     for item, node in nodes.items():
         if any(line.names(node) for line in listed):

@@ -35,7 +35,6 @@ FAULTS, HOSTS, PATIENCE = times(short=1, full=20), 2, 120.0
 ENVIRONMENT = {"SURROGYM_RAY_LEASE_SECONDS": "3"}
 
 pytestmark = [
-    pytest.mark.long,
     pytest.mark.postgresql,
     pytest.mark.timeout(3_600),
     pytest.mark.filterwarnings("ignore::FutureWarning:ray"),

@@ -91,7 +91,7 @@ def judge(api: Api, name: str, reported: dict[str, int], ends: int, noted: Count
     ("plant", "crashes", "queries"),
     [
         pytest.param(cartpole, 5, 24, id="few"),
-        pytest.param(program, 1_000, 200, id="thousand", marks=pytest.mark.long),  # its models are fitted fast
+        pytest.param(program, 1_000, 200, id="thousand"),  # its models are fitted fast
     ],
 )
 def test_crashes_of_a_program_lose_nothing(

@@ -28,7 +28,6 @@ LATEST = 1.0  # seconds until a kill, after all have made progress since the las
 FRONT_SECONDS = 5.0  # from one kill of a front server to the next
 
 pytestmark = [
-    pytest.mark.long,
     pytest.mark.postgresql,
     pytest.mark.timeout(7_200),
     pytest.mark.skipif(program() is None, reason="HAProxy is not on this machine: apt-get install haproxy"),

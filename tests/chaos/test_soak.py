@@ -71,7 +71,6 @@ def steps(envs: list[SurrogateVecEnv], enough: threading.Event) -> list[float]:
 
 
 @pytest.mark.timeout(1_200)
-@pytest.mark.long
 def test_a_long_time_under_load(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     with running_server(tmp_path) as server, ExitStack() as stack:
         api = stack.enter_context(Api(server.url))

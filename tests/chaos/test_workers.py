@@ -31,7 +31,7 @@ from surrogym_trainer.work.worker import Worker, WorkerSettings
 Worker(Api(sys.argv[1]), "pendulum", WorkerSettings("killed", Path(sys.argv[2]), lease_seconds=2)).run()
 """
 
-pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.timeout(600)
 
 
 @pytest.fixture

@@ -36,7 +36,6 @@ def running(folder: Path, *words: str) -> Iterator[None]:
 
 
 @pytest.mark.e2e
-@pytest.mark.long
 @pytest.mark.timeout(1_800)
 def test_a_page_alone_leads_to_a_judged_policy_of_ones_own_environment(
     tmp_path: Path, open_page: Open, complaints: list[str]

@@ -19,6 +19,7 @@ pytestmark = [pytest.mark.e2e, pytest.mark.slow]
 
 MARK = "DEMO_TEST_MARK"
 SECONDS = 180.0
+SMALL = ("--budget", "8")
 
 
 class Demo:
@@ -75,7 +76,7 @@ def demo(tmp_path):
 
 def test_a_small_demo_from_start_to_run_folder(demo, tmp_path):
     metrics_file = tmp_path / "metrics.json"
-    small = demo("--budget", "8", "--steps", "17000", "--episodes", "3", "--seed", "1", "--json", str(metrics_file))
+    small = demo(*SMALL, "--steps", "17000", "--episodes", "3", "--seed", "1", "--json", str(metrics_file))
     out, err = small.process.communicate(timeout=SECONDS)
     assert small.process.returncode == 0, err
     assert small.family() == []
@@ -122,7 +123,7 @@ def test_a_small_demo_from_start_to_run_folder(demo, tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_demo_ends_all_its_processes(demo, number):
-    interrupted = demo()
+    interrupted = demo(*SMALL)
     interrupted.await_training()
     assert len(interrupted.family()) >= 5  # the demo, the server, the sampler and its environment, the trainer
     interrupted.await_(lambda: (interrupted.folder / "training.jsonl").stat().st_size > 0)
@@ -137,14 +138,14 @@ def test_an_interrupted_demo_ends_all_its_processes(demo, number):
 
 
 def test_a_killed_demo_leaves_no_process_behind(demo):
-    killed = demo()
+    killed = demo(*SMALL)
     killed.await_training()
     killed.process.kill()
     killed.await_(lambda: killed.family() == [], seconds=60)
 
 
 def test_a_child_that_dies_ends_the_demo_with_its_name(demo):
-    failing = demo()
+    failing = demo(*SMALL)
     failing.await_training()
     (trainer,) = [pid for pid in failing.family() if b"--progress-file" in Path(f"/proc/{pid}/cmdline").read_bytes()]
     os.kill(trainer, signal.SIGKILL)

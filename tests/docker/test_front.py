@@ -21,7 +21,7 @@ from support.ray_cluster import RayCluster
 SCRIPT = Path(__file__).parents[2] / "docker" / "front.sh"
 PATIENCE = 240.0
 
-pytestmark = [pytest.mark.long, pytest.mark.postgresql, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.postgresql, pytest.mark.timeout(600)]
 
 
 def begun_for(head: str) -> list[int]:

@@ -38,7 +38,6 @@ def test_a_surrogate_is_stepped(server: ServerProcess, tmp_path: Path, page: str
     run(tmp_path, "-c", programs(page)[number].replace(PRINTED_URL, server.url))
 
 
-@pytest.mark.long
 def test_a_policy_of_another_algorithm_is_trained_and_its_states_are_known(
     server: ServerProcess, tmp_path: Path
 ) -> None:
@@ -50,7 +49,6 @@ def test_a_policy_of_another_algorithm_is_trained_and_its_states_are_known(
     assert view["budget"] == 7
 
 
-@pytest.mark.long
 def test_a_surrogate_leaves_as_a_file_and_is_stepped_without_a_server(server: ServerProcess, tmp_path: Path) -> None:
     on_server = ["--server", server.url]
     run(tmp_path, "-m", "surrogym", "export", "pendulum", "--out", "pendulum.surrogate", *on_server)
@@ -80,7 +78,6 @@ def test_the_lines_of_the_terminal_page_work(
 
 
 @pytest.mark.timeout(900)  # on a machine that others use as well
-@pytest.mark.long
 def test_a_policy_leaves_for_other_programs(server: ServerProcess, tmp_path: Path) -> None:
     train = ["train", "pendulum", "--steps", "512", "--num-envs", "16", "--quiet", "--server", server.url]
     run(tmp_path, "-m", "surrogym", *train)

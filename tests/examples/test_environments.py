@@ -18,7 +18,6 @@ from surrogym_sampler.original.protocol import RolloutEnvironment
 ENVIRONMENT_LINES = 60  # of one's own environment, without blank ones
 
 
-@pytest.mark.long
 def test_the_drone_is_learned_trained_on_and_evaluated(server: ServerProcess, tmp_path: Path) -> None:
     surrogym(server, tmp_path, "register", "drone:Drone", "--name", "drone", "--budget", "10", "--initial", "10")
     report = surrogym(server, tmp_path, "sample", "drone", "--env", "drone:Drone", "--until-done", "--json")
@@ -33,7 +32,6 @@ def test_the_drone_is_as_short_as_the_docs_say() -> None:
     assert sum(bool(line) for line in lines) <= ENVIRONMENT_LINES
 
 
-@pytest.mark.long
 def test_four_samplers_share_the_queries_of_a_slow_simulator(server: ServerProcess, tmp_path: Path) -> None:
     surrogym(
         server, tmp_path, "register", "slow_simulator:SlowPendulum", "--name", "slow", "--budget", "8", "--initial", "8"
@@ -54,7 +52,6 @@ def test_the_robot_that_can_be_set_to_no_state_is_sampled(server: ServerProcess,
     assert 12 <= json.loads(report)["steps"] <= 14
 
 
-@pytest.mark.long
 def test_an_fmu_is_controlled_by_a_policy_from_its_surrogate(server: ServerProcess, tmp_path: Path) -> None:
     pytest.importorskip("fmpy")
     pytest.importorskip("pythonfmu")

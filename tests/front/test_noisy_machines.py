@@ -39,7 +39,6 @@ def test_a_machine_without_noise_is_ready_without_any():
     assert noise_of(design) == [0, 0]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("name", ["arm", "cart"])
 def test_process_noise_is_found_and_the_rest_is_known(name: str, seed: int):
@@ -48,7 +47,6 @@ def test_process_noise_is_found_and_the_rest_is_known(name: str, seed: int):
     assert noise_of(design) == pytest.approx([0.01, 0.01], rel=0.5)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("name", ["arm", "cart", "pole", "mass"])
 def test_no_noise_is_found_where_there_is_none(name: str):
     assert not any(noise_of(designed(name, noise=0.0, seed=1, budget=40)))

@@ -71,7 +71,7 @@ def surrogate() -> LocalSurrogate:
 
 
 @pytest.mark.parametrize("law", POLICY_SEARCH_LAWS)
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.long) if n == "SAC" else n for n in SEARCHED])
+@pytest.mark.parametrize("name", SEARCHED)
 @pytest.mark.usefixtures("installed")
 def test_every_search_keeps_the_laws(
     surrogate: LocalSurrogate, tmp_path: Path, name: str, law: Callable[[SurrogatePort, TrainSettings, Path], None]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -16,18 +14,17 @@ import httpx
 import pytest
 
 from support import pendulum
-from support.server import ServerProcess, running_server
+from support.server import ServerProcess, refusal, running_server
 
 NAME = "pendulum"
 SECONDS = 60.0
-PLAIN = {"SURROGYM_COMPILED": "0"}  # what is damaged is found as soon without compiling steps first
 
 
 @pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A database that a stopped server has left: with a surrogate, its models and an open session."""
     folder = tmp_path_factory.mktemp("whole")
-    with running_server(folder, **PLAIN) as running, httpx.Client(base_url=running.url, timeout=SECONDS) as client:
+    with running_server(folder) as running, httpx.Client(base_url=running.url, timeout=SECONDS) as client:
         pendulum.teach(client, NAME, seconds=10 * SECONDS)
         client.post(f"/v1/surrogates/{NAME}/sessions", json={"num_envs": 1, "seed": 0}).raise_for_status()
     return folder / "surrogym.db"
@@ -67,7 +64,7 @@ def server(database: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     folder = tmp_path_factory.mktemp("damaged")
     file = Path(shutil.copy(database, folder))
     flip(file, "sessions", "data")
-    with running_server(folder, **PLAIN) as running:
+    with running_server(folder) as running:
         yield running
 
 
@@ -138,9 +135,6 @@ def test_broken_pages_end_the_start_with_one_sentence_and_the_way_out(database: 
     content[4096:8192] = bytes(4096)
     file.write_bytes(content)
     file.chmod(0o600)  # or a line of its own would say that others may read it
-    command = [sys.executable, "-m", "surrogym_server", "serve", "--port", "0", "--database", str(file)]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert ended.returncode == 1
-    [line] = ended.stderr.splitlines()
+    line = refusal(tmp_path, "--port", "0", "--database", str(file))
     assert line.startswith("error: the database is damaged: ")
     assert f"sqlite3 {file} .recover" in line

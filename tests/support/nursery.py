@@ -22,6 +22,7 @@ from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from multiprocessing import context, forkserver
+from pathlib import Path
 from typing import IO, Any
 
 MODULES = (
@@ -38,6 +39,7 @@ MODULES = (
     "scipy.spatial.distance",
     "uvicorn.lifespan.on",
 )
+READ_EARLY = ("SURROGYM_COMPILED",)  # variables that imported modules have read
 LONGEST = 1 << 18  # bytes of a request
 
 
@@ -90,11 +92,17 @@ class Nursery:
     def can_start_in(self, environment: Mapping[str, str]) -> bool:
         """Whether imported modules fit this environment: but for settings of the server it is that of the nursery."""
         differing = {name for name, _ in self._environment.items() ^ environment.items()}
-        return all(name.startswith(("SURROGYM_", "PYTEST_")) for name in differing)
+        return all(name.startswith(("SURROGYM_", "PYTEST_")) and name not in READ_EARLY for name in differing)
 
-    def start(self, arguments: Sequence[str], log: IO[bytes], environment: Mapping[str, str]) -> Forked:
-        """Run ``python -m surrogym_server ARGUMENTS`` in this folder, with its output in ``log``."""
-        request = {"arguments": arguments, "environment": dict(environment), "folder": os.getcwd()}
+    def start(self, arguments: Sequence[str], log: IO[bytes], environment: Mapping[str, str], folder: Path) -> Forked:
+        """Run ``python -m surrogym_server ARGUMENTS`` in a folder, with its output in ``log``."""
+        os.umask(umask := os.umask(0o077))
+        request = {
+            "arguments": arguments,
+            "environment": dict(environment),
+            "folder": str(folder),
+            "umask": umask,
+        }
         status, theirs = os.pipe()
         socket.send_fds(self._asked, [json.dumps(request).encode()], [log.fileno(), theirs])
         os.close(theirs)
@@ -143,14 +151,19 @@ def main(asked: socket.socket) -> None:
                 asked.send(str(pid).encode())
 
 
-def _fork_fits() -> None:
-    """Let processes of fits be forks as well, of a second process that has imported what they need."""
+def contexts_of_forks() -> dict[str, Any]:
+    """The ways of ``multiprocessing`` to start a process; "spawn" forks one that has imported what a fit needs."""
     forkserver.set_forkserver_preload([*MODULES])
     forkserver.ensure_running()
+    contexts: dict[str, Any] = context._concrete_contexts  # type: ignore[attr-defined]
+    return contexts | {"spawn": contexts["forkserver"]}
+
+
+def _fork_fits() -> None:
+    contexts = contexts_of_forks()
     server: Any = forkserver._forkserver  # type: ignore[attr-defined]
     server.ensure_running = lambda: None  # it is no child of the forks, which therefore can't ask for its state
-    contexts: Any = context._concrete_contexts  # type: ignore[attr-defined]
-    contexts["spawn"] = contexts["forkserver"]
+    context._concrete_contexts = contexts  # type: ignore[attr-defined]
 
 
 def _tell(end: int, pid: int, status: int) -> None:
@@ -162,7 +175,8 @@ def _tell(end: int, pid: int, status: int) -> None:
     os.close(end)
 
 
-def _run(log: int, arguments: list[str], environment: dict[str, str], folder: str) -> None:
+def _run(log: int, arguments: list[str], environment: dict[str, str], folder: str, umask: int) -> None:
+    os.umask(umask)
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(folder)

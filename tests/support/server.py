@@ -55,7 +55,7 @@ def start_server(
     ready.unlink(missing_ok=True)
     defaults = ["--port", "0", "--database", str(folder / "surrogym.db"), "--ready-file", str(ready)]
     kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
-    process = _process(folder / "server.log", program, ["serve", *defaults, *options], kept | environment)
+    process = _process(folder / "server.log", program, ["serve", *defaults, *options], kept | environment, Path.cwd())
     deadline = time.monotonic() + STARTING_SECONDS
     while not ready.exists():
         if process.poll() is not None or time.monotonic() > deadline:
@@ -65,23 +65,31 @@ def start_server(
     return ServerProcess(ready.read_text(), process, folder)
 
 
+def ended(folder: Path, *arguments: str, **environment: str) -> tuple[int, str]:
+    """Exit status and output of ``python -m surrogym_server ARGUMENTS``, run to its end in a folder."""
+    log = folder / "program.log"
+    log.unlink(missing_ok=True)
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
+    status = _process(log, None, list(arguments), kept | environment, folder).wait(STARTING_SECONDS)
+    return status, log.read_text()
+
+
 def refusal(folder: Path, *options: str, **environment: str) -> str:
     """The one sentence with which ``surrogym serve`` refuses to start."""
-    log = folder / "refusal.log"
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
-    assert _process(log, None, ["serve", *options], kept | environment).wait(STARTING_SECONDS) == 1
-    (line,) = log.read_text().strip().splitlines()
+    status, said = ended(folder, "serve", *options, **environment)
+    assert status == 1, said
+    (line,) = said.strip().splitlines()
     return line
 
 
 def _process(
-    path: Path, program: Sequence[str] | None, arguments: list[str], environment: dict[str, str]
+    path: Path, program: Sequence[str] | None, arguments: list[str], environment: dict[str, str], folder: Path
 ) -> subprocess.Popen[bytes] | Forked:
     with path.open("ab") as log:
         if program is None and (forking := nursery()) is not None and forking.can_start_in(environment):
-            return forking.start(arguments, log, environment)
+            return forking.start(arguments, log, environment, folder)
         command = [sys.executable, *(program or COLD), *arguments]
-        return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
+        return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, cwd=folder)
 
 
 @contextmanager

@@ -105,7 +105,6 @@ def test_it_is_not_prolonged(surrogate, tmp_path: Path):
     assert not is_prolonged(small(total_steps=None), pendulum())
 
 
-@pytest.mark.long
 def test_a_goal_far_from_the_start_is_found(tmp_path: Path):
     """Whole policies explore: noise on each action leads nowhere here."""
     surrogate = local(mountain_car_continuous())

@@ -200,7 +200,6 @@ def test_a_worker_that_is_stopped_keeps_the_best_policy(api: Api, tmp_path: Path
 
 
 @pytest.mark.e2e
-@pytest.mark.long
 def test_ctrl_c_keeps_the_best_policy_and_says_so(api: Api, tmp_path: Path):
     id = api.jobs.add(NAME, LONG).id
     command = [sys.executable, "-m", "surrogym", "work", NAME, "--folder", str(tmp_path), "--server", api.url]

@@ -1,14 +1,13 @@
 """``surrogym optimise``: from files to a policy and its card; what can't be optimised is one sentence."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from support.models import learn
 from support.real_steps import random_steps
+from support.server import ended
 from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.models.files import to_bytes
@@ -16,9 +15,8 @@ from surrogym_shared.network import Network
 from surrogym_trainer.policies import read_card
 
 
-def optimise(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "surrogym_server", "optimise", "--spec", "spec.json", "--model", "m.safetensors"]
-    return subprocess.run([*command, *options], cwd=folder, capture_output=True, text=True, check=False)
+def optimise(folder: Path, *options: str) -> tuple[int, str]:
+    return ended(folder, "optimise", "--spec", "spec.json", "--model", "m.safetensors", *options)
 
 
 def export(folder: Path, spec) -> None:
@@ -29,10 +27,10 @@ def export(folder: Path, spec) -> None:
 
 def test_a_policy_and_its_card_are_written(tmp_path: Path):
     export(tmp_path, pendulum())
-    said = optimise(tmp_path, "--updates", "2", "--horizon", "3", "--seed", "4")
-    assert said.returncode == 0, said.stderr
-    assert "optimise: 2 of 2 updates" in said.stderr
-    assert "next: surrogym evaluate policy.zip" in said.stdout
+    status, said = optimise(tmp_path, "--updates", "2", "--horizon", "3", "--seed", "4")
+    assert status == 0, said
+    assert "optimise: 2 of 2 updates" in said
+    assert "next: surrogym evaluate policy.zip" in said
     policy = tmp_path / "policy.zip"
     assert Network.is_at(policy)
     card = read_card(policy)
@@ -44,9 +42,9 @@ def test_a_policy_and_its_card_are_written(tmp_path: Path):
 def test_an_impossible_optimisation_is_refused_in_one_sentence(tmp_path: Path, missing: bool):
     if not missing:
         export(tmp_path, cartpole())
-    said = optimise(tmp_path)
-    assert said.returncode == 1
-    error = said.stderr.splitlines()[-1]
+    status, said = optimise(tmp_path)
+    assert status == 1
+    error = said.splitlines()[-1]
     assert error.startswith("error: ")
     assert ("spec.json" if missing else "expected continuous actions") in error
     assert not (tmp_path / "policy.zip").exists()

@@ -112,7 +112,6 @@ def test_a_request_that_takes_long_is_waited_for(
     asyncio.run(waited())
 
 
-@pytest.mark.long
 def test_an_opening_is_refused_when_its_host_stops_answering(
     case: EngineCase, postgresql: Postgresql, database: str, monkeypatch: pytest.MonkeyPatch
 ):
@@ -250,7 +249,6 @@ def fronts(
         yield [first.url, second.url]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("number", [0, 1])
 def test_conformance_holds_at_each_front_server(fronts: list[str], number: int):
     outcomes = {outcome.name: outcome.failure for outcome in conformance(fronts[number], None, f"front-{number}")}
@@ -258,7 +256,6 @@ def test_conformance_holds_at_each_front_server(fronts: list[str], number: int):
     assert set(outcomes.values()) == {None}, outcomes
 
 
-@pytest.mark.long
 def test_conformance_holds_while_each_session_alternates_between_two_front_servers(
     fronts: list[str], capsys: pytest.CaptureFixture[str]
 ):
@@ -275,7 +272,6 @@ def test_conformance_holds_while_each_session_alternates_between_two_front_serve
         print(f"\n{len(outcomes)} checks hold; {len(shared)} sessions, {counts} requests at the front servers")
 
 
-@pytest.mark.long
 def test_any_front_server_goes_on_with_a_session(fronts: list[str]):
     action = np.full((2, 1), 0.5)
     with HttpSurrogate(fronts[0], NAME, transport="stream") as port:
@@ -306,7 +302,6 @@ def server(database: str, address: str, engine: SessionEngine, tmp_path: Path) -
         yield running
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("transport", ["stream", "binary"])
 def test_a_client_goes_on_bit_for_bit_while_hosts_are_killed(
     server: ServerProcess, database: str, storage: Storage, transport: Transport
@@ -325,14 +320,12 @@ def test_a_client_goes_on_bit_for_bit_while_hosts_are_killed(
         np.testing.assert_array_equal(walked(port, {120: kill_its_host, 250: kill_its_host}), undisturbed)
 
 
-@pytest.mark.long
 def test_a_front_server_designs_with_fits_in_the_cluster(server: ServerProcess):
     with httpx.Client(base_url=server.url, timeout=60) as client:
         assert pendulum.teach(client, "taught")["model_version"] >= 1
     assert "fits run as tasks of the cluster" in server.log
 
 
-@pytest.mark.long
 def test_a_client_goes_on_bit_for_bit_while_postgresql_crashes(server: ServerProcess, postgresql: Postgresql):
     """Steps go on until the lease ends, and again when the database is back."""
 
