@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 from collections.abc import Iterator
+from multiprocessing import context
 from pathlib import Path
 
 os.environ.setdefault("RAY_AUTH_MODE", "disabled")  # a token in the home folder would change it between two clusters
@@ -17,6 +18,7 @@ import pytest
 import torch
 
 from support.long import TESTS, lines, unknown
+from support.nursery import contexts_of_forks
 from support.server import ServerProcess, running_server
 from support.teaching import teach
 from surrogym_client.transport import Api
@@ -75,6 +77,12 @@ def pytest_configure(config: pytest.Config) -> None:
 def _one_thread() -> None:
     """Small matrices gain nothing from more, and the server's processes want the other cores."""
     torch.set_num_threads(1)
+
+
+@pytest.fixture
+def forked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let processes of fits, of environments and of samplers be forks of one that has imported what they need."""
+    monkeypatch.setattr(context, "_concrete_contexts", contexts_of_forks())
 
 
 @pytest.fixture(params=["cpu", "cuda"])

@@ -40,6 +40,8 @@ from surrogym_shared.spec import (
     Uniform,
 )
 
+pytestmark = pytest.mark.usefixtures("forked")
+
 pytest.importorskip("fmpy")
 pytest.importorskip("pythonfmu")
 

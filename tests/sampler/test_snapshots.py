@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import uuid
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from support.rail import SPEC, Rail
-from support.saving import SPAWN, fill
+from support.saving import fill
 from surrogym_sampler.original.errors import (
     EnvironmentDied,
     SnapshotGone,
@@ -22,6 +23,8 @@ from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_sampler.queries.returning import Returning
 from surrogym_sampler.queries.snapshots import Bounds, SnapshotFolder, least_useful
 from surrogym_shared.spec import Design
+
+pytestmark = pytest.mark.usefixtures("forked")
 
 SAVED = SPEC.model_copy(update={"snapshots": True, "design": Design(initial=6, budget=16, target=0.9999)})
 
@@ -256,7 +259,8 @@ def test_a_return_to_nowhere_costs_no_step(api, rail, tmp_path):
 
 def test_samplers_share_a_full_folder(tmp_path):
     """Each drops the newest files of the other at any moment."""
-    both = [SPAWN.Process(target=fill, args=(tmp_path, SAVED, seed)) for seed in range(2)]
+    spawn = multiprocessing.get_context("spawn")
+    both = [spawn.Process(target=fill, args=(tmp_path, SAVED, seed)) for seed in range(2)]
     for process in both:
         process.start()
     for process in both:

@@ -24,7 +24,6 @@ from surrogym_shared import wire
 
 STEP_SECONDS = 0.1
 PATIENCE_SECONDS = 180.0
-SPAWN = multiprocessing.get_context("spawn")
 
 Point = tuple[float, ...]
 
@@ -144,7 +143,7 @@ class NotingSamplers:
         """One more."""
         path = self._folder / f"notes-{next(self._numbers)}"
         path.touch()
-        process = SPAWN.Process(target=work, args=(*self._args, str(path)), daemon=True)
+        process = multiprocessing.get_context("spawn").Process(target=work, args=(*self._args, str(path)), daemon=True)
         process.start()
         self.working[path] = process
 

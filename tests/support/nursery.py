@@ -17,6 +17,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
@@ -39,8 +40,16 @@ MODULES = (
     "scipy.spatial.distance",
     "uvicorn.lifespan.on",
 )
+SAMPLING = (
+    "gymnasium.envs.classic_control",
+    "surrogym_sampler.original.gymnasium",
+    "surrogym_sampler.original.isolated",
+    "surrogym_sampler.queries",
+)
 READ_EARLY = ("SURROGYM_COMPILED",)  # variables that imported modules have read
 LONGEST = 1 << 18  # bytes of a request
+
+_forkserver: Any = forkserver._forkserver  # type: ignore[attr-defined]
 
 
 class Forked:
@@ -82,11 +91,14 @@ class Nursery:
 
     def __init__(self) -> None:
         self._environment = dict(os.environ)
+        self._turn = threading.Lock()
         self._asked, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._asked.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, LONGEST)
-        command = [sys.executable, "-P", __file__, str(theirs.fileno())]
+        contexts_of_forks()
+        address, alive = _forkserver._forkserver_address, _forkserver._forkserver_alive_fd
+        command = [sys.executable, "-P", __file__, str(theirs.fileno()), address, str(alive)]
         with theirs:
-            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
+            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno(), alive], stdin=subprocess.DEVNULL)
         atexit.register(self._end)
 
     def can_start_in(self, environment: Mapping[str, str]) -> bool:
@@ -104,9 +116,11 @@ class Nursery:
             "umask": umask,
         }
         status, theirs = os.pipe()
-        socket.send_fds(self._asked, [json.dumps(request).encode()], [log.fileno(), theirs])
+        with self._turn:
+            socket.send_fds(self._asked, [json.dumps(request).encode()], [log.fileno(), theirs])
+            pid = int(self._asked.recv(100))
         os.close(theirs)
-        return Forked(int(self._asked.recv(100)), status)
+        return Forked(pid, status)
 
     def _end(self) -> None:
         self._asked.close()
@@ -119,11 +133,19 @@ def nursery() -> Nursery | None:
     return Nursery() if sys.platform == "linux" else None
 
 
-def main(asked: socket.socket) -> None:
-    """Fork a child for each request, until the socket closes."""
+def main(asked: socket.socket, address: str, alive: int) -> None:
+    """Fork a child for each request, until the socket closes.
+
+    Args:
+        asked: its other end sends the requests.
+        address: of the process that forks processes of fits.
+        alive: descriptor that this process has open for as long as it is needed.
+    """
     for name in MODULES:
         import_module(name)
-    _fork_fits()
+    _forkserver._forkserver_address, _forkserver._forkserver_alive_fd = address, alive
+    _forkserver.ensure_running = lambda: None  # it is no child of this process, which therefore can't ask for its state
+    context._concrete_contexts = _forking()  # type: ignore[attr-defined]
     gc.freeze()
     children: dict[int, tuple[int, int]] = {}  # by a descriptor that is readable at its end: its process, its status
     with selectors.DefaultSelector() as waiting:
@@ -152,18 +174,16 @@ def main(asked: socket.socket) -> None:
 
 
 def contexts_of_forks() -> dict[str, Any]:
-    """The ways of ``multiprocessing`` to start a process; "spawn" forks one that has imported what a fit needs."""
-    forkserver.set_forkserver_preload([*MODULES])
+    """The ways of ``multiprocessing`` to start a process; "spawn" forks one that has imported what fits, environments
+    and samplers need. Variables of the environment are those of the first call."""
+    forkserver.set_forkserver_preload([*MODULES, *SAMPLING])
     forkserver.ensure_running()
+    return _forking()
+
+
+def _forking() -> dict[str, Any]:
     contexts: dict[str, Any] = context._concrete_contexts  # type: ignore[attr-defined]
     return contexts | {"spawn": contexts["forkserver"]}
-
-
-def _fork_fits() -> None:
-    contexts = contexts_of_forks()
-    server: Any = forkserver._forkserver  # type: ignore[attr-defined]
-    server.ensure_running = lambda: None  # it is no child of the forks, which therefore can't ask for its state
-    context._concrete_contexts = contexts  # type: ignore[attr-defined]
 
 
 def _tell(end: int, pid: int, status: int) -> None:
@@ -190,4 +210,4 @@ def _run(log: int, arguments: list[str], environment: dict[str, str], folder: st
 
 if __name__ == "__main__":
     with socket.socket(fileno=int(sys.argv[1])) as opened:
-        main(opened)
+        main(opened, sys.argv[2], int(sys.argv[3]))

@@ -26,7 +26,6 @@ from surrogym_shared.spec import EnvironmentSpec
 
 STEP_SECONDS = 0.05
 LEASE_SECONDS = 2.0
-SPAWN = multiprocessing.get_context("spawn")
 ENDED = ("ready", "over_budget", "unsure")
 
 Step = tuple[float, ...]
@@ -110,7 +109,7 @@ class SavingSamplers:
         """One more."""
         path = self._notes / f"notes-{next(self._numbers)}"
         path.touch()
-        process = SPAWN.Process(target=work, args=(*self._args, str(path)), daemon=True)
+        process = multiprocessing.get_context("spawn").Process(target=work, args=(*self._args, str(path)), daemon=True)
         process.start()
         return process
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from multiprocessing import context
 
 import numpy as np
 import pytest
 import torch
 
 from support import pendulum
-from support.nursery import contexts_of_forks
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.session import Session, open_session
@@ -22,12 +20,6 @@ from surrogym_server.virtual import VirtualSettings
 from surrogym_shared.spec import EnvironmentSpec
 
 Fitted = Callable[[int], GaussianProcessModel]
-
-
-@pytest.fixture
-def forked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let processes of fits be forks of one that has imported what they need. Importing takes them four seconds."""
-    monkeypatch.setattr(context, "_concrete_contexts", contexts_of_forks())
 
 
 @pytest.fixture(scope="session")
