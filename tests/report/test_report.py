@@ -60,9 +60,15 @@ def known(pendulum_server: ServerProcess) -> Both:
     return Known(view, models, samples, "http://here, surrogym 0.1.0"), shown
 
 
-def test_it_says_what_is_known(known: Both) -> None:
+@pytest.fixture(scope="module")
+def text(known: Both) -> str:
+    """The page; its pictures take a second."""
+    return page(*known)
+
+
+def test_it_says_what_is_known(known: Both, text: str) -> None:
     view, models = known[0].view, known[0].models
-    read = Page(page(*known))
+    read = Page(text)
     titles = [
         "Ledger",
         "Fidelity",
@@ -82,9 +88,9 @@ def test_it_says_what_is_known(known: Both) -> None:
     assert not {"over_budget", "from_log"} & set(re.findall(r"\w+", " ".join(read.texts)))
 
 
-def test_scores_of_new_samples_have_a_table_where_there_are_any(known: Both) -> None:
+def test_scores_of_new_samples_have_a_table_where_there_are_any(known: Both, text: str) -> None:
     title = "New samples, predicted before the model learned from them: shares in intervals, or within the tolerance"
-    assert title not in Page(page(*known)).texts
+    assert title not in Page(text).texts
     *before, model = known[0].models
     first, *others = model.fidelity.outputs
     scores = PrequentialScores(predictions=17, within_50=0.4, within_80=0.7, within_90=0.8125, interval_score=3.375)
@@ -95,17 +101,16 @@ def test_scores_of_new_samples_have_a_table_where_there_are_any(known: Both) -> 
     assert {"17", "0.8125", "3.375"} <= set(read.texts)
 
 
-def test_the_encoding_of_angles_is_shown_only_where_there_are_angles(known: Both) -> None:
+def test_the_encoding_of_angles_is_shown_only_where_there_are_angles(known: Both, text: str) -> None:
     about, shown = known
     straight = tuple(one.model_copy(update={"kind": "linear"}) for one in about.view.spec.coordinates)
     view = about.view.model_copy(update={"spec": about.view.spec.model_copy(update={"coordinates": straight})})
     encoding = re.compile("cos[_ ]sin")
-    assert encoding.search(page(about, shown))
+    assert encoding.search(text)
     assert not encoding.search(page(replace(about, view=view), shown))
 
 
-def test_it_loads_nothing_and_its_policy_lets_nothing_load(known: Both) -> None:
-    text = page(*known)
+def test_it_loads_nothing_and_its_policy_lets_nothing_load(text: str) -> None:
     read = Page(text)
     assert {tag for tag, _ in read.tags} & {"script", "link", "iframe", "object", "a"} == set()
     for _, attributes in read.tags:
@@ -118,8 +123,8 @@ def test_it_loads_nothing_and_its_policy_lets_nothing_load(known: Both) -> None:
     assert policy == f"default-src 'none'; img-src data:; media-src data:; style-src 'sha256-{digest}'"
 
 
-def test_its_figures_are_whole_pictures_with_words_for_who_can_not_see_them(known: Both) -> None:
-    images = Page(page(*known)).of("img")
+def test_its_figures_are_whole_pictures_with_words_for_who_can_not_see_them(text: str) -> None:
+    images = Page(text).of("img")
     assert len(images) == 3
     for image in images:
         assert image["alt"]
