@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import signal
@@ -17,7 +18,7 @@ import hypothesis
 import pytest
 import torch
 
-from support.long import TESTS, lines, unknown
+from support.long import TESTS, Long
 from support.nursery import contexts_of_forks
 from support.server import ServerProcess, running_server
 from support.teaching import teach
@@ -55,14 +56,26 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Mark what ``long.toml`` lists. Files with tests that take long come first: one that begins last leaves the other
     workers with nothing to do."""
     nodes = {item: os.path.relpath(item.path, TESTS) + item.nodeid[item.nodeid.index("::") :] for item in items}
-    listed = lines()
+    long = Long()
     for item, node in nodes.items():
-        if any(line.names(node) for line in listed):
+        if long.lines_of(node):
             item.add_marker(pytest.mark.long)
-    if [Path(argument).resolve() for argument in config.args] == [TESTS] and (missing := unknown(nodes.values())):
-        raise pytest.UsageError(f"tests/long.toml: expected tests, got lines that name none: {missing}")
+    whole = [Path(argument).resolve() for argument in config.args] == [TESTS]
+    if whole and (unknown := long.unknown(nodes.values())):
+        raise pytest.UsageError(f"tests/long.toml: expected tests, got lines that name none: {unknown}")
     lasting = {item.path for item in items if any(item.get_closest_marker(mark) for mark in LASTING)}
     items.sort(key=lambda item: item.path not in lasting)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """What was imported stays: looking through a million objects for garbage takes most of a second each time."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_configure(config: pytest.Config) -> None:
