@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 from collections.abc import Iterator
+from functools import cache
 from multiprocessing import context
 from pathlib import Path
 
@@ -17,7 +18,9 @@ if "DISPLAY" not in os.environ:
 import hypothesis
 import pytest
 import torch
+import typer
 
+import surrogym.cli
 from support.long import TESTS, Long
 from support.nursery import contexts_of_forks
 from support.server import ServerProcess, running_server
@@ -90,6 +93,15 @@ def pytest_configure(config: pytest.Config) -> None:
 def _one_thread() -> None:
     """Small matrices gain nothing from more, and the server's processes want the other cores."""
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_command_line() -> Iterator[None]:
+    """Hundreds of tests run a command, and to assemble all of them takes a tenth of a second each time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(surrogym.cli, "build", cache(surrogym.cli.build))
+        patch.setattr(typer.main, "get_command", cache(typer.main.get_command))
+        yield
 
 
 @pytest.fixture

@@ -46,7 +46,8 @@ SAMPLING = (
     "surrogym_sampler.original.isolated",
     "surrogym_sampler.queries",
 )
-READ_EARLY = ("SURROGYM_COMPILED",)  # variables that imported modules have read
+# Variables that modules read when they are imported, or their beginnings.
+READ_EARLY = ("CUDA_", "HOME", "LD_", "MKL_", "NUMBA_", "OMP_", "OPENBLAS_", "PYTHON", "SURROGYM_COMPILED", "XDG_")
 LONGEST = 1 << 18  # bytes of a request
 
 _forkserver: Any = forkserver._forkserver  # type: ignore[attr-defined]
@@ -102,9 +103,9 @@ class Nursery:
         atexit.register(self._end)
 
     def can_start_in(self, environment: Mapping[str, str]) -> bool:
-        """Whether imported modules fit this environment: but for settings of the server it is that of the nursery."""
+        """Whether imported modules would be the same in this environment: what they read is that of the nursery."""
         differing = {name for name, _ in self._environment.items() ^ environment.items()}
-        return all(name.startswith(("SURROGYM_", "PYTEST_")) and name not in READ_EARLY for name in differing)
+        return not any(name.startswith(READ_EARLY) for name in differing)
 
     def start(self, arguments: Sequence[str], log: IO[bytes], environment: Mapping[str, str], folder: Path) -> Forked:
         """Run ``python -m surrogym_server ARGUMENTS`` in a folder, with its output in ``log``."""
