@@ -23,7 +23,8 @@ demo: .venv/demo  ## Solve Pendulum with server, sampler and trainer on this mac
 install: .venv/all  ## Everything a user may want into .venv: MuJoCo, pictures and exports as well
 	@echo "next: . .venv/bin/activate"
 
-test: format-check lint types imports audit unit  ## Everything that guards the project
+test: format-check lint imports audit  ## Everything that guards the project
+	@$(MAKE) --no-print-directory --jobs 2 types unit
 
 format-check: .venv/dev
 	$(BIN)/ruff format --check

@@ -28,7 +28,6 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     gc.unfreeze()
     asyncio.run(runner.startup())
     yield
-    gc.unfreeze()
     gc.set_threshold(*thresholds)
 
 
