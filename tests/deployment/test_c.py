@@ -164,6 +164,7 @@ def test_the_arduino_layout_has_what_its_tools_read_and_a_sketch_that_compiles(t
     assert json.loads((folder / "library.json").read_text())["headers"] == "arm_controller.h"
     properties = dict(line.split("=", 1) for line in (folder / "library.properties").read_text().splitlines())
     assert properties["includes"] == "arm_controller.h"
+    assert "#define ARM_FLOAT\n" in (folder / "src" / "arm_controller.h").read_text(), "the sketch sees it as well"
     if shutil.which("g++") is None:
         pytest.skip("g++ is not on this machine")
     stub = tmp_path / "Arduino.h"

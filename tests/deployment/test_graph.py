@@ -79,6 +79,6 @@ def test_the_description_has_what_a_program_on_a_machine_needs(tmp_path: Path):
         *("change of angle in the last step, by at most half a turn", "change of slide in the last step"),
         *("entry 0 of the last action", "entry 1 of the last action"),
     ]
-    assert (about["sampling_period"], about["timeout"]) == (0.05, 0.05)
+    assert (about["sampling_period"], about["timeout"]) == (0.05, 0.1)
     assert set(about["sha256"]) == {"policy", "specification"}
     assert len(about["observation"]) == len(spec.observation)

@@ -61,7 +61,7 @@ def test_a_linear_policy_and_a_network_of_arrays_become_controllers(tmp_path: Pa
         np.testing.assert_allclose(
             decided.action, decode_actions(spec, policy(declared(spec, begun(spec, read[0])[None])), 1), atol=1e-6
         )
-        assert controller.timeout == 0.05
+        assert controller.timeout == 0.1
         assert len(controller.decision.layers) == (len(units) if units else 0) + 1
 
 
@@ -71,12 +71,12 @@ def test_a_linear_policy_and_a_network_of_arrays_become_controllers(tmp_path: Pa
         ([np.nan, 0, 0], 0, NOT_FINITE),
         ([0, np.inf, 0], 0, NOT_FINITE),
         ([0, 5.1, 0], 0, OUT_OF_RANGE),
-        ([0, 0, -1.1], 0.051, OUT_OF_RANGE | LATE),
-        ([0, 0, 0], 0.051, LATE),
+        ([0, 0, -1.1], 0.101, OUT_OF_RANGE | LATE),
+        ([0, 0, 0], 0.101, LATE),
         ([0, 0, 0], np.nan, LATE),
         ([0, 0, 0], -0.001, LATE),
         ([700.0, 0, 0], 0, OUT_OF_RANGE),
-        ([600.0, 4.9, 1.9], 0.05, 0),
+        ([600.0, 4.9, 1.9], 0.1, 0),
     ],
 )
 def test_a_measurement_that_is_not_sound_leads_to_the_fallback(tmp_path: Path, read, age, status):
@@ -122,6 +122,12 @@ def test_policies_without_a_feed_forward_network_are_refused_with_what_can(tmp_p
         controller_of(path, algorithm="RECURRENTPPO", trust=True)
 
 
+def test_a_policy_with_weights_that_are_not_numbers_is_refused(tmp_path: Path):
+    path = network(tmp_path, plant(), (8,), np.nan)
+    with pytest.raises(NotDeployable, match="finite numbers"):
+        controller_of(path)
+
+
 def _elu():
     import torch
 
@@ -136,6 +142,7 @@ def test_choices_that_do_not_fit_are_refused(tmp_path: Path):
         (Choices(timeout=0.0), "more than 0 s"),
         (Choices(ranges={"speed": (0.0, 1.0)}), r"angle, slide, target\), got speed"),
         (Choices(ranges={"slide": (1.0, 1.0)}), "that rises, got 1 to 1"),
+        (Choices(ranges={"slide": (0.0, np.inf)}), "a finite range of slide that rises, got 0 to inf"),
     ]:
         with pytest.raises(NotDeployable, match=words):
             controller_of(path, choices=wrong)

@@ -37,7 +37,9 @@ class Faults:
     ] = None
     timeout: Annotated[
         float | None,
-        typer.Option(help="Largest age of a measurement in seconds. [default: the sampling period, if declared]"),
+        typer.Option(
+            help="Largest age of a measurement in seconds. [default: two sampling periods, if the period is declared]"
+        ),
     ] = None
     ranges: Annotated[
         list[str] | None,

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 Activation = Literal["none", "tanh", "relu"]
 
 NOT_FINITE, OUT_OF_RANGE, LATE, NO_ACTION = 1, 2, 4, 8  # bits of a status; 0: the action is the policy's
+PERIODS = 2  # age of a measurement in sampling periods that is no fault: its time varies
 TURNS = 100  # turns of an angle that a sensor may count, as wrapping loses digits
 
 
@@ -144,7 +145,7 @@ class Controller:
         fallback: action (F,) on a fault.
         timeout: largest age of a measurement in seconds; infinite without one.
         period: seconds between decisions; None if nobody declared it.
-        digests: SHA-256 of ``policy`` and ``specification``, and ``model`` where it is known.
+        digests: SHA-256 of ``policy`` and ``specification``.
     """
 
     name: str
@@ -171,7 +172,7 @@ class Choices:
 
     Attributes:
         fallback: action (F,) on a fault. Default: the continuous action nearest to 0. A discrete one has no default.
-        timeout: largest age of a measurement in seconds. Default: the sampling period, or none if it is not declared.
+        timeout: largest age of a measurement in seconds. Default: two sampling periods, if the period is declared.
         ranges: readings that a sensor can give, by measurement. Default: the range of the specification, widened by its
             own width at each end; 100 turns for an angle.
     """
@@ -189,6 +190,7 @@ def controller_from(
     Raises:
         NotDeployable: they don't fit, or a choice does not.
     """
+    _require_finite(decision)
     low, high = _limits(spec.action)
     outputs = sum(_counts(spec.action)) or len(low)
     shape, expected = (len(decision.mean), len(decision.layers[-1].bias)), (len(spec.observation), outputs)
@@ -213,6 +215,13 @@ def controller_from(
     )
 
 
+def _require_finite(decision: Decision) -> None:
+    layers = (array for layer in decision.layers for array in (layer.weights, layer.bias))
+    arrays = (decision.mean, decision.deviation, decision.centre, decision.reach, *layers)
+    if not all(np.isfinite(array).all() for array in arrays) or not (decision.deviation > 0).all():
+        raise NotDeployable("expected a policy of finite numbers and positive deviations, got NaN, infinity or 0")
+
+
 def _measurements(spec: EnvironmentSpec, ranges: dict[str, tuple[float, float]]) -> tuple[Measurement, ...]:
     names = [c.name for c in spec.coordinates if c.lag is None]
     if unknown := sorted(set(ranges) - set(names)):
@@ -222,8 +231,8 @@ def _measurements(spec: EnvironmentSpec, ranges: dict[str, tuple[float, float]])
         if c.lag is not None:
             continue
         lowest, highest = ranges.get(c.name) or _readable(c)
-        if not lowest < highest:
-            raise NotDeployable(f"expected a range of {c.name} that rises, got {lowest:g} to {highest:g}")
+        if not -np.inf < lowest < highest < np.inf:
+            raise NotDeployable(f"expected a finite range of {c.name} that rises, got {lowest:g} to {highest:g}")
         found.append(Measurement(c.name, c.unit, place, c.kind == "angle", *_bounds(c), lowest, highest))
     return tuple(found)
 
@@ -317,4 +326,6 @@ def _fallback(action: Action, low: Array, high: Array, chosen: tuple[float, ...]
 def _timeout(spec: EnvironmentSpec, chosen: float | None) -> float:
     if chosen is not None and not chosen > 0:
         raise NotDeployable(f"expected a timeout of more than 0 s, got {chosen:g}")
-    return chosen if chosen is not None else spec.sampling_period or np.inf
+    if chosen is not None:
+        return chosen
+    return np.inf if spec.sampling_period is None else PERIODS * spec.sampling_period

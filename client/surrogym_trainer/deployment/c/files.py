@@ -33,7 +33,7 @@ def write_arduino(controller: Controller, folder: Path) -> None:
     """Write a library for the Arduino IDE and PlatformIO: the same header and source, and a sketch that uses them."""
     prefix = prefix_of(controller)
     (folder / "src").mkdir()
-    _write_sources(controller, folder / "src")
+    _write_sources(controller, folder / "src", single=True)
     name = f"{prefix}_controller"
     library = {
         "name": name,
@@ -42,7 +42,6 @@ def write_arduino(controller: Controller, folder: Path) -> None:
         "frameworks": "*",
         "platforms": "*",
         "headers": f"{name}.h",
-        "build": {"flags": f"-D{prefix.upper()}_FLOAT"},
     }
     (folder / "library.json").write_text(json.dumps(library, indent=2) + "\n", encoding="utf-8")
     properties = {
@@ -76,9 +75,13 @@ def main_of(controller: Controller, vectors: list[Vector]) -> str:
     return _template("main.c").substitute(_names(controller), vectors="\n".join(rows), ranges=ranges)
 
 
-def _write_sources(controller: Controller, folder: Path) -> None:
+def _write_sources(controller: Controller, folder: Path, *, single: bool = False) -> None:
+    """Write header and source. With ``single`` the header itself chooses float: a sketch has no flags of its own."""
     names, prefix = _names(controller), prefix_of(controller)
-    for ending, parts in (("h", _header(controller)), ("c", source.parts_of(controller))):
+    flag = f"{prefix.upper()}_FLOAT"
+    chosen = {"single": f"#ifndef {flag}\n#define {flag}\n#endif\n" if single else ""}
+    chosen["numbers_are"] = "float" if single else f"double, or float with -D{flag}"
+    for ending, parts in (("h", _header(controller) | chosen), ("c", source.parts_of(controller))):
         content = _template(f"controller.{ending}").substitute(names, **parts)
         content = re.sub(r"\n{3,}", "\n\n", content)
         (folder / f"{prefix}_controller.{ending}").write_text(content, encoding="utf-8")
