@@ -30,7 +30,7 @@ def test_access_follows_from_query_and_snapshots(changes: dict[str, object], acc
     ("changes", "message"),
     [
         ({"max_rollout": 5}, "max_rollout 5 needs query 'rollout', got 'step'"),
-        ({"query": "rollout", "design": {"preset": "paper"}}, "Latin hypercube over states: expected query 'step'"),
+        ({"query": "rollout", "design": {"preset": "paper"}}, "Latin hypercube of states: expected query 'step'"),
         ({"query": "rollout", "max_rollout": 0}, "greater than or equal to 1"),
         ({"query": "rollout", "max_rollout": 5000}, "less than or equal to 4096"),
         ({"snapshots": True}, "snapshots need query 'rollout', got 'step'"),
