@@ -142,7 +142,8 @@ def equal(folder: Path, options: Any) -> None:
                 f"faults, {int(differs.sum())} other statuses, largest difference {largest:.2g} of the range"
                 f"{other}"
             )
-    visited(folder, options.visited)
+    for single in (False, True):
+        visited(folder, options.visited, single=single)
 
 
 def differences(
@@ -179,12 +180,12 @@ def bulk(
     return action.astype(np.float64), status
 
 
-def visited(folder: Path, count: int) -> None:
-    """Closed loops of a plant with lags: lags must be equal, observations to 2 units in the last place."""
+def visited(folder: Path, count: int, *, single: bool) -> None:
+    """Closed loops of a plant with lags: in double, lags are equal, and observations to 2 units in the last place."""
     spec = plant(**HISTORY)
     path = network(folder, spec)
     controller, policy = controller_of(path), load_policy(path)
-    compiled = Compiled(controller, folder / "visited")
+    compiled = Compiled(controller, folder / f"visited{single}", single=single)
     rng, other_lags, ulps, largest = np.random.default_rng(1), 0, 0, 0.0
     for _ in range(count // 100):
         state, q, last = rng.uniform([-3, -1, 0], [3, 2, 1]), None, None
@@ -201,10 +202,9 @@ def visited(folder: Path, count: int) -> None:
             last = action.astype(np.float32).astype(np.float64)
             state = state + np.array([0.3 * last[0] + rng.normal(0, 0.1), 0.05 * (last[1] - 5), 0.0])
             state[1] = np.clip(state[1], -1.2, 2.2)
-    print(
-        f"visited, double: {count} states, {other_lags} with other lags, observations within {ulps} units in the last "
-        f"place of float32, largest difference from the policy {largest:.2g} of the range"
-    )
+    print(f"visited, {'float' if single else 'double'}: {count} states, {other_lags} with other lags")
+    print(f"  observations within {ulps} units in the last place of float32")
+    print(f"  largest difference from the policy {largest:.2g} of the range")
 
 
 def strict(folder: Path, options: Any) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import stable_baselines3
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from support.controllers import LEARNERS, Idle, learner, network, plant
 from surrogym_sampler.original.actions import decode_actions
@@ -123,9 +124,25 @@ def test_policies_without_a_feed_forward_network_are_refused_with_what_can(tmp_p
 
 
 def test_a_policy_with_weights_that_are_not_numbers_is_refused(tmp_path: Path):
-    path = network(tmp_path, plant(), (8,), np.nan)
-    with pytest.raises(NotDeployable, match="finite numbers"):
-        controller_of(path)
+    for gain in (np.nan, 1e200):
+        path = network(tmp_path, plant(), (8,), gain)
+        with pytest.raises(NotDeployable, match="finite numbers"):
+            controller_of(path)
+
+
+def test_a_policy_that_learned_in_a_vecnormalize_keeps_its_statistics_and_its_clip(tmp_path: Path):
+    spec, path = plant(), tmp_path / "policy.zip"
+    env = VecNormalize(DummyVecEnv([lambda: Idle(spec)]))
+    made = stable_baselines3.PPO("MlpPolicy", env, device="cpu", n_steps=8, batch_size=8, seed=0)
+    made.learn(8).save(path)
+    write_card(path, PolicyCard(algorithm="PPO", spec=spec))
+    statistics = {"mean": np.arange(4.0), "var": np.full(4, 4.0), "epsilon": 1e-8, "clip": 0.5}
+    np.savez(tmp_path / "policy.vecnormalize.npz", **statistics)
+    controller, policy = controller_of(path, trust=True), load_policy(path, trust=True)
+    reads = readings(spec, 20)
+    shown = declared(spec, np.stack([begun(spec, read) for read in reads])).astype(np.float32)
+    decided = decide(controller, begin(controller, 20), reads)
+    np.testing.assert_allclose(decided.action, decode_actions(spec, policy(shown), 20), atol=1e-5)
 
 
 def _elu():

@@ -218,8 +218,9 @@ def controller_from(
 def _require_finite(decision: Decision) -> None:
     layers = (array for layer in decision.layers for array in (layer.weights, layer.bias))
     arrays = (decision.mean, decision.deviation, decision.centre, decision.reach, *layers)
-    if not all(np.isfinite(array).all() for array in arrays) or not (decision.deviation > 0).all():
-        raise NotDeployable("expected a policy of finite numbers and positive deviations, got NaN, infinity or 0")
+    largest = np.finfo(np.float32).max
+    if not all((np.abs(array) <= largest).all() for array in arrays) or not (decision.deviation > 0).all():
+        raise NotDeployable("expected a policy of finite numbers in float32 and positive deviations, got others")
 
 
 def _measurements(spec: EnvironmentSpec, ranges: dict[str, tuple[float, float]]) -> tuple[Measurement, ...]:

@@ -49,7 +49,7 @@ def write_arduino(controller: Controller, folder: Path) -> None:
         "version": "1.0.0",
         "author": "surrogym deploy",
         "maintainer": "surrogym deploy",
-        "sentence": _title(controller),
+        "sentence": source.plain(_title(controller)),
         "paragraph": "One call per sampling period.",
         "category": "Device Control",
         "url": "",
