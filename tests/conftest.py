@@ -6,6 +6,8 @@ import gc
 import os
 import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import cache
 from multiprocessing import context
@@ -27,7 +29,7 @@ from support.server import ServerProcess, running_server
 from support.teaching import teach
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import pendulum
-from surrogym_server.engine.compiling import Compiling
+from surrogym_server.engine.compiling import PROGRAM, Compiling
 
 # The same examples in every run, on machines of any speed, and none kept in the checkout.
 hypothesis.settings.register_profile(
@@ -82,8 +84,13 @@ def pytest_collection() -> Iterator[None]:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile steps once, before the first test: a dozen servers that do so at once outlast what tests wait for."""
-    if not hasattr(config, "workerinput"):
+    """Compile steps once, before the first test: a dozen servers that do so at once outlast what tests wait for.
+
+    Another checkout with the same sources may have compiled them for itself, so workers don't rely on what there is.
+    """
+    if getattr(config.option, "numprocesses", None):
+        subprocess.run([sys.executable, "-c", PROGRAM], check=True)
+    elif not hasattr(config, "workerinput"):
         ahead = Compiling()
         ahead.start()
         ahead.wait()
