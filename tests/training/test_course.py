@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from surrogym_trainer.training import TrainProgress
-from surrogym_trainer.training.course import Course, after, words_of_time_left
+from surrogym_trainer.training.course import Course, after
 
 REPORTED = [  # of a demo, whose bar went back twice
     *((steps, 442_368) for steps in (8_192, 217_088, 434_176)),
@@ -33,7 +33,16 @@ def test_a_training_after_another_continues_its_steps():
     assert after(TrainProgress(50, 200, None, 0.0), done=1_000, total=5_000).total_steps == 5_000
 
 
-def test_the_time_left_follows_from_the_pace_so_far():
-    assert words_of_time_left(100, 400, 10.0) == ", about 30 s left"
-    assert words_of_time_left(100, 4_000, 10.0) == ", about 6 min left"
-    assert words_of_time_left(0, 400, 10.0) == words_of_time_left(400, 400, 10.0) == ""
+def test_the_time_left_follows_from_the_pace_of_the_steps():
+    """The first estimate was far too long: it took the time of compiling for that of the first steps."""
+    course, compiling = Course(), 60.0
+    assert course.words_of_time_left(100, 1_000, compiling + 1.0) == "", "no pace is known yet"
+    assert course.words_of_time_left(200, 1_000, compiling + 2.0) == ", about 8 s left"
+    assert course.words_of_time_left(200, 100_000, compiling + 2.0) == ", about 17 min left"
+    assert course.words_of_time_left(1_000, 1_000, compiling + 10.0) == ""
+
+
+def test_nothing_is_said_of_the_time_left_before_the_first_step():
+    course = Course()
+    assert course.words_of_time_left(0, 400, 10.0) == course.words_of_time_left(0, 400, 20.0) == ""
+    assert course.words_of_time_left(100, 400, 30.0) == ", about 60 s left"

@@ -225,7 +225,7 @@ def _words_without_model(view: SurrogateView) -> str:
 def _recording(path: Path | None, curve: list[CurvePoint], update: Update) -> Iterator[Record]:
     """Show progress, collect the training curve, and append it to a file that other processes can watch."""
     from surrogym_shared.wire import CurvePoint
-    from surrogym_trainer.training.course import Course, words_of_time_left
+    from surrogym_trainer.training.course import Course
     from surrogym_trainer.training.words import words_of
 
     started, course = time.monotonic(), Course()
@@ -233,7 +233,7 @@ def _recording(path: Path | None, curve: list[CurvePoint], update: Update) -> It
 
         def record(now: TrainProgress) -> None:
             seconds = round(time.monotonic() - started, 3)
-            left = words_of_time_left(now.steps, now.total_steps, seconds)
+            left = course.words_of_time_left(now.steps, now.total_steps, seconds)
             update(course.share(now.steps, now.total_steps), f"{words_of(asdict(now))}{left}")
             curve.append(CurvePoint(steps=now.steps, imagined_return=now.imagined_return, seconds=seconds))
             if file is not None:

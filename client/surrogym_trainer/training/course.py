@@ -18,6 +18,7 @@ class Course:
         self._share = self._base = 0.0  # done, and done when the total last changed
         self._steps = self._begun = 0  # virtual steps so far, and when the total last changed
         self._total = 0
+        self._first: tuple[int, float] | None = None  # virtual steps and seconds when the time left was first asked for
 
     def share(self, steps: int, total: int) -> float:
         """Return the share that is done, in [0, 1], after ``steps`` virtual steps of ``total``."""
@@ -29,19 +30,22 @@ class Course:
         self._share = max(self._share, done)
         return self._share
 
+    def words_of_time_left(self, steps: int, total: int, seconds: float) -> str:
+        """Estimate in words how long a training of ``total`` virtual steps still takes.
 
-def words_of_time_left(steps: int, total: int, seconds: float) -> str:
-    """Estimate in words how long a training of ``total`` virtual steps still takes; empty before its first step.
+        The pace is that since the first call: what comes before the first steps, such as compiling, comes once. So the
+        first call gives no estimate, which is an empty text.
 
-    Args:
-        steps: virtual steps taken.
-        total: virtual steps of the whole training, as far as is known.
-        seconds: duration so far.
-    """
-    if steps <= 0 or seconds <= 0 or steps >= total:
-        return ""
-    left = (total - steps) * seconds / steps
-    return f", about {f'{left:.0f} s' if left < 90 else f'{left / 60:.0f} min'} left"
+        Args:
+            steps: virtual steps taken.
+            total: virtual steps of the whole training, as far as is known.
+            seconds: duration so far.
+        """
+        before, began = self._first = self._first or (steps, seconds)
+        if steps <= before or seconds <= began or steps >= total:
+            return ""
+        left = (total - steps) * (seconds - began) / (steps - before)
+        return f", about {f'{left:.0f} s' if left < 90 else f'{left / 60:.0f} min'} left"
 
 
 def after(now: TrainProgress, done: int, total: int = 0) -> TrainProgress:
