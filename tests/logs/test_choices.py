@@ -51,6 +51,8 @@ def test_codes_that_are_not_numbered_from_0_are_asked_about():
         assert said.spec.action == DiscreteAction(n=len(codes))
         np.testing.assert_array_equal(codes[said.steps.u[:, 0].astype(int)], values[:-1])
         assert any(f"0 is {codes[0]:g}, 1 is {codes[1]:g}" in note for note in said.notes)
+        with pytest.raises(UnusableLog, match="choices"):
+            read({"switch": values}, said.spec)
         again = read({"switch": values}, said.spec, discrete={"switch": codes.tolist()})
         np.testing.assert_array_equal(again.steps.u, said.steps.u)
         amounts = read({"switch": values}, discrete=False)
@@ -104,3 +106,31 @@ def test_a_value_that_is_no_declared_choice_is_set_aside():
 def test_choices_that_fit_no_action_are_refused(discrete: dict[str, list[int]]):
     with pytest.raises(UnusableLog, match="discrete"):
         read({"switch": np.tile([1.0, 2.0], 20)}, discrete=discrete)
+
+
+@pytest.mark.parametrize("spec", [DiscreteAction(n=3), MultiDiscreteAction(nvec=(3,))])
+@pytest.mark.parametrize("codes", [[1, 2, 3], [1, 2], [0, 2, 3], [-1, 0, 1], [0.5, 1, 1.5]])
+def test_codes_of_choices_are_never_taken_for_others(spec: DiscreteAction | MultiDiscreteAction, codes: list[float]):
+    """A log of 1, 2, 3 lost its rows with 3, and its rows with 1 and 2 became those of the second and third choice."""
+    numbered = read({"switch": np.tile([0.0, 1.0, 2.0], 20)}).spec.model_copy(update={"action": spec})
+    values = np.tile(np.array(codes, dtype=float), 20)
+    with pytest.raises(UnusableLog, match=r"choices from 0 to 2.*discrete = \{ switch = \["):
+        read({"switch": values}, numbered)
+
+
+def test_a_declaration_settles_what_codes_mean():
+    numbered = read({"switch": np.tile([0.0, 1.0, 2.0], 20)}).spec
+    values = np.tile([1.0, 2.0], 20)
+    np.testing.assert_array_equal(read({"switch": values}, numbered, discrete=True).steps.u[:, 0], values[:-1])
+    later = read({"switch": values}, numbered, discrete={"switch": [1, 2, 3]})
+    np.testing.assert_array_equal(later.steps.u[:, 0], values[:-1] - 1)
+    with pytest.raises(UnusableLog, match="expected 3 choices"):
+        read({"switch": values}, numbered, discrete={"switch": [1, 2]})
+
+
+def test_a_faulty_row_among_numbered_choices_is_set_aside():
+    numbered = read({"switch": np.tile([0.0, 1.0, 2.0], 20)}).spec
+    few = read({"switch": np.r_[np.tile([0.0, 1.0], 20), 0.0]}, numbered)
+    assert not few.rejected, "a log need not show every choice"
+    log = read({"switch": np.r_[np.tile([0.0, 1.0, 2.0], 20), 7.0, 1.0]}, numbered)
+    assert len(log.rejected) == 1

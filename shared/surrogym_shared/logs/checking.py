@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from surrogym_shared.checks import first_fault
 from surrogym_shared.logs.columns import Roles
-from surrogym_shared.logs.drafting import Draft, draft, lost_ends, wrapped
+from surrogym_shared.logs.drafting import Draft, declared_choices, draft, lost_ends, wrapped
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.rewards import declared_reward
 from surrogym_shared.logs.rows import rows_of
@@ -22,9 +22,10 @@ from surrogym_shared.logs.too_few import require_steps
 from surrogym_shared.logs.transitions import Transitions, transitions_of
 from surrogym_shared.logs.units import require_units
 from surrogym_shared.logs.writing import spreadsheet_cell
-from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 from surrogym_shared.terms import terminates
 
+SHOWN = 8  # values in a message
 HEADING = ("line", "reason")  # of a file of rejected rows, before the columns of its log
 OURS = ",".join(HEADING).encode() + b","
 
@@ -79,6 +80,8 @@ def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
     """
     roles = _of_spec(roles, spec)
     rows = rows_of(table, roles, None if table.evaluated else spec)
+    if not table.evaluated:
+        _require_choices(spec, roles, rows.u)
     steps = _shaped(spec, roles, transitions_of(rows))
     if not table.evaluated:
         require_units(rows.q, spec)
@@ -148,6 +151,32 @@ def _of_spec(roles: Roles, spec: EnvironmentSpec) -> Roles:
         following={name: roles.following[name] for name in spec.coordinate_names} if roles.following else {},
         ignored=(*roles.ignored, *(one for name, one in roles.state.items() if name not in spec.coordinate_names)),
     )
+
+
+def _require_choices(spec: EnvironmentSpec, roles: Roles, values: Floats) -> None:
+    """Refuse values (n, F) of a discrete action that may be codes of other choices than the numbers that they are.
+
+    Numbers from 0 include 0. If some are beyond the last choice, as a faulty row's may be, they include all choices. A
+    mapping that declares the choices, or that they are numbered, settles it.
+    """
+    if isinstance(spec.action, BoxAction):
+        return
+    counts = (spec.action.n,) if isinstance(spec.action, DiscreteAction) else spec.action.nvec
+    for name, count, column in zip(roles.action, counts, values.T, strict=True):
+        if (declared := roles.choices.get(name)) is not None:
+            if len(declared) != count:
+                raise UnusableLog(f"action {name}: expected {count} choices in discrete, got {list(declared)}")
+            continue
+        used = set(np.unique(column[np.isfinite(column)]).tolist())
+        missing = set(range(count)) - used
+        if used and not roles.discrete and (0 in missing or (missing and not used <= set(range(count)))):
+            some = [np.unique(one[np.isfinite(one)]) for one in values.T]
+            raise UnusableLog(
+                f"action {name}: expected the numbers of its choices from 0 to {count - 1}, got "
+                f"{', '.join(f'{value:g}' for value in sorted(used)[:SHOWN])}: declare all codes in this order in a "
+                f"mapping file (--map), such as {declared_choices(list(roles.action), some)}, or discrete = true if "
+                "these are the numbers"
+            )
 
 
 def _shaped(spec: EnvironmentSpec, roles: Roles, steps: Transitions) -> Transitions:

@@ -269,7 +269,7 @@ def _action(roles: Roles, steps: Transitions, notes: list[str]) -> BoxAction | D
         if not all((one >= 0).all() and (one == np.floor(one)).all() for one in codes):
             raise UnusableLog(
                 f"expected whole numbers from 0 for a discrete action, got {codes[0][:5].tolist()}: name the choices, "
-                f"such as {_declared_choices(names, codes)}"
+                f"such as {declared_choices(names, codes)}"
             )
         return _discrete(counts)
     if roles.discrete is None and not one_hot:
@@ -321,15 +321,15 @@ def _asked(names: list[str], codes: list[Floats], whole: list[bool]) -> Iterator
     yield f"action {shown}: few whole numbers, drafted as amounts, which a policy may choose between"
     if all(whole):
         yield (
-            f"action: for choices, declare {_declared_choices(names, codes)} in a mapping file (--map); for amounts, "
+            f"action: for choices, declare {declared_choices(names, codes)} in a mapping file (--map); for amounts, "
             "discrete = false"
         )
     else:
         yield "action: it has choices or amounts, not both; if these are amounts, declare discrete = false (--map)"
 
 
-def _declared_choices(names: list[str], codes: list[Floats]) -> str:
-    """Return the line of a mapping that declares these values as choices."""
+def declared_choices(names: list[str], codes: list[Floats]) -> str:
+    """Return the line of a mapping that declares these different values of each action entry as choices."""
     values = ", ".join(
         f"{name} = [{', '.join(f'{value:g}' for value in one[:MOST_DISCRETE])}]"
         for name, one in zip(names, codes, strict=True)
