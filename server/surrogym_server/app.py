@@ -19,7 +19,6 @@ from threadpoolctl import threadpool_limits
 from surrogym_server import dashboard
 from surrogym_server.api import (
     events,
-    jobs,
     logs,
     metrics,
     models,
@@ -34,6 +33,7 @@ from surrogym_server.api import (
 )
 from surrogym_server.api.auth import Gate
 from surrogym_server.api.caller import fingerprint
+from surrogym_server.api.feature import Core, Parts
 from surrogym_server.api.guards import BodyLimit, KnownHosts, OwnPages
 from surrogym_server.api.observe import Observed
 from surrogym_server.api.state import Services
@@ -51,6 +51,7 @@ from surrogym_server.engine.port import Compute, SessionEngine
 from surrogym_server.engine.sessions import MEBIBYTE, Limits
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
+from surrogym_server.features import jobs
 from surrogym_server.models.registry import MODELS
 from surrogym_server.private import keep_private
 from surrogym_server.sampling.acquisition import ACQUISITIONS
@@ -58,7 +59,6 @@ from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import Designer
 from surrogym_server.services.events import EventService
-from surrogym_server.services.jobs import JobService
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.models import ModelService, load_model, stored_tolerances
 from surrogym_server.services.notices import Notices
@@ -72,6 +72,8 @@ from surrogym_server.settings import LOCAL_NAMES, Settings
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
 from surrogym_shared.spec import EnvironmentSpec
+
+FEATURES = (jobs.FEATURE,)  # a server without one has no folder for it, and no line here
 
 logger = logging.getLogger(__name__)
 
@@ -93,6 +95,7 @@ class State(TypedDict):
     """State of the app for every request."""
 
     services: Services
+    parts: Parts
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,6 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     app.state.turns = Turns("predictions", at_work=2, waiting=32)
     app.state.streams = Waiting("open streams of events")
     app.state.query_claims = Waiting("waiting claims of queries")
-    app.state.job_claims = Waiting("waiting claims of jobs")
     app.state.log_turns = Turns("logs", at_work=1, waiting=8)
     if settings.tokens:
         known = ", ".join(f"{role} {fingerprint(token)}" for token, role in settings.tokens.items())
@@ -154,7 +156,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", *settings.host_names}))
     app.add_middleware(Observed, metrics=app.state.metrics)
     app.router.routes.extend(stepping.routes)  # tried first, and directly: an included router is another search
-    for room in (sessions, service, metrics, surrogates, queries, samples, logs, models, policies, jobs, events):
+    for room in (sessions, service, metrics, surrogates, queries, samples, logs, models, policies, *FEATURES, events):
         app.include_router(room.router)
     _add_dashboard(app)
     return app
@@ -189,7 +191,10 @@ async def _lifespan(
     process = _build_process(settings, design, storage, app.state.metrics, engine)
     app.state.notices = process.notices
     services = _build_services(settings, design, process)
-    sweeper = Sweeper(storage, process.engine, settings.sweep_seconds, process.metrics, process.notices)
+    core = Core(storage, process.notices, process.metrics)
+    parts = {type(one): one for one in [feature.start(core) for feature in FEATURES]}
+    sweeps = [one.sweep for one in parts.values()]
+    sweeper = Sweeper(storage, process.engine, settings.sweep_seconds, process.metrics, process.notices, sweeps)
     for registry in (ACQUISITIONS, MODELS):
         logger.info("%ss: %s", registry.kind, ", ".join(registry.names))
         for name, why in registry.broken.items():
@@ -202,7 +207,7 @@ async def _lifespan(
     work = (services.designer.run(), sweeper.run(), looking, process.engine.start())
     tasks = [asyncio.create_task(one) for one in work]
     try:
-        yield {"services": services}
+        yield {"services": services, "parts": parts}
     finally:
         process.notices.close()
         for task in tasks:
@@ -259,7 +264,6 @@ def _build_services(settings: Settings, design: DesignPort, process: _Process) -
         queries=QueryService(storage, definitions, notices, samplers),
         samples=SampleService(storage, definitions, notices, samplers),
         models=ModelService(storage, definitions, process.models, notices),
-        jobs=JobService(storage, notices),
         policies=PolicyService(storage, _complete, notices, settings.policies_mib * MEBIBYTE),
         sessions=SessionService(storage, definitions, process.engine),
         engine=process.engine,

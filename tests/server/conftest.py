@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from support import pendulum
+from support.databases import make, postgresql, prepared_file, set_clock_back, storage, until, url  # noqa: F401
 from support.real_steps import answer, random_steps
 from support.server import ServerProcess
 from surrogym_sampler.original import classic

@@ -13,7 +13,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from support import pendulum
-from support.postgresql import Postgresql, running_postgresql
+from support.postgresql import Postgresql
 from support.server import ServerProcess, running_server
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.services import lines
@@ -28,12 +28,6 @@ from surrogym_shared.spec import EnvironmentSpec
 SECONDS = 60.0
 
 pytestmark = pytest.mark.postgresql
-
-
-@pytest.fixture(scope="module")
-def postgresql() -> Iterator[Postgresql]:
-    with running_postgresql() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")

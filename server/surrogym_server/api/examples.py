@@ -97,18 +97,4 @@ EVALUATION: Example = {
     "lengths": [200, 200],
     "idempotency_key": "evaluation-1",
 }
-JOB: Example = {"task": {"kind": "train", "algorithm": "fastppo", "steps": 100_000, "seed": 0}}
-CLAIM_JOB: Example = {"worker": "trainer-1", "most_episodes": 100, "wait_seconds": 20, "lease_seconds": 60}
-REPORT_JOB: Example = {
-    "lease_token": "the token of the claim",
-    "state": {
-        "stage": "training",
-        "share": 0.25,
-        "steps": 2048,
-        "total_steps": 8192,
-        "imagined_return": -900.5,
-        "curve": [{"steps": 1024, "imagined_return": -1200}, {"steps": 2048, "imagined_return": -900.5}],
-    },
-}
-FINISH_JOB: Example = {"lease_token": "the token of the claim", "status": "done", "version": 3}
 ALIAS: Example = {"version": 1}

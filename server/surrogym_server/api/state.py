@@ -10,7 +10,6 @@ from fastapi import Depends, Request
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.services.designer import Designer
 from surrogym_server.services.events import EventService
-from surrogym_server.services.jobs import JobService
 from surrogym_server.services.models import ModelService
 from surrogym_server.services.policies import PolicyService
 from surrogym_server.services.queries import QueryService
@@ -29,7 +28,6 @@ class Services:
     samples: SampleService
     models: ModelService
     policies: PolicyService
-    jobs: JobService
     sessions: SessionService
     engine: SessionEngine
     designer: Designer

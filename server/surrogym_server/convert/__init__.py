@@ -1,7 +1,6 @@
 """Conversion between wire models and objects of the core, in pairs of functions."""
 
 from surrogym_server.convert.definitions import default_budget, definition_from_spec, stored_definition
-from surrogym_server.convert.jobs import claimed_job, job_detail, job_list, job_progress, job_result, job_view
 from surrogym_server.convert.logs import added_report, checked_log, drafted_log, drafted_report, logged_samples
 from surrogym_server.convert.numbers import numbers
 from surrogym_server.convert.policies import (
@@ -60,7 +59,6 @@ __all__ = [
     "checked",
     "checked_log",
     "claimed",
-    "claimed_job",
     "created",
     "default_budget",
     "definition_from_spec",
@@ -73,11 +71,6 @@ __all__ = [
     "framed_policy_run",
     "imagined",
     "improved",
-    "job_detail",
-    "job_list",
-    "job_progress",
-    "job_result",
-    "job_view",
     "lane_mask",
     "ledger",
     "logged_samples",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 
 from surrogym_server.engine.port import SessionEngine
@@ -23,13 +23,21 @@ ORPHAN_SECONDS = 3_600.0  # wait before unreferenced files are removed; an uploa
 
 class Sweeper:
     def __init__(
-        self, storage: Storage, engine: SessionEngine, seconds: float, metrics: ProcessMetrics, notices: Notices
+        self,
+        storage: Storage,
+        engine: SessionEngine,
+        seconds: float,
+        metrics: ProcessMetrics,
+        notices: Notices,
+        others: Sequence[Callable[[], Awaitable[None]]] = (),
     ) -> None:
+        """``others`` are sweeps of features."""
         self._storage = storage
         self._engine = engine
         self._seconds = seconds
         self._metrics = metrics
         self._notices = notices
+        self._others = others
         self._looked_at_files = -ORPHAN_SECONDS
         self._pruned = -PRUNE_SECONDS
 
@@ -43,14 +51,14 @@ class Sweeper:
         """Sweep once. The query of an expired lease goes to the next sampler or is set aside. A session whose surrogate
         another server has deleted ends."""
         await self._try(self._engine.sweep)
-        await self._try(self._sweep_leases)
+        for sweep in (self._sweep_leases, *self._others):
+            await self._try(sweep)
         await self._try(self._find_changes)
         await self._try(partial(asyncio.to_thread, self._sweep_files))
         await self._try(partial(asyncio.to_thread, self._prune))
 
     async def _sweep_leases(self) -> None:
         self._metrics.expired_leases += await asyncio.to_thread(self._storage.queries.sweep_expired)
-        self._metrics.expired_leases += await asyncio.to_thread(self._storage.jobs.sweep_expired)
 
     async def _find_changes(self) -> None:
         """Wake those who wait for a surrogate that has changed, although its notice was lost: one question for all."""

@@ -17,10 +17,10 @@ For all of it:
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 from surrogym_server.storage.announcements import Announcements
-from surrogym_server.storage.jobs import Jobs
 from surrogym_server.storage.live_sessions import LiveSessions
 from surrogym_server.storage.policies import Blobs, Policies
 from surrogym_server.storage.records import (
@@ -52,6 +52,8 @@ from surrogym_server.storage.records import (
 )
 
 MAX_ATTEMPTS = 3
+
+T = TypeVar("T")
 
 
 class Surrogates(ABC):
@@ -492,7 +494,10 @@ class Storage(ABC):
     policies: Policies
     blobs: Blobs
     announcements: Announcements
-    jobs: Jobs
+
+    @abstractmethod
+    def part(self, store: Callable[[Any], T]) -> T:
+        """Return a feature's own store: ``store`` is called with the adapter's database."""
 
     @abstractmethod
     def ping(self) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
+from pathlib import Path
 
 import httpx
 import pytest
@@ -24,17 +26,14 @@ ALLOWED = {
         GET /v1/surrogates/{name}/sessions, POST /v1/surrogates/{name}/query_uncertainty,
         POST /v1/surrogates/{name}/predict, POST /v1/surrogates/{name}/imagine, GET /v1/surrogates/{name}/policies,
         GET /v1/surrogates/{name}/policies/{which}, GET /v1/surrogates/{name}/policies/{which}/files/{form},
-        GET /v1/surrogates/{name}/policies/{which}/evaluations/{id}, GET /v1/surrogates/{name}/jobs,
-        GET /v1/surrogates/{name}/jobs/{job_id}, GET /v1/surrogates/{name}/snapshots""",
+        GET /v1/surrogates/{name}/policies/{which}/evaluations/{id}, GET /v1/surrogates/{name}/snapshots""",
     "train": """
         POST /v1/surrogates/{name}/sessions, POST /v1/surrogates/{name}/improve, GET /v1/sessions/{id},
         DELETE /v1/sessions/{id}, POST /v1/sessions/{id}/occupancy, POST /v1/sessions/{id}/reset,
         POST /v1/sessions/{id}/step, POST /v1/sessions/{id}/rollout, GET /v1/sessions/{id}/coordinates,
         POST /v1/surrogates/{name}/policies, PUT /v1/surrogates/{name}/policies/{version}/files/{form},
         POST /v1/surrogates/{name}/policies/{version}/evaluations, POST /v1/surrogates/{name}/audit,
-        POST /v1/surrogates/{name}/audit:withdraw, POST /v1/surrogates/{name}/jobs,
-        POST /v1/surrogates/{name}/jobs:claim, POST /v1/surrogates/{name}/jobs/{job_id}:cancel,
-        POST /v1/surrogates/{name}/jobs/{job_id}:report, POST /v1/surrogates/{name}/jobs/{job_id}:finish""",
+        POST /v1/surrogates/{name}/audit:withdraw""",
     "sample": """
         POST /v1/surrogates/{name}/queries, POST /v1/surrogates/{name}/queries:claim,
         POST /v1/surrogates/{name}/queries/{query_id}:renew, POST /v1/surrogates/{name}/queries/{query_id}:fail,
@@ -48,6 +47,9 @@ ALLOWED = {
         PUT /v1/surrogates/{name}/policies/aliases/{alias}, DELETE /v1/surrogates/{name}/policies/aliases/{alias}""",
 }
 ROLES_OF = {call.strip(): {*roles.split(), "admin"} for roles, calls in ALLOWED.items() for call in calls.split(",")}
+for _part in Path(__file__).parents[1].glob("features/*/allowed.json"):
+    for _roles, _calls in json.loads(_part.read_text()).items():
+        ROLES_OF |= {call: {*_roles.split(), "admin"} for call in _calls}
 UNDESCRIBED = {"GET /docs", "GET /openapi.json"}
 
 

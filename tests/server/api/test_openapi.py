@@ -35,10 +35,6 @@ EXAMPLES = {
     "POLICY": wire.AddPolicy,
     "EVALUATION": wire.AddEvaluation,
     "ALIAS": wire.PutAlias,
-    "JOB": wire.AddJob,
-    "CLAIM_JOB": wire.ClaimJob,
-    "REPORT_JOB": wire.ReportJob,
-    "FINISH_JOB": wire.FinishJob,
 }
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from support.postgresql import Postgresql, running_postgresql
+from support.postgresql import Postgresql
 from surrogym_sampler.original import classic
 from surrogym_server.cluster import pool
 from surrogym_server.convert import stored_definition
@@ -45,12 +45,6 @@ def fill(model: NewModel) -> Callable[[Storage], int]:
         return record.id
 
     return store
-
-
-@pytest.fixture(scope="module")
-def postgresql() -> Iterator[Postgresql]:
-    with running_postgresql() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")

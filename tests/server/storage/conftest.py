@@ -1,80 +1,17 @@
-"""Every test here runs on each adapter: a fresh SQLite file, a fresh database of a real PostgreSQL server."""
+"""What a sampler and a fit hand to storage."""
 
 from __future__ import annotations
 
-import shutil
-import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-import sqlalchemy as sa
 
-from support.postgresql import Postgresql, running_postgresql
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import LeasedQuery, NewDesign, NewModel, NewSample, NewSurrogate
-from surrogym_server.storage.sql import open_storage
-from surrogym_server.storage.sql.tables import metadata
+from surrogym_server.storage.records import LeasedQuery, NewDesign, NewModel, NewSample
 
-SPEC = {"environment": "Pendulum-v1", "coordinates": [{"name": "angle"}, {"name": "speed"}]}
 SECONDS = 60.0  # a lease no test outlives
-NAME = "pendulum"
-TIMES = ("created_at", "begun", "expires", "fit_expires", "finished_at")
-
-
-@pytest.fixture(scope="session")
-def postgresql() -> Iterator[Postgresql]:
-    with running_postgresql() as running:
-        yield running
-
-
-@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgresql)])
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """The address of an empty database."""
-    if request.param == "sqlite":
-        return f"sqlite:///{tmp_path}/surrogym.db"
-    running: Postgresql = request.getfixturevalue("postgresql")
-    return running.new_database()
-
-
-@pytest.fixture(scope="session")
-def prepared_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file with the schema; to make it takes three times as long as to open it."""
-    path = tmp_path_factory.mktemp("prepared") / "surrogym.db"
-    open_storage(f"sqlite:///{path}").close()
-    return path
-
-
-@pytest.fixture
-def storage(request: pytest.FixtureRequest, url: str) -> Iterator[Storage]:
-    """At the address, with the schema."""
-    address = sa.make_url(url)
-    if address.get_backend_name() == "sqlite":
-        shutil.copy(request.getfixturevalue("prepared_file"), str(address.database))
-    opened = open_storage(url)
-    yield opened
-    opened.close()
-
-
-@pytest.fixture
-def make(storage: Storage) -> Callable[..., str]:
-    """Create a surrogate with m queries of C = 2 and F = 1."""
-
-    def create(queries: int = 3, name: str = NAME, **changes: Any) -> str:
-        coordinates = np.arange(2.0 * queries).reshape(queries, 2)
-        action = np.full((queries, 1), 0.5)
-        storage.surrogates.create(
-            NewSurrogate(
-                **{"name": name, "spec": SPEC, "budget": 30, "target": 0.999, "state": {"round": 0}} | changes,
-                query_coordinates=coordinates,
-                query_action=action,
-            )
-        )
-        return name
-
-    return create
 
 
 @pytest.fixture
@@ -137,31 +74,3 @@ def design() -> Callable[..., NewDesign]:
         return NewDesign(**values | chosen | changes)
 
     return make_design
-
-
-@pytest.fixture
-def until() -> Callable[[Callable[[], bool]], None]:
-    """Wait for something the database's clock brings about."""
-
-    def wait(happened: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 30
-        while not happened():
-            assert time.monotonic() < deadline, "it never happened"
-            time.sleep(0.01)
-
-    return wait
-
-
-@pytest.fixture
-def set_clock_back(url: str) -> Callable[[float], None]:
-    """Set the database's clock back, as seen from what is stored: every stored time lies so much later."""
-
-    def change(seconds: float) -> None:
-        engine = sa.create_engine(url.replace("postgresql:", "postgresql+psycopg:"), poolclass=sa.NullPool)
-        with engine.begin() as connection:
-            for table in metadata.sorted_tables:
-                times = {name: table.c[name] + seconds for name in TIMES if name in table.c}
-                if times:
-                    connection.execute(sa.update(table).values(times))
-
-    return change

@@ -18,6 +18,7 @@ from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 
 from support.postgresql import Postgresql
+from surrogym_server import app  # noqa: F401  # its features define tables
 from surrogym_server.errors import InvalidInput, Unavailable
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSurrogate
@@ -53,10 +54,15 @@ def engine(url: str) -> sa.Engine:
 
 
 def test_migrations_make_the_tables_the_program_uses(url: str) -> None:
+    """Besides, there may be tables of features that this program lacks."""
     open_storage(url).close()
+
+    def is_known(table: sa.Table, name: str, kind: str, reflected: bool, known: sa.Table | None) -> bool:
+        return kind != "table" or known is not None
+
     with engine(url).connect() as connection:
-        context = MigrationContext.configure(connection, opts={"compare_type": True})
-        assert compare_metadata(context, metadata) == []
+        opts = {"compare_type": True, "include_object": is_known}
+        assert compare_metadata(MigrationContext.configure(connection, opts=opts), metadata) == []
 
 
 def test_opening_again_keeps_everything(url: str, storage: Storage, make: Callable[..., str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import sqlalchemy as sa
@@ -9,14 +10,13 @@ import sqlalchemy as sa
 from surrogym_server.errors import Damaged, Unavailable
 from surrogym_server.storage.announcements import Alone
 from surrogym_server.storage.policies import Blobs
-from surrogym_server.storage.port import Storage
+from surrogym_server.storage.port import Storage, T
 from surrogym_server.storage.records import Synchronous
 from surrogym_server.storage.sql.announcements import NotifiedAnnouncements
 from surrogym_server.storage.sql.blobs import FolderBlobs, RowBlobs
 from surrogym_server.storage.sql.checks import check_pages, check_tables
 from surrogym_server.storage.sql.database import Database, connect, never_connected
 from surrogym_server.storage.sql.designs import SqlDesigns
-from surrogym_server.storage.sql.jobs import SqlJobs
 from surrogym_server.storage.sql.ledger import SqlLedger
 from surrogym_server.storage.sql.live_sessions import SqlLiveSessions
 from surrogym_server.storage.sql.memory import SqlEvents, SqlOccupancy, SqlSessions
@@ -51,7 +51,9 @@ class SqlStorage(Storage):
         self.policies = SqlPolicies(database)
         self.blobs = blobs
         self.announcements = NotifiedAnnouncements(database) if database.notifies else Alone()
-        self.jobs = SqlJobs(database)
+
+    def part(self, store: Callable[[Database], T]) -> T:
+        return store(self._database)
 
     def ping(self) -> None:
         self._readiness.require()

@@ -1,6 +1,7 @@
 """The tables. Vectors are little-endian float64 bytes, so that they are read back bit for bit; JSON is text.
 
-Rows of a surrogate are deleted with it (``ON DELETE CASCADE``). Ids are never used twice.
+Rows of a surrogate are deleted with it (``ON DELETE CASCADE``). Ids are never used twice. A feature
+defines its tables in its own folder, on the same ``metadata``.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import numpy as np
 import sqlalchemy as sa
 from sqlalchemy.engine import Dialect
 
-from surrogym_server.storage.jobs import JobKind, JobStatus
 from surrogym_server.storage.records import (
     Array,
     EventKind,
@@ -125,19 +125,21 @@ class Checked(sa.types.TypeDecorator[Any]):
         return value
 
 
-def _check_plain_columns() -> None:
+def checked(table: sa.Table) -> sa.Table:
     """Check the values of columns without a type of this file. Ids are not checked, because they only refer to rows."""
-    for table in metadata.tables.values():
-        for column in table.columns:
-            if type(column.type) in PLAIN and column.type is not Id:
-                column.type = Checked(f"{table.name}.{column.name}", column.type)
+    for column in table.columns:
+        if type(column.type) in PLAIN and column.type is not Id:
+            column.type = Checked(f"{table.name}.{column.name}", column.type)
+    return table
 
 
-def _id() -> sa.Column[int]:
+def row_id() -> sa.Column[int]:
+    """The column of a row's id."""
     return sa.Column("id", Id, primary_key=True, autoincrement=True)
 
 
-def _owner(**options: Any) -> sa.Column[int]:
+def owner(**options: Any) -> sa.Column[int]:
+    """The column of the surrogate that a row belongs to, and is deleted with."""
     key = sa.ForeignKey("surrogates.id", ondelete="CASCADE")
     return sa.Column("surrogate_id", Id, key, nullable=False, **options)
 
@@ -145,7 +147,7 @@ def _owner(**options: Any) -> sa.Column[int]:
 surrogates = sa.Table(
     "surrogates",
     metadata,
-    _id(),
+    row_id(),
     sa.Column("name", sa.Text, nullable=False, unique=True),
     sa.Column("spec", Json("surrogates.spec"), nullable=False),
     sa.Column("budget", sa.Integer, nullable=False),
@@ -173,8 +175,8 @@ surrogates = sa.Table(
 queries = sa.Table(
     "queries",
     metadata,
-    _id(),
-    _owner(),
+    row_id(),
+    owner(),
     sa.Column("purpose", Word("queries.purpose", Purpose), nullable=False),
     sa.Column("status", Word("queries.status", QueryStatus), nullable=False),
     sa.Column("round", sa.Integer, nullable=False),
@@ -194,8 +196,8 @@ queries = sa.Table(
 leases = sa.Table(
     "leases",
     metadata,
-    _id(),
-    _owner(),
+    row_id(),
+    owner(),
     sa.Column("query_id", Id, sa.ForeignKey("queries.id", ondelete="CASCADE"), nullable=False, index=True),
     sa.Column("token", sa.Text, nullable=False, unique=True),
     sa.Column("sampler", sa.Text, nullable=False),
@@ -218,8 +220,8 @@ leases = sa.Table(
 samples = sa.Table(
     "samples",
     metadata,
-    _id(),
-    _owner(),
+    row_id(),
+    owner(),
     sa.Column("query_id", Id, sa.ForeignKey("queries.id", ondelete="CASCADE"), index=True),
     sa.Column("lease_id", Id, sa.ForeignKey("leases.id", ondelete="CASCADE")),
     sa.Column("step", sa.Integer, nullable=False, server_default="0"),
@@ -246,8 +248,8 @@ samples = sa.Table(
 snapshots = sa.Table(  # that samplers hold
     "snapshots",
     metadata,
-    _id(),
-    _owner(),
+    row_id(),
+    owner(),
     sa.Column("name", sa.Text, nullable=False),
     sa.Column("coordinates", Floats, nullable=False),
     sa.UniqueConstraint("surrogate_id", "name"),
@@ -257,8 +259,8 @@ snapshots = sa.Table(  # that samplers hold
 evaluations = sa.Table(
     "evaluations",
     metadata,
-    _id(),
-    _owner(index=True),
+    row_id(),
+    owner(index=True),
     sa.Column("steps", sa.BigInteger, nullable=False),
     sa.Column("episodes", sa.BigInteger, nullable=False),
     sa.Column("note", sa.Text, nullable=False),
@@ -269,7 +271,7 @@ evaluations = sa.Table(
 requests = sa.Table(  # what an idempotency key was used for, and what it returned
     "requests",
     metadata,
-    _owner(primary_key=True),
+    owner(primary_key=True),
     sa.Column("operation", sa.Text, primary_key=True),
     sa.Column("key", sa.Text, primary_key=True),
     sa.Column("fingerprint", sa.Text, nullable=False),
@@ -279,7 +281,7 @@ requests = sa.Table(  # what an idempotency key was used for, and what it return
 models = sa.Table(
     "models",
     metadata,
-    _owner(primary_key=True),
+    owner(primary_key=True),
     sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
     sa.Column("created_at", sa.Double, nullable=False),
     sa.Column("samples", sa.Integer, nullable=False),
@@ -295,8 +297,8 @@ models = sa.Table(
 occupancies = sa.Table(
     "occupancies",
     metadata,
-    _id(),
-    _owner(),
+    row_id(),
+    owner(),
     sa.Column("checkpoint", sa.Text, nullable=False),
     sa.Column("round", sa.Integer, nullable=False),
     sa.Column("created_at", sa.Double, nullable=False),
@@ -318,7 +320,7 @@ live_sessions = sa.Table(  # of a cluster; each is in the memory of its owner, a
     "live_sessions",
     metadata,
     sa.Column("id", sa.Text, primary_key=True),
-    _owner(),
+    owner(),
     sa.Column("key", sa.Text),  # idempotency key of its opening
     sa.Column("digest", sa.Text),  # of the opening
     sa.Column("machine", sa.Text, nullable=False),
@@ -334,8 +336,8 @@ live_sessions = sa.Table(  # of a cluster; each is in the memory of its owner, a
 events = sa.Table(
     "events",
     metadata,
-    _id(),
-    _owner(),
+    row_id(),
+    owner(),
     sa.Column("kind", Word("events.kind", EventKind), nullable=False),
     sa.Column("created_at", sa.Double, nullable=False),
     sa.Column("body", Json("events.body"), nullable=False),
@@ -346,7 +348,7 @@ events = sa.Table(
 policies = sa.Table(
     "policies",
     metadata,
-    _owner(primary_key=True),
+    owner(primary_key=True),
     sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
     sa.Column("created_at", sa.Double, nullable=False),
     sa.Column("card", Json("policies.card"), nullable=False),
@@ -384,7 +386,7 @@ policy_aliases = sa.Table(
 policy_evaluations = sa.Table(
     "policy_evaluations",
     metadata,
-    _id(),
+    row_id(),
     sa.Column("surrogate_id", Id, nullable=False),
     sa.Column("version", sa.Integer, nullable=False),
     sa.Column("key", sa.Text, nullable=False),
@@ -398,35 +400,6 @@ policy_evaluations = sa.Table(
     sqlite_autoincrement=True,
 )
 
-jobs = sa.Table(
-    "jobs",
-    metadata,
-    _id(),
-    _owner(),
-    sa.Column("kind", Word("jobs.kind", JobKind), nullable=False),
-    sa.Column("status", Word("jobs.status", JobStatus), nullable=False),
-    sa.Column("task", Json("jobs.task"), nullable=False),
-    sa.Column("episodes", sa.Integer, nullable=False),  # real ones that it asks for
-    sa.Column("created_at", sa.Double, nullable=False),
-    sa.Column("attempts", sa.Integer, nullable=False),
-    sa.Column("worker", sa.Text),
-    sa.Column("token", sa.Text),  # of the last lease
-    sa.Column("begun", sa.Double),
-    sa.Column("expires", sa.Double),
-    sa.Column("seconds", sa.Double),  # for how long the lease was given out last
-    sa.Column("cancelling", sa.Boolean, nullable=False),
-    sa.Column("lost", sa.Boolean, nullable=False),  # it ended because its lease did
-    sa.Column("finished_at", sa.Double),
-    sa.Column("state", Json("jobs.state"), nullable=False),
-    sa.Column("curve", Json("jobs.curve"), nullable=False),
-    sa.Column("error", sa.Text),
-    sa.Column("version", sa.Integer),  # of the policy
-    sa.Column("evaluation", Id),
-    sa.Index(None, "surrogate_id", "status", "id"),
-    sa.Index(None, "status", "expires"),
-    sqlite_autoincrement=True,
-)
-
 blobs = sa.Table(  # files, where they have no folder; a backup leaves this table out
     "blobs",
     metadata,
@@ -435,4 +408,5 @@ blobs = sa.Table(  # files, where they have no folder; a backup leaves this tabl
     sa.Column("content", sa.LargeBinary, nullable=False),
 )
 
-_check_plain_columns()
+for _table in metadata.tables.values():
+    checked(_table)

@@ -7,15 +7,15 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Request
 
-from surrogym_server import convert
-from surrogym_server.api import examples
 from surrogym_server.api.auth import READ, TRAIN
 from surrogym_server.api.body import example
 from surrogym_server.api.door import DoorRoute
+from surrogym_server.api.feature import part
 from surrogym_server.api.problems import documented
-from surrogym_server.api.state import Use
 from surrogym_server.api.turns import require_present
-from surrogym_server.services.activity import Offer
+from surrogym_server.features.jobs import forms
+from surrogym_server.features.jobs.service import JobService
+from surrogym_server.features.jobs.workers import Offer
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     AddJob,
@@ -32,8 +32,24 @@ from surrogym_shared.wire import (
 
 router = APIRouter(prefix="/v1/surrogates/{name}", tags=["jobs"], route_class=DoorRoute)
 
+Jobs = Annotated[JobService, part(JobService)]
 Number = Annotated[int, Path(ge=1, le=2**63 - 1)]
 THERE = (Code.UNKNOWN_SURROGATE, Code.UNKNOWN_JOB, Code.INVALID_REQUEST)
+
+ADD = {"task": {"kind": "train", "algorithm": "fastppo", "steps": 100_000, "seed": 0}}
+CLAIM = {"worker": "trainer-1", "most_episodes": 100, "wait_seconds": 20, "lease_seconds": 60}
+REPORT = {
+    "lease_token": "the token of the claim",
+    "state": {
+        "stage": "training",
+        "share": 0.25,
+        "steps": 2048,
+        "total_steps": 8192,
+        "imagined_return": -900.5,
+        "curve": [{"steps": 1024, "imagined_return": -1200}, {"steps": 2048, "imagined_return": -900.5}],
+    },
+}
+FINISH = {"lease_token": "the token of the claim", "status": "done", "version": 3}
 
 
 @router.get(
@@ -42,9 +58,9 @@ THERE = (Code.UNKNOWN_SURROGATE, Code.UNKNOWN_JOB, Code.INVALID_REQUEST)
     dependencies=[READ],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
-def list_all(name: str, use: Use) -> JobList:
+def list_all(name: str, jobs: Jobs) -> JobList:
     """List all jobs, newest first, and the connected trainer workers."""
-    return convert.job_list(*use.jobs.list(name))
+    return forms.job_list(*jobs.list(name))
 
 
 @router.post(
@@ -61,27 +77,27 @@ def list_all(name: str, use: Use) -> JobList:
         Code.INVALID_REQUEST,
     ),
 )
-def add(name: str, body: Annotated[AddJob, example(examples.JOB)], use: Use) -> JobView:
+def add(name: str, body: Annotated[AddJob, example(ADD)], jobs: Jobs) -> JobView:
     """Queue a job for a trainer worker (``surrogym work``). A task consists of numbers and of words from fixed lists;
     all code is the worker's own. An evaluation runs in the environment that the worker was started with, if the worker
     accepts that many real episodes."""
     task, fields = body.task, body.task.model_dump(mode="json")
     if isinstance(task, TrainTask):
-        return convert.job_view(use.jobs.train(name, fields, body.idempotency_key))
-    return convert.job_view(use.jobs.evaluate(name, fields, task.real_episodes, body.idempotency_key))
+        return forms.job_view(jobs.train(name, fields, body.idempotency_key))
+    return forms.job_view(jobs.evaluate(name, fields, task.real_episodes, body.idempotency_key))
 
 
 @router.get("/jobs/{job_id}", summary="One job", dependencies=[READ], responses=documented(*THERE))
-def get(name: str, job_id: Number, use: Use) -> JobDetail:
+def get(name: str, job_id: Number, jobs: Jobs) -> JobDetail:
     """Return a job with the curve of its training so far."""
-    return convert.job_detail(use.jobs.get(name, job_id))
+    return forms.job_detail(jobs.get(name, job_id))
 
 
 @router.post("/jobs/{job_id}:cancel", summary="Cancel a job", dependencies=[TRAIN], responses=documented(*THERE))
-def cancel(name: str, job_id: Number, use: Use) -> JobView:
+def cancel(name: str, job_id: Number, jobs: Jobs) -> JobView:
     """Cancel a job. A queued job ends at once. The worker of a running job stops at its next report, and stores the
     best policy so far."""
-    return convert.job_view(use.jobs.cancel(name, job_id))
+    return forms.job_view(jobs.cancel(name, job_id))
 
 
 @router.post(
@@ -90,17 +106,15 @@ def cancel(name: str, job_id: Number, use: Use) -> JobView:
     dependencies=[TRAIN],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_MANY_REQUESTS),
 )
-async def claim(
-    name: str, body: Annotated[ClaimJob, example(examples.CLAIM_JOB)], request: Request, use: Use
-) -> ClaimedJob:
+async def claim(name: str, body: Annotated[ClaimJob, example(CLAIM)], request: Request, jobs: Jobs) -> ClaimedJob:
     """Lease the oldest queued job to this worker only. If there is none, the reply waits for one, up to
     ``wait_seconds``."""
     offer = Offer(body.most_episodes, body.reference)
     present = partial(require_present, request)
-    request.app.state.job_claims.require_room(request)
-    with request.app.state.job_claims.count(request):
-        job = await use.jobs.claim(name, body.worker, offer, body.lease_seconds, body.wait_seconds, present)
-    return convert.claimed_job(job, body.lease_seconds)
+    jobs.claims.require_room(request)
+    with jobs.claims.count(request):
+        job = await jobs.claim(name, body.worker, offer, body.lease_seconds, body.wait_seconds, present)
+    return forms.claimed_job(job, body.lease_seconds)
 
 
 @router.post(
@@ -109,13 +123,11 @@ async def claim(
     dependencies=[TRAIN],
     responses=documented(*THERE, Code.LEASE_EXPIRED),
 )
-def report(
-    name: str, job_id: Number, body: Annotated[ReportJob, example(examples.REPORT_JOB)], use: Use
-) -> ReportedJob:
+def report(name: str, job_id: Number, body: Annotated[ReportJob, example(REPORT)], jobs: Jobs) -> ReportedJob:
     """Renew the lease of a job and store its progress. The reply tells the worker whether to stop. Without reports the
     lease ends: a training then goes to the next worker, and an evaluation fails."""
-    progress = convert.job_progress(body.state)
-    return ReportedJob(cancel=use.jobs.report(name, job_id, body.lease_token, body.lease_seconds, progress))
+    progress = forms.job_progress(body.state)
+    return ReportedJob(cancel=jobs.report(name, job_id, body.lease_token, body.lease_seconds, progress))
 
 
 @router.post(
@@ -124,6 +136,6 @@ def report(
     dependencies=[TRAIN],
     responses=documented(*THERE, Code.UNKNOWN_POLICY, Code.LEASE_EXPIRED),
 )
-def finish(name: str, job_id: Number, body: Annotated[FinishJob, example(examples.FINISH_JOB)], use: Use) -> JobView:
+def finish(name: str, job_id: Number, body: Annotated[FinishJob, example(FINISH)], jobs: Jobs) -> JobView:
     """End a job, with the version of the policy that was stored. A repeat is harmless."""
-    return convert.job_view(use.jobs.finish(name, job_id, body.lease_token, convert.job_result(body)))
+    return forms.job_view(jobs.finish(name, job_id, body.lease_token, forms.job_result(body)))

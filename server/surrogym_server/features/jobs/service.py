@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import asyncio
+from typing import NamedTuple, Self
 
+from surrogym_server.api.feature import Core
+from surrogym_server.api.turns import Waiting
 from surrogym_server.errors import UnknownPolicy
-from surrogym_server.services.activity import Offer, Workers
+from surrogym_server.features.jobs.records import JobProgress, JobRecord, JobResult, LeasedJob, NewJob
+from surrogym_server.features.jobs.store import Jobs
+from surrogym_server.features.jobs.workers import Offer, Workers
 from surrogym_server.services.lines import Lines, Present
+from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
-from surrogym_server.storage.jobs import JobProgress, JobRecord, JobResult, LeasedJob, NewJob
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import JSON
 
@@ -22,11 +27,22 @@ class _Claim(NamedTuple):
 class JobService:
     """Queues jobs, and hands them to trainer workers under leases."""
 
-    def __init__(self, storage: Storage, notices: Notices, workers: Workers | None = None) -> None:
+    def __init__(self, storage: Storage, notices: Notices, metrics: ProcessMetrics) -> None:
+        self.claims = Waiting("waiting claims of jobs")
         self._storage = storage
+        self._jobs = storage.part(Jobs)
         self._notices = notices
-        self._workers = workers or Workers()
+        self._metrics = metrics
+        self._workers = Workers()
         self._lines = Lines[_Claim](notices, has_work=lambda claim: claim.job is not None)
+
+    @classmethod
+    def start(cls, core: Core) -> Self:
+        return cls(core.storage, core.notices, core.metrics)
+
+    async def sweep(self) -> None:
+        """End the leases of workers that fell silent."""
+        self._metrics.expired_leases += await asyncio.to_thread(self._jobs.sweep_expired)
 
     def train(self, name: str, task: JSON, key: str | None) -> JobRecord:
         """Queue a training.
@@ -67,7 +83,7 @@ class JobService:
         most, reference = offer
 
         def claim() -> _Claim:
-            return _Claim(self._storage.jobs.claim(name, worker, most, lease_seconds, reference=reference))
+            return _Claim(self._jobs.claim(name, worker, most, lease_seconds, reference=reference))
 
         if self._workers.heard(name, worker, offer):
             self._notices.post(name)  # the page shows a worker as soon as it is connected
@@ -84,8 +100,8 @@ class JobService:
             UnknownJob: the job does not exist.
             LeaseExpired: the job has ended, or another worker has it.
         """
-        cancel = self._storage.jobs.report(name, id, token, lease_seconds, progress)
-        if worker := self._storage.jobs.get(name, id).worker:
+        cancel = self._jobs.report(name, id, token, lease_seconds, progress)
+        if worker := self._jobs.get(name, id).worker:
             self._workers.heard(name, worker)
         return cancel
 
@@ -102,22 +118,22 @@ class JobService:
             if result.evaluation not in (None, *(one.id for one in policy.evaluations)):
                 place = f"version {result.version} of {name!r}'s policies"
                 raise UnknownPolicy(f"expected an evaluation of {place}, got {result.evaluation}")
-        return self._changed(name, self._storage.jobs.finish(name, id, token, result))
+        return self._changed(name, self._jobs.finish(name, id, token, result))
 
     def cancel(self, name: str, id: int) -> JobRecord:
         """Cancel a queued job, or ask the worker of a running one to stop. Raises ``UnknownJob``."""
-        return self._changed(name, self._storage.jobs.cancel(name, id))
+        return self._changed(name, self._jobs.cancel(name, id))
 
     def get(self, name: str, id: int) -> JobRecord:
         """Return a job. Raises ``UnknownJob``."""
-        return self._storage.jobs.get(name, id)
+        return self._jobs.get(name, id)
 
     def list(self, name: str) -> tuple[list[JobRecord], dict[str, Offer]]:
         """Return all jobs, newest first, and the offer of each connected worker."""
-        return self._storage.jobs.list(name), self._workers.of(name)
+        return self._jobs.list(name), self._workers.of(name)
 
     def _add(self, name: str, new: NewJob, key: str | None) -> JobRecord:
-        return self._changed(name, self._storage.jobs.get(name, self._storage.jobs.add(name, new, key=key)))
+        return self._changed(name, self._jobs.get(name, self._jobs.add(name, new, key=key)))
 
     def _changed(self, name: str, record: JobRecord) -> JobRecord:
         self._notices.post(name)

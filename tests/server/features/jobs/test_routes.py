@@ -14,6 +14,7 @@ from support.server import ServerProcess
 from surrogym_client.errors import InvalidInput, LeaseExpired, NoModel, Overloaded, UnknownJob, UnknownPolicy
 from surrogym_client.transport import Api, Retries
 from surrogym_sampler.original.classic import pendulum
+from surrogym_server.features.jobs import routes
 from surrogym_shared import wire
 
 TRAIN = wire.TrainTask(kind="train", algorithm="fastppo", steps=1_000)
@@ -32,6 +33,19 @@ def known(api: Api, taught: str) -> Iterator[str]:
     """A surrogate with a model; jobs that are queued at the end are cancelled."""
     with left_alone(api, taught):
         yield taught
+
+
+@pytest.mark.parametrize(
+    ("example", "model"),
+    [
+        (routes.ADD, wire.AddJob),
+        (routes.CLAIM, wire.ClaimJob),
+        (routes.REPORT, wire.ReportJob),
+        (routes.FINISH, wire.FinishJob),
+    ],
+)
+def test_every_example_is_accepted_by_its_model(example: dict[str, Any], model: type[wire.Request]):
+    model.model_validate(example)
 
 
 def test_a_job_is_seen_from_its_queue_to_its_end(api: Api, known: str):

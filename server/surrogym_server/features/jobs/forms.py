@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from surrogym_server.convert.stored import read_stored
-from surrogym_server.storage.jobs import JobProgress, JobRecord, JobResult, LeasedJob
+from surrogym_server.features.jobs.records import JobProgress, JobRecord, JobResult, LeasedJob
 from surrogym_shared import wire
 
 JOB = "a job"  # name in the error if it is damaged

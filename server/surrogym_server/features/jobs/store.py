@@ -9,15 +9,16 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import LeaseExpired, Overloaded, UnknownJob, UnknownSurrogate
-from surrogym_server.storage import jobs as port
-from surrogym_server.storage.jobs import (
+from surrogym_server.features.jobs.records import (
     MAX_JOBS,
     MAX_OPEN,
     MAX_RUNS,
     SILENT,
+    JobKind,
     JobProgress,
     JobRecord,
     JobResult,
+    JobStatus,
     LeasedJob,
     NewJob,
 )
@@ -25,7 +26,38 @@ from surrogym_server.storage.records import fingerprint
 from surrogym_server.storage.sql import expiry
 from surrogym_server.storage.sql.database import NOW, Database
 from surrogym_server.storage.sql.rows import append_event, find, hold, recall, remember
-from surrogym_server.storage.sql.tables import jobs, surrogates
+from surrogym_server.storage.sql.tables import Id, Json, Word, checked, metadata, owner, row_id, surrogates
+
+jobs = checked(
+    sa.Table(
+        "jobs",
+        metadata,
+        row_id(),
+        owner(),
+        sa.Column("kind", Word("jobs.kind", JobKind), nullable=False),
+        sa.Column("status", Word("jobs.status", JobStatus), nullable=False),
+        sa.Column("task", Json("jobs.task"), nullable=False),
+        sa.Column("episodes", sa.Integer, nullable=False),  # real ones that it asks for
+        sa.Column("created_at", sa.Double, nullable=False),
+        sa.Column("attempts", sa.Integer, nullable=False),
+        sa.Column("worker", sa.Text),
+        sa.Column("token", sa.Text),  # of the last lease
+        sa.Column("begun", sa.Double),
+        sa.Column("expires", sa.Double),
+        sa.Column("seconds", sa.Double),  # for how long the lease was given out last
+        sa.Column("cancelling", sa.Boolean, nullable=False),
+        sa.Column("lost", sa.Boolean, nullable=False),  # it ended because its lease did
+        sa.Column("finished_at", sa.Double),
+        sa.Column("state", Json("jobs.state"), nullable=False),
+        sa.Column("curve", Json("jobs.curve"), nullable=False),
+        sa.Column("error", sa.Text),
+        sa.Column("version", sa.Integer),  # of the policy
+        sa.Column("evaluation", Id),
+        sa.Index(None, "surrogate_id", "status", "id"),
+        sa.Index(None, "status", "expires"),
+        sqlite_autoincrement=True,
+    )
+)
 
 SHOWN = [
     getattr(jobs.c, name)
@@ -38,11 +70,27 @@ RUNNING = jobs.c.status == "running"
 OPEN = jobs.c.status.in_(("queued", "running"))
 
 
-class SqlJobs(port.Jobs):
+class Jobs:
+    """Jobs of a surrogate, and their leases.
+
+    A training whose lease ends is queued again, and failed after ``MAX_RUNS``. An evaluation whose lease ends is
+    failed, because its real steps may have been taken. A job that was to be cancelled is then cancelled.
+
+    A worker proves its lease by the token. It may continue although the lease has ended, as long as no other worker has
+    claimed the job and nobody has cancelled it: its next report makes the job running again, and its result counts.
+
+    An operation on a job that does not exist raises ``UnknownJob``.
+    """
+
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def add(self, name: str, new: NewJob, *, key: str | None = None) -> int:
+        """Queue a job, and return its id. The oldest ended jobs beyond ``MAX_JOBS`` are removed.
+
+        Raises:
+            Overloaded: there are ``MAX_OPEN`` jobs that are queued or running.
+        """
         body = fingerprint(new.kind, new.task)
         with self._database.write() as connection:
             held = hold(connection, name)
@@ -61,6 +109,12 @@ class SqlJobs(port.Jobs):
     def claim(
         self, name: str, worker: str, most_episodes: int, seconds: float, *, reference: bool = False
     ) -> LeasedJob | None:
+        """Lease the oldest queued job of at most ``most_episodes`` real episodes to one caller. None if there is none.
+
+        Jobs that ask for a reference controller are leased only to a worker that has one.
+
+        Expired leases are ended first. A new lease clears the progress of the one before.
+        """
         with self._database.read() as connection:  # waiting workers don't block writers
             own = jobs.c.surrogate_id == find(connection, name)
             waiting = (jobs.c.status == "queued") | expiry.has_ended(jobs, RUNNING)
@@ -83,6 +137,11 @@ class SqlJobs(port.Jobs):
             return LeasedJob(row.id, row.task, row.attempts + 1, token)
 
     def report(self, name: str, id: int, token: str, seconds: float, progress: JobProgress | None) -> bool:
+        """Extend the lease to ``seconds`` from now, and store the progress. Returns whether the worker is to stop.
+
+        Raises:
+            LeaseExpired: the job has ended, or another worker has it.
+        """
         with self._database.write() as connection:
             surrogate = find(connection, name)
             alive = (jobs.c.token == token) & (OPEN | jobs.c.lost)
@@ -97,6 +156,11 @@ class SqlJobs(port.Jobs):
             return bool(cancelling)
 
     def finish(self, name: str, id: int, token: str, result: JobResult) -> JobRecord:
+        """End a job. A repeat is harmless, and changes nothing.
+
+        Raises:
+            LeaseExpired: another worker has the job, or it was cancelled before a worker had it again.
+        """
         with self._database.write() as connection:
             held = hold(connection, name)
             row = _read(connection, held.id, id)
@@ -109,6 +173,7 @@ class SqlJobs(port.Jobs):
             return _record(_read(connection, held.id, id))
 
     def cancel(self, name: str, id: int) -> JobRecord:
+        """Cancel a queued job at once, and ask the worker of a running one to stop. A job that has ended stays."""
         with self._database.write() as connection:
             held = hold(connection, name)
             row = _read(connection, held.id, id)
@@ -122,16 +187,22 @@ class SqlJobs(port.Jobs):
             return _record(_read(connection, held.id, id))
 
     def get(self, name: str, id: int) -> JobRecord:
+        """Return a job with its curve."""
         with self._database.read() as connection:
             return _record(_read(connection, find(connection, name), id))
 
     def list(self, name: str) -> list[JobRecord]:
+        """Return all jobs, newest first, without their curves."""
         with self._database.read() as connection:
             own = jobs.c.surrogate_id == find(connection, name)
             rows = connection.execute(sa.select(*SHOWN).where(own).order_by(jobs.c.id.desc()))
             return [JobRecord(**row._mapping) for row in rows]
 
     def sweep_expired(self) -> int:
+        """End the expired leases of all surrogates, and return how many there were.
+
+        A lease with more time left than it was given, because the clock was set back, gets that time from now.
+        """
         with self._database.read() as connection:
             owners = sa.select(jobs.c.surrogate_id).where(expiry.has_ended(jobs, RUNNING)).distinct()
             wanted = sa.select(surrogates.c.name).where(surrogates.c.id.in_(owners))

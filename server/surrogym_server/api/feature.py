@@ -1,0 +1,57 @@
+"""What ``app.py`` needs of an optional feature, and what a feature gets of the core.
+
+A feature is one folder of ``features``, with its routes, its service and its tables. It imports the core, and the core
+does not import it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
+
+from fastapi import APIRouter, Depends, Request
+
+from surrogym_server.services.metrics import ProcessMetrics
+from surrogym_server.services.notices import Notices
+from surrogym_server.storage.port import Storage
+
+S = TypeVar("S")
+
+
+class Service(Protocol):
+    """What a feature does in a server process, whoever calls its routes."""
+
+    async def sweep(self) -> None:
+        """Called at every sweep, every ``sweep_seconds``."""
+
+
+@dataclass(frozen=True)
+class Core:
+    """Objects of the server process that a feature may use."""
+
+    storage: Storage
+    notices: Notices
+    metrics: ProcessMetrics
+
+
+@dataclass(frozen=True)
+class Feature:
+    """Routes, and the service behind them, which ``start`` builds in a server process."""
+
+    router: APIRouter
+    start: Callable[[Core], Service]
+
+
+Parts = Mapping[type[Service], Service]  # of the features, by class
+
+
+def part(kind: type[S]) -> Any:
+    """A route's dependency on the service of its feature."""
+
+    async def started(request: Request) -> S:
+        found = request.state.parts[kind]
+        assert isinstance(found, kind)
+        return found
+
+    return Depends(started)
