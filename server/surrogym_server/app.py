@@ -23,7 +23,6 @@ from surrogym_server.api import (
     metrics,
     models,
     openapi,
-    policies,
     problems,
     queries,
     samples,
@@ -33,7 +32,6 @@ from surrogym_server.api import (
 )
 from surrogym_server.api.auth import Gate
 from surrogym_server.api.caller import fingerprint
-from surrogym_server.api.feature import Core, Parts
 from surrogym_server.api.guards import BodyLimit, KnownHosts, OwnPages
 from surrogym_server.api.observe import Observed
 from surrogym_server.api.state import Services
@@ -51,7 +49,8 @@ from surrogym_server.engine.port import Compute, SessionEngine
 from surrogym_server.engine.sessions import MEBIBYTE, Limits
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
-from surrogym_server.features import jobs
+from surrogym_server.feature import Core, Parts
+from surrogym_server.features import jobs, policies
 from surrogym_server.models.registry import MODELS
 from surrogym_server.private import keep_private
 from surrogym_server.sampling.acquisition import ACQUISITIONS
@@ -62,7 +61,6 @@ from surrogym_server.services.events import EventService
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.models import ModelService, load_model, stored_tolerances
 from surrogym_server.services.notices import Notices
-from surrogym_server.services.policies import PolicyService
 from surrogym_server.services.queries import QueryService
 from surrogym_server.services.samples import SampleService
 from surrogym_server.services.sessions import SessionService
@@ -73,7 +71,7 @@ from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
 from surrogym_shared.spec import EnvironmentSpec
 
-FEATURES = (jobs.FEATURE,)  # a server without one has no folder for it, and no line here
+FEATURES = (policies.FEATURE, jobs.FEATURE)  # a server without one has no folder for it, and no line here
 
 logger = logging.getLogger(__name__)
 
@@ -123,7 +121,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     if settings.engine == "ray":
         pool.check(settings)
     keep_private(settings)
-    storage = open_storage(settings.database_url, settings.synchronous, settings.files)
+    storage = open_storage(settings.database_url, settings.synchronous)
     engine = _cluster(settings, storage) if settings.engine == "ray" else None
     app = FastAPI(
         title="Surrogym",
@@ -156,7 +154,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", *settings.host_names}))
     app.add_middleware(Observed, metrics=app.state.metrics)
     app.router.routes.extend(stepping.routes)  # tried first, and directly: an included router is another search
-    for room in (sessions, service, metrics, surrogates, queries, samples, logs, models, policies, *FEATURES, events):
+    for room in (sessions, service, metrics, surrogates, queries, samples, logs, models, *FEATURES, events):
         app.include_router(room.router)
     _add_dashboard(app)
     return app
@@ -191,7 +189,7 @@ async def _lifespan(
     process = _build_process(settings, design, storage, app.state.metrics, engine)
     app.state.notices = process.notices
     services = _build_services(settings, design, process)
-    core = Core(storage, process.notices, process.metrics)
+    core = Core(settings, storage, process.notices, process.metrics, _complete)
     parts = {type(one): one for one in [feature.start(core) for feature in FEATURES]}
     sweeps = [one.sweep for one in parts.values()]
     sweeper = Sweeper(storage, process.engine, settings.sweep_seconds, process.metrics, process.notices, sweeps)
@@ -264,7 +262,6 @@ def _build_services(settings: Settings, design: DesignPort, process: _Process) -
         queries=QueryService(storage, definitions, notices, samplers),
         samples=SampleService(storage, definitions, notices, samplers),
         models=ModelService(storage, definitions, process.models, notices),
-        policies=PolicyService(storage, _complete, notices, settings.policies_mib * MEBIBYTE),
         sessions=SessionService(storage, definitions, process.engine),
         engine=process.engine,
         designer=designer,

@@ -81,20 +81,3 @@ RESET: Example = {"seq": 1, "seed": 0}
 STEP: Example = {"seq": 2, "action": [[1.5], [-0.5]]}
 ROLLOUT: Example = {"seq": 3, "actions": [[[1.5], [-0.5]], [[1.0], [0.0]]]}
 OCCUPANCY: Example = {"checkpoint": "after-100k-steps"}
-POLICY: Example = {
-    "card": {"algorithm": "PPO", "promise": {"median": -150, "low": -170, "high": -135}, "trusted": True},
-    "curve": [{"steps": 2048, "imagined_return": -1200}, {"steps": 4096, "imagined_return": -600}],
-    "file": {
-        "form": "zip",
-        "bytes": 148_213,
-        "digest": "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
-    },
-}
-EVALUATION: Example = {
-    "note": "2 episodes from seed 10000",
-    "first_seed": 10_000,
-    "returns": [-141.5, -118.2],
-    "lengths": [200, 200],
-    "idempotency_key": "evaluation-1",
-}
-ALIAS: Example = {"version": 1}

@@ -11,7 +11,6 @@ from surrogym_server.engine.port import SessionEngine
 from surrogym_server.services.designer import Designer
 from surrogym_server.services.events import EventService
 from surrogym_server.services.models import ModelService
-from surrogym_server.services.policies import PolicyService
 from surrogym_server.services.queries import QueryService
 from surrogym_server.services.samples import SampleService
 from surrogym_server.services.sessions import SessionService
@@ -27,7 +26,6 @@ class Services:
     queries: QueryService
     samples: SampleService
     models: ModelService
-    policies: PolicyService
     sessions: SessionService
     engine: SessionEngine
     designer: Designer

@@ -3,17 +3,6 @@
 from surrogym_server.convert.definitions import default_budget, definition_from_spec, stored_definition
 from surrogym_server.convert.logs import added_report, checked_log, drafted_log, drafted_report, logged_samples
 from surrogym_server.convert.numbers import numbers
-from surrogym_server.convert.policies import (
-    episodes,
-    evaluation_detail,
-    evaluation_view,
-    new_policy,
-    policy_detail,
-    policy_file,
-    policy_list,
-    policy_view,
-    pushed_policy,
-)
 from surrogym_server.convert.resources import (
     added_samples,
     checked,
@@ -64,9 +53,6 @@ __all__ = [
     "definition_from_spec",
     "drafted_log",
     "drafted_report",
-    "episodes",
-    "evaluation_detail",
-    "evaluation_view",
     "event",
     "framed_policy_run",
     "imagined",
@@ -75,17 +61,11 @@ __all__ = [
     "ledger",
     "logged_samples",
     "model_view",
-    "new_policy",
     "new_sample",
     "numbers",
     "opening",
-    "policy_detail",
-    "policy_file",
-    "policy_list",
     "policy_run",
-    "policy_view",
     "prediction",
-    "pushed_policy",
     "query_list",
     "query_view",
     "reset_frame",

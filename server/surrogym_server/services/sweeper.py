@@ -18,7 +18,6 @@ logger = logging.getLogger(__name__)
 
 EVENTS_KEPT = 10_000  # of a surrogate; the oldest beyond them are removed
 PRUNE_SECONDS = 60.0
-ORPHAN_SECONDS = 3_600.0  # wait before unreferenced files are removed; an upload takes less
 
 
 class Sweeper:
@@ -38,7 +37,6 @@ class Sweeper:
         self._metrics = metrics
         self._notices = notices
         self._others = others
-        self._looked_at_files = -ORPHAN_SECONDS
         self._pruned = -PRUNE_SECONDS
 
     async def run(self) -> None:
@@ -54,7 +52,6 @@ class Sweeper:
         for sweep in (self._sweep_leases, *self._others):
             await self._try(sweep)
         await self._try(self._find_changes)
-        await self._try(partial(asyncio.to_thread, self._sweep_files))
         await self._try(partial(asyncio.to_thread, self._prune))
 
     async def _sweep_leases(self) -> None:
@@ -72,18 +69,6 @@ class Sweeper:
             logger.warning("a sweep stopped early; it is repeated shortly: %s", error)
         except Exception:  # leases must continue to expire, whatever error one sweep raises
             logger.exception("a sweep failed; it is repeated shortly")
-
-    def _sweep_files(self) -> None:
-        """Once in ``ORPHAN_SECONDS``, remove the files whose policy or surrogate was deleted or never stored."""
-        now = time.monotonic()
-        if now - self._looked_at_files < ORPHAN_SECONDS:
-            return
-        self._looked_at_files = now
-        old = self._storage.blobs.older(ORPHAN_SECONDS)
-        orphans = tuple(sorted(old - self._storage.policies.blobs())) if old else ()
-        self._storage.blobs.remove(orphans)
-        if orphans:
-            logger.info("files removed that belonged to deleted policies: %d", len(orphans))
 
     def _prune(self) -> None:
         """Once in ``PRUNE_SECONDS``, remove the oldest events of surrogates that have more than ``EVENTS_KEPT``, and

@@ -22,7 +22,6 @@ from typing import Any, TypeVar
 
 from surrogym_server.storage.announcements import Announcements
 from surrogym_server.storage.live_sessions import LiveSessions
-from surrogym_server.storage.policies import Blobs, Policies
 from surrogym_server.storage.records import (
     AddedSamples,
     Array,
@@ -52,6 +51,7 @@ from surrogym_server.storage.records import (
 )
 
 MAX_ATTEMPTS = 3
+LATEST = "latest"  # the alias of the newest policy
 
 T = TypeVar("T")
 
@@ -477,6 +477,18 @@ class Events(ABC):
         """Return up to ``limit`` events with an id above ``after``, in order."""
 
 
+class PolicyNames(ABC):
+    """Versions and aliases of policies, which several features read. The feature ``policies`` stores them."""
+
+    @abstractmethod
+    def version(self, name: str, which: str) -> int:
+        """Return the version that ``which`` means: a version, an alias, or ``latest``. Raises ``UnknownPolicy``."""
+
+    @abstractmethod
+    def has_evaluation(self, name: str, version: int, id: int) -> bool:
+        """Return whether a version has this evaluation. Raises ``UnknownPolicy`` if there is no such version."""
+
+
 class Storage(ABC):
     """All parts of the storage. ``open_storage`` makes one."""
 
@@ -491,8 +503,7 @@ class Storage(ABC):
     sessions: Sessions
     live_sessions: LiveSessions
     events: Events
-    policies: Policies
-    blobs: Blobs
+    policy_names: PolicyNames
     announcements: Announcements
 
     @abstractmethod

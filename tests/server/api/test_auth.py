@@ -24,15 +24,12 @@ ALLOWED = {
         GET /v1/surrogates/{name}, GET /v1/surrogates/{name}/queries, GET /v1/surrogates/{name}/samples,
         GET /v1/surrogates/{name}/models, GET /v1/surrogates/{name}/models/{version}, GET /v1/surrogates/{name}/events,
         GET /v1/surrogates/{name}/sessions, POST /v1/surrogates/{name}/query_uncertainty,
-        POST /v1/surrogates/{name}/predict, POST /v1/surrogates/{name}/imagine, GET /v1/surrogates/{name}/policies,
-        GET /v1/surrogates/{name}/policies/{which}, GET /v1/surrogates/{name}/policies/{which}/files/{form},
-        GET /v1/surrogates/{name}/policies/{which}/evaluations/{id}, GET /v1/surrogates/{name}/snapshots""",
+        POST /v1/surrogates/{name}/predict, POST /v1/surrogates/{name}/imagine, GET /v1/surrogates/{name}/snapshots""",
     "train": """
         POST /v1/surrogates/{name}/sessions, POST /v1/surrogates/{name}/improve, GET /v1/sessions/{id},
         DELETE /v1/sessions/{id}, POST /v1/sessions/{id}/occupancy, POST /v1/sessions/{id}/reset,
         POST /v1/sessions/{id}/step, POST /v1/sessions/{id}/rollout, GET /v1/sessions/{id}/coordinates,
-        POST /v1/surrogates/{name}/policies, PUT /v1/surrogates/{name}/policies/{version}/files/{form},
-        POST /v1/surrogates/{name}/policies/{version}/evaluations, POST /v1/surrogates/{name}/audit,
+        POST /v1/surrogates/{name}/audit,
         POST /v1/surrogates/{name}/audit:withdraw""",
     "sample": """
         POST /v1/surrogates/{name}/queries, POST /v1/surrogates/{name}/queries:claim,
@@ -43,8 +40,7 @@ ALLOWED = {
     "": """
         POST /v1/surrogates, POST /v1/surrogates:check, POST /v1/logs:draft,
         PATCH /v1/surrogates/{name}, DELETE /v1/surrogates/{name},
-        POST /v1/surrogates/{name}/models, DELETE /v1/surrogates/{name}/policies/{version},
-        PUT /v1/surrogates/{name}/policies/aliases/{alias}, DELETE /v1/surrogates/{name}/policies/aliases/{alias}""",
+        POST /v1/surrogates/{name}/models""",
 }
 ROLES_OF = {call.strip(): {*roles.split(), "admin"} for roles, calls in ALLOWED.items() for call in calls.split(",")}
 for _part in Path(__file__).parents[1].glob("features/*/allowed.json"):

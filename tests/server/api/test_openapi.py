@@ -32,9 +32,6 @@ EXAMPLES = {
     "STEP": wire.StepSession,
     "ROLLOUT": wire.RolloutSession,
     "OCCUPANCY": wire.SubmitOccupancy,
-    "POLICY": wire.AddPolicy,
-    "EVALUATION": wire.AddEvaluation,
-    "ALIAS": wire.PutAlias,
 }
 
 

@@ -18,7 +18,6 @@ from surrogym_server.errors import Damaged, NoModel, SurrogymError
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewSample, NewSurrogate
 from surrogym_server.storage.sql import open_storage
-from surrogym_server.storage.sql.blobs import RowBlobs
 from surrogym_server.storage.sql.checks import check_pages
 from surrogym_server.storage.sql.database import connect
 from surrogym_server.storage.sql.storage import SqlStorage
@@ -242,7 +241,7 @@ def test_a_value_of_another_type_is_named_by_whatever_reads_it(file: Path) -> No
     named = []
     for place in places:
         database = connect(f"sqlite:///{changed_copy(file, place)}")
-        with closing(SqlStorage(database, RowBlobs(database))) as storage:
+        with closing(SqlStorage(database)) as storage:
             damage = [str(error) for error in all_read(storage) if isinstance(error, Damaged)]
         assert not damage or any(f" in {place}, got b'" in said for said in damage), (place, damage)
         named += [place] * bool(damage)

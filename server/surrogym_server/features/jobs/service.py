@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 from typing import NamedTuple, Self
 
-from surrogym_server.api.feature import Core
 from surrogym_server.api.turns import Waiting
 from surrogym_server.errors import UnknownPolicy
+from surrogym_server.feature import Core
 from surrogym_server.features.jobs.records import JobProgress, JobRecord, JobResult, LeasedJob, NewJob
 from surrogym_server.features.jobs.store import Jobs
 from surrogym_server.features.jobs.workers import Offer, Workers
@@ -61,7 +61,7 @@ class JobService:
             UnknownPolicy: the policy does not exist.
             Overloaded: too many jobs are queued or running.
         """
-        version = self._storage.policies.get(name, task["policy"]).version
+        version = self._storage.policy_names.version(name, task["policy"])
         return self._add(name, NewJob("evaluate", {**task, "policy": str(version)}, episodes), key)
 
     async def claim(
@@ -114,8 +114,9 @@ class JobService:
             LeaseExpired: another worker has the job.
         """
         if result.version is not None:
-            policy = self._storage.policies.get(name, str(result.version))
-            if result.evaluation not in (None, *(one.id for one in policy.evaluations)):
+            names, version, evaluation = self._storage.policy_names, result.version, result.evaluation
+            names.version(name, str(version))
+            if evaluation is not None and not names.has_evaluation(name, version, evaluation):
                 place = f"version {result.version} of {name!r}'s policies"
                 raise UnknownPolicy(f"expected an evaluation of {place}, got {result.evaluation}")
         return self._changed(name, self._jobs.finish(name, id, token, result))

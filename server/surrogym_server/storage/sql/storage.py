@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import sqlalchemy as sa
 
 from surrogym_server.errors import Damaged, Unavailable
 from surrogym_server.storage.announcements import Alone
-from surrogym_server.storage.policies import Blobs
 from surrogym_server.storage.port import Storage, T
 from surrogym_server.storage.records import Synchronous
 from surrogym_server.storage.sql.announcements import NotifiedAnnouncements
-from surrogym_server.storage.sql.blobs import FolderBlobs, RowBlobs
 from surrogym_server.storage.sql.checks import check_pages, check_tables
 from surrogym_server.storage.sql.database import Database, connect, never_connected
 from surrogym_server.storage.sql.designs import SqlDesigns
@@ -22,7 +19,7 @@ from surrogym_server.storage.sql.live_sessions import SqlLiveSessions
 from surrogym_server.storage.sql.memory import SqlEvents, SqlOccupancy, SqlSessions
 from surrogym_server.storage.sql.migrate import migrate
 from surrogym_server.storage.sql.models import SqlModels
-from surrogym_server.storage.sql.policies import SqlPolicies
+from surrogym_server.storage.sql.policy_names import SqlPolicyNames
 from surrogym_server.storage.sql.queries import SqlQueries
 from surrogym_server.storage.sql.readiness import Readiness
 from surrogym_server.storage.sql.sample_counts import CountedSamples
@@ -34,7 +31,7 @@ from surrogym_server.storage.sql.surrogates import SqlSurrogates
 class SqlStorage(Storage):
     """The port on SQLite or PostgreSQL."""
 
-    def __init__(self, database: Database, blobs: Blobs) -> None:
+    def __init__(self, database: Database) -> None:
         self._database, counted = database, CountedSamples()
         self._readiness = Readiness(database)
         self.surrogates = SqlSurrogates(database, counted)
@@ -48,8 +45,7 @@ class SqlStorage(Storage):
         self.sessions = SqlSessions(database)
         self.live_sessions = SqlLiveSessions(database)
         self.events = SqlEvents(database)
-        self.policies = SqlPolicies(database)
-        self.blobs = blobs
+        self.policy_names = SqlPolicyNames(database)
         self.announcements = NotifiedAnnouncements(database) if database.notifies else Alone()
 
     def part(self, store: Callable[[Database], T]) -> T:
@@ -64,15 +60,13 @@ class SqlStorage(Storage):
         self._database.close()
 
 
-def open_storage(url: str, synchronous: Synchronous = "full", files: Path | None = None) -> Storage:
+def open_storage(url: str, synchronous: Synchronous = "full") -> Storage:
     """Open a database, and bring its schema up to date.
 
     Args:
         url: ``sqlite:///path/to/file`` (created if it does not exist, for one server at a time) or
             ``postgresql://user:password@host/name`` (for several).
         synchronous: as in ``connect``.
-        files: folder for the files of policies. None means ``<database>.files`` beside a SQLite file, and the database
-            itself for PostgreSQL.
 
     Raises:
         InvalidInput: another kind of address.
@@ -88,8 +82,7 @@ def open_storage(url: str, synchronous: Synchronous = "full", files: Path | None
         if isinstance(error, Unavailable) and never_connected(error.__cause__) and database.notifies:
             raise Unavailable(f"{error}; {_way_out(url, str(error))}") from error
         raise
-    folder = files or _beside(url)
-    return SqlStorage(database, RowBlobs(database) if folder is None else FolderBlobs(folder))
+    return SqlStorage(database)
 
 
 def _way_out(url: str, said: str) -> str:
@@ -98,11 +91,6 @@ def _way_out(url: str, said: str) -> str:
     if f'database "{name}" does not exist' in said:
         return f"createdb {name} makes it, or check --database"
     return "check that PostgreSQL runs, and the address in --database"
-
-
-def _beside(url: str) -> Path | None:
-    parsed = sa.make_url(url)
-    return Path(f"{parsed.database}.files") if parsed.get_backend_name() == "sqlite" else None
 
 
 def _bring_up(database: Database) -> None:

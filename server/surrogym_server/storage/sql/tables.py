@@ -356,23 +356,11 @@ policies = sa.Table(
 )
 
 
-def _policy() -> sa.ForeignKeyConstraint:
+def policy_key() -> sa.ForeignKeyConstraint:
+    """The policy that a row belongs to, and is deleted with."""
     columns = ["surrogate_id", "version"]
     return sa.ForeignKeyConstraint(columns, [f"policies.{name}" for name in columns], ondelete="CASCADE")
 
-
-policy_files = sa.Table(
-    "policy_files",
-    metadata,
-    sa.Column("surrogate_id", Id, primary_key=True, autoincrement=False),
-    sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
-    sa.Column("form", sa.Text, primary_key=True),
-    sa.Column("main", sa.Boolean, nullable=False),  # the file that the version came with
-    sa.Column("bytes", sa.BigInteger, nullable=False),
-    sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of its content
-    sa.Column("blob", sa.Text),  # NULL: not there
-    _policy(),
-)
 
 policy_aliases = sa.Table(
     "policy_aliases",
@@ -380,7 +368,7 @@ policy_aliases = sa.Table(
     sa.Column("surrogate_id", Id, primary_key=True, autoincrement=False),
     sa.Column("alias", sa.Text, primary_key=True),
     sa.Column("version", sa.Integer, nullable=False),
-    _policy(),
+    policy_key(),
 )
 
 policy_evaluations = sa.Table(
@@ -396,16 +384,8 @@ policy_evaluations = sa.Table(
     sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of its episodes
     sa.Column("blob", sa.Text),  # NULL: not there
     sa.UniqueConstraint("surrogate_id", "version", "key"),
-    _policy(),
+    policy_key(),
     sqlite_autoincrement=True,
-)
-
-blobs = sa.Table(  # files, where they have no folder; a backup leaves this table out
-    "blobs",
-    metadata,
-    sa.Column("name", sa.Text, primary_key=True),
-    sa.Column("created_at", sa.Double, nullable=False),
-    sa.Column("content", sa.LargeBinary, nullable=False),
 )
 
 for _table in metadata.tables.values():

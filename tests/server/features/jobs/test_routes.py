@@ -9,7 +9,6 @@ from typing import Any
 import httpx
 import pytest
 
-from support.policies import left_alone, network_file
 from support.server import ServerProcess
 from surrogym_client.errors import InvalidInput, LeaseExpired, NoModel, Overloaded, UnknownJob, UnknownPolicy
 from surrogym_client.transport import Api, Retries
@@ -18,7 +17,6 @@ from surrogym_server.features.jobs import routes
 from surrogym_shared import wire
 
 TRAIN = wire.TrainTask(kind="train", algorithm="fastppo", steps=1_000)
-EVALUATE = wire.EvaluateTask(kind="evaluate", episodes=5, compare="zero")
 STATE = wire.JobState(stage="training", share=0.5, steps=512, total_steps=1024, curve=[wire.JobPoint(steps=512)])
 
 
@@ -31,8 +29,9 @@ def api(server_process: ServerProcess) -> Iterator[Api]:
 @pytest.fixture
 def known(api: Api, taught: str) -> Iterator[str]:
     """A surrogate with a model; jobs that are queued at the end are cancelled."""
-    with left_alone(api, taught):
-        yield taught
+    yield taught
+    for job in api.jobs.list(taught).jobs:
+        api.jobs.cancel(taught, job.id)
 
 
 @pytest.mark.parametrize(
@@ -65,11 +64,8 @@ def test_a_job_is_seen_from_its_queue_to_its_end(api: Api, known: str):
     assert api.jobs.report(known, job.id, job.lease_token)
     with pytest.raises(UnknownPolicy):
         api.jobs.finish(known, job.id, job.lease_token, "cancelled", version=2**30)
-    version = api.policies.push(known, wire.PushedCard(), [], "zip", network_file(seed=2)).version
-    with pytest.raises(UnknownPolicy, match="evaluation"):
-        api.jobs.finish(known, job.id, job.lease_token, "done", version=version, evaluation=2**40)
-    ended = api.jobs.finish(known, job.id, job.lease_token, "cancelled", error="stopped by a person", version=version)
-    assert (ended.status, ended.error, ended.version) == ("cancelled", "stopped by a person", version)
+    ended = api.jobs.finish(known, job.id, job.lease_token, "cancelled", error="stopped by a person")
+    assert (ended.status, ended.error, ended.version) == ("cancelled", "stopped by a person", None)
     with pytest.raises(LeaseExpired):
         api.jobs.report(known, job.id, job.lease_token)
     with pytest.raises(UnknownJob):
@@ -85,18 +81,6 @@ def test_a_waiting_worker_gets_a_job_as_it_comes(api: Api, known: str):
     waiting.join(20)
     assert [job.id for job in found] == [id]
     api.jobs.finish(known, id, found[0].lease_token, "done")
-
-
-def test_an_evaluation_names_a_version_and_goes_to_a_worker_that_takes_it(api: Api, known: str):
-    with pytest.raises(UnknownPolicy):
-        api.jobs.add(known, EVALUATE.model_copy(update={"policy": "production"}))
-    version = api.policies.push(known, wire.PushedCard(), [], "zip", network_file(seed=1)).version
-    added = api.jobs.add(known, EVALUATE)
-    assert added.task == EVALUATE.model_copy(update={"policy": str(version)})
-    assert api.jobs.claim(known, "careful", most_episodes=9) is None  # the comparison takes as many
-    job = api.jobs.claim(known, "bold", most_episodes=10)
-    assert job is not None
-    api.jobs.finish(known, job.id, job.lease_token, "failed", error="the motor did not answer")
 
 
 def test_a_training_needs_a_model(api: Api, name: str):

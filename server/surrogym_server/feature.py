@@ -14,6 +14,8 @@ from fastapi import APIRouter, Depends, Request
 
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
+from surrogym_server.services.surrogates import Complete
+from surrogym_server.settings import Settings
 from surrogym_server.storage.port import Storage
 
 S = TypeVar("S")
@@ -30,9 +32,11 @@ class Service(Protocol):
 class Core:
     """Objects of the server process that a feature may use."""
 
+    settings: Settings
     storage: Storage
     notices: Notices
     metrics: ProcessMetrics
+    complete: Complete  # a specification, as JSON, with every field that this program knows
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,14 @@ from fastapi import APIRouter, Path, Query, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 
-from surrogym_server import convert
-from surrogym_server.api import examples
 from surrogym_server.api.auth import ADMIN, READ, TRAIN
 from surrogym_server.api.body import example
 from surrogym_server.api.caller import holder, role_of
 from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.problems import documented
-from surrogym_server.api.state import Use
+from surrogym_server.feature import part
+from surrogym_server.features.policies import forms
+from surrogym_server.features.policies.service import PolicyService
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     AddEvaluation,
@@ -38,15 +38,34 @@ BINARY = "application/octet-stream"
 MEDIA_TYPES = {"mp4": "video/mp4", "gif": "image/gif"}
 HEADERS = {"x-content-type-options": "nosniff", "content-security-policy": "default-src 'none'; sandbox"}
 
+Policies = Annotated[PolicyService, part(PolicyService)]
 Version = Annotated[int, Path(ge=1, le=2**31 - 1)]
 Which = Annotated[str, Path(max_length=32, description="a version, an alias, or latest")]
 THERE = (Code.UNKNOWN_SURROGATE, Code.UNKNOWN_POLICY, Code.INVALID_REQUEST)
 
+POLICY_EXAMPLE = {
+    "card": {"algorithm": "PPO", "promise": {"median": -150, "low": -170, "high": -135}, "trusted": True},
+    "curve": [{"steps": 2048, "imagined_return": -1200}, {"steps": 4096, "imagined_return": -600}],
+    "file": {
+        "form": "zip",
+        "bytes": 148_213,
+        "digest": "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
+    },
+}
+EVALUATION_EXAMPLE = {
+    "note": "2 episodes from seed 10000",
+    "first_seed": 10_000,
+    "returns": [-141.5, -118.2],
+    "lengths": [200, 200],
+    "idempotency_key": "evaluation-1",
+}
+ALIAS_EXAMPLE = {"version": 1}
+
 
 @router.get("", summary="All policies", dependencies=[READ], responses=documented(*THERE))
-def list_all(name: str, use: Use) -> PolicyList:
+def list_all(name: str, policies: Policies) -> PolicyList:
     """List policies, newest first, each with its promise, its files and the statistics of its real episodes."""
-    return convert.policy_list(use.policies.list(name))
+    return forms.policy_list(policies.list(name))
 
 
 @router.post(
@@ -57,28 +76,30 @@ def list_all(name: str, use: Use) -> PolicyList:
     openapi_extra=json_up_to(256),
     responses=documented(Code.UNKNOWN_SURROGATE, Code.SPEC_CONFLICT, Code.INVALID_REQUEST, Code.TOO_LARGE),
 )
-def add(name: str, body: Annotated[AddPolicy, example(examples.POLICY)], request: Request, use: Use) -> PushedPolicy:
+def add(
+    name: str, body: Annotated[AddPolicy, example(POLICY_EXAMPLE)], request: Request, policies: Policies
+) -> PushedPolicy:
     """Store a policy's card, the curve of its training, and the form of the file that follows with ``PUT
     .../files/{form}``. A version never changes: the same file with another card or curve is a new version, and a repeat
     of all three returns the version that is there. A policy for other observations or actions is refused; other
     differences of its specification are named in ``differs``."""
-    record, created = use.policies.add(name, *convert.new_policy(body), by=holder(request.scope))
-    return convert.pushed_policy(record, created=created)
+    record, created = policies.add(name, *forms.new_policy(body), by=holder(request.scope))
+    return forms.pushed_policy(record, created=created)
 
 
 @router.get("/{which}", summary="One policy", dependencies=[READ], responses=documented(*THERE))
-def get(name: str, which: Which, use: Use) -> PolicyDetail:
+def get(name: str, which: Which, policies: Policies) -> PolicyDetail:
     """Return a policy with the settings and the curve of its training. ``which`` is a version, an alias, or
     ``latest``."""
-    return convert.policy_detail(use.policies.get(name, which))
+    return forms.policy_detail(policies.get(name, which))
 
 
 @router.delete(
     "/{version}", status_code=204, summary="Delete a policy", dependencies=[ADMIN], responses=documented(*THERE)
 )
-def delete(name: str, version: Version, use: Use) -> Response:
+def delete(name: str, version: Version, policies: Policies) -> Response:
     """Delete a policy with its files, evaluations and aliases. This can't be undone."""
-    use.policies.delete(name, version)
+    policies.delete(name, version)
     return Response(status_code=204)
 
 
@@ -97,15 +118,15 @@ async def put_file(
     form: PolicyForm,
     digest: Annotated[str, Query(pattern=r"^[0-9a-f]{64}$", description="SHA-256 of the body, as hex")],
     request: Request,
-    use: Use,
+    policies: Policies,
 ) -> PolicyView:
     """Send a file as the body. Its size, digest and outer form are checked; it is never loaded. A file
     that is there is never replaced, and only the token that stored the version adds files to it. If the files of a
     surrogate's policies exceed their limit, the files of the oldest policies without an alias are removed."""
     content = await request.body()
-    file = convert.policy_file(FileNotice(form=form, bytes=max(1, len(content)), digest=digest))
+    file = forms.policy_file(FileNotice(form=form, bytes=max(1, len(content)), digest=digest))
     by = None if role_of(request.scope) == "admin" else holder(request.scope)
-    return convert.policy_view(await run_in_threadpool(use.policies.put_file, name, version, file, content, by))
+    return forms.policy_view(await run_in_threadpool(policies.put_file, name, version, file, content, by))
 
 
 @router.get(
@@ -115,10 +136,10 @@ async def put_file(
     dependencies=[READ],
     responses={200: {"content": {BINARY: {}}}, **documented(*THERE, Code.DAMAGED)},
 )
-def file(name: str, which: Which, form: PolicyForm, use: Use) -> Response:
+def file(name: str, which: Which, form: PolicyForm, policies: Policies) -> Response:
     """Download a file as it was sent. A program that loads a zip should never unpickle content that it does not
     trust."""
-    version, content = use.policies.file(name, which, form)
+    version, content = policies.file(name, which, form)
     disposition = f'attachment; filename="{name}-{version}.{form}"'
     media_type = MEDIA_TYPES.get(form, BINARY)
     return Response(content, media_type=media_type, headers={**HEADERS, "content-disposition": disposition})
@@ -133,10 +154,10 @@ def file(name: str, which: Which, form: PolicyForm, use: Use) -> Response:
     responses=documented(*THERE, Code.TOO_LARGE),
 )
 def evaluate(
-    name: str, version: Version, body: Annotated[AddEvaluation, example(examples.EVALUATION)], use: Use
+    name: str, version: Version, body: Annotated[AddEvaluation, example(EVALUATION_EXAMPLE)], policies: Policies
 ) -> EvaluationView:
     """Report real episodes, once for each idempotency key. ``POST .../ledger`` counts their real steps separately."""
-    return convert.evaluation_view(*use.policies.evaluate(name, version, convert.episodes(body), body.idempotency_key))
+    return forms.evaluation_view(*policies.evaluate(name, version, forms.episodes(body), body.idempotency_key))
 
 
 @router.get("/{which}/evaluations/{id}", summary="One evaluation", dependencies=[READ], responses=documented(*THERE))
@@ -144,24 +165,26 @@ def evaluation(
     name: str,
     which: Which,
     id: Annotated[int, Path(ge=1, le=2**63 - 1)],
-    use: Use,
+    policies: Policies,
     traces: Annotated[bool, Query(description="whether the reply has traces too; they are most of its bytes")] = True,
 ) -> EvaluationDetail:
     """Return an evaluation with the return of each episode, and traces of some. ``missing`` says why they can't be
     read."""
-    return convert.evaluation_detail(*use.policies.episodes(name, which, id), traces=traces)
+    return forms.evaluation_detail(*policies.episodes(name, which, id), traces=traces)
 
 
 @router.put("/aliases/{alias}", summary="Name a policy", dependencies=[ADMIN], responses=documented(*THERE))
-def put_alias(name: str, alias: AliasName, body: Annotated[PutAlias, example(examples.ALIAS)], use: Use) -> PolicyView:
+def put_alias(
+    name: str, alias: AliasName, body: Annotated[PutAlias, example(ALIAS_EXAMPLE)], policies: Policies
+) -> PolicyView:
     """Let the alias, such as ``production``, point to this version, and no longer to another one."""
-    return convert.policy_view(use.policies.put_alias(name, alias, body.version))
+    return forms.policy_view(policies.put_alias(name, alias, body.version))
 
 
 @router.delete(
     "/aliases/{alias}", status_code=204, summary="Take a name away", dependencies=[ADMIN], responses=documented(*THERE)
 )
-def drop_alias(name: str, alias: AliasName, use: Use) -> Response:
+def drop_alias(name: str, alias: AliasName, policies: Policies) -> Response:
     """Remove an alias. The policy itself stays."""
-    use.policies.drop_alias(name, alias)
+    policies.drop_alias(name, alias)
     return Response(status_code=204)

@@ -16,17 +16,41 @@ from uuid import uuid4
 import sqlalchemy as sa
 
 from surrogym_server.errors import Unavailable
-from surrogym_server.storage import policies as port
-from surrogym_server.storage.policies import Freed
+from surrogym_server.features.policies.records import Blobs, Freed
+from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql.damage import damaged
 from surrogym_server.storage.sql.database import NOW, Database
-from surrogym_server.storage.sql.tables import blobs
+from surrogym_server.storage.sql.tables import checked, metadata
+
+blobs = checked(
+    sa.Table(  # files, where they have no folder; a backup leaves this table out
+        "blobs",
+        metadata,
+        sa.Column("name", sa.Text, primary_key=True),
+        sa.Column("created_at", sa.Double, nullable=False),
+        sa.Column("content", sa.LargeBinary, nullable=False),
+    )
+)
 
 NAME = re.compile(r"[0-9a-f]{32}")
 PART = ".part"  # of a file that is being written
 
 
-class FolderBlobs(port.Blobs):
+def open_blobs(storage: Storage, url: str, folder: Path | None) -> Blobs:
+    """The files of policies.
+
+    Args:
+        storage: of the server.
+        url: address of its database.
+        folder: None means ``<database>.files`` beside a SQLite file, and the database itself for PostgreSQL.
+    """
+    address = sa.make_url(url)
+    if folder is None and address.get_backend_name() == "sqlite":
+        folder = Path(f"{address.database}.files")
+    return storage.part(RowBlobs) if folder is None else FolderBlobs(folder)
+
+
+class FolderBlobs(Blobs):
     """Files in a folder, which is created with the first file. Only their owner may read them."""
 
     def __init__(self, folder: Path) -> None:
@@ -79,7 +103,7 @@ class FolderBlobs(port.Blobs):
             os.close(descriptor)
 
 
-class RowBlobs(port.Blobs):
+class RowBlobs(Blobs):
     """Rows of the table ``blobs``."""
 
     def __init__(self, database: Database) -> None:

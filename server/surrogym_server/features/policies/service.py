@@ -2,31 +2,42 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
+import logging
 import statistics
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Self
 
 from surrogym_server.errors import Damaged, Forbidden, InvalidInput, NotThere, SpecConflict, UnknownPolicy
-from surrogym_server.services.notices import Notices
-from surrogym_server.services.policy_files import check_file
-from surrogym_server.services.surrogates import Complete, difference, short
-from surrogym_server.storage.policies import (
-    LATEST,
+from surrogym_server.feature import Core
+from surrogym_server.features.policies.blobs import open_blobs
+from surrogym_server.features.policies.file_checks import check_file
+from surrogym_server.features.policies.records import (
     PUSHED_BY,
+    Blobs,
     EvaluationRecord,
     NewEvaluation,
     PolicyFile,
     PolicyRecord,
 )
-from surrogym_server.storage.port import Storage
+from surrogym_server.features.policies.store import Policies
+from surrogym_server.services.notices import Notices
+from surrogym_server.services.surrogates import Complete, difference, short
+from surrogym_server.storage.port import LATEST, Storage
 from surrogym_server.storage.records import JSON
 from surrogym_shared import intervals
 from surrogym_shared.checks import trace_fault
 from surrogym_shared.environments import is_name, is_same
 
+logger = logging.getLogger(__name__)
+
+MEBIBYTE = 2**20
+ORPHAN_SECONDS = 3_600.0  # wait before unreferenced files are removed; an upload takes less
 MUST_AGREE = ("observation", "action")  # of two specifications: a policy's inputs and outputs
 
 
@@ -47,16 +58,30 @@ class Episodes:
 
 
 class PolicyService:
-    def __init__(self, storage: Storage, complete: Complete, notices: Notices, most_bytes: int) -> None:
+    def __init__(self, storage: Storage, blobs: Blobs, complete: Complete, notices: Notices, most_bytes: int) -> None:
         """Args:
         storage: holds the policies.
+        blobs: holds their files.
         complete: returns a specification with every field that this program knows, as JSON.
         notices: of this process.
         most_bytes: limit for all files of one surrogate's policies."""
         self._storage = storage
+        self._policies = storage.part(Policies)
+        self._blobs = blobs
         self._complete = complete
         self._notices = notices
         self._most_bytes = most_bytes
+        self._looked_at_files = -ORPHAN_SECONDS
+
+    @classmethod
+    def start(cls, core: Core) -> Self:
+        settings = core.settings
+        blobs = open_blobs(core.storage, settings.database_url, settings.files)
+        return cls(core.storage, blobs, core.complete, core.notices, settings.policies_mib * MEBIBYTE)
+
+    async def sweep(self) -> None:
+        """Once in ``ORPHAN_SECONDS``, remove the files whose policy or surrogate was deleted or never stored."""
+        await asyncio.to_thread(self._sweep_files)
 
     def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile, by: str) -> tuple[PolicyRecord, bool]:
         """Store a policy before its file is sent. Returns it, and whether it is new: a policy with the same file, card
@@ -67,17 +92,17 @@ class PolicyService:
         """
         differs = self._difference(name, card["spec"])
         kept = {**card, "spec": card["spec"] if differs else None, "differs": differs, PUSHED_BY: by}
-        version, created, freed = self._storage.policies.add(name, kept, curve, file)
+        version, created, freed = self._policies.add(name, kept, curve, file)
         self._changed(name, freed)
-        return self._storage.policies.get(name, str(version)), created
+        return self._policies.get(name, str(version)), created
 
     def list(self, name: str) -> list[PolicyRecord]:
         """All policies, newest first."""
-        return self._storage.policies.list(name)
+        return self._policies.list(name)
 
     def get(self, name: str, which: str) -> PolicyRecord:
         """Return a policy. Raises ``UnknownPolicy``."""
-        return self._storage.policies.get(name, which)
+        return self._policies.get(name, which)
 
     def put_file(
         self, name: str, version: int, file: PolicyFile, content: bytes, by: str | None = None
@@ -90,7 +115,7 @@ class PolicyService:
             InvalidInput: it differs from the announcement, or does not have its form.
             TooLarge: there is no room for it.
         """
-        record = self._storage.policies.get(name, str(version))
+        record = self._policies.get(name, str(version))
         owner = record.card.get(PUSHED_BY, by)
         if by not in (None, owner):
             raise Forbidden(f"expected the token that stored version {version}, {owner}, or an admin's, got {by}")
@@ -98,12 +123,12 @@ class PolicyService:
         if own is not None and own.digest != file.digest:
             raise InvalidInput(f"expected the file that version {version} was announced with, got a different file")
         check_file(file.form, content, file.bytes, file.digest)
-        blob = self._storage.blobs.put(content)
+        blob = self._blobs.put(content)
         with self._removed_if_refused(blob):
             stored = PolicyFile(file.form, file.bytes, file.digest, blob)
-            freed = self._storage.policies.attach(name, version, stored, self._most_bytes)
+            freed = self._policies.attach(name, version, stored, self._most_bytes)
         self._changed(name, freed)
-        return self._storage.policies.get(name, str(version))
+        return self._policies.get(name, str(version))
 
     def file(self, name: str, which: str, form: str) -> tuple[int, bytes]:
         """Return a file, and the version to which it belongs.
@@ -112,7 +137,7 @@ class PolicyService:
             UnknownPolicy: there is no such policy, or it has no such file.
             Damaged: the file has changed since it was stored.
         """
-        record = self._storage.policies.get(name, which)
+        record = self._policies.get(name, which)
         place = f"version {record.version} of {name!r}'s policies"
         file = next((one for one in record.files if one.form == form and one.blob is not None), None)
         if file is None:
@@ -131,13 +156,13 @@ class PolicyService:
         episodewise = {name: getattr(episodes, name) for name in ("returns", "lengths", "success", "traces")}
         content = json.dumps(episodewise, separators=(",", ":")).encode()
         digest = hashlib.sha256(content).hexdigest()
-        blob = self._storage.blobs.put(content)
+        blob = self._blobs.put(content)
         summary = {**_summary(episodes), "own": self._is_own(name, episodes.environment)}
         new = NewEvaluation(key, summary, len(content), digest, blob)
         with self._removed_if_refused(blob):
-            stored, created, freed = self._storage.policies.evaluate(name, version, new, self._most_bytes)
+            stored, created, freed = self._policies.evaluate(name, version, new, self._most_bytes)
         self._changed(name, freed if created else (blob,))
-        return self._storage.policies.get(name, str(version)), stored
+        return self._policies.get(name, str(version)), stored
 
     def episodes(
         self, name: str, which: str, id: int
@@ -147,7 +172,7 @@ class PolicyService:
         Raises:
             UnknownPolicy: there is no such policy, or it has no such evaluation.
         """
-        record = self._storage.policies.get(name, which)
+        record = self._policies.get(name, which)
         found = next((one for one in record.evaluations if one.id == id), None)
         if found is None:
             raise UnknownPolicy(f"expected an evaluation of version {record.version} of {name!r}'s policies, got {id}")
@@ -164,18 +189,29 @@ class PolicyService:
         newest."""
         if alias == LATEST:
             raise InvalidInput(f"expected another alias than {LATEST!r}, which is always the newest version")
-        self._storage.policies.put_alias(name, alias, version)
+        self._policies.put_alias(name, alias, version)
         self._changed(name)
-        return self._storage.policies.get(name, alias)
+        return self._policies.get(name, alias)
 
     def drop_alias(self, name: str, alias: str) -> None:
         """Remove an alias. Raises ``UnknownPolicy``."""
-        self._storage.policies.drop_alias(name, alias)
+        self._policies.drop_alias(name, alias)
         self._changed(name)
 
     def delete(self, name: str, version: int) -> None:
         """Remove a policy with its files and evaluations. Raises ``UnknownPolicy``."""
-        self._changed(name, self._storage.policies.delete(name, version))
+        self._changed(name, self._policies.delete(name, version))
+
+    def _sweep_files(self) -> None:
+        now = time.monotonic()
+        if now - self._looked_at_files < ORPHAN_SECONDS:
+            return
+        self._looked_at_files = now
+        old = self._blobs.older(ORPHAN_SECONDS)
+        orphans = tuple(sorted(old - self._policies.blobs())) if old else ()
+        self._blobs.remove(orphans)
+        if orphans:
+            logger.info("files removed that belonged to deleted policies: %d", len(orphans))
 
     @contextmanager
     def _removed_if_refused(self, blob: str) -> Iterator[None]:
@@ -187,12 +223,12 @@ class PolicyService:
         try:
             yield
         except (InvalidInput, NotThere):
-            self._storage.blobs.remove((blob,))
+            self._blobs.remove((blob,))
             raise
 
     def _content(self, blob: str | None, digest: str, what: str) -> bytes:
         assert blob is not None
-        content = self._storage.blobs.get(blob)
+        content = self._blobs.get(blob)
         if hashlib.sha256(content).hexdigest() != digest:
             raise Damaged(f"{what} has changed since it was stored: its digest differs")
         return content
@@ -205,7 +241,7 @@ class PolicyService:
         """
         own = str(self._storage.surrogates.get(name).spec["environment"])
         if not is_name(own):
-            known = (one for policy in self._storage.policies.list(name) for one in policy.evaluations)
+            known = (one for policy in self._policies.list(name) for one in policy.evaluations)
             named = [(one.id, one.summary["environment"]) for one in known if one.summary.get("environment")]
             own = min(named)[1] if named else environment
         return not environment or is_same(environment, own)
@@ -226,7 +262,7 @@ class PolicyService:
         return difference(own, spec)[0]
 
     def _changed(self, name: str, freed: tuple[str, ...] = ()) -> None:
-        self._storage.blobs.remove(freed)
+        self._blobs.remove(freed)
         self._notices.post(name)
 
 

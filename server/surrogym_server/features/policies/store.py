@@ -9,10 +9,8 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
-from surrogym_server.errors import InvalidInput, TooLarge, UnknownPolicy
-from surrogym_server.storage import policies as port
-from surrogym_server.storage.policies import (
-    LATEST,
+from surrogym_server.errors import InvalidInput, TooLarge
+from surrogym_server.features.policies.records import (
     MAX_EVALUATIONS,
     MAX_POLICIES,
     PUSHED_BY,
@@ -24,17 +22,55 @@ from surrogym_server.storage.policies import (
 )
 from surrogym_server.storage.records import JSON
 from surrogym_server.storage.sql.database import Database, conflict_insert
+from surrogym_server.storage.sql.policy_names import require_version, resolve, unknown_policy
 from surrogym_server.storage.sql.rows import append_event, find, hold
-from surrogym_server.storage.sql.tables import policies, policy_aliases, policy_evaluations, policy_files, surrogates
+from surrogym_server.storage.sql.tables import (
+    Id,
+    checked,
+    metadata,
+    policies,
+    policy_aliases,
+    policy_evaluations,
+    policy_key,
+    surrogates,
+)
+
+policy_files = checked(
+    sa.Table(
+        "policy_files",
+        metadata,
+        sa.Column("surrogate_id", Id, primary_key=True, autoincrement=False),
+        sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
+        sa.Column("form", sa.Text, primary_key=True),
+        sa.Column("main", sa.Boolean, nullable=False),  # the file that the version came with
+        sa.Column("bytes", sa.BigInteger, nullable=False),
+        sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of its content
+        sa.Column("blob", sa.Text),  # NULL: not there
+        policy_key(),
+    )
+)
 
 OWNED = (policy_files, policy_evaluations)  # tables whose rows may have a blob
 
 
-class SqlPolicies(port.Policies):
+class Policies:
+    """Policies by version. ``which`` is a version, an alias, or ``latest``.
+
+    An operation on a policy that does not exist raises ``UnknownPolicy``.
+    """
+
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile) -> tuple[int, bool, Freed]:
+        """Store a policy before its ``file`` is sent. Returns its version, and whether that is new.
+
+        A version never changes. The same main file, card and curve are the same version, whoever stores them. Beyond
+        ``MAX_POLICIES`` the oldest policy without an alias is removed.
+
+        Raises:
+            TooLarge: there are ``MAX_POLICIES``, and all have aliases.
+        """
         with self._database.write() as connection:
             held = hold(connection, name)
             known = _known(connection, held.id, card, curve, file.digest)
@@ -49,20 +85,30 @@ class SqlPolicies(port.Policies):
             return version, True, freed
 
     def list(self, name: str) -> list[PolicyRecord]:
+        """Return all policies, newest first, without their curves."""
         with self._database.read() as connection:
             return _records(connection, find(connection, name), sa.true(), curves=False)
 
     def get(self, name: str, which: str) -> PolicyRecord:
         with self._database.read() as connection:
             surrogate = find(connection, name)
-            version = _resolve(connection, surrogate, name, which)
+            version = resolve(connection, surrogate, name, which)
             (record,) = _records(connection, surrogate, policies.c.version == version, curves=True)
             return record
 
     def attach(self, name: str, version: int, file: PolicyFile, most: int) -> Freed:
+        """Store a file of a policy. A file of this form that was stored or announced is the same one.
+
+        If the files of the surrogate's policies then exceed ``most`` bytes together, files of the oldest policies
+        without an alias are removed first. Their descriptions stay.
+
+        Raises:
+            InvalidInput: the policy has another file of this form.
+            TooLarge: the files of policies with aliases and of this one exceed the limit.
+        """
         with self._database.write() as connection:
             held = hold(connection, name)
-            _require(connection, held.id, name, version)
+            require_version(connection, held.id, name, version)
             own = _own(policy_files, held.id, version) & (policy_files.c.form == file.form)
             before = connection.execute(sa.select(policy_files).where(own)).one_or_none()
             if before is None:
@@ -81,10 +127,12 @@ class SqlPolicies(port.Policies):
             return (*replaced, *freed)
 
     def evaluate(self, name: str, version: int, new: NewEvaluation, most: int) -> tuple[EvaluationRecord, bool, Freed]:
+        """Store an evaluation, once for each key. Returns whether it is new. Beyond ``MAX_EVALUATIONS`` the policy's
+        oldest evaluation is removed. ``most`` is that of ``attach``."""
         table = policy_evaluations
         with self._database.write() as connection:
             held = hold(connection, name)
-            _require(connection, held.id, name, version)
+            require_version(connection, held.id, name, version)
             own = _own(table, held.id, version)
             known = connection.execute(sa.select(table).where(own, table.c.key == new.key)).one_or_none()
             if known is not None:
@@ -100,9 +148,10 @@ class SqlPolicies(port.Policies):
             return _evaluation(row), True, (*gone, *freed)
 
     def put_alias(self, name: str, alias: str, version: int) -> None:
+        """Let the alias point to this version, and no longer to another one."""
         with self._database.write() as connection:
             held = hold(connection, name)
-            _require(connection, held.id, name, version)
+            require_version(connection, held.id, name, version)
             insert = conflict_insert(connection, policy_aliases)
             insert = insert.values(surrogate_id=held.id, alias=alias, version=version)
             moved = insert.on_conflict_do_update(
@@ -116,18 +165,20 @@ class SqlPolicies(port.Policies):
             held = hold(connection, name)
             own = (policy_aliases.c.surrogate_id == held.id) & (policy_aliases.c.alias == alias)
             if not connection.execute(sa.delete(policy_aliases).where(own)).rowcount:
-                raise _unknown(name, alias)
+                raise unknown_policy(name, alias)
             append_event(connection, held, "policy", what="alias", alias=alias)
 
     def delete(self, name: str, version: int) -> Freed:
+        """Remove a policy with its evaluations and aliases. Its version is never used again."""
         with self._database.write() as connection:
             held = hold(connection, name)
-            _require(connection, held.id, name, version)
+            require_version(connection, held.id, name, version)
             freed = _delete(connection, held.id, [version])
             append_event(connection, held, "policy", version=version, what="deleted")
             return freed
 
     def blobs(self) -> set[str]:
+        """Return the names of all blobs that rows of policies refer to, of all surrogates."""
         with self._database.read() as connection:
             return {
                 name
@@ -136,15 +187,15 @@ class SqlPolicies(port.Policies):
             }
 
 
+def _own(table: sa.Table, surrogate: int, version: int) -> sa.ColumnElement[bool]:
+    return (table.c.surrogate_id == surrogate) & (table.c.version == version)
+
+
 def _next_version(connection: Connection, surrogate: int) -> int:
     """A version that was never used."""
     count = sa.update(surrogates).where(surrogates.c.id == surrogate)
     given = count.values(policy_versions=surrogates.c.policy_versions + 1).returning(surrogates.c.policy_versions)
     return int(connection.execute(given).scalar_one())
-
-
-def _own(table: sa.Table, surrogate: int, version: int) -> sa.ColumnElement[bool]:
-    return (table.c.surrogate_id == surrogate) & (table.c.version == version)
 
 
 def _of_file(file: PolicyFile) -> dict[str, Any]:
@@ -165,31 +216,6 @@ def _known(connection: Connection, surrogate: int, card: JSON, curve: list[JSON]
 
 def _without_owner(card: JSON) -> JSON:
     return {name: value for name, value in card.items() if name != PUSHED_BY}
-
-
-def _resolve(connection: Connection, surrogate: int, name: str, which: str) -> int:
-    if which.isascii() and which.isdecimal() and len(which) < 10:
-        _require(connection, surrogate, name, int(which))
-        return int(which)
-    if which == LATEST:
-        wanted = sa.select(sa.func.max(policies.c.version)).where(policies.c.surrogate_id == surrogate)
-    else:
-        aliases = policy_aliases.c
-        wanted = sa.select(aliases.version).where(aliases.surrogate_id == surrogate, aliases.alias == which)
-    version = connection.execute(wanted).scalar()
-    if version is None:
-        raise _unknown(name, which)
-    return int(version)
-
-
-def _require(connection: Connection, surrogate: int, name: str, version: int) -> None:
-    own = _own(policies, surrogate, version)
-    if connection.execute(sa.select(policies.c.version).where(own)).scalar() is None:
-        raise _unknown(name, version)
-
-
-def _unknown(name: str, which: object) -> UnknownPolicy:
-    return UnknownPolicy(f"expected a version or an alias of {name!r}'s policies, got {which}, which does not exist")
 
 
 def _make_place(connection: Connection, surrogate: int, name: str) -> Freed:

@@ -3,19 +3,35 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from support import pendulum
 from surrogym_server.errors import Forbidden, TooLarge, Unavailable
+from surrogym_server.features.policies.blobs import RowBlobs
+from surrogym_server.features.policies.records import PolicyFile
+from surrogym_server.features.policies.service import Episodes, PolicyService
+from surrogym_server.features.policies.store import Policies
 from surrogym_server.services.notices import Notices
-from surrogym_server.services.policies import Episodes, PolicyService
-from surrogym_server.storage.policies import PolicyFile
 from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import NewSurrogate
+from surrogym_server.storage.sql import open_storage
 
 NAME = "pendulum"
 GIF = b"GIF89a and so on"
 EPISODES = Episodes("policy", "", True, "", True, 0, [-1.0], [3], None, [])
+
+
+@pytest.fixture
+def storage(tmp_path: Path) -> Iterator[Storage]:
+    """With one surrogate."""
+    opened = open_storage(f"sqlite:///{tmp_path / 'surrogym.db'}")
+    opened.surrogates.create(NewSurrogate(NAME, pendulum.spec(), pendulum.BUDGET, 0.999))
+    yield opened
+    opened.close()
 
 
 class Silent(Notices):
@@ -29,26 +45,26 @@ class Silent(Notices):
 def service(storage: Storage, most: int = 10_000) -> tuple[PolicyService, PolicyFile]:
     """With a policy whose file is to come."""
     file = PolicyFile("gif", len(GIF), hashlib.sha256(GIF).hexdigest())
-    policies = PolicyService(storage, lambda spec: spec, Silent(), most)
+    policies = PolicyService(storage, storage.part(RowBlobs), lambda spec: spec, Silent(), most)
     policies.add(NAME, {"spec": None}, [], file, by="train one")
     return policies, file
 
 
-def lost_at_commit(storage: Storage, monkeypatch: pytest.MonkeyPatch, operation: str) -> None:
+def lost_at_commit(monkeypatch: pytest.MonkeyPatch, operation: str) -> None:
     """Let an operation be carried out, and its caller not hear of it."""
-    carry_out = getattr(storage.policies, operation)
+    carry_out = getattr(Policies, operation)
 
     def broken(*arguments: Any) -> None:
         carry_out(*arguments)
         raise Unavailable("the connection was lost")
 
-    monkeypatch.setattr(storage.policies, operation, broken)
+    monkeypatch.setattr(Policies, operation, broken)
 
 
 def test_a_file_with_a_lost_acknowledgement_is_stored(storage: Storage, monkeypatch: pytest.MonkeyPatch):
     policies, file = service(storage)
     with monkeypatch.context() as patched:
-        lost_at_commit(storage, patched, "attach")
+        lost_at_commit(patched, "attach")
         with pytest.raises(Unavailable, match="connection was lost"):
             policies.put_file(NAME, 1, file, GIF)
     assert policies.file(NAME, "1", "gif") == (1, GIF)
@@ -57,7 +73,7 @@ def test_a_file_with_a_lost_acknowledgement_is_stored(storage: Storage, monkeypa
 def test_episodes_with_a_lost_acknowledgement_are_stored_once(storage: Storage, monkeypatch: pytest.MonkeyPatch):
     policies, _ = service(storage)
     with monkeypatch.context() as patched:
-        lost_at_commit(storage, patched, "evaluate")
+        lost_at_commit(patched, "evaluate")
         with pytest.raises(Unavailable, match="connection was lost"):
             policies.evaluate(NAME, 1, EPISODES, "key")
     _, stored = policies.evaluate(NAME, 1, EPISODES, "key")
@@ -71,7 +87,7 @@ def test_file_that_is_refused_leaves_nothing(storage: Storage):
     policies, file = service(storage, most=len(GIF) - 1)
     with pytest.raises(TooLarge):
         policies.put_file(NAME, 1, file, GIF)
-    assert storage.blobs.older(-1.0) == set()
+    assert storage.part(RowBlobs).older(-1.0) == set()
 
 
 def test_only_who_stored_a_version_adds_files_to_it(storage: Storage):

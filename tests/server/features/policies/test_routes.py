@@ -19,6 +19,7 @@ from support.server import ServerProcess
 from surrogym_client.errors import InvalidInput, ServerFailure, SpecConflict, UnknownPolicy
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import cartpole, pendulum
+from surrogym_server.features.policies import routes
 from surrogym_shared import wire
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
@@ -34,6 +35,18 @@ class Bomb:
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         return open, (str(self.path), "w")
+
+
+@pytest.mark.parametrize(
+    ("example", "model"),
+    [
+        (routes.POLICY_EXAMPLE, wire.AddPolicy),
+        (routes.EVALUATION_EXAMPLE, wire.AddEvaluation),
+        (routes.ALIAS_EXAMPLE, wire.PutAlias),
+    ],
+)
+def test_every_example_is_accepted_by_its_model(example: dict[str, Any], model: type[wire.Request]):
+    model.model_validate(example)
 
 
 @pytest.fixture

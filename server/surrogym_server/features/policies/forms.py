@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from surrogym_server.convert.stored import read_stored
-from surrogym_server.services.policies import Episodes
-from surrogym_server.storage.policies import PUSHED_BY, EvaluationRecord, PolicyFile, PolicyRecord
+from surrogym_server.features.policies.records import PUSHED_BY, EvaluationRecord, PolicyFile, PolicyRecord
+from surrogym_server.features.policies.service import Episodes
 from surrogym_server.storage.records import JSON
 from surrogym_shared import wire
 
