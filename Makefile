@@ -59,7 +59,7 @@ audit: .venv/dev  ## Ask for known holes of the pinned packages, where that can 
 	@$(BIN)/python tests/audit.py
 
 chaos: .venv/dev postgresql haproxy  ## Faults, attacks and clusters in full length; make test has a short form (ARGS="-k killed")
-	CHAOS=full $(BIN)/pytest -m "" --durations 0 tests/chaos tests/security tests/server/cluster $(ARGS)
+	CHAOS=full $(BIN)/pytest -m "" --durations 0 tests/chaos tests/security tests/server/features/ray $(ARGS)
 
 bench: .venv/dev  ## What steps, predictions and trainings cost here, beside echoes, libraries and other systems (ARGS="--quick")
 	$(BIN)/python lab/benchmarks/bench.py $(ARGS)

@@ -33,7 +33,8 @@ from support.server import running_server
 from support.teaching import teach
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_sampler.original.classic import pendulum
-from surrogym_server.storage.live_sessions import Checkpoint, SessionLease
+from surrogym_server.features.ray.records import Checkpoint, SessionLease
+from surrogym_server.features.ray.store import LiveSessions
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
 from surrogym_shared.wire import OpenSession
@@ -88,7 +89,7 @@ class Hosts(threading.Thread):
 
     def __init__(self, storage: Storage, sessions: int) -> None:
         super().__init__(daemon=True)
-        self.live, self.sessions, self.ending = storage.live_sessions, sessions, threading.Event()
+        self.live, self.sessions, self.ending = storage.part(LiveSessions), sessions, threading.Event()
         self.ids = [[f"session-{n}.{owner}" for n in range(owner, sessions, 2)] for owner in range(2)]
         self.renewals: list[float] = []
         self.records: list[float] = []
@@ -166,7 +167,7 @@ def requests(client: httpx.Client, names: list[str], samples: int, count: int) -
 
 def of_storage(storage: Storage, names: list[str], count: int) -> dict[str, dict[str, float]]:
     """What servers ask without a request: once a second, or once a request of a session that moved."""
-    live = storage.live_sessions
+    live = storage.part(LiveSessions)
     calls: dict[str, Callable[[], Any]] = {
         "designs due": storage.designs.due,
         "designs without hope": storage.designs.hopeless,
@@ -185,7 +186,7 @@ def of_large_checkpoint(storage: Storage, postmaster: int, count: int) -> dict[s
     lease, ran = SessionLease("session-7.1", "1 host", 1), []
     for number in range(count):
         before = {pid: ran_and_waited(pid)[0] for pid in children(postmaster)}
-        storage.live_sessions.record(lease, Checkpoint(number, data))
+        storage.part(LiveSessions).record(lease, Checkpoint(number, data))
         ran.append(sum(max(0.0, ran_and_waited(pid)[0] - ms) for pid, ms in before.items()))
     return {"ms median": statistics.median(ran), "calls": count}
 

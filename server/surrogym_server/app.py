@@ -38,7 +38,6 @@ from surrogym_server.api.state import Services
 from surrogym_server.api.stepping.routes import StepDoor
 from surrogym_server.api.stepping.routes import router as stepping
 from surrogym_server.api.turns import Turns, Waiting
-from surrogym_server.cluster import pool
 from surrogym_server.convert import definition_from_spec, stored_definition
 from surrogym_server.convert.stored import read_stored
 from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
@@ -49,8 +48,9 @@ from surrogym_server.engine.port import Compute, SessionEngine
 from surrogym_server.engine.sessions import MEBIBYTE, Limits
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
-from surrogym_server.feature import Core, Parts
+from surrogym_server.feature import Cluster, Core, Parts
 from surrogym_server.features import jobs, policies
+from surrogym_server.features.ray import pool as ray
 from surrogym_server.models.registry import MODELS
 from surrogym_server.private import keep_private
 from surrogym_server.sampling.acquisition import ACQUISITIONS
@@ -72,6 +72,7 @@ from surrogym_server.storage.sql import open_storage
 from surrogym_shared.spec import EnvironmentSpec
 
 FEATURES = (policies.FEATURE, jobs.FEATURE)  # a server without one has no folder for it, and no line here
+CLUSTERS = {"ray": ray.CLUSTER}  # by the setting ``engine``
 
 logger = logging.getLogger(__name__)
 
@@ -118,11 +119,12 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         Unavailable: the database is taken, or does not answer; or the cluster's session hosts do not.
     """
     _check_device(settings.device)
-    if settings.engine == "ray":
-        pool.check(settings)
+    cluster = _cluster(settings.engine)
+    if cluster is not None:
+        cluster.check(settings)
     keep_private(settings)
     storage = open_storage(settings.database_url, settings.synchronous)
-    engine = _cluster(settings, storage) if settings.engine == "ray" else None
+    engine = None if cluster is None else _connected(cluster, settings, storage)
     app = FastAPI(
         title="Surrogym",
         version=version("surrogym"),
@@ -166,9 +168,15 @@ def _check_device(name: str) -> None:
         raise InvalidInput(f"setting device: expected cpu, got cuda, and {why}")
 
 
-def _cluster(settings: Settings, storage: Storage) -> SessionEngine:
+def _cluster(engine: str) -> Cluster | None:
+    if engine not in ("local", *CLUSTERS):
+        raise InvalidInput(f"setting engine: expected local, got {engine}, a feature that this server does not have")
+    return CLUSTERS.get(engine)
+
+
+def _connected(cluster: Cluster, settings: Settings, storage: Storage) -> SessionEngine:
     try:
-        return pool.connect(settings, storage.live_sessions)
+        return cluster.connect(settings, storage)
     except BaseException:
         storage.close()
         raise
@@ -234,8 +242,8 @@ def _build_process(
         idle_seconds=settings.session_idle_seconds,
         device=torch.device(settings.device),
     )
-    shared = pool.fits_of(settings, design.run) if settings.engine == "ray" else None
-    fits = shared or Fits(design.run, settings.fit_workers)
+    cluster = _cluster(settings.engine)
+    fits = (cluster and cluster.fits(settings, design.run)) or Fits(design.run, settings.fit_workers)
     return _Process(storage, definitions, models, engine, fits, Notices(storage.announcements), metrics)
 
 

@@ -12,6 +12,8 @@ from typing import Any, Protocol, TypeVar
 
 from fastapi import APIRouter, Depends, Request
 
+from surrogym_server.engine.design_job import DesignJob, DesignResult
+from surrogym_server.engine.port import Compute, SessionEngine
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.surrogates import Complete
@@ -45,6 +47,19 @@ class Feature:
 
     router: APIRouter
     start: Callable[[Core], Service]
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Other machines, where sessions and fits run; the setting ``engine`` names it.
+
+    ``check`` raises ``InvalidInput`` if this server can't use it. ``connect`` waits until it is ready, and returns its
+    engine. ``fits`` is None where fits run in processes of this server.
+    """
+
+    check: Callable[[Settings], None]
+    connect: Callable[[Settings, Storage], SessionEngine]
+    fits: Callable[[Settings, Callable[[DesignJob], DesignResult]], Compute | None]
 
 
 Parts = Mapping[type[Service], Service]  # of the features, by class

@@ -29,7 +29,7 @@ from surrogym_trainer.training import TrainResult
 
 ray = pytest.importorskip("ray")
 
-from surrogym_server.cluster import pool  # noqa: E402
+from surrogym_server.features.ray import pool  # noqa: E402
 
 FAULTS, HOSTS, PATIENCE = times(short=1, full=20), 2, 120.0
 ENVIRONMENT = {"SURROGYM_RAY_LEASE_SECONDS": "3"}

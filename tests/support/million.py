@@ -5,7 +5,6 @@ from __future__ import annotations
 import sqlalchemy as sa
 
 from support.many import create, finish
-from surrogym_server.storage.live_sessions import Checkpoint, NewLiveSession
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
 from surrogym_server.storage.sql.tables import metadata
@@ -42,10 +41,15 @@ def fill(url: str, surrogates: int, samples: int, sessions: int, checkpoint_byte
 
 
 def _sessions(storage: Storage, count: int, size: int) -> None:
-    surrogate = storage.surrogates.get(FIRST).id
+    if not count:
+        return
+    from surrogym_server.features.ray.records import Checkpoint, NewLiveSession  # late: a server may lack the feature
+    from surrogym_server.features.ray.store import LiveSessions
+
+    surrogate, live = storage.surrogates.get(FIRST).id, storage.part(LiveSessions)
     for number in range(count):
         new = NewLiveSession(f"session-{number}.{number % 2}", surrogate, "machine", Checkpoint(0, bytes(size)))
-        storage.live_sessions.add(new, f"{number % 2} host", 1e6)
+        live.add(new, f"{number % 2} host", 1e6)
 
 
 def _multiply(connection: sa.Connection, wanted: int) -> None:

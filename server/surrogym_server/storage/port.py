@@ -21,7 +21,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 from surrogym_server.storage.announcements import Announcements
-from surrogym_server.storage.live_sessions import LiveSessions
 from surrogym_server.storage.records import (
     AddedSamples,
     Array,
@@ -501,7 +500,6 @@ class Storage(ABC):
     models: Models
     occupancy: Occupancy
     sessions: Sessions
-    live_sessions: LiveSessions
     events: Events
     policy_names: PolicyNames
     announcements: Announcements

@@ -12,19 +12,22 @@ from sqlalchemy.engine import Connection
 
 from surrogym_server.storage.sql.database import BATCH, Database
 from surrogym_server.storage.sql.rows import hold
-from surrogym_server.storage.sql.tables import live_sessions, metadata, models, policies, surrogates
+from surrogym_server.storage.sql.tables import metadata, models, policies, surrogates
 
 REMOVED = "/removed/"  # no name has a slash; the id follows
 IS_THERE = surrogates.c.name.not_like(f"{REMOVED}%")
 NAMELESS = sa.select(surrogates.c.id).where(~IS_THERE)
 LARGE = {models: 8, policies: 8}  # tables whose rows have many bytes, or further rows
+AT_ONCE = "at once"  # in the ``info`` of a table whose rows go together with the name
 NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None, "fit_seconds": None}
 
 
 def take_name(connection: Connection, name: str) -> int:
     """Let nobody find a surrogate any more, and return its id. Raises ``UnknownSurrogate``."""
     id = int(hold(connection, name).id)
-    connection.execute(sa.delete(live_sessions).where(live_sessions.c.surrogate_id == id))
+    for table in metadata.tables.values():
+        if AT_ONCE in table.info:
+            connection.execute(sa.delete(table).where(table.c.surrogate_id == id))
     gone = {"name": f"{REMOVED}{id}", "paused": True, **NO_RIGHT}
     connection.execute(sa.update(surrogates).where(surrogates.c.id == id).values(**gone))
     return id

@@ -15,7 +15,6 @@ from surrogym_server.storage.sql.checks import check_pages, check_tables
 from surrogym_server.storage.sql.database import Database, connect, never_connected
 from surrogym_server.storage.sql.designs import SqlDesigns
 from surrogym_server.storage.sql.ledger import SqlLedger
-from surrogym_server.storage.sql.live_sessions import SqlLiveSessions
 from surrogym_server.storage.sql.memory import SqlEvents, SqlOccupancy, SqlSessions
 from surrogym_server.storage.sql.migrate import migrate
 from surrogym_server.storage.sql.models import SqlModels
@@ -43,7 +42,6 @@ class SqlStorage(Storage):
         self.models = SqlModels(database)
         self.occupancy = SqlOccupancy(database)
         self.sessions = SqlSessions(database)
-        self.live_sessions = SqlLiveSessions(database)
         self.events = SqlEvents(database)
         self.policy_names = SqlPolicyNames(database)
         self.announcements = NotifiedAnnouncements(database) if database.notifies else Alone()

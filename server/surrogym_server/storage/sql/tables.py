@@ -316,23 +316,6 @@ sessions = sa.Table(
     sa.Column("data", sa.LargeBinary, nullable=False),
 )
 
-live_sessions = sa.Table(  # of a cluster; each is in the memory of its owner, and here as at its last checkpoint
-    "live_sessions",
-    metadata,
-    sa.Column("id", sa.Text, primary_key=True),
-    owner(),
-    sa.Column("key", sa.Text),  # idempotency key of its opening
-    sa.Column("digest", sa.Text),  # of the opening
-    sa.Column("machine", sa.Text, nullable=False),
-    sa.Column("owner", sa.Text, nullable=False, index=True),
-    sa.Column("fence", sa.BigInteger, nullable=False),
-    sa.Column("expires", sa.Double, nullable=False),
-    sa.Column("seconds", sa.Double, nullable=False),  # that the lease was given
-    sa.Column("seq", sa.BigInteger, nullable=False),
-    sa.Column("data", sa.LargeBinary),  # NULL: too large
-    sa.UniqueConstraint("surrogate_id", "key"),
-)
-
 events = sa.Table(
     "events",
     metadata,

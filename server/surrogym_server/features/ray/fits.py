@@ -12,11 +12,11 @@ from typing import Any, cast
 import ray
 from ray.exceptions import RayError, RayTaskError, TaskCancelledError
 
-from surrogym_server.cluster.host import versions
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.fits import Failure, Function, done, error_of
 from surrogym_server.engine.port import Compute
 from surrogym_server.errors import PluginFailed, Unavailable
+from surrogym_server.features.ray.host import versions
 from surrogym_server.plugins import in_one_line
 
 logger = logging.getLogger(__name__)

@@ -15,13 +15,13 @@ from zlib import crc32
 import ray
 from ray.exceptions import RayActorError, RayError
 
-from surrogym_server.cluster.host import HostSettings, Refused
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance, Array, Open, Reply, Restore, Saved, SessionInfo, Visited
 from surrogym_server.engine.session import digest_of
 from surrogym_server.engine.tallies import Counts, Durations, SessionActivity
 from surrogym_server.errors import IdempotencyConflict, Overloaded, Unavailable, UnknownSession
-from surrogym_server.storage.live_sessions import LiveSessions
+from surrogym_server.features.ray.host import HostSettings, Refused
+from surrogym_server.features.ray.store import LiveSessions
 
 logger = logging.getLogger(__name__)
 

@@ -6,7 +6,6 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from surrogym_server.cluster.leases import Leases
 from surrogym_server.engine.local import LocalEngine
 from surrogym_server.engine.opening import OpeningLocks
 from surrogym_server.engine.port import SessionEngine
@@ -22,7 +21,9 @@ from surrogym_server.errors import (
     Unavailable,
     UnknownSession,
 )
-from surrogym_server.storage.live_sessions import LiveSessions, TakenSession
+from surrogym_server.features.ray.leases import Leases
+from surrogym_server.features.ray.records import TakenSession
+from surrogym_server.features.ray.store import LiveSessions
 
 UNKNOWN = -1
 

@@ -9,11 +9,11 @@ import pytest
 
 from support.postgresql import Postgresql
 from surrogym_sampler.original import classic
-from surrogym_server.cluster import pool
 from surrogym_server.convert import stored_definition
 from surrogym_server.engine.design_job import DesignJob, run_design_job
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.environment.samples import Samples
+from surrogym_server.features.ray import pool
 from surrogym_server.settings import Settings
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewModel, NewSurrogate
@@ -84,7 +84,7 @@ def settings(database: str, address: str) -> Settings:
 
 @pytest.fixture(scope="module")
 def engine(settings: Settings, storage: Storage) -> SessionEngine:
-    return pool.connect(settings, storage.live_sessions)
+    return pool.connect(settings, storage)
 
 
 @pytest.fixture

@@ -10,12 +10,14 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from surrogym_server.cluster.host import HostInfo, HostSettings, SessionHost, versions
 from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.engine.port import Compute, SessionEngine
 from surrogym_server.errors import InvalidInput, Unavailable
+from surrogym_server.feature import Cluster
+from surrogym_server.features.ray.host import HostInfo, HostSettings, SessionHost, versions
+from surrogym_server.features.ray.store import LiveSessions
 from surrogym_server.settings import Settings
-from surrogym_server.storage.live_sessions import LiveSessions
+from surrogym_server.storage.port import Storage
 from surrogym_shared.ray_address import no_cluster, require_cluster, send_token
 
 logger = logging.getLogger(__name__)
@@ -36,12 +38,12 @@ def check(settings: Settings) -> None:
         )
 
 
-def connect(settings: Settings, store: LiveSessions) -> SessionEngine:
+def connect(settings: Settings, storage: Storage) -> SessionEngine:
     """Connect to the cluster at ``ray_address``, wait until all session hosts are ready, and return its engine.
 
     Args:
         settings: settings of this server.
-        store: records of the sessions, in the same database.
+        storage: its storage, where the sessions are recorded.
 
     Raises:
         InvalidInput: the settings can't serve a cluster, there is no cluster, or it runs other versions or settings.
@@ -65,14 +67,14 @@ def connect(settings: Settings, store: LiveSessions) -> SessionEngine:
         if "ersion mismatch" in said:
             raise InvalidInput(f"engine ray: expected a cluster of the same versions: {said}") from error
         raise Unavailable(f"engine ray: the cluster can't be used: {said}") from error
-    return _of_hosts(HostSettings.of(settings), store)
+    return _of_hosts(HostSettings.of(settings), storage.part(LiveSessions))
 
 
 def fits_of(settings: Settings, function: Callable[[DesignJob], DesignResult]) -> Compute | None:
     """Return the object that runs fits in the connected cluster; None if session hosts leave no CPU or too few GPUs."""
     import ray
 
-    from surrogym_server.cluster.fits import RayFits
+    from surrogym_server.features.ray.fits import RayFits
 
     untyped: Any = ray
     resources: dict[str, float] = untyped.cluster_resources()
@@ -100,7 +102,7 @@ def _gpus_of_host(device: str) -> int:
 
 
 def _of_hosts(wanted: HostSettings, store: LiveSessions) -> SessionEngine:
-    from surrogym_server.cluster.engine import RayEngine
+    from surrogym_server.features.ray.engine import RayEngine
 
     pool = pool_name(wanted.database)
     first = _host(pool, 0, wanted)
@@ -195,3 +197,6 @@ def _require_same(wanted: HostSettings, found: Sequence[HostInfo]) -> None:
                     f"engine ray: expected the settings of the session hosts, which have {field.name} {told}; ray stop "
                     "ends them"
                 )
+
+
+CLUSTER = Cluster(check, connect, fits_of)

@@ -13,15 +13,16 @@ import numpy as np
 import pytest
 
 from surrogym_sampler.original import classic
-from surrogym_server.cluster import leases
-from surrogym_server.cluster.host import HostSettings, recorded_engine
-from surrogym_server.cluster.leases import Pace
-from surrogym_server.cluster.recorded import RecordedEngine
 from surrogym_server.convert import stored_definition
 from surrogym_server.engine.requests import Advance, Reply
 from surrogym_server.engine.sessions import Limits
 from surrogym_server.errors import Overloaded, SeqConflict, Unavailable, UnknownSession
-from surrogym_server.storage.live_sessions import SessionLease
+from surrogym_server.features.ray import leases
+from surrogym_server.features.ray.host import HostSettings, recorded_engine
+from surrogym_server.features.ray.leases import Pace
+from surrogym_server.features.ray.recorded import RecordedEngine
+from surrogym_server.features.ray.records import SessionLease
+from surrogym_server.features.ray.store import LiveSessions
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
 from surrogym_server.testing import LAWS_OF_ENGINES, EngineCase
@@ -82,7 +83,7 @@ def end_lease(storage: Storage) -> Callable[[Host, str], None]:
     """End the lease of a session by the database's clock, as if its host had been gone for so long."""
 
     def end(host: Host, session: str) -> None:
-        storage.live_sessions.release(host.leases._held[session].lease)
+        storage.part(LiveSessions).release(host.leases._held[session].lease)
 
     return end
 
@@ -225,7 +226,7 @@ def test_a_session_that_is_behind_answers_to_nothing_but_its_requests(host, end_
         }
         await refused(UnknownSession, calls[what](), "was lost with its session host")
         await refused(UnknownSession, second.engine.advance(first.case.steps(session)[0]))
-        assert storage.live_sessions.holder(session) is None
+        assert storage.part(LiveSessions).holder(session) is None
 
     asyncio.run(asked())
 
@@ -236,7 +237,7 @@ def test_a_session_on_another_kind_of_machine_is_lost_with_the_reason(host, end_
         session = await first.case.opened()
         end_lease(first, session)
         await refused(UnknownSession, second.engine.take(session), "no host of the same kind of machine")
-        assert storage.live_sessions.holder(session) is None
+        assert storage.part(LiveSessions).holder(session) is None
 
     asyncio.run(moved())
 
@@ -281,11 +282,11 @@ def test_records_end_with_their_sessions(host, storage: Storage):
         one = host()
         sessions = [await one.case.opened() for _ in range(3)]
         await one.engine.close(sessions[0])
-        assert [storage.live_sessions.holder(id) is None for id in sessions] == [True, False, False]
+        assert [storage.part(LiveSessions).holder(id) is None for id in sessions] == [True, False, False]
         one.engine._inner.end(sessions[1])  # as a session that was idle for too long
         await one.engine.sweep()
-        assert [storage.live_sessions.holder(id) is None for id in sessions] == [True, True, False]
-        storage.live_sessions.remove(sessions[2])  # as a front server that closes it
+        assert [storage.part(LiveSessions).holder(id) is None for id in sessions] == [True, True, False]
+        storage.part(LiveSessions).remove(sessions[2])  # as a front server that closes it
         await one.leases.renew()
         await refused(UnknownSession, one.engine.describe(sessions[2]))
 
@@ -297,7 +298,7 @@ def test_an_opening_under_one_key_at_two_hosts_opens_one_session(host, storage: 
         first, second = host(), host()
         info = await first.engine.open(first.case.asked(key="once"))
         await refused(Unavailable, second.engine.open(second.case.asked(key="once")), "under this key")
-        known = storage.live_sessions.opened(first.case.surrogate_id, "once")
+        known = storage.part(LiveSessions).opened(first.case.surrogate_id, "once")
         assert known is not None
         assert known[0] == info.id
         assert second.engine._inner.sessions() == []
@@ -311,15 +312,15 @@ def test_a_session_whose_recording_was_not_confirmed_is_free_after_its_lease(hos
     async def opened() -> None:
         first, second = host(), host()
         await first.case.opened()
-        add = storage.live_sessions.add
-        monkeypatch.setattr(storage.live_sessions, "add", unconfirmed(add))
+        add = LiveSessions.add
+        monkeypatch.setattr(LiveSessions, "add", unconfirmed(add))
         await refused(Unavailable, first.engine.open(first.case.asked(key="once")))
-        monkeypatch.setattr(storage.live_sessions, "add", add)
-        known = storage.live_sessions.opened(first.case.surrogate_id, "once")
+        monkeypatch.setattr(LiveSessions, "add", add)
+        known = storage.part(LiveSessions).opened(first.case.surrogate_id, "once")
         assert known is not None
-        holder = storage.live_sessions.holder(known[0])
+        holder = storage.part(LiveSessions).holder(known[0])
         assert holder is not None
-        storage.live_sessions.release(SessionLease(known[0], holder.owner, 1))
+        storage.part(LiveSessions).release(SessionLease(known[0], holder.owner, 1))
         await first.leases.renew()
         assert (await second.engine.take(known[0])).seq == 0
 
@@ -332,13 +333,13 @@ def test_a_record_that_could_not_be_deleted_is_deleted_later(host, storage: Stor
     async def ended() -> None:
         one = host()
         session = await one.case.opened()
-        remove = storage.live_sessions.remove
-        monkeypatch.setattr(storage.live_sessions, "remove", away)
+        remove = LiveSessions.remove
+        monkeypatch.setattr(LiveSessions, "remove", away)
         one.engine._inner.end(session)  # as a session that was idle for too long
         await refused(Unavailable, one.engine.sweep())
-        monkeypatch.setattr(storage.live_sessions, "remove", remove)
+        monkeypatch.setattr(LiveSessions, "remove", remove)
         await one.engine.sweep()
-        assert storage.live_sessions.holder(session) is None
+        assert storage.part(LiveSessions).holder(session) is None
 
     asyncio.run(ended())
 

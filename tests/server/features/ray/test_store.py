@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
@@ -10,13 +10,20 @@ import pytest
 import sqlalchemy as sa
 
 from surrogym_server.errors import IdempotencyConflict, Unavailable, UnknownSession, UnknownSurrogate
-from surrogym_server.storage.live_sessions import Checkpoint, NewLiveSession, SessionLease, TakenSession
+from surrogym_server.features.ray.records import Checkpoint, NewLiveSession, SessionLease, TakenSession
+from surrogym_server.features.ray.store import LiveSessions, live
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import database
-from surrogym_server.storage.sql.tables import live_sessions
+from surrogym_server.storage.sql import database, open_storage
 
 LONG, SHORT, DAY = 60.0, 0.05, 86_400.0
 Until = Callable[[Callable[[], bool]], None]
+
+
+@pytest.fixture
+def storage(url: str) -> Iterator[Storage]:
+    opened = open_storage(url)
+    yield opened
+    opened.close()
 
 
 @pytest.fixture
@@ -29,26 +36,26 @@ def add(storage: Storage, surrogate: int) -> Callable[..., SessionLease]:
     def record(id: str = "s", owner: str = "a", seconds: float = LONG, key: str | None = None) -> SessionLease:
         digest = None if key is None else f"opening under {key}"
         new = NewLiveSession(id, surrogate, "this machine", Checkpoint(0, b"opened"), key, digest)
-        return storage.live_sessions.add(new, owner, seconds)
+        return storage.part(LiveSessions).add(new, owner, seconds)
 
     return record
 
 
 def test_a_session_is_taken_as_at_its_last_checkpoint(storage: Storage, surrogate: int, add, until: Until) -> None:
     lease = add(seconds=SHORT)
-    assert storage.live_sessions.record(lease, Checkpoint(7, b"\0seven"))
+    assert storage.part(LiveSessions).record(lease, Checkpoint(7, b"\0seven"))
     until(lambda: seconds_left(storage, "s") < 0)
-    taken = storage.live_sessions.take("s", "b", LONG)
+    taken = storage.part(LiveSessions).take("s", "b", LONG)
     assert taken == TakenSession(SessionLease("s", "b", 2), surrogate, "this machine", Checkpoint(7, b"\0seven"))
-    assert storage.live_sessions.record(taken.lease, Checkpoint(9, None))
-    assert storage.live_sessions.take("s", "b", LONG).checkpoint == Checkpoint(9, None)
+    assert storage.part(LiveSessions).record(taken.lease, Checkpoint(9, None))
+    assert storage.part(LiveSessions).take("s", "b", LONG).checkpoint == Checkpoint(9, None)
 
 
 def test_nobody_takes_a_session_under_a_living_lease(storage: Storage, add) -> None:
     add()
     with pytest.raises(Unavailable, match=r"belongs to another session host for (59|60)\.\d s more"):
-        storage.live_sessions.take("s", "b", LONG)
-    holder = storage.live_sessions.holder("s")
+        storage.part(LiveSessions).take("s", "b", LONG)
+    holder = storage.part(LiveSessions).holder("s")
     assert holder is not None
     assert (holder.owner, holder.machine) == ("a", "this machine")
 
@@ -56,13 +63,13 @@ def test_nobody_takes_a_session_under_a_living_lease(storage: Storage, add) -> N
 def test_an_owner_whose_lease_was_replaced_changes_nothing(storage: Storage, add, until: Until) -> None:
     old = add(seconds=SHORT)
     until(lambda: seconds_left(storage, "s") < 0)
-    new = storage.live_sessions.take("s", "b", LONG).lease
-    assert storage.live_sessions.renew("a", ["s"], LONG) == frozenset()
-    assert not storage.live_sessions.record(old, Checkpoint(99, b"late"))
-    storage.live_sessions.release(old)
+    new = storage.part(LiveSessions).take("s", "b", LONG).lease
+    assert storage.part(LiveSessions).renew("a", ["s"], LONG) == frozenset()
+    assert not storage.part(LiveSessions).record(old, Checkpoint(99, b"late"))
+    storage.part(LiveSessions).release(old)
     assert seconds_left(storage, "s") > 0
-    assert storage.live_sessions.take("s", "b", LONG).checkpoint == Checkpoint(0, b"opened")
-    assert not storage.live_sessions.record(new, Checkpoint(1, b"of the lease before"))
+    assert storage.part(LiveSessions).take("s", "b", LONG).checkpoint == Checkpoint(0, b"opened")
+    assert not storage.part(LiveSessions).record(new, Checkpoint(1, b"of the lease before"))
 
 
 def test_a_lease_that_nobody_replaced_is_renewed_after_its_end(storage: Storage, add, until: Until) -> None:
@@ -70,16 +77,16 @@ def test_a_lease_that_nobody_replaced_is_renewed_after_its_end(storage: Storage,
     add("t", seconds=SHORT)
     add("u", owner="b")
     until(lambda: seconds_left(storage, "s") < 0 and seconds_left(storage, "t") < 0)
-    assert storage.live_sessions.renew("a", ["s", "t", "u", "never"], LONG) == {"s", "t"}
+    assert storage.part(LiveSessions).renew("a", ["s", "t", "u", "never"], LONG) == {"s", "t"}
     with pytest.raises(Unavailable):
-        storage.live_sessions.take("s", "b", LONG)
+        storage.part(LiveSessions).take("s", "b", LONG)
 
 
 def test_a_lease_that_its_owner_does_not_name_ends(storage: Storage, add) -> None:
     """The answer to ``add`` was lost with the connection: the owner never heard of its session."""
     add("s", seconds=SHORT)
     ids = [f"id'{number}" for number in range(70_000)]  # more than a statement may have parameters
-    assert storage.live_sessions.renew("a", ids, LONG) == frozenset()
+    assert storage.part(LiveSessions).renew("a", ids, LONG) == frozenset()
     assert seconds_left(storage, "s") <= SHORT
 
 
@@ -94,38 +101,38 @@ def test_an_owner_that_stops_within_a_transaction_locks_its_session_for_some_sec
 
     def is_taken() -> bool:
         with suppress(Unavailable):
-            return storage.live_sessions.take("s", "b", LONG).lease.owner == "b"
+            return storage.part(LiveSessions).take("s", "b", LONG).lease.owner == "b"
         return False
 
     def write_late() -> None:
         with stopped.write() as connection:
-            connection.execute(sa.update(live_sessions).where(live_sessions.c.id == lease.id).values(seq=5))
+            connection.execute(sa.update(live).where(live.c.id == lease.id).values(seq=5))
             until(is_taken)
-            connection.execute(sa.select(live_sessions.c.id))
+            connection.execute(sa.select(live.c.id))
 
     with pytest.raises(Unavailable, match="the database can't be used now"):
         write_late()
     stopped.close()
-    assert storage.live_sessions.take("s", "b", LONG).checkpoint == Checkpoint(0, b"opened")
+    assert storage.part(LiveSessions).take("s", "b", LONG).checkpoint == Checkpoint(0, b"opened")
 
 
 def test_a_released_session_is_free_at_once(storage: Storage, add) -> None:
-    storage.live_sessions.release(add())
-    assert storage.live_sessions.take("s", "b", LONG).lease.fence == 2
+    storage.part(LiveSessions).release(add())
+    assert storage.part(LiveSessions).take("s", "b", LONG).lease.fence == 2
 
 
 def test_of_several_at_once_one_takes_a_session(storage: Storage, add) -> None:
-    storage.live_sessions.release(add())
+    storage.part(LiveSessions).release(add())
 
     def take(owner: str) -> str | None:
         try:
-            return storage.live_sessions.take("s", owner, LONG).lease.owner
+            return storage.part(LiveSessions).take("s", owner, LONG).lease.owner
         except Unavailable:
             return None
 
     with ThreadPoolExecutor(4) as threads:
         won = [owner for owner in threads.map(take, ("b", "c", "d", "e")) if owner]
-    holder = storage.live_sessions.holder("s")
+    holder = storage.part(LiveSessions).holder("s")
     assert holder is not None
     assert won == [holder.owner]
 
@@ -134,33 +141,33 @@ def test_a_session_is_found_by_the_key_of_its_opening(storage: Storage, surrogat
     add("s", key="once")
     add("t")
     add("u")
-    assert storage.live_sessions.opened(surrogate, "once") == ("s", "opening under once")
-    assert storage.live_sessions.opened(surrogate, "never") is None
+    assert storage.part(LiveSessions).opened(surrogate, "once") == ("s", "opening under once")
+    assert storage.part(LiveSessions).opened(surrogate, "never") is None
     for again in ({"id": "other", "key": "once"}, {"id": "s"}):
         with pytest.raises(IdempotencyConflict):
             add(**again)
-    assert storage.live_sessions.holder("other") is None
+    assert storage.part(LiveSessions).holder("other") is None
 
 
 def test_a_removed_session_is_unknown(storage: Storage, surrogate: int, add) -> None:
     lease = add("s", key="once")
     add("t")
-    storage.live_sessions.remove("s")
-    storage.live_sessions.remove("s")
-    assert storage.live_sessions.holder("s") is None
-    assert not storage.live_sessions.record(lease, Checkpoint(1, b""))
+    storage.part(LiveSessions).remove("s")
+    storage.part(LiveSessions).remove("s")
+    assert storage.part(LiveSessions).holder("s") is None
+    assert not storage.part(LiveSessions).record(lease, Checkpoint(1, b""))
     with pytest.raises(UnknownSession):
-        storage.live_sessions.take("s", "a", LONG)
+        storage.part(LiveSessions).take("s", "a", LONG)
     assert add("s", key="once").fence == 1, "its id and key are free again"
-    storage.live_sessions.remove_all_of(surrogate + 1)
-    storage.live_sessions.remove_all_of(surrogate)
-    assert storage.live_sessions.renew("a", ["s", "t"], LONG) == frozenset()
+    storage.part(LiveSessions).remove_all_of(surrogate + 1)
+    storage.part(LiveSessions).remove_all_of(surrogate)
+    assert storage.part(LiveSessions).renew("a", ["s", "t"], LONG) == frozenset()
 
 
 def test_sessions_go_with_their_surrogate(storage: Storage, make, add) -> None:
     add()
     storage.surrogates.delete(make())
-    assert storage.live_sessions.holder("s") is None
+    assert storage.part(LiveSessions).holder("s") is None
     with pytest.raises(UnknownSurrogate):
         add("t")
 
@@ -168,10 +175,10 @@ def test_sessions_go_with_their_surrogate(storage: Storage, make, add) -> None:
 def test_a_session_that_nobody_took_is_swept(storage: Storage, add, until: Until) -> None:
     add("s", seconds=SHORT)
     add("t")
-    assert storage.live_sessions.sweep(LONG) == 0
-    until(lambda: storage.live_sessions.sweep(SHORT) == 1)
-    assert storage.live_sessions.holder("s") is None
-    assert storage.live_sessions.holder("t") is not None
+    assert storage.part(LiveSessions).sweep(LONG) == 0
+    until(lambda: storage.part(LiveSessions).sweep(SHORT) == 1)
+    assert storage.part(LiveSessions).holder("s") is None
+    assert storage.part(LiveSessions).holder("t") is not None
 
 
 def test_a_lease_lasts_no_longer_though_the_clock_is_set_back(
@@ -180,11 +187,11 @@ def test_a_lease_lasts_no_longer_though_the_clock_is_set_back(
     add()
     set_clock_back(DAY)
     assert seconds_left(storage, "s") > LONG
-    storage.live_sessions.sweep(LONG)
+    storage.part(LiveSessions).sweep(LONG)
     assert LONG / 2 < seconds_left(storage, "s") <= LONG
 
 
 def seconds_left(storage: Storage, id: str) -> float:
-    holder = storage.live_sessions.holder(id)
+    holder = storage.part(LiveSessions).holder(id)
     assert holder is not None
     return holder.seconds_left

@@ -24,8 +24,8 @@ from surrogym_server.testing import LAWS_OF_COMPUTE, ComputeCase
 
 ray = pytest.importorskip("ray")
 
-from surrogym_server.cluster import fits, pool  # noqa: E402
-from surrogym_server.cluster.host import HostSettings  # noqa: E402
+from surrogym_server.features.ray import fits, pool  # noqa: E402
+from surrogym_server.features.ray.host import HostSettings  # noqa: E402
 
 pytestmark = [pytest.mark.timeout(600), pytest.mark.filterwarnings("ignore::FutureWarning:ray")]
 

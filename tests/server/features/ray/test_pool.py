@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from surrogym_server.cluster import pool
 from surrogym_server.errors import InvalidInput
+from surrogym_server.features.ray import pool
 from surrogym_server.settings import Settings
 
 ray = pytest.importorskip("ray")

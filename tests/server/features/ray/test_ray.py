@@ -24,13 +24,14 @@ from support.postgresql import Postgresql
 from support.server import ServerProcess, running_server
 from surrogym_client.transport import HttpSurrogate, Transport
 from surrogym_sampler.diagnosis.conformance import conformance, leases, sessions
-from surrogym_server.cluster import pool
-from surrogym_server.cluster.host import Refused
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance, Reply, Reset
 from surrogym_server.errors import InvalidInput, SeqConflict, Unavailable
+from surrogym_server.features.ray import pool
+from surrogym_server.features.ray.host import Refused
+from surrogym_server.features.ray.records import SessionHolder
+from surrogym_server.features.ray.store import LiveSessions
 from surrogym_server.settings import Settings
-from surrogym_server.storage.live_sessions import SessionHolder
 from surrogym_server.storage.port import Storage
 from surrogym_server.testing import LAWS_OF_ENGINES, EngineCase
 from surrogym_shared.wire import OpenSession
@@ -69,7 +70,7 @@ def test_a_session_goes_on_at_another_host_when_its_own_died_or_stopped(
         [died] = [host for host in await about(database) if host.number == number]
         os.kill(died.pid, how)
         await replayed(case, requests[:8])
-        holder = storage.live_sessions.holder(session)
+        holder = storage.part(LiveSessions).holder(session)
         assert holder is not None
         assert not holder.owner.startswith(f"{number} ")
         away = "has ended and is started again" if how is signal.SIGKILL else "does not answer now"
@@ -88,18 +89,16 @@ def test_a_session_goes_on_at_another_host_when_its_own_died_or_stopped(
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_a_request_that_takes_long_is_waited_for(
-    case: EngineCase, storage: Storage, monkeypatch: pytest.MonkeyPatch, late: bool
-):
+def test_a_request_that_takes_long_is_waited_for(case: EngineCase, monkeypatch: pytest.MonkeyPatch, late: bool):
     """As long as its host renews the lease, or is late with that and lives."""
-    looks, look = [], storage.live_sessions.holder
+    looks, look = [], LiveSessions.holder
 
-    def holder(id: str) -> SessionHolder | None:
+    def holder(live: LiveSessions, id: str) -> SessionHolder | None:
         looks.append(id)
-        found = look(id)
+        found = look(live, id)
         return replace(found, seconds_left=-1.0) if found and late else found
 
-    monkeypatch.setattr(storage.live_sessions, "holder", holder)
+    monkeypatch.setattr(LiveSessions, "holder", holder)
     monkeypatch.setattr(case.engine, "_patience", 1e-3)
 
     async def waited() -> None:
@@ -117,7 +116,7 @@ def test_an_opening_is_refused_when_its_host_stops_answering(
 ):
     """The host stops while it waits for the database, which a lock holds up. The repeat opens one session."""
     monkeypatch.setattr(case.engine, "_patience", 0.5)
-    monkeypatch.setattr("surrogym_server.cluster.engine.ANSWERING_SECONDS", 1.0)
+    monkeypatch.setattr("surrogym_server.features.ray.engine.ANSWERING_SECONDS", 1.0)
 
     async def stopped() -> None:
         hosts = await about(database)
@@ -150,7 +149,7 @@ def test_a_host_that_has_stopped_is_left_out_of_what_is_shown(
     case: EngineCase, database: str, monkeypatch: pytest.MonkeyPatch
 ):
     """The view of each surrogate has them, also in the answer to a request that has created it."""
-    monkeypatch.setattr("surrogym_server.cluster.engine.ANSWERING_SECONDS", 1.0)
+    monkeypatch.setattr("surrogym_server.features.ray.engine.ANSWERING_SECONDS", 1.0)
     sessions = [asyncio.run(case.opened()) for _ in range(HOSTS)]
     held, before = sessions[0].rpartition(".")[2], case.engine.counts().sessions[NAME]
     [stopped] = [host for host in asyncio.run(about(database)) if str(host.number) == held]
@@ -176,7 +175,7 @@ def test_a_session_of_another_pool_is_refused_with_the_reason(
 ):
     """A front server that writes the database's address in another way has session hosts of its own."""
     database = f"{settings.database}/"  # of the folder of PostgreSQL's socket
-    other = pool.connect(settings.model_copy(update={"database": database, "ray_hosts": 1}), storage.live_sessions)
+    other = pool.connect(settings.model_copy(update={"database": database, "ray_hosts": 1}), storage)
 
     async def asked() -> None:
         session = await case.opened(key="of one pool")
@@ -309,7 +308,7 @@ def test_a_client_goes_on_bit_for_bit_while_hosts_are_killed(
     """The client sends its last requests again by itself."""
 
     def kill_its_host(session: str) -> None:
-        holder = storage.live_sessions.holder(session)
+        holder = storage.part(LiveSessions).holder(session)
         assert holder is not None
         owner = int(holder.owner.partition(" ")[0])
         [host] = [one for one in asyncio.run(about(database)) if one.number == owner]
@@ -368,7 +367,7 @@ def test_an_unsuitable_cluster_is_refused_in_one_sentence(
     settings: Settings, engine: SessionEngine, storage: Storage, options: dict[str, object], said: str
 ):
     with pytest.raises(InvalidInput, match=said) as refused:
-        pool.connect(Settings.model_validate(settings.model_dump() | options), storage.live_sessions)
+        pool.connect(Settings.model_validate(settings.model_dump() | options), storage)
     assert "\n" not in str(refused.value)
 
 
@@ -384,7 +383,7 @@ def test_hosts_that_wait_for_room_are_logged_with_the_reason(
     database = f"{settings.database}//"
     try:
         with pytest.raises(Unavailable, match="each takes one of the cluster's CPUs and one of its GPUs"):
-            pool.connect(settings.model_copy(update={"database": database, "device": "cuda"}), storage.live_sessions)
+            pool.connect(settings.model_copy(update={"database": database, "device": "cuda"}), storage)
     finally:
         ray.kill(ray.get_actor(f"session host 0 of {pool.pool_name(database)}"))
     assert "waiting for 1 session hosts to start, for 1 s at most" in caplog.text
@@ -396,4 +395,4 @@ def test_other_versions_than_the_hosts_run_are_refused(
 ):
     monkeypatch.setattr(pool, "versions", lambda: {"Python": "2.7"})
     with pytest.raises(InvalidInput, match=r"expected Python 3\..*, which the session hosts run, got Python 2\.7"):
-        pool.connect(settings, storage.live_sessions)
+        pool.connect(settings, storage)

@@ -15,9 +15,6 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from surrogym_server import logs
-from surrogym_server.cluster.leases import Leases, Pace, seconds_now
-from surrogym_server.cluster.machine import machine_kind
-from surrogym_server.cluster.recorded import RecordedEngine, Surroundings
 from surrogym_server.convert import stored_definition
 from surrogym_server.convert.stored import read_stored
 from surrogym_server.engine.local import LocalEngine
@@ -25,6 +22,10 @@ from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import MEBIBYTE, Limits
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import SurrogymError
+from surrogym_server.features.ray.leases import Leases, Pace, seconds_now
+from surrogym_server.features.ray.machine import machine_kind
+from surrogym_server.features.ray.recorded import RecordedEngine, Surroundings
+from surrogym_server.features.ray.store import LiveSessions
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.models import load_model, stored_tolerances
 from surrogym_server.settings import Settings
@@ -186,5 +187,6 @@ def recorded_engine(
         return record.name, definitions.of(record)
 
     owner = f"{number} {settings.pool} {uuid4().hex}"
-    leases = Leases(storage.live_sessions, owner, machine, settings.pace, inner.end, clock)
-    return RecordedEngine(inner, storage.live_sessions, leases, Surroundings(surrogate, models.refresh))
+    live = storage.part(LiveSessions)
+    leases = Leases(live, owner, machine, settings.pace, inner.end, clock)
+    return RecordedEngine(inner, live, leases, Surroundings(surrogate, models.refresh))
