@@ -48,9 +48,10 @@ from surrogym_server.engine.port import Compute, SessionEngine
 from surrogym_server.engine.sessions import MEBIBYTE, Limits
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
-from surrogym_server.feature import Cluster, Core, Parts
-from surrogym_server.features import jobs, policies
-from surrogym_server.features.ray import pool as ray
+from surrogym_server.feature import Cluster, Core, Feature, Parts
+from surrogym_server.features.jobs import FEATURE as jobs
+from surrogym_server.features.policies import FEATURE as policies
+from surrogym_server.features.ray.pool import CLUSTER as ray
 from surrogym_server.models.registry import MODELS
 from surrogym_server.private import keep_private
 from surrogym_server.sampling.acquisition import ACQUISITIONS
@@ -71,8 +72,13 @@ from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
 from surrogym_shared.spec import EnvironmentSpec
 
-FEATURES = (policies.FEATURE, jobs.FEATURE)  # a server without one has no folder for it, and no line here
-CLUSTERS = {"ray": ray.CLUSTER}  # by the setting ``engine``
+FEATURES: tuple[Feature, ...] = (  # a server without one has no folder for it, and no line here
+    policies,
+    jobs,
+)
+CLUSTERS: dict[str, Cluster] = {  # by the setting ``engine``
+    "ray": ray,
+}
 
 logger = logging.getLogger(__name__)
 
@@ -156,8 +162,9 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", *settings.host_names}))
     app.add_middleware(Observed, metrics=app.state.metrics)
     app.router.routes.extend(stepping.routes)  # tried first, and directly: an included router is another search
-    for room in (sessions, service, metrics, surrogates, queries, samples, logs, models, *FEATURES, events):
-        app.include_router(room.router)
+    rooms = (sessions, service, metrics, surrogates, queries, samples, logs, models)
+    for one in (*(room.router for room in rooms), *(feature.router for feature in FEATURES), events.router):
+        app.include_router(one)
     _add_dashboard(app)
     return app
 
