@@ -17,7 +17,7 @@ import pytest
 from support.simulators import CASES, Register, installed
 from surrogym_sampler.original.adapters import open_simulator
 from surrogym_sampler.original.adapters.parts import action_of
-from surrogym_sampler.original.adapters.pcgym import parameters_of
+from surrogym_sampler.original.adapters.pcgym.adapter import parameters_of
 from surrogym_sampler.original.errors import UnknownEnvironment
 from surrogym_sampler.original.simulator import Simulator
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from support.fmus import EXAMPLES, STATES, build, changed, mapping
-from surrogym_sampler.original.adapters.fmu import open_simulator
 from surrogym_sampler.original.errors import UnknownEnvironment
 from surrogym_sampler.original.fmus import archive
+from surrogym_sampler.original.fmus.adapter import open_simulator
 
 pytest.importorskip("fmpy")
 pytest.importorskip("pythonfmu")

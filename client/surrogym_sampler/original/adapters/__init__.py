@@ -47,8 +47,10 @@ ADAPTERS = (
         re.compile(r"dm_control:[a-z0-9_]+-[a-z0-9_]+"),
         "dm-control",
     ),
-    Adapter("surrogym_sampler.original.adapters.pcgym", re.compile(r"pcgym:.*"), re.compile(r"pcgym:cstr"), "pcgym"),
-    Adapter("surrogym_sampler.original.adapters.fmu", re.compile(r"fmu:.*"), NEVER, "fmu", separate=True),
+    Adapter(
+        "surrogym_sampler.original.adapters.pcgym.adapter", re.compile(r"pcgym:.*"), re.compile(r"pcgym:cstr"), "pcgym"
+    ),
+    Adapter("surrogym_sampler.original.fmus.adapter", re.compile(r"fmu:.*"), NEVER, "fmu", separate=True),
     Adapter(
         "surrogym_sampler.original.adapters.gymnasium_ids",
         re.compile(r"gymnasium_robotics:.*"),

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from surrogym_sampler.original.adapters.parts import OfParts, action_of
-from surrogym_sampler.original.adapters.pcgym_file import RANGES, check_model, read_parameters
+from surrogym_sampler.original.adapters.pcgym.file import RANGES, check_model, read_parameters
 from surrogym_sampler.original.errors import OriginalError, UnknownEnvironment
 from surrogym_sampler.original.gymnasium import native_action
 from surrogym_sampler.original.protocol import Array
