@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from surrogym_server.convert import opening, session_view, stored_definition
+from surrogym_server.convert import stored_definition
+from surrogym_server.convert.sessions import opening, session_view
 from surrogym_server.engine.core import carried_out, opened, visited_states
 from surrogym_server.engine.requests import Advance, Open, PolicySteps, Reset, Rollout, Step, info_of
 from surrogym_server.engine.session import Outcome, Session, check_opening, digest_of

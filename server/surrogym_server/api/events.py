@@ -9,12 +9,12 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import StreamingResponse
 
-from surrogym_server import convert
 from surrogym_server.api.auth import READ
 from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.api.turns import Waiting
+from surrogym_server.convert import resources
 from surrogym_server.services.events import Page
 from surrogym_shared.codes import Code
 
@@ -95,6 +95,6 @@ async def _lines(pages: AsyncIterator[Page | None]) -> AsyncIterator[str]:
 def _text(page: Page) -> str:
     """A page for a stream, made once for all that wait for it."""
     return "".join(
-        f"id: {record.id}\nevent: {record.kind}\ndata: {convert.event(record).model_dump_json()}\n\n"
+        f"id: {record.id}\nevent: {record.kind}\ndata: {resources.event(record).model_dump_json()}\n\n"
         for record in page.events
     )

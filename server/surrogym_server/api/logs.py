@@ -6,7 +6,6 @@ from typing import Annotated
 
 from fastapi import APIRouter, Request
 
-from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import ADMIN, SAMPLE
 from surrogym_server.api.body import example
@@ -14,6 +13,7 @@ from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Services, Use
 from surrogym_server.api.turns import Turns
+from surrogym_server.convert import logs
 from surrogym_server.services.samples import NOTHING
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import AddedLog, AddLog, DraftedLog, DraftLog
@@ -33,7 +33,7 @@ KIBIBYTES = 5 * 1024  # letters of a log, and what JSON adds to them
 async def draft(body: Annotated[DraftLog, example(examples.DRAFT_LOG)], request: Request) -> DraftedLog:
     """Check each row of a log, and draft a specification from the usable ones. Nothing is stored."""
     turns: Turns = request.app.state.log_turns
-    return await turns.take(request, lambda: convert.drafted_report(convert.drafted_log(body)))
+    return await turns.take(request, lambda: logs.drafted_report(logs.drafted_log(body)))
 
 
 @router.post(
@@ -51,6 +51,6 @@ async def add(name: str, body: Annotated[AddLog, example(examples.ADD_LOG)], req
 
 
 def _added(name: str, body: AddLog, use: Services) -> AddedLog:
-    log = convert.checked_log(body, use.surrogates.spec(name))
-    added = NOTHING if body.check_only else use.samples.add_log(name, convert.logged_samples(log), log.steps.origin)
-    return convert.added_report(log, added)
+    log = logs.checked_log(body, use.surrogates.spec(name))
+    added = NOTHING if body.check_only else use.samples.add_log(name, logs.logged_samples(log), log.steps.origin)
+    return logs.added_report(log, added)

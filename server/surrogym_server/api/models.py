@@ -9,7 +9,6 @@ from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 
-from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import ADMIN, READ
 from surrogym_server.api.body import example
@@ -17,6 +16,8 @@ from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.api.turns import Turns
+from surrogym_server.convert import resources
+from surrogym_server.convert.numbers import numbers
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import Imagine, Imagined, ModelList, ModelView, Points, Prediction, Uncertainty
 
@@ -45,7 +46,7 @@ POINT_ERRORS = documented(
 )
 def list_all(name: str, use: Use) -> ModelList:
     """List all versions of the model with their fidelity, oldest first."""
-    return ModelList(models=[convert.model_view(record) for record in use.models.list(name)])
+    return ModelList(models=[resources.model_view(record) for record in use.models.list(name)])
 
 
 @router.get(
@@ -61,7 +62,7 @@ def list_all(name: str, use: Use) -> ModelList:
 def get(name: str, version: int, use: Use, format: Literal["json", "safetensors"] = "json") -> ModelView | Response:
     """Return a model's structure and fidelity, or with ``format=safetensors`` the complete model as a file."""
     if format == "json":
-        return convert.model_view(use.models.get(name, version))
+        return resources.model_view(use.models.get(name, version))
     return Response(use.models.export(name, version), media_type=SAFETENSORS)
 
 
@@ -76,7 +77,7 @@ def get(name: str, version: int, use: Use, format: Literal["json", "safetensors"
 async def add(name: str, request: Request, use: Use) -> ModelView:
     """Import a model from an exported file that has the same outputs. It becomes the newest version."""
     data = await request.body()
-    return convert.model_view(await run_in_threadpool(use.models.add, name, data))
+    return resources.model_view(await run_in_threadpool(use.models.add, name, data))
 
 
 @router.post(
@@ -90,9 +91,9 @@ async def query_uncertainty(
 ) -> Uncertainty:
     """Return for each point and output: mean, deviation, model uncertainty (eq. 10), input probability (eq. 11) and
     uncertainty index (eq. 12) of Active Uncertainty Reduction."""
-    q, u = convert.numbers("coordinates", body.coordinates), convert.numbers("action", body.action)
+    q, u = numbers("coordinates", body.coordinates), numbers("action", body.action)
     said = await _in_turn(request, lambda: use.models.query_uncertainty(name, q, u, body.model))
-    return convert.uncertainty(said)
+    return resources.uncertainty(said)
 
 
 @router.post("/predict", summary="The stateless transition", dependencies=[READ], responses=POINT_ERRORS)
@@ -100,8 +101,8 @@ async def predict(
     name: str, body: Annotated[Points, example(examples.POINTS)], request: Request, use: Use
 ) -> Prediction:
     """Predict one mean step from each point. No session is needed."""
-    q, u = convert.numbers("coordinates", body.coordinates), convert.numbers("action", body.action)
-    return convert.prediction(await _in_turn(request, lambda: use.models.predict(name, q, u, body.model)))
+    q, u = numbers("coordinates", body.coordinates), numbers("action", body.action)
+    return resources.prediction(await _in_turn(request, lambda: use.models.predict(name, q, u, body.model)))
 
 
 @router.post("/imagine", summary="An episode from a given state", dependencies=[READ], responses=POINT_ERRORS)
@@ -110,10 +111,10 @@ async def imagine(
 ) -> Imagined:
     """Imagine episodes without a session: one along the mean, and some along functions drawn from the posterior, which
     diverge where the model is uncertain. An episode that terminates is shorter than ``actions``."""
-    q, u = convert.numbers("coordinates", body.coordinates), convert.numbers("actions", body.actions)
+    q, u = numbers("coordinates", body.coordinates), numbers("actions", body.actions)
     draws, seed, version = body.draws, body.seed, body.model
     episodes = await _in_turn(request, lambda: use.models.imagine(name, q, u, draws=draws, seed=seed, version=version))
-    return convert.imagined(episodes)
+    return resources.imagined(episodes)
 
 
 async def _in_turn(request: Request, work: Callable[[], T]) -> T:

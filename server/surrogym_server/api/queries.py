@@ -10,7 +10,6 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 from numpy.typing import NDArray
 
-from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import READ, SAMPLE, TRAIN
 from surrogym_server.api.body import example
@@ -18,6 +17,8 @@ from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.api.turns import require_present
+from surrogym_server.convert import resources
+from surrogym_server.convert.numbers import numbers
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     AddQueries,
@@ -63,7 +64,7 @@ async def claim(
         claimed = await use.queries.claim(
             name, body.sampler, body.max_queries, body.lease_seconds, body.wait_seconds, present
         )
-    return convert.claimed(claimed, body.lease_seconds)
+    return resources.claimed(claimed, body.lease_seconds)
 
 
 @router.post(
@@ -83,7 +84,7 @@ def renew(name: str, query_id: int, body: Annotated[RenewLease, example(examples
 def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.FAIL)], use: Use) -> QueryView:
     """Return a query with an error. It goes to the next sampler. A query that keeps failing is set aside, and the
     design continues without it."""
-    return convert.query_view(
+    return resources.query_view(
         use.queries.fail(name, query_id, body.lease_token, body.error, begun=body.begun, refused=body.refused)
     )
 
@@ -98,7 +99,7 @@ def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.F
 )
 def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUERIES)], use: Use) -> QueryList:
     """Queue queries behind those of the design. The model learns from their answers too."""
-    return convert.query_list(use.queries.add(name, *_asked(body)))
+    return resources.query_list(use.queries.add(name, *_asked(body)))
 
 
 @router.post(
@@ -112,7 +113,7 @@ def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUER
 def audit(name: str, body: Annotated[AuditModel, example(examples.ADD_QUERIES)], use: Use) -> QueryList:
     """Queue real steps on a policy's way, to compare them with the model. They don't count towards the budget, and the
     model learns from them too."""
-    return convert.query_list(use.queries.add(name, *_asked(body), purpose="audit"))
+    return resources.query_list(use.queries.add(name, *_asked(body), purpose="audit"))
 
 
 @router.post(
@@ -134,11 +135,11 @@ def withdraw(name: str, body: Annotated[WithdrawQueries, example(examples.WITHDR
 )
 def list_all(name: str, use: Use, status: Annotated[list[QueryStatus], Query()] = []) -> QueryList:  # noqa: B006
     """List queries, oldest first. ``status`` may be given several times."""
-    return convert.query_list(use.queries.list(name, status))
+    return resources.query_list(use.queries.list(name, status))
 
 
 def _asked(body: AddQueries) -> tuple[Floats, Floats, str | None, list[Floats]]:
     """From a body: coordinates (m, C), actions (m, F), the idempotency key and action sequences, (T, F) each."""
-    q = convert.numbers("coordinates", body.coordinates or ())
-    u = convert.numbers("action", body.action or ())
-    return q, u, body.idempotency_key, [convert.numbers("rollouts", actions) for actions in body.rollouts or ()]
+    q = numbers("coordinates", body.coordinates or ())
+    u = numbers("action", body.action or ())
+    return q, u, body.idempotency_key, [numbers("rollouts", actions) for actions in body.rollouts or ()]

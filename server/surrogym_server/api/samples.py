@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Query
 from fastapi.responses import Response
 
-from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import READ, SAMPLE, TRAIN_OR_SAMPLE
 from surrogym_server.api.body import example
@@ -15,6 +14,7 @@ from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.api.tables import CSV, NPZ, as_csv, as_npz
+from surrogym_server.convert import resources
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     AddedSamples,
@@ -49,10 +49,10 @@ def add_sample(name: str, body: Annotated[AddSamples, example(examples.ADD_SAMPL
     """Store one or many samples, all or none, with or without a query. They are stored durably when the reply comes. A
     repeat is harmless: a sample of a query is identified by its lease token, a logged one by its place in its log,
     others by the idempotency key."""
-    samples = [convert.new_sample(sample) for sample in body.samples]
+    samples = [resources.new_sample(sample) for sample in body.samples]
     logged, key = body.purpose == "logged", body.idempotency_key
     added = use.samples.add(name, body.sampler, samples, key, logged=logged, complete=body.complete, after=body.after)
-    return convert.added_samples(added)
+    return resources.added_samples(added)
 
 
 @router.get(
@@ -74,7 +74,7 @@ def samples(
 ) -> SamplePage | Response:
     """Read samples. JSON comes in pages: give ``next_after`` as ``after`` for the next page. CSV and NPZ come whole."""
     if format == "json":
-        return convert.sample_page(use.samples.page(name, after, limit), limit)
+        return resources.sample_page(use.samples.page(name, after, limit), limit)
     write, media_type = (as_csv, CSV) if format == "csv" else (as_npz, NPZ)
     content = write(use.samples.coordinate_names(name), use.samples.all(name))
     return Response(content, media_type=media_type, headers=_attachment(f"{name}.{format}"))
@@ -88,7 +88,7 @@ def samples(
 )
 def snapshots(name: str, use: Use) -> SnapshotList:
     """List the saved states to which a sampler can return, oldest first. ``add_sample`` adds to them."""
-    return convert.snapshot_list(use.samples.snapshots(name))
+    return resources.snapshot_list(use.samples.snapshots(name))
 
 
 @router.post(
@@ -112,7 +112,7 @@ def drop_snapshots(
 )
 def report(name: str, body: Annotated[ReportSteps, example(examples.LEDGER)], use: Use) -> Ledger:
     """Count real steps of an evaluation, separately from the cost of the design, once for each idempotency key."""
-    return convert.ledger(use.samples.report_steps(name, body.steps, body.episodes, body.note, body.idempotency_key))
+    return resources.ledger(use.samples.report_steps(name, body.steps, body.episodes, body.note, body.idempotency_key))
 
 
 def _attachment(name: str) -> dict[str, str]:

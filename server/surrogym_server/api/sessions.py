@@ -7,13 +7,13 @@ from typing import Annotated
 from fastapi import APIRouter
 from fastapi.responses import Response
 
-from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import READ, TRAIN
 from surrogym_server.api.body import example
 from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
+from surrogym_server.convert import sessions
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     OpenSession,
@@ -47,8 +47,8 @@ SESSION_ERRORS = (Code.UNKNOWN_SESSION, Code.SESSION_EXPIRED, Code.INVALID_REQUE
 )
 async def open_session(name: str, body: Annotated[OpenSession, example(examples.OPEN)], use: Use) -> SessionView:
     """Open a session: N lanes with one seed, variant and autoreset mode. The reply has the spaces and the seed."""
-    session = await use.sessions.open(name, convert.opening(body))
-    return convert.session_view(session, use.sessions.idle_seconds, use.sessions.replay)
+    session = await use.sessions.open(name, sessions.opening(body))
+    return sessions.session_view(session, use.sessions.idle_seconds, use.sessions.replay)
 
 
 @router.get(
@@ -60,13 +60,13 @@ async def open_session(name: str, body: Annotated[OpenSession, example(examples.
 async def list_sessions(name: str, use: Use) -> SessionList:
     """List the open sessions of a surrogate, with the virtual steps, imagined returns and penalties of each, counted
     since the server started."""
-    return SessionList(sessions=[convert.session_activity(activity) for activity in await use.sessions.activity(name)])
+    return SessionList(sessions=[sessions.session_activity(activity) for activity in await use.sessions.activity(name)])
 
 
 @router.get("/sessions/{id}", summary="One session", dependencies=[TRAIN], responses=documented(*SESSION_ERRORS))
 async def get_session(id: str, use: Use) -> SessionView:
     """Return a session's options, the last ``seq`` that was answered, and the model version of each lane."""
-    return convert.session_view(await use.sessions.get(id), use.sessions.idle_seconds, use.sessions.replay)
+    return sessions.session_view(await use.sessions.get(id), use.sessions.idle_seconds, use.sessions.replay)
 
 
 @router.get(
@@ -77,7 +77,7 @@ async def get_session(id: str, use: Use) -> SessionView:
 )
 async def session_coordinates(id: str, use: Use) -> SessionCoordinates:
     """Return the present coordinates of every lane, in the form to which the original environment can be set."""
-    return convert.session_coordinates(await use.sessions.coordinates(id))
+    return sessions.session_coordinates(await use.sessions.coordinates(id))
 
 
 @router.delete(

@@ -7,7 +7,6 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
-from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import ADMIN, READ, TRAIN
 from surrogym_server.api.body import example
@@ -15,6 +14,7 @@ from surrogym_server.api.caller import role_of
 from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
+from surrogym_server.convert import default_budget, resources
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     CheckedSurrogate,
@@ -44,9 +44,9 @@ def create(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use)
     """Create a surrogate from a specification, and queue its initial queries. The same name and specification again
     change nothing, and ``created`` is false. Another specification for the name is refused."""
     spec = body.spec
-    budget = convert.default_budget(spec)
+    budget = default_budget(spec)
     status, created = use.surrogates.create(body.name, spec.model_dump(mode="json"), budget, spec.design.target)
-    return convert.created(status, created=created)
+    return resources.created(status, created=created)
 
 
 @router.post(
@@ -60,8 +60,8 @@ def check(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use) 
     """Preview what the registration of this body would store, with every default. Nothing is stored. A body that a
     registration refuses is refused here too."""
     spec = body.spec
-    budget = convert.default_budget(spec)
-    return convert.checked(
+    budget = default_budget(spec)
+    return resources.checked(
         body.name, spec, budget, use.surrogates.check(body.name, spec.model_dump(mode="json"), budget)
     )
 
@@ -74,7 +74,7 @@ def list_all(
 ) -> SurrogateList:
     """List surrogates with phase, number of samples and confidence, oldest first, in pages: give ``next_after`` as
     ``after`` for the next page."""
-    return convert.surrogate_list(use.surrogates.list(after, limit + 1), limit)
+    return resources.surrogate_list(use.surrogates.list(after, limit + 1), limit)
 
 
 @router.get(
@@ -85,7 +85,7 @@ def list_all(
 )
 def get(name: str, use: Use) -> SurrogateView:
     """Return a surrogate's phase, the fidelity of every output, its ledger of real steps, and counts of its queries."""
-    return convert.surrogate_view(use.surrogates.status(name))
+    return resources.surrogate_view(use.surrogates.status(name))
 
 
 @router.patch(
@@ -98,7 +98,7 @@ def patch(name: str, body: Annotated[PatchSurrogate, example(examples.PATCH)], u
     """Change the given fields; others stay. A larger budget or target continues a finished design, a tolerance makes
     the server judge the model again, and resuming a failed design retries it. Queries that the design chose for another
     target or tolerance, or a larger budget, are withdrawn if no sampler has begun them, and chosen again."""
-    return convert.surrogate_view(use.surrogates.change(name, **dict(body)))
+    return resources.surrogate_view(use.surrogates.change(name, **dict(body)))
 
 
 @router.delete(
@@ -128,4 +128,4 @@ def improve(
     used. For a token of role ``admin`` the budget is raised if needed, and ``budget_raised_by`` is the increase."""
     may_raise = role_of(request.scope) == "admin"
     granted = use.designer.improve(name, body.queries, body.checkpoint, body.idempotency_key, raise_budget=may_raise)
-    return convert.improved(use.surrogates.status(name), granted.raised)
+    return resources.improved(use.surrogates.status(name), granted.raised)

@@ -8,8 +8,9 @@ from typing import Literal
 
 import msgspec
 
-from surrogym_server import convert
 from surrogym_server.api.json_body import parse_as
+from surrogym_server.convert import sessions
+from surrogym_server.convert.numbers import numbers
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance, PolicySteps, Reply, Reset, Rollout, Step
 from surrogym_server.engine.session import steps_of
@@ -35,16 +36,16 @@ def request_in_json(operation: Operation, session: str, content: bytes, within: 
     match operation:
         case "step":
             step = parse_as(StepSession, content)
-            action, mask = convert.numbers("action", step.action), convert.lane_mask(step.mask)
+            action, mask = numbers("action", step.action), sessions.lane_mask(step.mask)
             return Step(session, step.seq, action, mask, step.deviations, within)
         case "reset":
             reset = parse_as(ResetSession, content)
-            return Reset(session, reset.seq, reset.seed, convert.lane_mask(reset.mask), within)
+            return Reset(session, reset.seq, reset.seed, sessions.lane_mask(reset.mask), within)
         case "rollout":
             rollout = parse_as(RolloutSession, content)
             if rollout.actions is None:
-                return PolicySteps(session, rollout.seq, convert.policy_run(rollout), within)
-            return Rollout(session, rollout.seq, convert.numbers("actions", rollout.actions), within)
+                return PolicySteps(session, rollout.seq, sessions.policy_run(rollout), within)
+            return Rollout(session, rollout.seq, numbers("actions", rollout.actions), within)
 
 
 def frame_of(operation: Operation, content: bytes) -> frames.Request:
@@ -67,7 +68,7 @@ def request_in_frame(frame: frames.Request, session: str, shape: frames.Shape, w
         case frames.RolloutRequest():
             return Rollout(session, frame.seq, frames.actions_of(frame, shape), within)
         case frames.PolicyRequest():
-            return PolicySteps(session, frame.seq, convert.framed_policy_run(frame, shape), within)
+            return PolicySteps(session, frame.seq, sessions.framed_policy_run(frame, shape), within)
 
 
 async def carried_out(engine: SessionEngine, request: Advance, writers: Writers) -> bytes:
@@ -78,29 +79,29 @@ async def carried_out(engine: SessionEngine, request: Advance, writers: Writers)
 
 
 def _reset_in_json(reply: Reply) -> bytes:
-    return _JSON.encode(convert.reset_reply(reply))
+    return _JSON.encode(sessions.reset_reply(reply))
 
 
 def _step_in_json(reply: Reply) -> bytes:
-    return _JSON.encode(convert.step_reply(reply))
+    return _JSON.encode(sessions.step_reply(reply))
 
 
 def _rollout_in_json(reply: Reply) -> bytes:
     """Write a rollout step by step, because a thread that encodes blocks all others."""
-    steps = [msgspec.Raw(_JSON.encode(step)) for step in convert.rollout_steps(reply)]
-    return _JSON.encode({"seq": reply.seq, "steps": steps, **convert.rollout_actions(reply)})
+    steps = [msgspec.Raw(_JSON.encode(step)) for step in sessions.rollout_steps(reply)]
+    return _JSON.encode({"seq": reply.seq, "steps": steps, **sessions.rollout_actions(reply)})
 
 
 def _reset_in_frame(reply: Reply) -> bytes:
-    return frames.encode(convert.reset_frame(reply))
+    return frames.encode(sessions.reset_frame(reply))
 
 
 def _step_in_frame(reply: Reply) -> bytes:
-    return frames.encode(convert.step_frame(reply))
+    return frames.encode(sessions.step_frame(reply))
 
 
 def _rollout_in_frame(reply: Reply) -> bytes:
-    return frames.encode(convert.rollout_frame(reply))
+    return frames.encode(sessions.rollout_frame(reply))
 
 
 AS_JSON: Writers = {

@@ -14,7 +14,6 @@ from starlette.requests import ClientDisconnect
 from starlette.routing import WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import TRAIN
 from surrogym_server.api.body import BINARY, described
@@ -24,6 +23,7 @@ from surrogym_server.api.json_body import JSON, take_turn
 from surrogym_server.api.problems import answer_to, documented
 from surrogym_server.api.stepping import forms
 from surrogym_server.api.stepping.stream import StepStream
+from surrogym_server.convert import sessions
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance
 from surrogym_shared.codes import Code
@@ -124,7 +124,7 @@ async def _carried(operation: forms.Operation, id: str, request: Request) -> Res
         asked: Advance = forms.request_in_json(operation, id, body, _left(limit, began))
         return Response(await forms.carried_out(engine, asked, forms.AS_JSON), media_type=media_type)
     frame = forms.frame_of(operation, body)
-    shape = convert.session_shape(await engine.describe(id))
+    shape = sessions.session_shape(await engine.describe(id))
     asked = forms.request_in_frame(frame, id, shape, _left(limit, began))
     return Response(await forms.carried_out(engine, asked, forms.AS_FRAME), media_type=media_type)
 

@@ -17,11 +17,11 @@ from contextvars import copy_context
 from starlette.datastructures import Headers
 from starlette.types import Receive, Scope, Send
 
-from surrogym_server import convert
 from surrogym_server.api.auth import Gate, bearer_token
 from surrogym_server.api.deadline import seconds_left
 from surrogym_server.api.problems import problem_of, response_of
 from surrogym_server.api.stepping.forms import AS_FRAME, carried_out, request_in_frame
+from surrogym_server.convert import sessions
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.errors import SurrogymError
 from surrogym_shared import frames
@@ -41,7 +41,7 @@ class StepStream:
         await receive()  # the client's wish to connect
         try:
             _admit(scope)
-            shape = convert.session_shape(await engine.describe(id))
+            shape = sessions.session_shape(await engine.describe(id))
             limit = seconds_left(Headers(scope=scope))
         except SurrogymError as error:
             await response_of(problem_of(error))(scope, receive, send)

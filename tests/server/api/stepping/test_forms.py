@@ -12,8 +12,8 @@ import pytest
 
 from support.acting import assert_same_rollout, random_policy
 from surrogym_client.transport.step_codecs import BinaryForm, JsonForm
-from surrogym_server import convert
 from surrogym_server.api.stepping import forms
+from surrogym_server.convert import sessions
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance, PolicySteps, Reply, Rollout
 from surrogym_shared import frames, wire
@@ -66,9 +66,9 @@ def writers(monkeypatch: pytest.MonkeyPatch) -> set[threading.Thread]:
     """The threads that replies are written in."""
     seen: set[threading.Thread] = set()
     for name in ("rollout_frame", "rollout_steps"):
-        write = getattr(convert, name)
+        write = getattr(sessions, name)
         monkeypatch.setattr(
-            convert, name, lambda answer, write=write: seen.add(threading.current_thread()) or write(answer)
+            sessions, name, lambda answer, write=write: seen.add(threading.current_thread()) or write(answer)
         )
     return seen
 
