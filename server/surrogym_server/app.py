@@ -30,8 +30,7 @@ from surrogym_server.api import (
     sessions,
     surrogates,
 )
-from surrogym_server.api.auth import Gate
-from surrogym_server.api.caller import fingerprint
+from surrogym_server.api.auth import Gate, fingerprint
 from surrogym_server.api.guards import BodyLimit, KnownHosts, OwnPages
 from surrogym_server.api.observe import Observed
 from surrogym_server.api.state import Services

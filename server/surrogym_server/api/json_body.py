@@ -1,4 +1,4 @@
-"""Bodies of JSON: strictly parsed, and at most one long body in a turn of the event loop."""
+"""Bodies of requests: parsed strictly, at most one long one in a turn of the event loop; described in OpenAPI."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import asyncio
 from typing import Any, TypeVar
 
 import jiter
-from fastapi import Request
+from fastapi import Body, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 from starlette.exceptions import HTTPException
 from starlette.types import Scope
+
+from surrogym_shared import frames
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -18,6 +20,8 @@ JSON = "application/json"
 LONG = 16 * 1024  # bytes; parsing them takes half a millisecond
 DEEPEST = 200  # of jiter
 MOST_FIELDS = 64  # of a body; each unknown one makes an error
+SCHEMAS = "#/components/schemas/{model}"
+BINARY: dict[str, Any] = {frames.MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}}
 
 
 class JsonRequest(Request):
@@ -70,3 +74,15 @@ def parse_as(model: type[M], content: bytes) -> M:
         return model.model_validate(parse(content))
     except ValidationError as error:
         raise RequestValidationError(error.errors(include_url=False)) from error
+
+
+def described(model: type[BaseModel], example: dict[str, Any]) -> dict[str, Any]:
+    """OpenAPI of a body that is accepted as JSON or as a frame."""
+    schema = model.model_json_schema(ref_template=SCHEMAS)
+    content = {JSON: {"schema": schema, "example": example}, **BINARY}
+    return {"requestBody": {"required": True, "content": content}}
+
+
+def example(value: dict[str, Any]) -> Any:
+    """A body that FastAPI reads, with an example."""
+    return Body(openapi_examples={"example": {"value": value}})

@@ -8,8 +8,8 @@ from fastapi import APIRouter, Request
 
 from surrogym_server.api import examples
 from surrogym_server.api.auth import ADMIN, SAMPLE
-from surrogym_server.api.body import example
 from surrogym_server.api.door import DoorRoute, json_up_to
+from surrogym_server.api.json_body import example
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Services, Use
 from surrogym_server.api.turns import Turns

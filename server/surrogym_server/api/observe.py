@@ -14,7 +14,7 @@ from itertools import count
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from surrogym_server.api.caller import caller
+from surrogym_server.api.auth import caller
 from surrogym_server.api.headers import raw_header
 from surrogym_server.api.problems import REQUEST_HEADER
 from surrogym_server.engine.tallies import Durations

@@ -10,8 +10,7 @@ from fastapi.openapi.utils import get_openapi
 from fastapi.responses import Response
 from starlette.routing import compile_path
 
-from surrogym_server.api.body import SCHEMAS
-from surrogym_server.api.json_body import JSON
+from surrogym_server.api.json_body import JSON, SCHEMAS
 from surrogym_server.api.problems import documented, problem_response
 from surrogym_shared.codes import Code, Problem
 

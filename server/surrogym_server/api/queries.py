@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from surrogym_server.api import examples
 from surrogym_server.api.auth import READ, SAMPLE, TRAIN
-from surrogym_server.api.body import example
 from surrogym_server.api.door import DoorRoute, json_up_to
+from surrogym_server.api.json_body import example
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.api.turns import require_present

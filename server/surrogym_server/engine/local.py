@@ -21,7 +21,6 @@ from surrogym_server.engine.core import (
     visited_states,
 )
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.engine.opening import OpeningLocks
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import (
     Advance,
@@ -37,7 +36,7 @@ from surrogym_server.engine.requests import (
 )
 from surrogym_server.engine.saved import session_from_bytes, session_to_bytes
 from surrogym_server.engine.session import Answer, Outcome, Session, digest_of, steps_of
-from surrogym_server.engine.sessions import Limits, LiveSessions, Threads
+from surrogym_server.engine.sessions import Limits, LiveSessions, OpeningLocks, Threads
 from surrogym_server.engine.tallies import Counts, Durations, SessionActivity, Tallies
 from surrogym_server.models.draws import function_draws
 from surrogym_server.models.guard import plugin_calls

@@ -12,6 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from weakref import WeakValueDictionary
 
 from surrogym_server.engine.session import (
     Answer,
@@ -318,3 +319,15 @@ def _timed(work: Work, session: Session) -> tuple[tuple[Session, Outcome], float
     start = time.perf_counter()
     done = work(session)
     return done, time.perf_counter() - start
+
+
+class OpeningLocks:
+    """A lock for each surrogate: its sessions are opened one after the other, so that a repeat finds the session of its
+    key. Openings of other surrogates don't wait: a large model takes long to load and to draw functions from."""
+
+    def __init__(self) -> None:
+        self._locks = WeakValueDictionary[int, asyncio.Lock]()
+
+    def of(self, surrogate: int) -> asyncio.Lock:
+        """The lock of a surrogate, by its id. It exists as long as somebody holds it or waits for it."""
+        return self._locks.setdefault(surrogate, asyncio.Lock())

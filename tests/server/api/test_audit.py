@@ -13,7 +13,7 @@ import pytest
 from support import pendulum
 from support.noting import until
 from support.server import ServerProcess, running_server
-from surrogym_server.api.caller import fingerprint
+from surrogym_server.api.auth import fingerprint
 from surrogym_server.api.observe import CHANGING, FREQUENT
 
 TOKENS = {role: f"the-token-to-{role}" for role in ("sample", "train", "admin")}

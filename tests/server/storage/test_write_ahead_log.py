@@ -16,7 +16,7 @@ import pytest
 from surrogym_server.errors import Unavailable
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSurrogate
-from surrogym_server.storage.sql import open_storage, readiness
+from surrogym_server.storage.sql import checks, open_storage
 from surrogym_server.storage.sql import write_ahead_log as log
 
 KILLED = """
@@ -187,7 +187,7 @@ def test_a_database_overwritten_under_the_server_is_used_no_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, copied: str
 ) -> None:
     """What was written over it stays as it is, byte for byte, and is what a server finds when the log is put away."""
-    monkeypatch.setattr(readiness, "FRESH_SECONDS", 0.0)
+    monkeypatch.setattr(checks, "FRESH_SECONDS", 0.0)
     file, other = tmp_path / "a.db", tmp_path / "b.db"
     register(other, "other")
     storage = opened(file)

@@ -1,4 +1,4 @@
-"""Assignment of reported samples to leases, and the effect on their queries.
+"""Assignment of reported samples to leases, the effect on their queries, and samples as rows of their table.
 
 A lease has one answer: one sample, or the first samples of a rollout. It comes whole, in one batch.
 """
@@ -7,15 +7,16 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import IdempotencyConflict, InvalidInput
-from surrogym_server.storage.records import NewSample, Purpose
+from surrogym_server.storage.records import NewSample, Purpose, SamplePurpose, fingerprint
 from surrogym_server.storage.sql.leases import foreign_lease, set_outcome, unknown_query
+from surrogym_server.storage.sql.rows import append_event
 from surrogym_server.storage.sql.tables import leases, queries, samples
 
 ASKED: sa.Select[Any] = (
@@ -36,6 +37,7 @@ ANSWER = (
     .where(queries.c.id.in_(sa.bindparam("done", expanding=True)))
     .values(status="answered", error=None)
 )
+NEW_SAMPLES = sa.insert(samples).returning(samples.c.id, sort_by_parameter_order=True)
 
 
 class Reported(NamedTuple):
@@ -152,3 +154,40 @@ def _lease_of(
     if lease is None:
         raise foreign_lease(sample.query_id)
     return lease
+
+
+def insert_samples(connection: Connection, held: Row[Any], sampler: str, rows: list[dict[str, Any]]) -> list[int]:
+    """Insert rows of samples and append the event. Returns their ids in order."""
+    if not rows:
+        return []
+    ids = [int(id) for id in connection.execute(NEW_SAMPLES, rows).scalars()]
+    late = sum(row["late"] for row in rows)
+    append_event(connection, held, "sample", sampler=sampler, ids=ids, late=late)
+    return ids
+
+
+def row_of(
+    held: Row[Any], sampler: str, sample: NewSample, lease: Answered | None = None, *, logged: bool = False
+) -> dict[str, Any]:
+    """A sample as a row of its table: an answer under a lease, a logged sample, or one by hand."""
+    purpose: SamplePurpose = "logged" if logged else "manual"
+    return {
+        "surrogate_id": held.id,
+        "query_id": lease.query_id if lease else None,
+        "lease_id": lease.lease_id if lease else None,
+        "purpose": lease.purpose if lease else purpose,
+        "sampler": sampler,
+        "attempt": lease.attempt if lease else 0,
+        "step": sample.step,
+        "late": lease is not None and not lease.live,
+        "coordinates": sample.coordinates,
+        "action": sample.action,
+        "next_coordinates": sample.next_coordinates,
+        "reward": sample.reward,
+        "terminated": sample.terminated,
+        "truncated": sample.truncated,
+        "observation": sample.observation,
+        "next_observation": sample.next_observation,
+        "fingerprint": fingerprint(asdict(sample)),
+        "created_at": held.now,
+    }

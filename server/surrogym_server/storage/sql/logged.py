@@ -19,8 +19,8 @@ from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import InvalidInput
 from surrogym_server.storage.records import AddedSamples, NewSample, fingerprint
+from surrogym_server.storage.sql.answers import insert_samples, row_of
 from surrogym_server.storage.sql.rows import touch
-from surrogym_server.storage.sql.sample_rows import insert_samples, row_of
 from surrogym_server.storage.sql.tables import samples, surrogates
 
 

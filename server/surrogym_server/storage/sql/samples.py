@@ -22,11 +22,10 @@ from surrogym_server.storage.records import (
     fingerprint,
     no_rows,
 )
-from surrogym_server.storage.sql.answers import Answered, read_answered, settle
+from surrogym_server.storage.sql.answers import Answered, insert_samples, read_answered, row_of, settle
 from surrogym_server.storage.sql.database import Database
 from surrogym_server.storage.sql.logged import complete_log, store_logged
 from surrogym_server.storage.sql.rows import find, hold, recall, remember, touch
-from surrogym_server.storage.sql.sample_rows import insert_samples, row_of
 from surrogym_server.storage.sql.snapshots import insert_snapshots
 from surrogym_server.storage.sql.tables import queries, samples
 

@@ -11,7 +11,7 @@ from surrogym_server.storage.announcements import Alone
 from surrogym_server.storage.port import Storage, T
 from surrogym_server.storage.records import Synchronous
 from surrogym_server.storage.sql.announcements import NotifiedAnnouncements
-from surrogym_server.storage.sql.checks import check_pages, check_tables
+from surrogym_server.storage.sql.checks import Readiness, check_pages, check_tables
 from surrogym_server.storage.sql.database import Database, connect, never_connected
 from surrogym_server.storage.sql.designs import SqlDesigns
 from surrogym_server.storage.sql.ledger import SqlLedger
@@ -20,7 +20,6 @@ from surrogym_server.storage.sql.migrate import migrate
 from surrogym_server.storage.sql.models import SqlModels
 from surrogym_server.storage.sql.policy_names import SqlPolicyNames
 from surrogym_server.storage.sql.queries import SqlQueries
-from surrogym_server.storage.sql.readiness import Readiness
 from surrogym_server.storage.sql.sample_counts import CountedSamples
 from surrogym_server.storage.sql.samples import SqlSamples
 from surrogym_server.storage.sql.snapshots import SqlSnapshots
