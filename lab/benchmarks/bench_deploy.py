@@ -45,7 +45,7 @@ from surrogym_trainer.deployment.c.files import prefix_of
 from surrogym_trainer.deployment.controller import Array, Choices, Controller
 from surrogym_trainer.deployment.graph import write as write_onnx
 from surrogym_trainer.deployment.reading import controller_of
-from surrogym_trainer.deployment.reference import begin, decide, observe, scores
+from surrogym_trainer.deployment.reference import Decided, begin, decide, observe, scores
 from surrogym_trainer.deployment.running import Comparison
 from surrogym_trainer.deployment.vectors import sensors_of
 from surrogym_trainer.policies import load_policy
@@ -82,6 +82,7 @@ int main(void)
     }}
 }}
 """
+ROWS = 50_000  # states at once in the reference
 M4 = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-Os", "-ffunction-sections")
 
 
@@ -131,34 +132,43 @@ def equal(folder: Path, options: Any) -> None:
             real = np.float32 if single else np.float64
             controller = in_type(controller, real)
             shown, ages = states(controller, options.random, real)
-            expected = decide(
-                controller, begin(controller, len(shown)), shown.astype(np.float64), ages.astype(np.float64)
-            )
+            expected = referred(controller, shown.astype(np.float64), ages.astype(np.float64))
             action, status = bulk(controller, folder / f"{len(list(folder.iterdir()))}", shown, ages, single=single)
             differs = status != expected.status
-            largest, other = differences(controller, action, expected.action, shown, status)
-            print(
-                f"{name}, {'float' if single else 'double'}: {len(shown)} random states, {int((status > 0).sum())} "
-                f"faults, {int(differs.sum())} other statuses, largest difference {largest:.2g} of the range"
-                f"{other}"
-            )
+            largest, other = differences(controller, action, expected.action, shown)
+            print(f"{name}, {'float' if single else 'double'}: {len(shown)} random states, ", end="")
+            print(f"{int((status > 0).sum())} faults, {int(differs.sum())} other statuses, ", end="")
+            print(f"largest difference {largest:.2g} of the range{other}")
     for single in (False, True):
         visited(folder, options.visited, single=single)
 
 
-def differences(
-    controller: Controller, action: Array, expected: Array, reads: Array, status: np.ndarray
-) -> tuple[float, str]:
+def referred(controller: Controller, reads: Array, age: Array) -> Decided:
+    """What the reference decides, some rows at a time: all of them together fill the memory."""
+    parts = [
+        decide(controller, begin(controller, len(some)), some, age[at : at + ROWS])
+        for at in range(0, len(reads), ROWS)
+        if len(some := reads[at : at + ROWS])
+    ]
+    action, status = (np.concatenate([getattr(part, name) for part in parts]) for name in ("action", "status"))
+    return Decided(parts[0].memory, action, status)
+
+
+def differences(controller: Controller, action: Array, expected: Array, reads: np.ndarray) -> tuple[float, str]:
     """Return the largest difference as a share of the range, and what else must be said. A choice of which the best two
     scores are equal up to rounding is counted apart."""
     share = (np.abs(action - expected) / (controller.high - controller.low)).max(1)
     if not controller.counts:
         return float(share.max()), ""
+    used = len(np.unique(expected))
     other = np.flatnonzero(share > 0)
     q = decide(controller, begin(controller, len(other)), reads[other].astype(np.float64)).memory.coordinates
     y = np.sort(scores(controller.decision, observe(controller, q)), axis=1)
     margin = float((y[:, -1] - y[:, -2]).max()) if len(other) else 0.0
-    return 0.0, f", {len(other)} other choices, their best two scores at most {margin:.2g} apart"
+    return (
+        0.0,
+        f", {used} values of an action, {len(other)} other choices, their best two scores at most {margin:.2g} apart",
+    )
 
 
 def bulk(
@@ -203,7 +213,8 @@ def visited(folder: Path, count: int, *, single: bool) -> None:
             state = state + np.array([0.3 * last[0] + rng.normal(0, 0.1), 0.05 * (last[1] - 5), 0.0])
             state[1] = np.clip(state[1], -1.2, 2.2)
     print(f"visited, {'float' if single else 'double'}: {count} states, {other_lags} with other lags")
-    print(f"  observations within {ulps} units in the last place of float32")
+    if not single:  # in float, a change is the difference of two rounded numbers
+        print(f"  observations within {ulps} units in the last place of float32")
     print(f"  largest difference from the policy {largest:.2g} of the range")
 
 

@@ -73,13 +73,15 @@ def test_random_measurements_give_the_actions_of_the_reference(tmp_path: Path, c
     low, high = sensors_of(controller)
     reads = rng.uniform(low, high, (500, len(low))).astype(np.float32).astype(np.float64)
     reads[::50, 0], reads[25::50, 1], reads[13::50] = np.nan, np.inf, high
-    memory, close = begin(controller), []
+    memory, close, chosen = begin(controller), [], []
     for read in reads:
         decided = decide(controller, memory, read[None])
         status, action = compiled.step(read)
         assert status == decided.status
         close.append((np.abs(action - decided.action[0]) <= tolerance * (controller.high - controller.low)).all())
         memory = decided.memory
+        chosen.append(tuple(action))
+    assert len(set(chosen)) >= 4, "a policy that always does the same shows nothing"
     # in float the two best choices may be equal up to rounding, and an angle may lie at half a turn
     assert np.mean(close) >= (0.98 if single else 1.0)
 
@@ -108,10 +110,13 @@ def test_stable_baselines3_policies_run_in_c(tmp_path: Path, case: str):
     fallback = (0.0,) if spec.action.kind == "discrete" else None
     path = learner(tmp_path, case, spec)
     compiled = Compiled(controller_of(path, trust=True, choices=Choices(fallback=fallback)), tmp_path / "c")
-    policy = load_policy(path, LEARNERS[case][0], trust=True)
+    policy, chosen = load_policy(path, LEARNERS[case][0], trust=True), set()
     for read in np.random.default_rng(0).uniform([-3, -1, 0], [3, 2, 1], (100, 3)):
         shown = declared(spec, begun(spec, read)[None]).astype(np.float32)
-        np.testing.assert_allclose(compiled.step(read)[1], decode_actions(spec, policy(shown), 1)[0], atol=1e-3)
+        action = compiled.step(read)[1]
+        np.testing.assert_allclose(action, decode_actions(spec, policy(shown), 1)[0], atol=1e-3)
+        chosen.add(tuple(action))
+    assert len(chosen) > 1, "a policy that always does the same shows nothing"
 
 
 @pytest.mark.parametrize("case", PLANTS)

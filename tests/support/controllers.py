@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import stable_baselines3
 import torch
 from gymnasium import spaces
 
-from surrogym_shared.network import Network
+from surrogym_shared.network import Layer, Network
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,
@@ -71,7 +72,8 @@ def network(folder: Path, spec: EnvironmentSpec, units: Any = (64, 64), gain: fl
     d, rng = len(spec.observation), np.random.default_rng(0)
     weights = gain * rng.normal(size=Network.size(spec, units))
     made = Network.of(spec, rng.normal(size=d), rng.uniform(0.5, 2.0, d), units, weights)
-    made.save(folder / "policy.zip")
+    small = tuple(Layer(layer.weights, 0.1 * layer.bias) for layer in made.layers)  # else one choice is always the best
+    replace(made, layers=small).save(folder / "policy.zip")
     write_card(folder / "policy.zip", PolicyCard(surrogate="arm", spec=spec, **card))
     return folder / "policy.zip"
 
@@ -107,10 +109,11 @@ def learner(folder: Path, case: str, spec: EnvironmentSpec) -> Path:
     if policy is PaperPolicy:
         options = options | {"policy_kwargs": {"features_extractor_kwargs": standardised}}
     made = getattr(stable_baselines3, algorithm)(policy, Idle(spec), device="cpu", seed=0, **options)
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(2)
     with torch.no_grad():
         for parameter in made.policy.parameters():
-            parameter += 0.3 * torch.randn(parameter.shape, generator=generator)
+            size = 1.5 / parameter.shape[-1] ** 0.5 if parameter.ndim > 1 else 0.05
+            parameter += size * torch.randn(parameter.shape, generator=generator)
     made.save(folder / "policy.zip")
     write_card(folder / "policy.zip", PolicyCard(algorithm=algorithm, surrogate="arm", spec=spec))
     return folder / "policy.zip"
