@@ -16,8 +16,10 @@ from fmpy.fmi1 import FMICallException
 from fmpy.validation import validate_fmu
 
 from support.real_steps import random_steps
+from support.saying import speaker
 from support.steps_in_c import COMPILER, needs_compiler
 from support.twins import PERIOD, OpenFmu, drained, exported, opened, tanks
+from surrogym.cli import main
 from surrogym_sampler import original
 from surrogym_sampler.original.classic import cartpole
 from surrogym_server.deployment import twin_of, write_twin
@@ -241,3 +243,17 @@ def test_a_family_that_has_no_source_is_refused_with_those_that_have(tmp_path):
     )
     with pytest.raises(InvalidInput, match="gaussian_process or sparse_gaussian_process, got 'ensemble'"):
         twin_of(exported("tanks", spec, drained(24)))
+
+
+def test_the_command_writes_the_twin_of_a_file_and_leaves_other_folders_alone(surrogate, tmp_path, capsys, monkeypatch):
+    surrogym = speaker(main, capsys, monkeypatch, tmp_path)
+    (tmp_path / "tanks.surrogate").write_bytes(surrogate.to_bytes())
+    command = ("deploy", "tanks.surrogate", "--target", "fmu", "--out")
+    (written,) = surrogym(*command, "twin", "--json").json["files"]
+    assert validate_fmu(written) == []
+    (tmp_path / "twin" / "other.txt").write_text("kept")
+    said = surrogym(*command, "twin")
+    assert (said.code, "other files: nothing was written" in said.err) == (1, True)
+    said = surrogym(*command, "new", "--period", "0")
+    assert (said.code, "above 0, got 0" in said.err) == (1, True)
+    assert not (tmp_path / "new").exists()

@@ -120,11 +120,19 @@ class Checking:
 def command(
     context: typer.Context,
     policy: Annotated[
-        str, typer.Argument(metavar="POLICY", help="Policy file, or a stored policy such as pendulum@production.")
+        str,
+        typer.Argument(
+            metavar="POLICY",
+            help="Policy file, or a stored policy such as pendulum@production. For --target fmu also a surrogate.",
+        ),
     ],
-    target: Annotated[str, typer.Option(help="What to write: c, arduino, onnx.")],
+    target: Annotated[str, typer.Option(help="What to write: c, arduino, fmu, onnx.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write, new or empty.")],
     spec: SpecFile = None,
+    period: Annotated[
+        float | None,
+        typer.Option(help="Seconds of one step of a surrogate's FMU. [default: the specification's sampling_period]"),
+    ] = None,
     *,
     faults: Faults,
     checking: Checking,
@@ -140,13 +148,20 @@ def command(
     Example: surrogym deploy policy.zip --target c --out controller --check
 
     Example: surrogym deploy pendulum@production --target arduino --out pendulum_controller
+
+    Example: surrogym deploy pendulum --target fmu --out twin
     """
     from surrogym.cli.options import read_spec
+    from surrogym.cli.twins import in_words, is_surrogate, write_twin
     from surrogym_trainer.deployment.reading import controller_of
     from surrogym_trainer.deployment.running import Comparison
     from surrogym_trainer.deployment.targets import RUNNERS, deploy
     from surrogym_trainer.policies.card import read_card
 
+    if target == "fmu" and is_surrogate(policy):
+        twin = write_twin(context, policy, out, period, service)
+        output.give(twin, lambda: in_words(twin))
+        return
     with _local(context, policy, service) as path:
         card = read_card(path)
         checking.require_possible(target, card)

@@ -12,6 +12,7 @@ from surrogym_trainer.deployment.c import running as running_c
 from surrogym_trainer.deployment.c import write as write_c
 from surrogym_trainer.deployment.c import write_arduino
 from surrogym_trainer.deployment.controller import Controller, NotDeployable
+from surrogym_trainer.deployment.fmu import write as write_fmu
 from surrogym_trainer.deployment.graph import write as write_onnx
 from surrogym_trainer.deployment.running import Running
 
@@ -21,7 +22,7 @@ Runner = Callable[[Controller], AbstractContextManager[Running]]
 Writer = Callable[[Controller, Path], None]
 """Write the files of a controller into an empty folder."""
 
-TARGETS: dict[str, Writer] = {"c": write_c, "arduino": write_arduino, "onnx": write_onnx}
+TARGETS: dict[str, Writer] = {"c": write_c, "arduino": write_arduino, "fmu": write_fmu, "onnx": write_onnx}
 RUNNERS: dict[str, Runner] = {"c": running_c, "arduino": running_c}
 
 

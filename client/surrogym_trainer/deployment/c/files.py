@@ -24,7 +24,7 @@ def prefix_of(controller: Controller) -> str:
 
 def write(controller: Controller, folder: Path) -> None:
     """Write the header, the source and the program that runs test vectors."""
-    _write_sources(controller, folder)
+    write_sources(controller, folder)
     prefix = prefix_of(controller)
     (folder / f"{prefix}_main.c").write_text(main_of(controller, vectors_of(controller)), encoding="utf-8")
 
@@ -33,7 +33,7 @@ def write_arduino(controller: Controller, folder: Path) -> None:
     """Write a library for the Arduino IDE and PlatformIO: the same header and source, and a sketch that uses them."""
     prefix = prefix_of(controller)
     (folder / "src").mkdir()
-    _write_sources(controller, folder / "src", single=True)
+    write_sources(controller, folder / "src", single=True)
     name = f"{prefix}_controller"
     library = {
         "name": name,
@@ -75,7 +75,7 @@ def main_of(controller: Controller, vectors: list[Vector]) -> str:
     return _template("main.c").substitute(_names(controller), vectors="\n".join(rows), ranges=ranges)
 
 
-def _write_sources(controller: Controller, folder: Path, *, single: bool = False) -> None:
+def write_sources(controller: Controller, folder: Path, *, single: bool = False) -> None:
     """Write header and source. With ``single`` the header itself chooses float: a sketch has no flags of its own."""
     names, prefix = _names(controller), prefix_of(controller)
     flag = f"{prefix.upper()}_FLOAT"

@@ -1,0 +1,79 @@
+"""A controller as an FMU: it decides at the beginning of each sampling period, from its inputs there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from tempfile import TemporaryDirectory
+
+from surrogym_shared.fmu import Block, CannotCompile, Variable, write_fmu
+from surrogym_trainer.deployment.c.files import prefix_of, write_sources
+from surrogym_trainer.deployment.c.source import number
+from surrogym_trainer.deployment.controller import Controller, NotDeployable
+
+STATUS = "0, or a sum of 1: not finite, 2: out of range, 4: late, 8: the network has no action"
+
+
+def write(controller: Controller, folder: Path) -> None:
+    """Write the FMU, with native code if a C compiler is at hand.
+
+    Raises:
+        NotDeployable: nobody declared the sampling period, two variables have the same name, or the compiler refused
+            the sources.
+    """
+    try:
+        write_fmu(block_of(controller), folder / f"{prefix_of(controller)}_controller.fmu")
+    except CannotCompile as error:
+        raise NotDeployable(str(error)) from error
+
+
+def block_of(controller: Controller) -> Block:
+    """Return the block of a controller. Raises ``NotDeployable``."""
+    if controller.period is None:
+        raise NotDeployable("an FMU has a period: expected sampling_period in the specification, got none (--spec)")
+    prefix = prefix_of(controller)
+    names = {"prefix": prefix, "PREFIX": prefix.upper(), "fallback": ", ".join(map(number, controller.fallback))}
+    glue = Template(files(__package__).joinpath("block.c.txt").read_text(encoding="utf-8")).substitute(names)
+    digests = ", ".join(f"{name} {value[:16]}" for name, value in sorted(controller.digests.items()))
+    return Block(
+        name=f"{prefix}_controller",
+        description=f"Controller of {controller.name}: {digests}",
+        variables=tuple(_variables(controller)),
+        period=controller.period,
+        stop=None,
+        sources={**_sources(controller), f"{prefix}_block.c": glue},
+        memory=len(controller.coordinates) + len(controller.low) + 1,
+        acts_first=True,
+    )
+
+
+def _sources(controller: Controller) -> dict[str, str]:
+    """The header and the source of the controller in C, by their names."""
+    with TemporaryDirectory() as folder:
+        write_sources(controller, Path(folder))
+        return {path.name: path.read_text(encoding="utf-8") for path in sorted(Path(folder).iterdir())}
+
+
+def _variables(controller: Controller) -> Iterator[Variable]:
+    """All variables, in the order of the values in ``block.c.txt``. A name that is taken is preceded by its kind."""
+    taken: set[str] = set()
+
+    def free(name: str, kind: str) -> str:
+        chosen = f"{kind}.{name}" if name in taken else name
+        taken.add(chosen)
+        return chosen
+
+    for one in controller.measurements:
+        about = f"measurement, from {one.lowest:.6g} to {one.highest:.6g}"
+        start = min(max(0.0, one.lowest), one.highest)
+        yield Variable(free(one.name, "measurement"), "Float64", "input", start, unit=one.unit, description=about)
+    about = "of the measurements, in seconds"
+    yield Variable(free("age", "controller"), "Float64", "input", 0.0, description=about)
+    for index, (low, high) in enumerate(zip(controller.low.tolist(), controller.high.tolist(), strict=True)):
+        name = "action" if len(controller.low) == 1 else f"action_{index}"
+        ends = (low, high) if math.isfinite(low) and math.isfinite(high) else (None, None)
+        yield Variable(free(name, "controller"), "Float64", "output", None, *ends)
+    yield Variable(free("status", "controller"), "Int32", "output", description=STATUS)

@@ -1,0 +1,63 @@
+"""A controller as an FMU passes the checks of FMI and decides as its policy does, at once and once in each period."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fmpy.validation import validate_fmu
+
+from support.controllers import network, plant
+from support.steps_in_c import needs_compiler
+from support.twins import opened
+from surrogym_trainer.deployment.controller import NotDeployable
+from surrogym_trainer.deployment.reading import controller_of
+from surrogym_trainer.deployment.reference import begin, decide
+from surrogym_trainer.deployment.targets import deploy
+from surrogym_trainer.deployment.vectors import sensors_of
+
+pytestmark = needs_compiler
+PERIOD, ACTIONS = 0.05, ("action_0", "action_1")
+
+
+def test_the_fmu_decides_as_the_reference_does_and_takes_its_fallback(tmp_path: Path):
+    history = plant(changes=2, actions=2, largest={"angle": 0.5, "slide": 0.2}, at_start={"angle": 0.3})
+    controller = controller_of(network(tmp_path, history, (8,)))
+    (path,) = deploy(controller, "fmu", tmp_path / "out")
+    assert validate_fmu(str(path)) == []
+    low, high = sensors_of(controller)
+    reads = np.random.default_rng(0).uniform(low, high, (40, len(low)))
+    reads[10, 0], reads[20, 1] = np.nan, high[1] + 1
+    memory, names = begin(controller), [one.name for one in controller.measurements]
+    with opened(path) as one:
+        one.begin()
+        assert one.get(*ACTIONS) == controller.fallback.tolist()
+        for count, read in enumerate(reads):
+            age = 1.0 if count == 30 else 0.0
+            memory, action, status = decide(controller, memory, read[None], age)
+            one.step(count * PERIOD, PERIOD, age=age, **dict(zip(names, map(float, read), strict=True)))
+            np.testing.assert_allclose(one.get(*ACTIONS), action[0], rtol=0, atol=1e-9)
+            assert one.get("status") == [status[0]]
+    assert deploy(controller, "fmu", tmp_path / "out") == [path]  # the same bytes
+
+
+def test_a_decision_holds_until_the_next_period(tmp_path: Path):
+    controller = controller_of(network(tmp_path, plant(), (8,)))
+    (path,) = deploy(controller, "fmu", tmp_path / "out")
+    with opened(path) as one:
+        one.begin()
+        one.step(0.0, PERIOD / 4, slide=0.5)
+        first = one.get(*ACTIONS)
+        for quarter in (1, 2, 3):
+            one.step(quarter * PERIOD / 4, PERIOD / 4, slide=1.5)
+            assert one.get(*ACTIONS) == first
+        one.step(PERIOD, PERIOD / 4)
+        assert one.get(*ACTIONS) != first
+
+
+def test_a_controller_without_a_period_is_refused(tmp_path: Path):
+    spec = plant().model_copy(update={"sampling_period": None})
+    with pytest.raises(NotDeployable, match="expected sampling_period"):
+        deploy(controller_of(network(tmp_path, spec, (8,))), "fmu", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
