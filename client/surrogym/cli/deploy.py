@@ -126,7 +126,7 @@ def command(
             help="Policy file, or a stored policy such as pendulum@production. For --target fmu also a surrogate.",
         ),
     ],
-    target: Annotated[str, typer.Option(help="What to write: c, arduino, fmu, onnx.")],
+    target: Annotated[str, typer.Option(help="What to write: c, arduino, fmu, onnx, st.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write, new or empty.")],
     spec: SpecFile = None,
     period: Annotated[

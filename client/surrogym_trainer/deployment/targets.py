@@ -15,6 +15,7 @@ from surrogym_trainer.deployment.controller import Controller, NotDeployable
 from surrogym_trainer.deployment.fmu import write as write_fmu
 from surrogym_trainer.deployment.graph import write as write_onnx
 from surrogym_trainer.deployment.running import Running
+from surrogym_trainer.deployment.st import write as write_st
 
 Runner = Callable[[Controller], AbstractContextManager[Running]]
 """Run a controller as the target does, for ``surrogym deploy --check``."""
@@ -22,7 +23,13 @@ Runner = Callable[[Controller], AbstractContextManager[Running]]
 Writer = Callable[[Controller, Path], None]
 """Write the files of a controller into an empty folder."""
 
-TARGETS: dict[str, Writer] = {"c": write_c, "arduino": write_arduino, "fmu": write_fmu, "onnx": write_onnx}
+TARGETS: dict[str, Writer] = {
+    "c": write_c,
+    "arduino": write_arduino,
+    "fmu": write_fmu,
+    "onnx": write_onnx,
+    "st": write_st,
+}
 RUNNERS: dict[str, Runner] = {"c": running_c, "arduino": running_c}
 
 

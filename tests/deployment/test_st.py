@@ -1,0 +1,83 @@
+"""A controller in structured text decides as its policy does. blark parses it; a small interpreter runs it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("blark")
+
+from support.controllers import network, plant
+from support.structured_text import FunctionBlock
+from surrogym_shared.spec import MultiDiscreteAction
+from surrogym_trainer.deployment.controller import Choices, Controller, NotDeployable
+from surrogym_trainer.deployment.reading import controller_of
+from surrogym_trainer.deployment.reference import begin, decide
+from surrogym_trainer.deployment.st import source_of
+from surrogym_trainer.deployment.targets import deploy
+from surrogym_trainer.deployment.vectors import sensors_of
+
+PAST = {"changes": 2, "actions": 1, "largest": {"angle": 0.5, "slide": 0.2}, "at_start": {"angle": 0.3}}
+STEPS, RESTARTS = 200, (0, 60)
+
+
+def decided(controller: Controller, real: str) -> list[float]:
+    """Run the block beside the reference, with faults; the difference of each command, as a share of its range."""
+    block, rng = FunctionBlock(source_of(controller, real, "arm")), np.random.default_rng(0)
+    low, high = sensors_of(controller)
+    reads = rng.uniform(low, high, (STEPS, len(low))).astype(np.float32).astype(np.float64)
+    reads[::40, 0], reads[7::40, 1], reads[13::40] = np.nan, np.inf, high + 1e3
+    differences, memory = [], begin(controller)
+    for count, read in enumerate(reads):
+        restart, age = count in RESTARTS, 9.0 if count % 50 == 49 else 0.0
+        memory, action, status = decide(controller, begin(controller) if restart else memory, read[None], age)
+        block(measurement=read, age=age, restart=restart)
+        assert block.values["status"] == status[0]
+        off = np.abs(np.array(block.values["command"], dtype=np.float64) - action[0])
+        differences.append(float((off / (controller.high - controller.low)).max()))
+    return differences
+
+
+@pytest.mark.slow
+def test_lags_limits_and_faults_are_those_of_the_reference(tmp_path: Path):
+    controller = controller_of(network(tmp_path, plant(**PAST), (3,)))
+    assert max(decided(controller, "LREAL")) <= 1e-6
+
+
+@pytest.mark.slow
+def test_choices_in_32_bits_are_those_of_the_reference(tmp_path: Path):
+    spec = plant(MultiDiscreteAction(nvec=(2, 5)))
+    controller = controller_of(network(tmp_path, spec, (3,)), choices=Choices(fallback=(1.0, 3.0)))
+    differences = np.array(decided(controller, "REAL"))
+    assert (differences <= 1e-4).mean() >= 0.98  # two best choices may be equal up to rounding
+
+
+def test_both_widths_are_written_with_literals_that_have_a_point(tmp_path: Path):
+    controller = controller_of(network(tmp_path, plant(), (64, 64)))
+    written = deploy(controller, "st", tmp_path / "st")
+    assert [path.name for path in written] == ["arm_controller.st", "arm_controller_real.st"]
+    for path, real in zip(written, ("LREAL", "REAL"), strict=True):
+        text = path.read_text()
+        assert not re.search(r"\d[eE]|inf|nan", re.sub(r"\d+\.\d+E-?\d+|\(\*.*?\*\)", "", text, flags=re.S))
+        weights = re.search(rf"WEIGHTS1 : ARRAY\[0\.\.4095\] OF {real} := \[([^]]*)\]", text)
+        assert weights is not None
+        kind = np.float64 if real == "LREAL" else np.float32
+        read = np.array([kind(one) for one in weights[1].split(",")])
+        np.testing.assert_array_equal(read, controller.decision.layers[1].weights.ravel().astype(kind))
+
+
+def test_names_with_the_end_of_a_comment_stay_in_it(tmp_path: Path):
+    spec = plant()
+    first, *others = spec.coordinates
+    named = spec.model_copy(update={"coordinates": (first.model_copy(update={"unit": "*) x"}), *others)})
+    text = source_of(controller_of(network(tmp_path, named, (3,))), "LREAL", "arm")
+    assert text.count("(*") == text.count("*)")
+
+
+def test_an_angle_of_more_turns_than_a_dint_counts_is_refused(tmp_path: Path):
+    choices = Choices(ranges={"angle": (-1e12, 1e12)})
+    with pytest.raises(NotDeployable, match="turns"):
+        source_of(controller_of(network(tmp_path, plant(), (3,)), choices=choices), "LREAL", "arm")
