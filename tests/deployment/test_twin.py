@@ -257,3 +257,9 @@ def test_the_command_writes_the_twin_of_a_file_and_leaves_other_folders_alone(su
     said = surrogym(*command, "new", "--period", "0")
     assert (said.code, "above 0, got 0" in said.err) == (1, True)
     assert not (tmp_path / "new").exists()
+    for other in (
+        [*command, "new", "--check"],
+        ["deploy", "policy.zip", "--target", "c", "--out", "c", "--period", "1"],
+    ):
+        said = surrogym(*other)
+        assert (said.code, "--period with the FMU of a surrogate alone" in said.err) == (1, True)

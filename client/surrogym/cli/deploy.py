@@ -151,6 +151,7 @@ def command(
 
     Example: surrogym deploy pendulum --target fmu --out twin
     """
+    from surrogym.cli.errors import CommandError
     from surrogym.cli.options import read_spec
     from surrogym.cli.twins import in_words, is_surrogate, write_twin
     from surrogym_trainer.deployment.reading import controller_of
@@ -158,7 +159,10 @@ def command(
     from surrogym_trainer.deployment.targets import RUNNERS, deploy
     from surrogym_trainer.policies.card import read_card
 
-    if target == "fmu" and is_surrogate(policy):
+    twins = target == "fmu" and is_surrogate(policy)
+    if (checking.check and twins) or (period is not None and not twins):
+        raise CommandError("expected --check with a policy, and --period with the FMU of a surrogate alone")
+    if twins:
         twin = write_twin(context, policy, out, period, service)
         output.give(twin, lambda: in_words(twin))
         return
