@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from functools import cache
 from multiprocessing import context
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("RAY_AUTH_MODE", "disabled")  # a token in the home folder would change it between two clusters
 if "DISPLAY" not in os.environ:
@@ -53,6 +54,7 @@ for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHU
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, usual)
 
+COMPILING = pytest.StashKey[subprocess.Popen[bytes]]()
 LASTING = ("slow", "e2e", "timeout")  # marks; a limit of its own is one of more time
 
 
@@ -86,14 +88,19 @@ def pytest_collection() -> Iterator[None]:
 def pytest_configure(config: pytest.Config) -> None:
     """Compile steps once, before the first test: a dozen servers that do so at once outlast what tests wait for.
 
-    Another checkout with the same sources may have compiled them for itself, so workers don't rely on what there is.
+    Workers collect their tests meanwhile. What another checkout has compiled is of no use to this one.
     """
     if getattr(config.option, "numprocesses", None):
-        subprocess.run([sys.executable, "-c", PROGRAM], check=True)
+        config.stash[COMPILING] = subprocess.Popen([sys.executable, "-c", PROGRAM])
     elif not hasattr(config, "workerinput"):
         ahead = Compiling()
         ahead.start()
         ahead.wait()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_node_collection_finished(node: Any) -> None:
+    node.config.stash[COMPILING].wait()
 
 
 @pytest.fixture(scope="session", autouse=True)
