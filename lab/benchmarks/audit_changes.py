@@ -209,8 +209,14 @@ def audited(machine: Machine, change: str, subject: Subject, returns: Returns) -
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Policies that lost trust, by plant: in harmful changes, and in the unchanged plant."""
-    lines = ["| plant | audits | runs | untrusted | share, 95 % interval | steps |", "|---|---|---|---|---|---|"]
+    """Policies that lost trust, by plant: in harmful changes, and in the unchanged plant.
+
+    A promise is broken where the policy's real return is below the interval that was handed over.
+    """
+    lines = [
+        "| plant | audits | runs | untrusted | share, 95 % interval | trusted, and broken | steps |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for plant in [*dict.fromkeys(row.plant for row in rows), "all"]:
         own = [row for row in rows if plant in (row.plant, "all")]
         lines.append(_line(plant, "harmful change", [row for row in own if row.change not in UNCHANGED]))
@@ -220,11 +226,13 @@ def table(rows: Sequence[Row]) -> str:
 
 def _line(plant: str, what: str, rows: Sequence[Row]) -> str:
     if not rows:
-        return f"| {plant} | {what} | 0 | - | - | - |"
+        return f"| {plant} | {what} | 0 | - | - | - | - |"
     lost = sum(not row.trusted for row in rows)
+    broken = sum(row.trusted and row.now < row.promised_low for row in rows)
     low, high = exact_interval(lost, len(rows))
     share = f"{100 * lost / len(rows):.0f} % ({100 * low:.0f} to {100 * high:.0f})"
-    return f"| {plant} | {what} | {len(rows)} | {lost} | {share} | {np.mean([row.steps for row in rows]):.1f} |"
+    steps = np.mean([row.steps for row in rows])
+    return f"| {plant} | {what} | {len(rows)} | {lost} | {share} | {broken} | {steps:.1f} |"
 
 
 def _options() -> argparse.Namespace:

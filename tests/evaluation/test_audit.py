@@ -43,6 +43,20 @@ def test_errors_within_the_tolerance_are_never_a_fault():
     assert judge(compared(errors, deviation=1e-9), PROMISE, PROMISE, UNTRAINED).passed
 
 
+def test_errors_within_the_tolerance_and_beyond_the_claim_are_surprising():
+    """A heavier pendulum's errors were 2.4 times the model's claim, within the tolerance, and nothing asked further."""
+    claimed, rng = np.array([0.2, 0.2]), np.random.default_rng(0)
+    right = [compared(rng.normal(0, 0.2, (8, 2)), deviation=1e-9) for _ in range(500)]
+    assert sum(replace(one, claimed_alone=claimed).surprising.any() for one in right) <= 10
+    errors = rng.normal(0, [0.2, 0.5], (8, 2))
+    larger = replace(compared(errors, deviation=1e-9), claimed_alone=claimed)
+    assert larger.surprising.tolist() == [False, True]
+    assert judge(larger, PROMISE, PROMISE, UNTRAINED).passed
+    at_the_end = replace(right[0], errors=np.r_[np.zeros((7, 2)), [[0.0, 2.0]]], claimed_alone=claimed)
+    assert at_the_end.surprising.any()
+    assert not replace(at_the_end, elsewhere=1).surprising.any(), "off the policy's way, it says nothing of the return"
+
+
 @pytest.mark.parametrize(
     ("after", "passed"), [(-155.0, True), (-250.0, True), (-300.0, False), (-60.0, True), (0.0, False)]
 )

@@ -59,6 +59,14 @@ def test_draws_are_the_shift_and_its_uncertainty():
     assert not found.expected()[[0, 2]].any()
 
 
+def test_no_draw_leaves_an_output_right_whose_errors_are_too_large():
+    found, rng = jointly(0, 8, scale=3.0), np.random.default_rng(0)
+    wrong = np.array([False, True, False])
+    drawn = found.draws(400, rng, wrong)
+    assert (drawn[:, 1] != 0).any(1).all()
+    assert (drawn[:, [0, 2]] == 0).all(2).mean() > 0.5
+
+
 def consequence(seed: int, shift: float, cost: float, steps: int = 40) -> Consequence:
     """A shift of 1 changes the return by ``cost``."""
     found = jointly(seed, steps, shift=shift)

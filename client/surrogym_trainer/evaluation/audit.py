@@ -67,6 +67,16 @@ class Compared:
         scale: Array = np.sqrt(self.deviations**2 + self.expected**2)
         return scale
 
+    @property
+    def surprising(self) -> Bools:
+        """Which outputs (O,) have larger errors on the policy's way than the model's own claim without any tolerance,
+        beyond chance."""
+        on_way = slice(len(self.errors) - self.elsewhere)
+        errors, deviations = self.errors[on_way], self.deviations[on_way]
+        sums = (errors**2 / (deviations**2 + self.claimed_alone**2)).sum(0)
+        beyond: Bools = sums > chi_squared(len(errors), ALARM / errors.shape[1])
+        return beyond
+
     def together(self, spec: EnvironmentSpec, inputs: Inputs) -> Systematic:
         """Test the errors on the policy's way together."""
         on_way = slice(len(self.errors) - self.elsewhere)

@@ -138,11 +138,15 @@ class Systematic:
         odds: Array = self._by_output / len(self.names)
         return odds / (1 + odds)
 
-    def draws(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw weights (count, O, 1 + P) that the errors support; those of an output that is right are 0."""
+    def draws(self, count: int, rng: np.random.Generator, wrong: NDArray[np.bool_] | None = None) -> Array:
+        """Draw weights (count, O, 1 + P) that the errors support; those of an output that is right are 0.
+
+        None of the outputs that are ``wrong`` (O,) is right: their errors have shown it by their size.
+        """
         size = len(self.inputs.centre) + 1
         weights = np.zeros((count, len(self.names), size))
-        for o, (forms, chance) in enumerate(zip(self.forms, self.chances, strict=True)):
+        chances = self.chances if wrong is None else np.where(wrong, 1.0, self.chances)
+        for o, (forms, chance) in enumerate(zip(self.forms, chances, strict=True)):
             share = np.array([form.evidence for form in forms])
             which = rng.choice(len(forms), size=count, p=share / share.sum())
             drawn = [forms[i].mean + forms[i].root @ rng.standard_normal(size) for i in which]

@@ -226,7 +226,7 @@ def _consequence(
     if len(beside.errors) == beside.elsewhere or view.model_version is None:
         return None
     shifted = beside.together(subject.port.spec(), inputs)
-    weights = shifted.draws(DRAWS, np.random.default_rng(subject.seed))
+    weights = shifted.draws(DRAWS, np.random.default_rng(subject.seed), beside.surprising)
     changes = changes_of(
         subject.port, subject.predict, subject.seed, subject.session, view.model_version, shifted, weights
     )
