@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +122,15 @@ def test_policies_without_a_feed_forward_network_are_refused_with_what_can(tmp_p
         controller_of(path)
     with pytest.raises(NotDeployable, match=r"RECURRENTPPO.*feed-forward network can"):
         controller_of(path, algorithm="RECURRENTPPO", trust=True)
+
+
+def test_a_controller_names_what_it_was_made_from(tmp_path: Path):
+    spec = plant()
+    path = network(tmp_path, spec)
+    write_card(path, PolicyCard(spec=spec, model="5a" * 32))
+    digests = controller_of(path).digests
+    assert digests["policy"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert digests["samples of the model"] == "5a" * 32
 
 
 def test_a_policy_with_weights_that_are_not_numbers_is_refused(tmp_path: Path):

@@ -98,6 +98,7 @@ def test_a_right_model_passes_and_its_steps_stand_apart(line: Place) -> None:
     assert handover.trusted, handover.reason
     assert handover.audit is not None
     assert handover.audit.steps == 8
+    assert handover.model == line.api.model(line.name).data_hash, "of the model that has learned from the audit"
     assert after.ledger.audit == 8
     assert after.ledger.total == before.ledger.total, "an audit costs none of the budget"
     assert after.budget_left == before.budget_left

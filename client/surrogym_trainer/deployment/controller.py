@@ -145,7 +145,7 @@ class Controller:
         fallback: action (F,) on a fault.
         timeout: largest age of a measurement in seconds; infinite without one.
         period: seconds between decisions; None if nobody declared it.
-        digests: SHA-256 of ``policy`` and ``specification``.
+        digests: SHA-256 of policy and specification and, if the card has it, the hash of the model's samples.
     """
 
     name: str

@@ -75,6 +75,7 @@ def controller_of(
     digests = {
         "policy": hashlib.sha256(policy.read_bytes()).hexdigest(),
         "specification": hashlib.sha256(meant.model_dump_json().encode()).hexdigest(),
+        **({"samples of the model": card.model} if card.model else {}),
     }
     name = card.surrogate or policy.stem
     controller = controller_from(meant, decision, name, digests, choices or Choices())

@@ -49,6 +49,7 @@ class PolicyCard(BaseModel):
     spec: EnvironmentSpec | None = None
     seed: int | None = None
     virtual_steps: int | None = None
+    model: str = ""  # hash of the samples of the model that the promise is of
     seconds: float | None = None
     imagined_return: float | None = None
     visited_confidence: tuple[float | None, ...] = ()

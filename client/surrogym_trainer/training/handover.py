@@ -67,12 +67,14 @@ class Handover:
         audit: audit of the policy; None without one.
         trusted: whether the promise is to be trusted.
         reason: why it is trusted or not, in one sentence.
+        model: hash of the samples of the promise's model.
     """
 
     promise: Promise | None
     audit: Audit | None
     trusted: bool
     reason: str
+    model: str = ""
 
 
 @dataclass(frozen=True)
@@ -115,6 +117,12 @@ def hand_over(
         DesignUnfinished: the audit's queries were not answered in time.
         SurrogymClientError: the server refused.
     """
+    return replace(_handed_over(subject, audit, progress), model=subject.api.model(subject.name).data_hash)
+
+
+def _handed_over(
+    subject: Subject, audit: AuditSettings | None, progress: Callable[[SurrogateView], None] | None
+) -> Handover:
     before = subject.promise()
     if audit is None or (why := _not_possible(subject)) is not None:
         return _unaudited(subject, before, "none was requested" if audit is None else str(why))

@@ -84,6 +84,7 @@ class PushedCard(BaseModel):
     spec: EnvironmentSpec | None = Field(default=None, description="specification that the policy was trained for")
     seed: Count | None = Field(default=None, description="seed of the training")
     virtual_steps: Count | None = Field(default=None, description="virtual steps of the training")
+    model: Text = Field(default="", description="hash of the samples of the model that the promise is of")
     seconds: float | None = Field(default=None, description="duration of the training")
     imagined_return: float | None = Field(default=None, description="imagined return of the policy")
     untrained: float | None = Field(default=None, description="imagined return of an untrained network")
@@ -326,6 +327,7 @@ class PolicyDetail(PolicyView):
 
     seed: int | None = Field(description="seed of the training")
     seconds: float | None = Field(description="duration of the training")
+    model: str = Field(default="", description="hash of the samples of the model that the promise is of")
     untrained: float | None = Field(default=None, description="imagined return of an untrained network")
     settings: dict[str, Any] = Field(description="settings of the training, by name")
     versions: dict[str, str] = Field(description="versions of the packages of the training, by name")

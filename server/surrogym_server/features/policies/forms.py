@@ -59,7 +59,9 @@ def policy_detail(record: PolicyRecord) -> wire.PolicyDetail:
     """A policy with the settings and the curve of its training."""
     card = _card(record)
     curve = [read_stored(wire.CurvePoint, "the curve of a training", point) for point in record.curve]
-    of_training = {name: getattr(card, name) for name in ("seed", "seconds", "untrained", "settings", "versions")}
+    of_training = {
+        name: getattr(card, name) for name in ("seed", "seconds", "model", "untrained", "settings", "versions")
+    }
     return wire.PolicyDetail(**_fields(record, card), **of_training, curve=curve)
 
 
