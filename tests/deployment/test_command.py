@@ -15,6 +15,7 @@ from surrogym.cli import main
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_trainer.policies.card import read_card, write_card
+from surrogym_trainer.policies.controller_check import StoredCheck, write_check
 from surrogym_trainer.policies.pushing import push
 
 
@@ -40,8 +41,12 @@ def test_a_stored_policy_is_deployed_by_its_name_and_checked_in_the_virtual_envi
     said = surrogym(*deploy, "--server", pendulum_server.url, "--json")
     assert said.code == 0, said.err
     names = [Path(file).name for file in said.json["files"]]
-    assert names == ["pendulum_controller.c", "pendulum_controller.h", "pendulum_main.c"]
+    assert names[:3] == ["pendulum_controller.c", "pendulum_controller.h", "pendulum_main.c"]
     if check:
+        assert names[3:] == ["check.json"]
+        report = ["report", "pendulum", "--policy", str(version), "--controller", "c", "--server", pendulum_server.url]
+        assert surrogym(*report).code == 0
+        assert "On the controller" in (tmp_path / "report.html").read_text()
         checked = said.json["check"]
         assert checked["steps"] == 2 * pendulum().time_limit
         assert (checked["faults"], checked["different_actions"]) == (0, 0)
@@ -74,6 +79,21 @@ def test_what_can_not_be_written_or_checked_is_refused_and_nothing_is_written(su
         said = surrogym("deploy", *arguments)
         assert (said.code, words in said.err.replace("\n", " ")) == (1, True), said.err
         assert not (tmp_path / "c").exists()
+
+
+def test_a_report_takes_no_check_of_another_policy(surrogym, pendulum_server, tmp_path):
+    with Api(pendulum_server.url) as api:
+        path = policy_for(tmp_path, api.surrogate("pendulum").spec, "pendulum")
+        version = push(api, path).policy.version
+    report = ["report", "pendulum", "--policy", str(version), "--controller", ".", "--server", pendulum_server.url]
+    said = surrogym(*report)
+    assert (said.code, "surrogym deploy --check" in said.err.replace("\n", " ")) == (1, True)
+    counts = {"episodes": 1, "steps": 1, "different_actions": 0, "faults": 0}
+    numbers = {"largest_difference": 0.0, "mean_return": 0.0, "mean_return_of_policy": 0.0, "microseconds": None}
+    write_check(tmp_path, StoredCheck(target="c", environment="here", policy="0" * 64, **counts, **numbers))
+    said = surrogym(*report)
+    assert (said.code, "got the check of another one" in said.err.replace("\n", " ")) == (1, True)
+    assert not (tmp_path / "report.html").exists()
 
 
 def test_a_check_without_a_compiler_says_what_is_missing(surrogym, tmp_path, monkeypatch):

@@ -80,6 +80,8 @@ OTHERWISE = {
     "docs/how-to/fmus.md": "tests/original/test_fmus.py builds its FMUs, tests/examples runs its program",
     "docs/how-to/executables.md": "tests/original/test_executables.py runs its program",
     "docs/how-to/deploy.md": "tests/deployment runs its commands and compiles its controllers",
+    "docs/how-to/digital-twin.md": "tests/deployment writes a twin by the command and runs it",
+    "docs/how-to/plc.md": "tests/deployment writes a function block and runs it",
     "docs/how-to/history.md": "tests/docs/test_how_to.py runs its programs",
     "docs/how-to/snapshots.md": "tests/docs/test_how_to.py runs its program",
     "docs/how-to/models.md": "test_benchmarks imports its benchmark",

@@ -56,7 +56,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 @each_page
 def test_the_tests_that_a_page_names_are_there(page: Path) -> None:
     named = re.findall(
-        r"(?<![\w/])(?:lab/)?(?:tests|benchmarks)/[\w/-]+(?:\.(?:py|json))?", page.read_text(encoding="utf-8")
+        r"(?<![\w/])(?:lab/)?(?:tests|benchmarks)/[\w/-]+(?:\.(?:py|json|toml))?", page.read_text(encoding="utf-8")
     )
     assert [name for name in named if not (ROOT / name).exists()] == []
 

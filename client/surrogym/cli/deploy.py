@@ -15,9 +15,10 @@ from surrogym.cli.options import NAMES, SpecFile
 
 if TYPE_CHECKING:
     from surrogym_sampler.original.episodes import Episode
-    from surrogym_trainer.deployment.controller import Choices
+    from surrogym_trainer.deployment.controller import Choices, Controller
     from surrogym_trainer.deployment.running import Checked, Comparison
     from surrogym_trainer.policies.card import PolicyCard
+    from surrogym_trainer.policies.controller_check import StoredCheck
 
 
 def register(app: typer.Typer) -> None:
@@ -158,6 +159,7 @@ def command(
     from surrogym_trainer.deployment.running import Comparison
     from surrogym_trainer.deployment.targets import RUNNERS, deploy
     from surrogym_trainer.policies.card import read_card
+    from surrogym_trainer.policies.controller_check import write_check
 
     twins = target == "fmu" and is_surrogate(policy)
     if (checking.check and twins) or (period is not None and not twins):
@@ -183,7 +185,9 @@ def command(
                 finally:
                     if checking.env is not None:
                         _enter(context, comparison.begun, checking, card, path, service, output)
-            result["check"] = _as_json(checked)
+            stored = _stored(checked, target, checking.env or f"virtual environment of {card.surrogate}", controller)
+            result["check"] = stored.model_dump(mode="json")
+            result["files"].append(str(write_check(out, stored)))
             words += _in_words(checked)
     output.give(result, lambda: "\n".join(words))
 
@@ -240,17 +244,22 @@ def _range(text: str) -> tuple[str, tuple[float, float]]:
         raise CommandError(f"--range: expected NAME=LOW:HIGH, such as level=0:2, got {text!r}") from error
 
 
-def _as_json(checked: Checked) -> dict[str, Any]:
-    return {
-        "episodes": len(checked.returns),
-        "steps": checked.steps,
-        "largest_difference": checked.largest,
-        "different_actions": checked.different,
-        "faults": checked.faults,
-        "mean_return": float(checked.returns.mean()),
-        "mean_return_of_policy": float(checked.policy_returns.mean()),
-        "microseconds": checked.microseconds,
-    }
+def _stored(checked: Checked, target: str, environment: str, controller: Controller) -> StoredCheck:
+    from surrogym_trainer.policies.controller_check import StoredCheck
+
+    return StoredCheck(
+        target=target,
+        environment=environment,
+        policy=controller.digests["policy"],
+        episodes=len(checked.returns),
+        steps=checked.steps,
+        largest_difference=checked.largest,
+        different_actions=checked.different,
+        faults=checked.faults,
+        mean_return=float(checked.returns.mean()),
+        mean_return_of_policy=float(checked.policy_returns.mean()),
+        microseconds=checked.microseconds,
+    )
 
 
 def _in_words(checked: Checked) -> list[str]:

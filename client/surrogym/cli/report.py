@@ -26,6 +26,10 @@ def command(
         str | None,
         typer.Option(help="Version or alias of the policy. [default: the one in production, or else the newest]"),
     ] = None,
+    controller: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the policy's controller, with what surrogym deploy --check found."),
+    ] = None,
     *,
     service: Service,
     output: Output,
@@ -49,7 +53,7 @@ def command(
         update(0.0, f"reading {surrogate}")
         from surrogym_trainer.report.known import collect, cuts_of
 
-        known = collect(api, surrogate, policy)
+        known = collect(api, surrogate, policy, controller)
         shown, lacking = cuts_of(api, known)  # if maps can't be computed, the page shows all stored data without them
         update(0.3, "drawing")
         from surrogym_trainer.report.files import write

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 from surrogym_client.errors import NotInstalled, SurrogymClientError, UnknownPolicy
 from surrogym_client.transport import Api
@@ -21,6 +22,7 @@ from surrogym_shared.wire import (
     SampleView,
     SurrogateView,
 )
+from surrogym_trainer.policies.controller_check import StoredCheck, UnusableCheck, read_check
 from surrogym_trainer.report.maps import Cut, cuts
 
 PREFERRED = "production"
@@ -43,6 +45,7 @@ class Known:
         reference: real episodes of a reference controller, from the same starts.
         video: its form and content, as a browser plays it; None: there is none.
         others: the other versions of the surrogate's policies.
+        check: of the policy's deployed controller; None: there is none.
         missing: sentences about what could not be read.
     """
 
@@ -56,25 +59,33 @@ class Known:
     reference: EvaluationDetail | None = None
     video: tuple[str, bytes] | None = None
     others: tuple[PolicyView, ...] = ()
+    check: StoredCheck | None = None
     missing: tuple[str, ...] = ()
 
 
-def collect(api: Api, name: str, which: str | None = None) -> Known:
+def collect(api: Api, name: str, which: str | None = None, controller: Path | None = None) -> Known:
     """Collect the data of a report. It names data that can't be read.
 
     Args:
         api: the server.
         name: of the surrogate.
         which: version or alias of the policy. None: the one in production, otherwise the newest.
+        controller: folder of the policy's deployed controller, with its check.
 
     Raises:
         UnknownSurrogate, UnknownPolicy: there is none of this name.
+        UnusableCheck: the folder has no check of this policy.
     """
     view, models, samples = api.surrogate(name), api.models(name), list(api.samples(name))
     server = f"{api.url}, surrogym {api.health().version}"
     policy, missing = _policy(api, name, which), list[str]()
     if policy is None:
+        if controller is not None:
+            raise UnusableCheck(f"expected a stored policy of {name!r} for the check in {controller}, got none")
         return Known(view, models, samples, server)
+    check = None
+    if controller is not None:
+        check = read_check(controller, next((file.digest for file in policy.files if file.form == "zip"), ""))
     real = chosen_real(policy)
     chosen = (real, chosen_without(policy, real), chosen_reference(policy, real))
     details: list[EvaluationDetail | None] = []
@@ -87,7 +98,7 @@ def collect(api: Api, name: str, which: str | None = None) -> Known:
     missing += lacks
     others = tuple(one for one in api.policies.list(name) if one.version != policy.version)
     return Known(
-        view, models, samples, server, policy, details[0], details[1], details[2], video, others, tuple(missing)
+        view, models, samples, server, policy, details[0], details[1], details[2], video, others, check, tuple(missing)
     )
 
 

@@ -13,6 +13,7 @@ from surrogym_client.runtime.versions import versions
 from surrogym_client.surrogates.phases import IN_WORDS
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import ModelView, OutputFidelity, Phase, SampleView, SurrogateView
+from surrogym_trainer.policies.controller_check import StoredCheck
 from surrogym_trainer.report.coverage import coverage_of
 from surrogym_trainer.report.decision import decision
 from surrogym_trainer.report.figures import draw_coverage, draw_fidelity, draw_maps, draw_samples, svg
@@ -77,6 +78,8 @@ def _details(known: Known, cuts: Sequence[Cut]) -> list[str]:
         sections.append(section("Samples", figure + _covered(view, samples)))
     if cuts:
         sections.append(_maps(view, cuts))
+    if known.check is not None:
+        sections.append(_on_controller(known.check))
     if models:
         sections += [_structure(models[-1], view.spec), _history(models)]
     specification = escape(view.spec.model_dump_json(indent=2))
@@ -133,6 +136,22 @@ def _maps(view: SurrogateView, cuts: Sequence[Cut]) -> str:
     alt = "Uncertainty in tolerances, occupancy, and the index, over two coordinates a row"
     note = "<p>The worst output; the other coordinates and the action are in the middle of their ranges.</p>"
     return section("Maps", picture(svg(draw_maps(view, cuts)), alt) + note)
+
+
+def _on_controller(check: StoredCheck) -> str:
+    latency = (
+        "not measured" if check.microseconds is None else f"{check.microseconds:.2g} µs on the machine of the check"
+    )
+    facts = [
+        ("controller", f"target {check.target}, made from the policy's file {check.policy[:12]}"),
+        ("checked in", f"{check.environment}, {check.episodes} episodes of each"),
+        ("mean return", f"{check.mean_return:.6g}, of the policy {check.mean_return_of_policy:.6g}"),
+        ("largest difference of actions", f"{check.largest_difference:.1g} of their range"),
+        ("steps with another action", f"{check.different_actions} of {check.steps}"),
+        ("steps with the fallback", check.faults),
+        ("a decision takes", latency),
+    ]
+    return section("On the controller", rows(facts))
 
 
 def _structure(model: ModelView, spec: EnvironmentSpec) -> str:

@@ -1,0 +1,66 @@
+"""What a check of a deployed controller has found, as a file in the controller's folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from surrogym_client.errors import SurrogymClientError
+from surrogym_shared.checks import first_fault
+
+FILE = "check.json"
+MOST_BYTES = 64 * 1024
+
+
+class UnusableCheck(SurrogymClientError):
+    """The folder has no check of this policy."""
+
+
+class StoredCheck(BaseModel):
+    """A check of a controller beside its policy, over the same starts."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    target: str
+    environment: str = Field(description="original environment, or the virtual one of a surrogate")
+    policy: str = Field(description="SHA-256 of the policy's file")
+    episodes: int
+    steps: int = Field(description="steps of the controller")
+    largest_difference: float = Field(description="of the actions, as a share of their range")
+    different_actions: int = Field(description="steps whose actions differ by more than 1e-6 of the range")
+    faults: int = Field(description="steps in which the controller took its fallback")
+    mean_return: float
+    mean_return_of_policy: float
+    microseconds: float | None = Field(description="of one decision on the machine of the check; null: not measured")
+
+
+def write_check(folder: Path, check: StoredCheck) -> Path:
+    """Write a check into the folder of its controller, and return the file."""
+    path = folder / FILE
+    path.write_text(check.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    return path
+
+
+def read_check(folder: Path, policy: str) -> StoredCheck:
+    """Read the check of a policy's controller.
+
+    Args:
+        folder: of the controller.
+        policy: SHA-256 of the policy's file.
+
+    Raises:
+        UnusableCheck: the folder has no check, or that of another policy.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        raise UnusableCheck(f"expected {path}, which surrogym deploy --check writes, got no such file")
+    with path.open("rb") as file:
+        content = file.read(MOST_BYTES + 1)
+    try:
+        check = StoredCheck.model_validate_json(content[:MOST_BYTES])
+    except ValidationError as error:
+        raise UnusableCheck(f"{path} is not the check of a controller: {first_fault(error)}") from error
+    if check.policy != policy:
+        raise UnusableCheck(f"expected {path} to be of the report's policy, got the check of another one")
+    return check
