@@ -177,7 +177,7 @@ class Api:
         *,
         max_queries: int = 1,
         wait_seconds: float = 0.0,
-        lease_seconds: float = 60.0,
+        lease_seconds: float = wire.LEASE_SECONDS,
         retries: Retries | None = None,
     ) -> wire.ClaimedQueries:
         """Lease queries for a sampler, and wait up to ``wait_seconds`` until there are some. The list may be empty.
@@ -211,7 +211,7 @@ class Api:
         query_id: int,
         lease_token: str,
         *,
-        lease_seconds: float = 60.0,
+        lease_seconds: float = wire.LEASE_SECONDS,
         retries: Retries | None = None,
     ) -> None:
         """Extend a lease while the original environment works. ``retries`` replaces the connection's.

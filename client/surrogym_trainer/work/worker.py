@@ -36,7 +36,7 @@ class WorkerSettings:
     name: str = field(default_factory=worker_name)
     folder: Path = Path("work")
     wait_seconds: float = 20.0
-    lease_seconds: float = 60.0
+    lease_seconds: float = wire.LEASE_SECONDS
     once: bool = False
 
 

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "base": (
-        "MAX_BATCH MAX_CLAIM MAX_DRAWS MAX_IMAGINED MAX_LANES MAX_MEASURED MAX_PARTICLES MAX_ROLLOUT PROTOCOL "
-        "AutoresetMode Key Matrix Measured Phase Purpose QueryKind QueryStatus Reply Request Role SamplePurpose "
-        "Seed Seq SurrogateName Variant Vector"
+        "LEASE_SECONDS MAX_BATCH MAX_CLAIM MAX_DRAWS MAX_IMAGINED MAX_LANES MAX_MEASURED MAX_PARTICLES MAX_ROLLOUT "
+        "PROTOCOL AutoresetMode Key Matrix Measured Phase Purpose QueryKind QueryStatus Reply Request Role "
+        "SamplePurpose Seed Seq SurrogateName Variant Vector"
     ),
     "jobs": (
         "MAX_JOB_EPISODES MAX_JOB_POINTS MAX_JOB_STEPS AddJob ClaimedJob ClaimJob EvaluateTask FinishJob "

@@ -11,6 +11,7 @@ from surrogym_shared.bounded import FailFast
 from surrogym_shared.spec import MAX_DIMENSIONS, NAME_PATTERN
 
 PROTOCOL = 1
+LEASE_SECONDS = 60.0  # default of a claim: of a query by a sampler, and of a job by a worker
 MAX_LANES = 65_536
 MAX_PARTICLES = 1_000_000
 MAX_CLAIM = 256

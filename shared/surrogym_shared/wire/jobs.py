@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from surrogym_shared.wire.base import VISIBLE, Key, Measured, Reply, Request
+from surrogym_shared.wire.base import LEASE_SECONDS, VISIBLE, Key, Measured, Reply, Request
 
 MAX_JOB_EPISODES = 1_000  # real episodes of an evaluation
 MAX_JOB_STEPS = 10_000_000  # virtual steps of a training
@@ -127,7 +127,7 @@ class ClaimJob(Request):
         default=0.0, description="seconds that the reply may wait for a job; 0: reply at once"
     )
     lease_seconds: LeaseSeconds = Field(
-        default=60.0, description="seconds until the lease ends, unless a report renews it"
+        default=LEASE_SECONDS, description="seconds until the lease ends, unless a report renews it"
     )
 
 
@@ -181,7 +181,7 @@ class ReportJob(Request):
     """Heartbeat of a worker: the lease of its job ends ``lease_seconds`` from now."""
 
     lease_token: Key = Field(description="token of the lease")
-    lease_seconds: LeaseSeconds = Field(default=60.0, description="seconds from now until the lease ends")
+    lease_seconds: LeaseSeconds = Field(default=LEASE_SECONDS, description="seconds from now until the lease ends")
     state: JobState | None = Field(default=None, description="progress of the job; null: as in the last report")
 
 

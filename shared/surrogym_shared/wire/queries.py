@@ -8,6 +8,7 @@ from pydantic import Field
 
 from surrogym_shared.spec import MAX_ROLLOUT_QUERY
 from surrogym_shared.wire.base import (
+    LEASE_SECONDS,
     MAX_BATCH,
     MAX_CLAIM,
     Key,
@@ -36,7 +37,7 @@ class ClaimQueries(Request):
         default=0.0, description="seconds that the reply may wait for a query; 0: reply at once"
     )
     lease_seconds: Annotated[float, Field(gt=0, le=86_400)] = Field(
-        default=60.0, description="seconds until the leases end, unless they are renewed"
+        default=LEASE_SECONDS, description="seconds until the leases end, unless they are renewed"
     )
 
 
@@ -91,7 +92,7 @@ class RenewLease(Request):
 
     lease_token: Key = Field(description="token of the lease")
     lease_seconds: Annotated[float, Field(gt=0, le=86_400)] = Field(
-        default=60.0, description="seconds from now until the lease ends"
+        default=LEASE_SECONDS, description="seconds from now until the lease ends"
     )
 
 

@@ -92,7 +92,7 @@ class Target:
         answer: dict[str, Any] = reply.json()
         return answer
 
-    def claim(self, lease_seconds: float = 60.0) -> wire.StepQuery:
+    def claim(self, lease_seconds: float = wire.LEASE_SECONDS) -> wire.StepQuery:
         """Claim one query, which must exist."""
         claimed = self.api.claim(self.surrogate, "conformance", lease_seconds=lease_seconds, wait_seconds=5.0)
         expect("number of claimed queries", 1, len(claimed.queries))

@@ -1,17 +1,6 @@
-"""Rules for what may be asked next, in their order. The first rule that applies chooses the queries of a round."""
+"""Rules for what may be asked next: a file for each, and their order in ``order``."""
 
-from surrogym_server.sampling.rules.excursions import take_excursion
-from surrogym_server.sampling.rules.initial import complete_initial_rollouts
-from surrogym_server.sampling.rules.past import see_the_past
-from surrogym_server.sampling.rules.planned import plan_rollouts
-from surrogym_server.sampling.rules.repeats import repeat_steps
+from surrogym_server.sampling.rules.order import ROLLOUT_RULES, STEP_RULES
 from surrogym_server.sampling.rules.rule import Chosen, Rule
-from surrogym_server.sampling.rules.valued import ask_best_candidates
 
 __all__ = ["ROLLOUT_RULES", "STEP_RULES", "Chosen", "Rule"]
-
-# An environment that can be set to any state answers single steps.
-STEP_RULES: tuple[Rule, ...] = (repeat_steps, ask_best_candidates)
-
-# One that begins at resets or snapshots answers rollouts.
-ROLLOUT_RULES: tuple[Rule, ...] = (take_excursion, see_the_past, complete_initial_rollouts, plan_rollouts)

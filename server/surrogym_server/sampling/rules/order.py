@@ -1,0 +1,15 @@
+"""The order of the rules. The first one that applies chooses the queries of a round."""
+
+from surrogym_server.sampling.rules.excursions import take_excursion
+from surrogym_server.sampling.rules.initial import complete_initial_rollouts
+from surrogym_server.sampling.rules.past import see_the_past
+from surrogym_server.sampling.rules.planned import plan_rollouts
+from surrogym_server.sampling.rules.repeats import repeat_steps
+from surrogym_server.sampling.rules.rule import Rule
+from surrogym_server.sampling.rules.valued import ask_best_candidates
+
+# An environment that can be set to any state answers single steps.
+STEP_RULES: tuple[Rule, ...] = (repeat_steps, ask_best_candidates)
+
+# One that begins at resets or snapshots answers rollouts.
+ROLLOUT_RULES: tuple[Rule, ...] = (take_excursion, see_the_past, complete_initial_rollouts, plan_rollouts)
