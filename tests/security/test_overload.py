@@ -295,7 +295,7 @@ def test_a_stream_is_opened_by_get_alone(server: ServerProcess):
 
 
 def test_many_readers_are_refused_while_others_are_served(server: ServerProcess, client: httpx.Client):
-    body = {"coordinates": [0.1, 0.0], "actions": [[0.5]] * 100, "draws": 2}
+    body = {"coordinates": [0.1, 0.0], "actions": [[0.5]] * 40, "draws": 2}
     with ThreadPoolExecutor(50) as pool, httpx.Client(base_url=server.url, timeout=120) as lookers:
         asked = [pool.submit(lookers.post, "/v1/surrogates/pendulum/imagine", json=body) for _ in range(50)]
         claim = {"sampler": "worker", "wait_seconds": 0}

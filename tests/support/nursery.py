@@ -91,7 +91,6 @@ class Nursery:
     """A process that forks servers. It ends with this process, and its children with it."""
 
     def __init__(self) -> None:
-        self._environment = dict(os.environ)
         self._turn = threading.Lock()
         self._asked, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._asked.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, LONGEST)
@@ -101,11 +100,6 @@ class Nursery:
         with theirs:
             self._process = subprocess.Popen(command, pass_fds=[theirs.fileno(), alive], stdin=subprocess.DEVNULL)
         atexit.register(self._end)
-
-    def can_start_in(self, environment: Mapping[str, str]) -> bool:
-        """Whether imported modules would be the same in this environment: what they read is that of the nursery."""
-        differing = {name for name, _ in self._environment.items() ^ environment.items()}
-        return not any(name.startswith(READ_EARLY) for name in differing)
 
     def start(self, arguments: Sequence[str], log: IO[bytes], environment: Mapping[str, str], folder: Path) -> Forked:
         """Run ``python -m surrogym_server ARGUMENTS`` in a folder, with its output in ``log``."""
@@ -126,6 +120,11 @@ class Nursery:
     def _end(self) -> None:
         self._asked.close()
         self._process.wait()
+
+
+def reads_early(environment: Mapping[str, str]) -> bool:
+    """Whether imported modules have read one of these variables, so that they have to be imported anew."""
+    return any(name.startswith(READ_EARLY) for name in environment)
 
 
 @cache

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from support.nursery import Forked, nursery
+from support.nursery import Forked, nursery, reads_early
 
 COLD = ("-m", "surrogym_server")
 STARTING_SECONDS = 400.0  # of a machine on which much else runs
@@ -54,8 +54,7 @@ def start_server(
     ready = folder / "ready"
     ready.unlink(missing_ok=True)
     defaults = ["--port", "0", "--database", str(folder / "surrogym.db"), "--ready-file", str(ready)]
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
-    process = _process(folder / "server.log", program, ["serve", *defaults, *options], kept | environment, Path.cwd())
+    process = _process(folder / "server.log", program, ["serve", *defaults, *options], environment, Path.cwd())
     deadline = time.monotonic() + STARTING_SECONDS
     while not ready.exists():
         if process.poll() is not None or time.monotonic() > deadline:
@@ -69,8 +68,7 @@ def ended(folder: Path, *arguments: str, **environment: str) -> tuple[int, str]:
     """Exit status and output of ``python -m surrogym_server ARGUMENTS``, run to its end in a folder."""
     log = folder / "program.log"
     log.unlink(missing_ok=True)
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
-    status = _process(log, None, list(arguments), kept | environment, folder).wait(STARTING_SECONDS)
+    status = _process(log, None, list(arguments), environment, folder).wait(STARTING_SECONDS)
     return status, log.read_text()
 
 
@@ -83,10 +81,12 @@ def refusal(folder: Path, *options: str, **environment: str) -> str:
 
 
 def _process(
-    path: Path, program: Sequence[str] | None, arguments: list[str], environment: dict[str, str], folder: Path
+    path: Path, program: Sequence[str] | None, arguments: list[str], added: dict[str, str], folder: Path
 ) -> subprocess.Popen[bytes] | Forked:
+    """Start a program of the server with this environment, but for settings of a server, and further variables."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")} | added
     with path.open("ab") as log:
-        if program is None and (forking := nursery()) is not None and forking.can_start_in(environment):
+        if program is None and not reads_early(added) and (forking := nursery()) is not None:
             return forking.start(arguments, log, environment, folder)
         command = [sys.executable, *(program or COLD), *arguments]
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, cwd=folder)
