@@ -28,7 +28,7 @@ from common import parser, started, write
 from support.million import FIRST, fill
 from support.postgresql import running_postgresql
 from support.server import start_server
-from surrogym_server.convert import sample_page
+from surrogym_server.convert.resources import sample_page
 from surrogym_server.storage.sql import open_storage
 
 SAMPLES, PAGE, ROUNDS, CALLS = 20_000, 1_000, 10, 40
