@@ -11,7 +11,8 @@ from fmpy.validation import validate_fmu
 from support.controllers import network, plant
 from support.steps_in_c import needs_compiler
 from support.twins import opened
-from surrogym_trainer.deployment.controller import NotDeployable
+from surrogym_shared.fmu import Block, Variable
+from surrogym_trainer.deployment.controller import Choices, NotDeployable
 from surrogym_trainer.deployment.reading import controller_of
 from surrogym_trainer.deployment.reference import begin, decide
 from surrogym_trainer.deployment.targets import deploy
@@ -58,6 +59,20 @@ def test_a_decision_holds_until_the_next_period(tmp_path: Path):
 
 def test_a_controller_without_a_period_is_refused(tmp_path: Path):
     spec = plant().model_copy(update={"sampling_period": None})
-    with pytest.raises(NotDeployable, match="expected sampling_period"):
+    with pytest.raises(NotDeployable, match="expected --period"):
         deploy(controller_of(network(tmp_path, spec, (8,))), "fmu", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+    with pytest.raises(NotDeployable, match="expected --period"):
+        deploy(controller_of(network(tmp_path, spec, (8,))), "arduino", tmp_path / "out")
+    controller = controller_of(network(tmp_path, spec, (8,)), choices=Choices(period=0.1))
+    assert (controller.period, controller.timeout) == (0.1, 0.2)
+    with pytest.raises(NotDeployable, match="that the specification declares"):
+        controller_of(network(tmp_path, plant(), (8,)), choices=Choices(period=0.1))
+
+
+def test_a_measurement_called_time_or_with_trigraphs_gets_a_name_that_is_valid():
+    block = Block("b", "", (Variable("??/", "Float64", "input", 0.0),), 1.0, None, {})
+    assert '"?""?/"' in block.header()
+    for name in ("time", "a\nb"):
+        with pytest.raises(ValueError, match=r"time|control characters"):
+            Block("b", "", (Variable(name, "Float64", "input", 0.0),), 1.0, None, {})

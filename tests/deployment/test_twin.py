@@ -259,7 +259,7 @@ def test_the_command_writes_the_twin_of_a_file_and_leaves_other_folders_alone(su
     assert not (tmp_path / "new").exists()
     for other in (
         [*command, "new", "--check"],
-        ["deploy", "policy.zip", "--target", "c", "--out", "c", "--period", "1"],
+        [*command, "new", "--fallback", "0"],
     ):
         said = surrogym(*other)
-        assert (said.code, "--period with the FMU of a surrogate alone" in said.err) == (1, True)
+        assert (said.code, "with a policy, got a surrogate" in said.err) == (1, True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -51,7 +52,7 @@ class Faults:
         ),
     ] = None
 
-    def choices(self) -> Choices:
+    def choices(self, period: float | None) -> Choices:
         """Return the choices.
 
         Raises:
@@ -60,7 +61,7 @@ class Faults:
         from surrogym_trainer.deployment.controller import Choices
 
         fallback = tuple(self.fallback) if self.fallback else None
-        return Choices(fallback, self.timeout, dict(map(_range, self.ranges or ())))
+        return Choices(fallback, self.timeout, period, dict(map(_range, self.ranges or ())))
 
 
 @dataclass(frozen=True)
@@ -82,14 +83,18 @@ class Checking:
 
         Raises:
             CommandError: the target does not run on this machine, or no environment is known.
+            NotDeployable: there is no compiler.
         """
         from surrogym.cli.errors import CommandError
+        from surrogym_trainer.deployment.c.compiling import c_compiler
         from surrogym_trainer.deployment.targets import RUNNERS
 
         if self.check and target not in RUNNERS:
             raise CommandError(f"expected --check with a target that runs here ({', '.join(RUNNERS)}), got {target}")
         if self.check and self.env is None and card.surrogate is None:
             raise CommandError("--check needs --env, because no card beside the policy names its surrogate")
+        if self.check:
+            c_compiler()
 
     @contextmanager
     def episode(self, context: typer.Context, card: PolicyCard, service: Service, output: Output) -> Iterator[Episode]:
@@ -132,7 +137,7 @@ def command(
     spec: SpecFile = None,
     period: Annotated[
         float | None,
-        typer.Option(help="Seconds of one step of a surrogate's FMU. [default: the specification's sampling_period]"),
+        typer.Option(help="Seconds of one step, if the specification declares no sampling_period."),
     ] = None,
     *,
     faults: Faults,
@@ -162,8 +167,8 @@ def command(
     from surrogym_trainer.policies.controller_check import write_check
 
     twins = target == "fmu" and is_surrogate(policy)
-    if (checking.check and twins) or (period is not None and not twins):
-        raise CommandError("expected --check with a policy, and --period with the FMU of a surrogate alone")
+    if twins and (checking.check or faults != Faults()):
+        raise CommandError("expected --check, --fallback, --timeout and --range with a policy, got a surrogate")
     if twins:
         twin = write_twin(context, policy, out, period, service)
         output.give(twin, lambda: in_words(twin))
@@ -172,11 +177,13 @@ def command(
         card = read_card(path)
         checking.require_possible(target, card)
         controller = controller_of(
-            path, read_spec(spec), reading.algorithm, trust=reading.trust_policy, choices=faults.choices()
+            path, read_spec(spec), reading.algorithm, trust=reading.trust_policy, choices=faults.choices(period)
         )
         written = deploy(controller, target, out)
         result: dict[str, Any] = {"target": target, "files": [str(file) for file in written]}
         words = [f"{out}: {', '.join(str(file.relative_to(out)) for file in written)}"]
+        if not isfinite(controller.timeout):
+            words.append("no timeout, so a sensor that stops is no fault: --timeout or --period sets one")
         if checking.check:
             with checking.episode(context, card, service, output) as episode, RUNNERS[target](controller) as running:
                 comparison = Comparison(controller, running, reading.load(path, card), episode)

@@ -165,6 +165,13 @@ class Controller:
     def counts(self) -> tuple[int, ...]:
         return self.decision.counts
 
+    @property
+    def late(self) -> str:
+        """Which ages of a measurement are faults, in words."""
+        if np.isfinite(self.timeout):
+            return f"older than {self.timeout:g} s"
+        return "of a negative age (no timeout was given)"
+
 
 @dataclass(frozen=True)
 class Choices:
@@ -173,12 +180,14 @@ class Choices:
     Attributes:
         fallback: action (F,) on a fault. Default: the continuous action nearest to 0. A discrete one has no default.
         timeout: largest age of a measurement in seconds. Default: two sampling periods, if the period is declared.
+        period: seconds between two decisions. Default: ``sampling_period`` of the specification, which it can't change.
         ranges: readings that a sensor can give, by measurement. Default: the range of the specification, widened by its
             own width at each end; 100 turns for an angle.
     """
 
     fallback: tuple[float, ...] | None = None
     timeout: float | None = None
+    period: float | None = None
     ranges: dict[str, tuple[float, float]] | None = None
 
 
@@ -199,6 +208,7 @@ def controller_from(
             f"expected a network of {expected[0]} inputs and {expected[1]} outputs for this specification, got "
             f"{shape[0]} and {shape[1]}"
         )
+    period = _period(spec, choices.period)
     return Controller(
         name=name,
         coordinates=spec.coordinate_names,
@@ -209,8 +219,8 @@ def controller_from(
         low=low,
         high=high,
         fallback=_fallback(spec.action, low, high, choices.fallback),
-        timeout=_timeout(spec, choices.timeout),
-        period=spec.sampling_period,
+        timeout=_timeout(period, choices.timeout),
+        period=period,
         digests=digests,
     )
 
@@ -324,9 +334,20 @@ def _fallback(action: Action, low: Array, high: Array, chosen: tuple[float, ...]
     return given
 
 
-def _timeout(spec: EnvironmentSpec, chosen: float | None) -> float:
+def _period(spec: EnvironmentSpec, chosen: float | None) -> float | None:
+    declared = spec.sampling_period
+    if chosen is None:
+        return declared
+    if not 0 < chosen < np.inf:
+        raise NotDeployable(f"expected a period of more than 0 s, got {chosen:g}")
+    if declared is not None and declared != chosen:
+        raise NotDeployable(f"expected the period that the specification declares, {declared:g} s, got {chosen:g}")
+    return chosen
+
+
+def _timeout(period: float | None, chosen: float | None) -> float:
     if chosen is not None and not chosen > 0:
         raise NotDeployable(f"expected a timeout of more than 0 s, got {chosen:g}")
     if chosen is not None:
         return chosen
-    return np.inf if spec.sampling_period is None else PERIODS * spec.sampling_period
+    return np.inf if period is None else PERIODS * period

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -13,6 +14,9 @@ FILE = "check.json"
 MOST_BYTES = 64 * 1024
 
 
+Count = Annotated[int, Field(ge=0, le=10**12)]
+
+
 class UnusableCheck(SurrogymClientError):
     """The folder has no check of this policy."""
 
@@ -20,19 +24,19 @@ class UnusableCheck(SurrogymClientError):
 class StoredCheck(BaseModel):
     """A check of a controller beside its policy, over the same starts."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
     target: str
     environment: str = Field(description="original environment, or the virtual one of a surrogate")
     policy: str = Field(description="SHA-256 of the policy's file")
-    episodes: int
-    steps: int = Field(description="steps of the controller")
-    largest_difference: float = Field(description="of the actions, as a share of their range")
-    different_actions: int = Field(description="steps whose actions differ by more than 1e-6 of the range")
-    faults: int = Field(description="steps in which the controller took its fallback")
+    episodes: Count
+    steps: Count = Field(description="steps of the controller")
+    largest_difference: float = Field(ge=0, description="of the actions, as a share of their range")
+    different_actions: Count = Field(description="steps whose actions differ by more than 1e-6 of the range")
+    faults: Count = Field(description="steps in which the controller took its fallback")
     mean_return: float
     mean_return_of_policy: float
-    microseconds: float | None = Field(description="of one decision on the machine of the check; null: not measured")
+    microseconds: float | None = Field(ge=0, description="of one decision, where it was checked; null: not measured")
 
 
 def write_check(folder: Path, check: StoredCheck) -> Path:
@@ -57,8 +61,10 @@ def read_check(folder: Path, policy: str) -> StoredCheck:
         raise UnusableCheck(f"expected {path}, which surrogym deploy --check writes, got no such file")
     with path.open("rb") as file:
         content = file.read(MOST_BYTES + 1)
+    if len(content) > MOST_BYTES:
+        raise UnusableCheck(f"{path} is not the check of a controller: expected at most {MOST_BYTES} bytes")
     try:
-        check = StoredCheck.model_validate_json(content[:MOST_BYTES])
+        check = StoredCheck.model_validate_json(content)
     except ValidationError as error:
         raise UnusableCheck(f"{path} is not the check of a controller: {first_fault(error)}") from error
     if check.policy != policy:

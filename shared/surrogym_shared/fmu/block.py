@@ -15,6 +15,7 @@ Kind = Literal["Float64", "Int32", "Boolean"]
 Causality = Literal["input", "output", "parameter"]
 KINDS: tuple[Kind, ...] = ("Float64", "Int32", "Boolean")
 NEVER, AT_START, ALWAYS = range(3)  # when a value may be set
+TIME = "time"  # name of the independent variable, which every FMU has
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,8 @@ class Block:
         acts_first: whether it acts at the beginning of a period, as a controller does, or shows the result at its end.
 
     Raises:
-        ValueError: two variables have the same name, or the period is not above 0.
+        ValueError: two variables have the same name, a name is ``time`` or has control characters, or the period is not
+            above 0.
     """
 
     name: str
@@ -76,7 +78,10 @@ class Block:
     acts_first: bool = False
 
     def __post_init__(self) -> None:
-        require_unique("variable", [one.name for one in self.variables])
+        names = [one.name for one in self.variables]
+        require_unique("variable", [TIME, *names])
+        odd = [name for name in names if not name.isprintable()]
+        require(not odd, f"expected names of variables without control characters, got {odd}")
         require(self.period > 0, f"expected a period above 0 s, got {self.period}")
 
     @property
@@ -107,11 +112,16 @@ class Block:
         yield "int block_start(double *values, double *memory);"
         yield "int block_step(double *values, const double *held, double *memory);"
         yield "#ifdef BLOCK_TABLES"
-        yield _array("char *const", "block_names", [json.dumps(one.name) for one in self.variables])
+        yield _array("char *const", "block_names", [_string(one.name) for one in self.variables])
         yield _array("double", "block_starts", [repr(float(one.start or 0.0)) for one in self.variables])
         yield _array("unsigned char", "block_kinds", [str(KINDS.index(one.kind)) for one in self.variables])
         yield _array("unsigned char", "block_settable", [str(one.settable) for one in self.variables])
         yield "#endif\n"
+
+
+def _string(text: str) -> str:
+    """A string of C, without the trigraphs of C99."""
+    return json.dumps(text).replace("??", '?""?')
 
 
 def _array(of: str, name: str, values: list[str]) -> str:

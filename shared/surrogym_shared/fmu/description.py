@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from surrogym_shared.fmu.block import Block, Variable
+from surrogym_shared.fmu.block import TIME, Block, Variable
 
 FMI = "3.0"
-TIME = 0  # value reference; that of variable i is i + 1
+REFERENCE = 0  # of the time; that of variable i is i + 1
 
 
 def model_description(block: Block) -> bytes:
@@ -42,12 +42,17 @@ def model_description(block: Block) -> bytes:
         experiment.set("stopTime", repr(block.stop))
     variables = SubElement(root, "ModelVariables")
     SubElement(
-        variables, "Float64", name="time", valueReference=str(TIME), causality="independent", variability="continuous"
+        variables,
+        "Float64",
+        name=TIME,
+        valueReference=str(REFERENCE),
+        causality="independent",
+        variability="continuous",
     )
-    for reference, one in enumerate(block.variables, TIME + 1):
+    for reference, one in enumerate(block.variables, REFERENCE + 1):
         _add(variables, one, reference)
     structure = SubElement(root, "ModelStructure")
-    outputs = [(ref, one) for ref, one in enumerate(block.variables, TIME + 1) if one.causality == "output"]
+    outputs = [(ref, one) for ref, one in enumerate(block.variables, REFERENCE + 1) if one.causality == "output"]
     for reference, _ in outputs:
         SubElement(structure, "Output", valueReference=str(reference))
     for reference, one in outputs:

@@ -68,16 +68,23 @@ def running(controller: Controller) -> Iterator[CompiledController]:
 
 
 def compiled(sources: list[Path], out: Path) -> Path:
-    """Compile C sources with the first compiler on the path.
+    """Compile C sources for this machine.
 
     Raises:
         NotDeployable: there is none, or it refuses the sources.
     """
-    compiler = next((found for name in COMPILERS if (found := shutil.which(name))), None)
-    if compiler is None:
-        raise NotDeployable(f"expected a C compiler ({', '.join(COMPILERS)}) on the path to check the controller")
+    compiler = c_compiler()
     command = [compiler, *FLAGS, *map(str, sources), "-lm", "-o", str(out)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode != 0:
-        raise NotDeployable(f"{compiler} refuses the controller: {result.stderr[-400:]}")
+        said = result.stderr[-400:] or f"exit status {result.returncode}"
+        raise NotDeployable(f"{compiler} refuses the controller: {said}")
     return out
+
+
+def c_compiler() -> str:
+    """Return the first C compiler on the path. Raises ``NotDeployable`` if there is none."""
+    compiler = next((found for name in COMPILERS if (found := shutil.which(name))), None)
+    if compiler is None:
+        raise NotDeployable(f"expected a C compiler ({', '.join(COMPILERS)}) on the path to check the controller")
+    return compiler

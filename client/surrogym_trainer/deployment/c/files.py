@@ -9,10 +9,8 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-import numpy as np
-
 from surrogym_trainer.deployment.c import source
-from surrogym_trainer.deployment.controller import Array, Controller
+from surrogym_trainer.deployment.controller import Array, Controller, NotDeployable
 from surrogym_trainer.deployment.vectors import Vector, vectors_of
 
 
@@ -99,14 +97,13 @@ def _header(controller: Controller) -> dict[str, Any]:
         for i, (low, high, n) in enumerate(zip(controller.low, controller.high, choices, strict=True))
     ]
     observed = [f"observation[{i}]  {o.name}{_in(o.unit)}" for i, o in enumerate(controller.observation)]
-    late = f"{controller.timeout:g} s" if np.isfinite(controller.timeout) else "any time (no timeout was given)"
     return {
         "digests": "\n".join(f" *   {value}  {name}" for name, value in sorted(controller.digests.items())),
         "measured": _comment(measured),
         "acted": _comment(acted),
         "observed": _comment(observed),
         "period": "sampling period" if controller.period is None else f"{controller.period:g} s",
-        "timeout": late,
+        "late": controller.late,
         "fallback": ", ".join(f"{a:g}" for a in controller.fallback),
         "numbers": source.stack_of(controller),
         "R": len(controller.measurements),
@@ -126,7 +123,9 @@ def _title(controller: Controller) -> str:
 
 
 def _milliseconds(controller: Controller) -> str:
-    return "10" if controller.period is None else f"{max(1, round(1000 * controller.period))}"
+    if controller.period is None:
+        raise NotDeployable("a sketch has a period: expected --period, or sampling_period in the specification")
+    return f"{max(1, round(1000 * controller.period))}"
 
 
 def _in(unit: str) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
 
-from surrogym_shared.fmu import Block, CannotCompile, Variable, write_fmu
+from surrogym_shared.fmu import TIME, Block, CannotCompile, Variable, write_fmu
 from surrogym_trainer.deployment.c.files import prefix_of, write_sources
 from surrogym_trainer.deployment.c.source import number
 from surrogym_trainer.deployment.controller import Controller, NotDeployable
@@ -26,14 +26,14 @@ def write(controller: Controller, folder: Path) -> None:
     """
     try:
         write_fmu(block_of(controller), folder / f"{prefix_of(controller)}_controller.fmu")
-    except CannotCompile as error:
+    except (CannotCompile, ValueError) as error:
         raise NotDeployable(str(error)) from error
 
 
 def block_of(controller: Controller) -> Block:
     """Return the block of a controller. Raises ``NotDeployable``."""
     if controller.period is None:
-        raise NotDeployable("an FMU has a period: expected sampling_period in the specification, got none (--spec)")
+        raise NotDeployable("an FMU has a period: expected --period, or sampling_period in the specification")
     prefix = prefix_of(controller)
     names = {"prefix": prefix, "PREFIX": prefix.upper(), "fallback": ", ".join(map(number, controller.fallback))}
     glue = Template(files(__package__).joinpath("block.c.txt").read_text(encoding="utf-8")).substitute(names)
@@ -59,7 +59,7 @@ def _sources(controller: Controller) -> dict[str, str]:
 
 def _variables(controller: Controller) -> Iterator[Variable]:
     """All variables, in the order of the values in ``block.c.txt``. A name that is taken is preceded by its kind."""
-    taken: set[str] = set()
+    taken = {TIME}
 
     def free(name: str, kind: str) -> str:
         chosen = f"{kind}.{name}" if name in taken else name

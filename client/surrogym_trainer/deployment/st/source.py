@@ -277,7 +277,6 @@ def _comments(controller: Controller) -> dict[str, str]:
         f"command[{i}]  from {low:.6g} to {high:.6g}{f', one of {n} values' if n else ''}"
         for i, (low, high, n) in enumerate(zip(controller.low, controller.high, choices, strict=True))
     ]
-    finite = math.isfinite(controller.timeout)
     return {
         "title": plain(f"Controller of {controller.name}"),
         "digests": "\n".join(f"     {value}  {name}" for name, value in sorted(controller.digests.items())),
@@ -285,7 +284,7 @@ def _comments(controller: Controller) -> dict[str, str]:
         "acted": "\n".join(f"     {line}" for line in acted),
         "observed": plain(", ".join(one.name for one in controller.observation)),
         "period": "sampling period" if controller.period is None else f"{controller.period:g} s",
-        "timeout": f"{controller.timeout:g} s" if finite else "any time (no timeout was given)",
+        "late": controller.late,
         "fallback": ", ".join(f"{action:g}" for action in controller.fallback),
     }
 
