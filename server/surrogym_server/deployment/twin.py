@@ -20,7 +20,7 @@ from surrogym_server.models.abilities import StepSource, WrittenInC, offers
 from surrogym_server.models.files import from_bytes
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual import reward_limits
-from surrogym_shared.fmu import TIME, Block, Causality, Variable, WrittenFmu, write_fmu
+from surrogym_shared.fmu import Block, Causality, Names, Variable, WrittenFmu, write_fmu
 from surrogym_shared.surrogate_file import SurrogateFile
 
 MOST_NUMBERS = 4_000_000  # constants in the source: a compiler needs about a minute and 1 GB for as many
@@ -93,12 +93,7 @@ def _source_of(model: DynamicsModel) -> StepSource:
 
 def _variables(definition: EnvironmentDefinition, units: Sequence[str]) -> Iterator[Variable]:
     """All variables, in the order of the values in ``twin.c``. A name that is taken is preceded by its kind."""
-    taken = {TIME}
-
-    def free(name: str, kind: str) -> str:
-        chosen = f"{kind}.{name}" if name in taken else name
-        taken.add(chosen)
-        return chosen
+    free = Names().free
 
     action, count = definition.action, definition.action.size
     for entry in range(count):

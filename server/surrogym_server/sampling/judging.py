@@ -142,7 +142,7 @@ def outcome_of(judged: Judged, state: DesignState, request: Request, now: tuple[
 
 
 def _asks_more(now: tuple[float, ...], before: tuple[float, ...]) -> bool:
-    """Whether another budget, another target or a smaller tolerance is asked for than at the design's end."""
+    """Whether budget or target have changed since the design ended, or a tolerance has become smaller."""
     smaller = any(new < old for new, old in zip(now[3:], before[3:], strict=True))
     return now[1:3] != before[1:3] or smaller
 

@@ -16,7 +16,7 @@ from surrogym_server.sampling.state import Request
 
 @dataclass(frozen=True)
 class Round:
-    """A fitted and judged model, and what is asked of the round. O outputs."""
+    """The model of a round, its judgement, and the request that the round answers. O outputs."""
 
     number: int
     model: DynamicsModel

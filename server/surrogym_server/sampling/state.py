@@ -1,4 +1,4 @@
-"""What a round of the design takes: the state that the round before passed on, and what is asked of this one."""
+"""Inputs of a round of the design: the state that the last round returned, and the request for this one."""
 
 from __future__ import annotations
 

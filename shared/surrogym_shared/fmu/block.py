@@ -119,6 +119,19 @@ class Block:
         yield "#endif\n"
 
 
+class Names:
+    """Names of an FMU's variables. One that is taken is preceded by its kind; ``time`` always is."""
+
+    def __init__(self) -> None:
+        self._taken = {TIME}
+
+    def free(self, name: str, kind: str) -> str:
+        """Return a name that no variable has yet, and take it."""
+        chosen = f"{kind}.{name}" if name in self._taken else name
+        self._taken.add(chosen)
+        return chosen
+
+
 def _string(text: str) -> str:
     """A string of C, without the trigraphs of C99."""
     return json.dumps(text).replace("??", '?""?')

@@ -155,7 +155,7 @@ class EnvironmentSpec(Frozen):
 
     @property
     def preset(self) -> Preset:
-        """The preset that chooses what is left open."""
+        """The preset, which has a value for each choice that the specification leaves out."""
         return PRESETS[self.design.preset]
 
     def known(self, coordinates: Sequence[float]) -> bool:

@@ -9,7 +9,7 @@ from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
 
-from surrogym_shared.fmu import TIME, Block, CannotCompile, Variable, write_fmu
+from surrogym_shared.fmu import Block, CannotCompile, Names, Variable, write_fmu
 from surrogym_trainer.deployment.c.files import prefix_of, write_sources
 from surrogym_trainer.deployment.c.source import number
 from surrogym_trainer.deployment.controller import Controller, NotDeployable
@@ -59,13 +59,7 @@ def _sources(controller: Controller) -> dict[str, str]:
 
 def _variables(controller: Controller) -> Iterator[Variable]:
     """All variables, in the order of the values in ``block.c.txt``. A name that is taken is preceded by its kind."""
-    taken = {TIME}
-
-    def free(name: str, kind: str) -> str:
-        chosen = f"{kind}.{name}" if name in taken else name
-        taken.add(chosen)
-        return chosen
-
+    free = Names().free
     for one in controller.measurements:
         about = f"measurement, from {one.lowest:.6g} to {one.highest:.6g}"
         start = min(max(0.0, one.lowest), one.highest)
