@@ -13,11 +13,11 @@ from tempfile import TemporaryDirectory
 
 from surrogym_sampler.original.executables.messages import numbers
 from surrogym_sampler.original.executables.program import Program
+from surrogym_shared.fmu import COMPILERS
 from surrogym_trainer.deployment.c.files import write
 from surrogym_trainer.deployment.controller import Array, Controller, NotDeployable
 from surrogym_trainer.deployment.running import Running
 
-COMPILERS = ("cc", "gcc", "clang")
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
 SECONDS = 10.0  # until the program answers
 
