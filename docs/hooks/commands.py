@@ -1,5 +1,5 @@
-"""Makes the page of all commands while the site is built, from the source of ``surrogym COMMAND --help``, and puts
-every decision into the navigation."""
+"""Makes the page of all commands while the site is built, from the source of ``surrogym COMMAND --help``, and names
+the paths of records, which are in the repository and not in the site."""
 
 from __future__ import annotations
 
@@ -12,19 +12,27 @@ import click
 import typer
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 from surrogym.cli import build
 
 PAGE = "reference/commands.md"
+LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)\s]+)\)")
 
 
-def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Adds the pages of decisions behind their index, the last entry of the last section."""
-    (section,) = config.nav[-1].values()
-    assert section[-1] == "decisions/README.md"
-    pages = sorted(Path(config.docs_dir, "decisions").glob("[0-9]*.md"))
-    section.extend(f"decisions/{path.name}" for path in pages)
-    return config
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, **_: Any) -> str:
+    """Replaces each link to a file outside the site, such as a record of the lab, by its text and path."""
+    folder = Path(config.docs_dir, page.file.src_uri).parent
+    return LINK.sub(lambda link: outside(link, folder, Path(config.docs_dir)), markdown)
+
+
+def outside(link: re.Match[str], folder: Path, docs: Path) -> str:
+    """The link as it is if its target is within the site, or else its text with the path in the repository."""
+    text, target = link.groups()
+    path = (folder / target.partition("#")[0]).resolve()
+    if "://" in target or path.is_relative_to(docs):
+        return link[0]
+    return f"{text} (`{path.relative_to(docs.parent)}`)"
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

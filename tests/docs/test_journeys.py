@@ -89,21 +89,6 @@ OTHERWISE = {
     "docs/how-to/ray.md": "tests/cli/test_sampling_on_ray.py reads such a runtime environment",
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
     "docs/how-to/work.md": "tests/work and tests/cli/test_jobs.py run its commands",
-    "docs/results/efficiency.md": "lab/tests runs its studies, in short",
-    "docs/results/fresh-seeds.md": "lab/tests runs its studies, in short",
-    "docs/results/fastppo.md": "lab/tests runs its studies, in short",
-    "docs/results/by-name.md": "lab/tests and tests/original run its commands, in short",
-    "docs/results/hidden.md": "lab/tests runs its study, in short; test_benchmarks imports its benchmarks",
-    "docs/results/larger.md": "lab/tests runs its study, in short; test_benchmarks imports its benchmarks",
-    "docs/results/peers.md": "lab/tests/test_peers_command.py and lab/tests/peers",
-    "docs/results/trust.md": "lab/tests runs its study, in short",
-    "docs/results/trust-third.md": "lab/tests runs its study, in short",
-    "docs/results/trust-fourth.md": "lab/tests runs its study, in short",
-    "docs/results/trust-fifth.md": "lab/tests runs its study, in short",
-    "docs/results/trust-sixth.md": "lab/tests runs its study, in short",
-    "docs/results/trust-again.md": "lab/tests runs its study, in short",
-    "docs/results/acquisition.md": "lab/tests runs its studies, in short",
-    "docs/results/paper.md": "lab/tests runs its studies, in short",
 }
 BLOCK = re.compile(r"^```(python|console)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 SAVED = re.compile(r"[Ss]ave (?:this|it) as `(\S+\.py)`")

@@ -14,7 +14,9 @@ import pytest
 from support.commands import command_line, options, parse
 
 ROOT = Path(__file__).parents[2]
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted(
+    [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "lab").rglob("*.md")]
+)
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 SHELLS = "console|bash|sh|shell"
 each_page = pytest.mark.parametrize("page", PAGES, ids=NAMES)

@@ -18,6 +18,7 @@ LOADED = re.compile(
     r"""<link\b(?=[^>]*rel="(?:stylesheet|preload|preconnect|icon)")[^>]*href="(?:https?:)?//[^"]*"|"""
     r"""url\(["']?(?:https?:)?//[^)]*\)"""
 )
+LINK = re.compile(r'href="([^"]*)"')
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +34,18 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_builds_with_every_page_in_its_navigation(site: Path) -> None:
     pages = {path.relative_to(ROOT / "docs").with_suffix(".html") for path in (ROOT / "docs").rglob("*.md")}
     built = {path.relative_to(site) for path in site.rglob("*.html")}
-    assert {Path("decisions/index.html") if page == Path("decisions/README.html") else page for page in pages} <= built
+    assert pages <= built
     home = (site / "index.html").read_text(encoding="utf-8")
-    assert [str(page) for page in pages if page.stem != "README" and f'href="{page}"' not in home] == []
+    assert [str(page) for page in pages if f'href="{page}"' not in home] == []
+
+
+def test_links_to_records_outside_the_site_are_paths_in_the_repository(site: Path) -> None:
+    architecture = (site / "architecture.html").read_text(encoding="utf-8")
+    assert "<code>lab/records/decisions/README.md</code>" in architecture
+    outside = {
+        str(page) for page in site.rglob("*.html") if "records/" in "".join(LINK.findall(page.read_text("utf-8")))
+    }
+    assert outside == set()
 
 
 def test_nothing_is_loaded_from_another_host(site: Path) -> None:

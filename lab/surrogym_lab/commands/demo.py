@@ -20,7 +20,9 @@ else:
     Task, ArmName = Literal[tuple(EVERY_TASK)], Literal[tuple(ARMS)]
 
 
-Arm = Annotated[ArmName, typer.Option(help="Method to choose real steps by; docs/results/efficiency.md explains each.")]
+Arm = Annotated[
+    ArmName, typer.Option(help="Method to choose real steps by; lab/records/results/efficiency.md explains each.")
+]
 Algorithm = Annotated[
     str | None,
     typer.Option(

@@ -60,8 +60,8 @@ def command(
     The folder --out gets rows.csv, efficiency.md and a picture of each task. A run that has a row in rows.csv is not
     repeated, so the same command continues after Ctrl-C. An arm is a way to choose real steps: default, no_symmetry,
     declared_starts, no_loop, variance, latin_hypercube, paper, paper_hypercube or oracle;
-    docs/results/efficiency.md explains each. --arms study runs default on every task, latin_hypercube and paper on
-    four of them, and the other arms on the same four with half of the seeds.
+    lab/records/results/efficiency.md explains each. --arms study runs default on every task, latin_hypercube and paper
+    on four of them, and the other arms on the same four with half of the seeds.
 
     Example: python -m surrogym_lab efficiency --seeds 10 --jobs 2 --out runs/efficiency
 

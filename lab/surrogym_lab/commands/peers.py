@@ -54,15 +54,15 @@ def command(
     """Run other methods on our tasks, and draw learning curves.
 
     The folder --out gets points.csv, peers.md and a picture of each task. A finished run is not repeated, so the same
-    command continues after Ctrl-C. Runs with other settings need another --out. docs/results/peers.md has the rules.
-    The methods default and latin_hypercube are ours; their runs come from files of rows, which surrogym
-    reproduce efficiency writes.
+    command continues after Ctrl-C. Runs with other settings need another --out. lab/records/results/peers.md has the
+    rules. The methods default and latin_hypercube are ours; their runs come from files of rows, which python -m
+    surrogym_lab efficiency writes.
 
     Example: python -m surrogym_lab peers --tasks pendulum --methods sac,ppo --seeds 3
 
     Example: python -m surrogym_lab peers --seeds 5 --on-ray auto --jobs 64
 
-    Example: python -m surrogym_lab peers --rows docs/results/efficiency.csv --out runs/peers --only-table
+    Example: python -m surrogym_lab peers --rows lab/records/results/efficiency.csv --out runs/peers --only-table
     """
     from surrogym.cli.errors import CommandError
     from surrogym_lab.peers.study import PeerCell

@@ -38,7 +38,7 @@ class OffPolicySearch(StableBaselinesSearch):
 
 
 class PPO(OnPolicySearch):
-    """PPO with large batches and a decreasing learning rate: docs/decisions/0011."""
+    """PPO with large batches and a decreasing learning rate: lab/records/decisions/0011."""
 
     algorithm = stable_baselines3.PPO
 
