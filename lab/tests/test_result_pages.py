@@ -9,22 +9,23 @@ from surrogym_lab.reproduce.promises import promise_tables
 from surrogym_lab.reproduce.rows import merge, read_rows
 from surrogym_lab.reproduce.table import contrasts, grouped, summary, tasks_with_results
 
-RESULTS = Path(__file__).parents[1] / "records" / "results"
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "lab" / "records" / "results"
 ROWS = read_rows(RESULTS / "efficiency.csv")
 
 
 @pytest.mark.parametrize(
     ("page", "name", "rows", "out"),
     [
-        ("README.md", "headline", "efficiency-audited", "runs/table"),
-        ("efficiency.md", "efficiency", "efficiency", "lab/records/results"),
+        ("docs/evidence.md", "headline", "efficiency-audited", "runs/table"),
+        ("lab/records/results/README.md", "headline", "efficiency-audited", "runs/table"),
+        ("lab/records/results/efficiency.md", "efficiency", "efficiency", "lab/records/results"),
     ],
 )
 def test_the_tables_are_those_of_the_rows(page, name, rows, out):
     made = section(name, read_rows(RESULTS / f"{rows}.csv"), ".")
-    records = "lab/records/results"
-    again = f"python -m surrogym_lab table --rows {records}/{rows}.csv --out {out} --page {records}/{page}"
-    assert present_sections(RESULTS / page) == {name: made}, again
+    again = f"python -m surrogym_lab table --rows lab/records/results/{rows}.csv --out {out} --page {page}"
+    assert present_sections(ROOT / page) == {name: made}, again
 
 
 @pytest.mark.parametrize(

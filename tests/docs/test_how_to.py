@@ -33,15 +33,15 @@ def run(folder: Path, *arguments: str) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize(("page", "number"), [("remote-gymnasium.md", 0), ("remote-gymnasium.md", 1)])
-def test_a_surrogate_is_stepped(server: ServerProcess, tmp_path: Path, page: str, number: int) -> None:
-    run(tmp_path, "-c", programs(page)[number].replace(PRINTED_URL, server.url))
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_surrogate_is_stepped(server: ServerProcess, tmp_path: Path, number: int) -> None:
+    run(tmp_path, "-c", programs("trainers.md")[number].replace(PRINTED_URL, server.url))
 
 
 def test_a_policy_of_another_algorithm_is_trained_and_its_states_are_known(
     server: ServerProcess, tmp_path: Path
 ) -> None:
-    (program,) = programs("stable-baselines3.md")
+    program = programs("trainers.md")[2]
     run(tmp_path, "-c", program.replace(PRINTED_URL, server.url).replace("10_000", "500"))
     assert (tmp_path / "mine.zip").exists()
     improve = ["improve", "pendulum", "--queries", "1", "--checkpoint", "after-10k-steps", "--json"]
@@ -58,7 +58,7 @@ def test_a_surrogate_leaves_as_a_file_and_is_stepped_without_a_server(server: Se
 
 
 def test_an_episode_is_filmed(server: ServerProcess, tmp_path: Path) -> None:
-    film, own = programs("pictures.md")
+    film, own = programs("policies.md")[-2:]
     run(tmp_path, "-c", film.replace(PRINTED_URL, server.url))
     assert [video.stat().st_size > 0 for video in (tmp_path / "videos").glob("*.mp4")] == [True]
     run(tmp_path, "-c", f"{own}\nassert Cart().picture([0.5])[30, 140].tolist() == [200, 60, 20]")

@@ -32,14 +32,9 @@ ALL_PAGES = [
     "docs/how-to/no-teleport.md",
     "docs/how-to/own-environment.md",
     "docs/how-to/page.md",
-    "docs/how-to/paper-method.md",
-    "docs/how-to/pictures.md",
     "docs/how-to/policy-search.md",
-    "docs/how-to/remote-gymnasium.md",
     "docs/how-to/rewards-and-terminations.md",
-    "docs/how-to/stable-baselines3.md",
     "docs/how-to/terminal.md",
-    "docs/how-to/tracking.md",
     "docs/how-to/trainers.md",
     "docs/how-to/variants.md",
 ]
@@ -60,6 +55,8 @@ ELSEWHERE = {
     "tensorboard": "a page that stays open",
     "surrogym serve": "a server of this test runs already",
     "surrogym demo": "tests/demo",
+    "surrogym work": "tests/work",
+    "surrogym jobs": "tests/cli/test_jobs.py",
     "python -m surrogym_lab": "lab/tests/test_commands.py",
 }
 ELSEWHERE_WITH = {  # a word anywhere in the line
@@ -70,7 +67,9 @@ ELSEWHERE_WITH = {  # a word anywhere in the line
     "mlflow": "tests/examples/test_trackers.py",
 }
 OTHERWISE = {
-    "docs/how-to/policies.md": "tests/cli/test_commands.py, as it needs three versions and an alias",
+    "docs/how-to/policies.md": "tests/cli/test_commands.py, as it needs three versions; test_how_to.py films",
+    "docs/how-to/backup.md": "tests/server starts on databases and copies of them",
+    "docs/evidence.md": "lab/tests runs its studies, in short",
     "docs/http-api.md": "test_http_api.py sends its requests without curl",
     "docs/how-to/containers.md": "tests/docker reads it; no container engine is needed",
     "docs/how-to/operate.md": "tests/server and tests/security start servers with these settings",
@@ -84,11 +83,8 @@ OTHERWISE = {
     "docs/how-to/plc.md": "tests/deployment writes a function block and runs it",
     "docs/how-to/history.md": "tests/docs/test_how_to.py runs its programs",
     "docs/how-to/snapshots.md": "tests/docs/test_how_to.py runs its program",
-    "docs/how-to/models.md": "test_benchmarks imports its benchmark",
     "docs/how-to/rounds.md": "tests/cli/test_commands.py, as its rounds take an hour",
-    "docs/how-to/ray.md": "tests/cli/test_sampling_on_ray.py reads such a runtime environment",
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
-    "docs/how-to/work.md": "tests/work and tests/cli/test_jobs.py run its commands",
 }
 BLOCK = re.compile(r"^```(python|console)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 SAVED = re.compile(r"[Ss]ave (?:this|it) as `(\S+\.py)`")

@@ -7,7 +7,7 @@ from surrogym_lab.commands import build
 from surrogym_lab.reproduce.page import present_sections, section
 from surrogym_lab.reproduce.rows import read_rows
 
-RESULTS = Path(__file__).parents[2] / "lab" / "records" / "results"
+ROOT = Path(__file__).parents[2]
 
 
 def test_its_commands_are_there():
@@ -15,5 +15,5 @@ def test_its_commands_are_there():
 
 
 def test_the_page_of_results_shows_its_rows():
-    rows = read_rows(RESULTS / "efficiency-audited.csv")
-    assert present_sections(RESULTS / "README.md") == {"headline": section("headline", rows, ".")}
+    rows = read_rows(ROOT / "lab" / "records" / "results" / "efficiency-audited.csv")
+    assert present_sections(ROOT / "docs" / "evidence.md") == {"headline": section("headline", rows, ".")}

@@ -10,7 +10,7 @@ from typing import Any
 from surrogym_server.cli.serve import serve
 from surrogym_server.settings import PREFIX, Settings
 
-PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "operate.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "server.md"
 DOCS = PAGE.parents[1]
 ROW = re.compile(r"^\| `(SURROGYM_\w+)` \| (none|`--[\w-]+`) \| (\S+) \| .+ \|$", re.MULTILINE)
 NOT_SETTINGS = {  # read by a client, by the compose file, or elsewhere in the server
