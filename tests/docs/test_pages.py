@@ -108,4 +108,4 @@ def test_rows_of_a_table_have_the_cells_of_its_header(page: Path) -> None:
 
 
 def test_there_are_pages() -> None:
-    assert {"README.md", "docs/architecture.md", "docs/http-api.md", "docs/notation.md"} <= set(NAMES)
+    assert {"README.md", "docs/architecture.md", "docs/http-api.md", "docs/glossary.md"} <= set(NAMES)

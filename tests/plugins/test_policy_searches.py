@@ -164,7 +164,10 @@ def test_a_strangers_search_solves_pendulum_over_http(server: ServerProcess, sit
 
 def test_the_page_shows_the_example():
     """Every line of the page's module stands in the package's."""
-    shown = PAGE.read_text().partition("## A policy search")[2].partition("```python\n")[2].partition("```")[0]
+    shown = (
+        PAGE.read_text().partition("## Write your own policy search")[2].partition("```python\n")[2].partition("```")[0]
+    )
     module = (EXAMPLE / "cross_entropy.py").read_text()
+    assert "class CrossEntropy(PolicySearch)" in shown
     assert [line for line in shown.splitlines() if line not in module.splitlines()] == []
     assert 'cross_entropy = "cross_entropy:CrossEntropy"' in (EXAMPLE / "pyproject.toml").read_text()

@@ -1,4 +1,4 @@
-"""Gaussian processes, exact, float64: one output, well done. Notation: docs/notation.md.
+"""Gaussian processes, exact, float64: one output, well done. Notation: docs/glossary.md.
 
 ========  ======================  =========================================================
 paper     code                    meaning
