@@ -21,11 +21,12 @@ if "DISPLAY" not in os.environ:
 import hypothesis
 import pytest
 import torch
-import typer
+import typer.main
+import typer.testing
 
 import surrogym.cli
 from support.long import TESTS, Long
-from support.nursery import contexts_of_forks
+from support.nursery import CONTEXTS, contexts_of_forks
 from support.server import ServerProcess, running_server
 from support.teaching import teach
 from surrogym_client.transport import Api
@@ -43,6 +44,10 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("surrogym")
 
 
+# Hundreds of tests run a command, and to assemble all of them takes a tenth of a second each time.
+surrogym.cli.build = cache(surrogym.cli.build)
+typer.main.get_command = typer.testing._get_command = cache(typer.main.get_command)
+
 # Thousands of databases flush each commit, which costs nothing in memory.
 MEMORY, ROOM = Path("/dev/shm"), 4 * 2**30  # bytes that must be free in it
 if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > ROOM:
@@ -55,6 +60,7 @@ for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHU
         signal.signal(number, usual)
 
 COMPILING = pytest.StashKey[subprocess.Popen[bytes]]()
+WHOLE = pytest.StashKey[bool]()  # whether this run is one of all tests
 LASTING = ("slow", "e2e", "timeout")  # marks; a limit of its own is one of more time
 
 
@@ -67,11 +73,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item, node in nodes.items():
         if long.lines_of(node):
             item.add_marker(pytest.mark.long)
-    whole = [Path(argument).resolve() for argument in config.args] == [TESTS]
-    if whole and (unknown := long.unknown(nodes.values())):
+    if config.stash[WHOLE] and (unknown := long.unknown(nodes.values())):
         raise pytest.UsageError(f"tests/long.toml: expected tests, got lines that name none: {unknown}")
     lasting = {item.path for item in items if any(item.get_closest_marker(mark) for mark in LASTING)}
-    items.sort(key=lambda item: item.path not in lasting)
+    items.sort(key=lambda item: (item.path not in lasting, item.path))
 
 
 @pytest.hookimpl(wrapper=True)
@@ -88,8 +93,14 @@ def pytest_collection() -> Iterator[None]:
 def pytest_configure(config: pytest.Config) -> None:
     """Compile steps once, before the first test: a dozen servers that do so at once outlast what tests wait for.
 
-    Workers collect their tests meanwhile. What another checkout has compiled is of no use to this one.
+    Workers collect their tests meanwhile, each from another file on: whichever comes to a file first compiles it for
+    all. What another checkout has compiled is of no use to this one.
     """
+    config.stash[WHOLE] = [Path(argument).resolve() for argument in config.args] == [TESTS]
+    if config.stash[WHOLE] and (worker := getattr(config, "workerinput", None)):
+        files = sorted(str(path) for path in TESTS.rglob("test_*.py"))
+        first = len(files) * int(worker["workerid"].removeprefix("gw")) // worker["workercount"]
+        config.args = files[first:] + files[:first]
     if getattr(config.option, "numprocesses", None):
         config.stash[COMPILING] = subprocess.Popen([sys.executable, "-c", PROGRAM])
     elif not hasattr(config, "workerinput"):
@@ -110,18 +121,17 @@ def _one_thread() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _one_command_line() -> Iterator[None]:
-    """Hundreds of tests run a command, and to assemble all of them takes a tenth of a second each time."""
+def _forks() -> Iterator[None]:
+    """Let processes of fits, of environments and of samplers be forks of one that has imported what they need."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(surrogym.cli, "build", cache(surrogym.cli.build))
-        patch.setattr(typer.main, "get_command", cache(typer.main.get_command))
+        patch.setattr(context, "_concrete_contexts", contexts_of_forks())
         yield
 
 
 @pytest.fixture
-def forked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let processes of fits, of environments and of samplers be forks of one that has imported what they need."""
-    monkeypatch.setattr(context, "_concrete_contexts", contexts_of_forks())
+def cold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let processes import what they need, as those of a user do."""
+    monkeypatch.setattr(context, "_concrete_contexts", CONTEXTS)
 
 
 @pytest.fixture(params=["cpu", "cuda"])

@@ -15,8 +15,6 @@ from support.noting import NotingSamplers, Tally, create, finished, noting_sampl
 from support.server import running_server
 from surrogym_client.transport import Api
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 KILLS = times(short=3, full=50)
 SAMPLERS, BUDGET, KILLS_A_RUN = 3, times(short=9, full=16), 10
 LEASE_SECONDS = 2.0

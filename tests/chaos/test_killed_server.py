@@ -14,8 +14,6 @@ from support.noting import Tally, create, finished, noting_samplers, until
 from support.server import RestartingServer
 from surrogym_client.transport import Api
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 SAMPLERS, BUDGET, KILLS_A_RUN = 3, times(short=9, full=18), 10
 LONGEST_LIFE = 2.0
 LEASE_SECONDS = 4.0  # a restart takes as long, so that some leases end meanwhile

@@ -22,7 +22,7 @@ BUDGET, RACE_BUDGET = times(short=8, full=24), times(short=12, full=24)  # real 
 LATEST = 6 * STEP_SECONDS  # from the first step of a sampler to its kill
 FEW = 5  # snapshots in the folder of two samplers
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("forked")]
+pytestmark = pytest.mark.slow
 
 
 @pytest.mark.timeout(3_600)

@@ -9,7 +9,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from surrogym.cli import COMMANDS, build
+from support.commands import command_line
+from surrogym.cli import COMMANDS
 from surrogym.cli.groups import add
 from surrogym.cli.train_options import SessionOptions
 from surrogym_shared.wire import OpenSession
@@ -48,7 +49,7 @@ def test_a_field_without_a_default_is_required_and_bounds_are_kept():
 
 @pytest.mark.parametrize("name", sorted(set(COMMANDS) - WITHOUT_A_SERVER))
 def test_every_command_that_asks_a_server_takes_it_in_the_same_way(name: str):
-    command = typer.main.get_command(build()).commands[name]
+    command = command_line().commands[name]
     found = {parameter.name: parameter for parameter in command.params}
     assert found.keys() >= SHARED
     assert found["server"].envvar == "SURROGYM_URL"

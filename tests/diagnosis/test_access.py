@@ -21,8 +21,6 @@ from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.original.simulator import Simulated
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 CLI = Path(surrogym.cli.__file__).parent
 PAGES = Path(__file__).parents[2] / "docs" / "how-to"
 RANGE = Uniform(low=-1, high=1)

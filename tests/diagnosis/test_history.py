@@ -15,8 +15,6 @@ from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.original.rollouts import answering
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform, with_history
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 CIRCLE = Uniform(low=-math.pi, high=math.pi)
 STEPS = 60
 SPEC = EnvironmentSpec(

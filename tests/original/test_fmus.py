@@ -40,8 +40,6 @@ from surrogym_shared.spec import (
     Uniform,
 )
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 pytest.importorskip("fmpy")
 pytest.importorskip("pythonfmu")
 

@@ -15,8 +15,6 @@ from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.original.protocol import OriginalEnvironment, RolloutEnvironment
 from surrogym_sampler.original.rollouts import FromReset, answering
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 RIGHT, LEFT = np.array([1.0]), np.array([-1.0])
 
 

@@ -11,8 +11,6 @@ from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_sampler.queries import failures as limits
 from surrogym_sampler.queries.failures import FIRST_FEW, LONGEST_DELAY, MANY, Failures
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 UNTIL_DONE = SamplerSettings(name="worker", until_done=True, time_limit=60.0)
 
 

@@ -21,8 +21,6 @@ from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_sampler.queries.sample_conversion import reset_seed
 from surrogym_shared.wire import NewSample
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 RIGHT, LEFT = [1.0], [-1.0]
 ONE = SamplerSettings(name="worker", batch=1, once=True, wait_seconds=5.0)
 KILLED = """

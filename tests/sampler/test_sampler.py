@@ -17,8 +17,6 @@ from surrogym_sampler.queries import Sampler, SamplerReport, SamplerSettings
 from surrogym_shared.codes import Code, Problem
 from surrogym_shared.spec import BoxAction
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 ONE_ROUND = SamplerSettings(name="worker", max_queries=6, wait_seconds=5.0, time_limit=60.0)
 
 

@@ -24,8 +24,6 @@ from surrogym_sampler.queries.returning import Returning
 from surrogym_sampler.queries.snapshots import Bounds, SnapshotFolder, least_useful
 from surrogym_shared.spec import Design
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 SAVED = SPEC.model_copy(update={"snapshots": True, "design": Design(initial=6, budget=16, target=0.9999)})
 
 

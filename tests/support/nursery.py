@@ -21,7 +21,6 @@ import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
-from importlib import import_module
 from multiprocessing import context, forkserver
 from pathlib import Path
 from typing import IO, Any
@@ -50,7 +49,8 @@ SAMPLING = (
 READ_EARLY = ("CUDA_", "HOME", "LD_", "MKL_", "NUMBA_", "OMP_", "OPENBLAS_", "PYTHON", "SURROGYM_COMPILED", "XDG_")
 LONGEST = 1 << 18  # bytes of a request
 
-_forkserver: Any = forkserver._forkserver  # type: ignore[attr-defined]
+forkserver.set_forkserver_preload([*MODULES, *SAMPLING])
+CONTEXTS: dict[str, Any] = context._concrete_contexts  # type: ignore[attr-defined]
 
 
 class Forked:
@@ -88,17 +88,16 @@ class Forked:
 
 
 class Nursery:
-    """A process that forks servers. It ends with this process, and its children with it."""
+    """A process that forks servers. It is a fork itself, of the process that forks fits. It ends with this process,
+    and its children with it."""
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
         self._asked, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._asked.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, LONGEST)
-        contexts_of_forks()
-        address, alive = _forkserver._forkserver_address, _forkserver._forkserver_alive_fd
-        command = [sys.executable, "-P", __file__, str(theirs.fileno()), address, str(alive)]
         with theirs:
-            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno(), alive], stdin=subprocess.DEVNULL)
+            self._process = CONTEXTS["forkserver"].Process(target=main, args=(theirs, _search_path()))
+            self._process.start()
         atexit.register(self._end)
 
     def start(self, arguments: Sequence[str], log: IO[bytes], environment: Mapping[str, str], folder: Path) -> Forked:
@@ -119,12 +118,26 @@ class Nursery:
 
     def _end(self) -> None:
         self._asked.close()
-        self._process.wait()
+        self._process.join()
+
+
+def _search_path() -> list[str]:
+    """Where a program finds modules that runs outside of any folder."""
+    listed = subprocess.run(
+        [sys.executable, "-P", "-c", "import sys; print(*sys.path, sep='\\n')"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return listed.stdout.splitlines()
 
 
 def reads_early(environment: Mapping[str, str]) -> bool:
-    """Whether imported modules have read one of these variables, so that they have to be imported anew."""
-    return any(name.startswith(READ_EARLY) for name in environment)
+    """Whether imported modules have read one of these variables, so that they have to be imported anew.
+
+    Folders of ``PYTHONPATH`` hold packages that a server looks for later.
+    """
+    return any(name.startswith(READ_EARLY) for name in environment if name != "PYTHONPATH")
 
 
 @cache
@@ -133,19 +146,16 @@ def nursery() -> Nursery | None:
     return Nursery() if sys.platform == "linux" else None
 
 
-def main(asked: socket.socket, address: str, alive: int) -> None:
+def main(asked: socket.socket, path: list[str]) -> None:
     """Fork a child for each request, until the socket closes.
 
     Args:
         asked: its other end sends the requests.
-        address: of the process that forks processes of fits.
-        alive: descriptor that this process has open for as long as it is needed.
+        path: where servers look for modules; not where tests do.
     """
-    for name in MODULES:
-        import_module(name)
-    _forkserver._forkserver_address, _forkserver._forkserver_alive_fd = address, alive
-    _forkserver.ensure_running = lambda: None  # it is no child of this process, which therefore can't ask for its state
-    context._concrete_contexts = _forking()  # type: ignore[attr-defined]
+    sys.path[:] = path
+    forkserver._forkserver.ensure_running = lambda: None  # type: ignore[attr-defined]  # the one this is a fork of
+    context._concrete_contexts = CONTEXTS | {"spawn": CONTEXTS["forkserver"]}  # type: ignore[attr-defined]
     gc.freeze()
     children: dict[int, tuple[int, int]] = {}  # by a descriptor that is readable at its end: its process, its status
     with selectors.DefaultSelector() as waiting:
@@ -173,17 +183,27 @@ def main(asked: socket.socket, address: str, alive: int) -> None:
                 asked.send(str(pid).encode())
 
 
+class _Fork(context.ForkServerProcess):
+    """A process with the variables of the environment that its parent has, not those of what it is a fork of."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._environment = dict(os.environ)
+
+    def run(self) -> None:
+        os.environ.clear()
+        os.environ.update(self._environment)
+        super().run()
+
+
+class _Forks(context.ForkServerContext):
+    Process = _Fork  # type: ignore[assignment]
+
+
 def contexts_of_forks() -> dict[str, Any]:
     """The ways of ``multiprocessing`` to start a process; "spawn" forks one that has imported what fits, environments
-    and samplers need. Variables of the environment are those of the first call."""
-    forkserver.set_forkserver_preload([*MODULES, *SAMPLING])
-    forkserver.ensure_running()
-    return _forking()
-
-
-def _forking() -> dict[str, Any]:
-    contexts: dict[str, Any] = context._concrete_contexts  # type: ignore[attr-defined]
-    return contexts | {"spawn": contexts["forkserver"]}
+    and samplers need. That one starts with the first of its forks."""
+    return {**CONTEXTS, "spawn": _Forks()} if sys.platform == "linux" else CONTEXTS
 
 
 def _tell(end: int, pid: int, status: int) -> None:
@@ -203,11 +223,6 @@ def _run(log: int, arguments: list[str], environment: dict[str, str], folder: st
     for stream in (1, 2):
         os.dup2(log, stream)
     os.close(log)
-    sys.path.insert(0, folder)
+    sys.path[:0] = [folder, *filter(None, environment.get("PYTHONPATH", "").split(os.pathsep))]
     sys.argv = ["surrogym_server", *arguments]
     runpy.run_module("surrogym_server", run_name="__main__", alter_sys=True)
-
-
-if __name__ == "__main__":
-    with socket.socket(fileno=int(sys.argv[1])) as opened:
-        main(opened, sys.argv[2], int(sys.argv[3]))

@@ -12,7 +12,6 @@ from surrogym_server.engine.fits import Fits
 from surrogym_server.testing import LAWS_OF_COMPUTE, ComputeCase
 
 
-@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("law", LAWS_OF_COMPUTE, ids=lambda law: law.__name__)
 def test_processes_of_this_machine_keep_the_laws(law, job: DesignJob, tmp_path: Path):
     asyncio.run(law(ComputeCase(Fits, job, tmp_path)))

@@ -27,7 +27,7 @@ class Job:
 
 
 @pytest.fixture
-def started_cold() -> Iterator[Started]:
+def started() -> Iterator[Started]:
     made: list[Fits] = []
 
     def start(function: Callable[[DesignJob], DesignResult]) -> Fits:
@@ -39,18 +39,13 @@ def started_cold() -> Iterator[Started]:
         fits.close()
 
 
-@pytest.fixture
-def started(forked: None, started_cold: Started) -> Started:
-    """Their processes are forks of one that has imported what they need."""
-    return started_cold
-
-
 def run(fits: Fits, **state: Any) -> DesignResult:
     return asyncio.run(fits.run(cast(DesignJob, Job(**state))))
 
 
-def test_a_job_is_done_in_another_process(started_cold: Started):
-    fits = started_cold(jobs.answer)
+@pytest.mark.usefixtures("cold")
+def test_a_job_is_done_in_another_process(started: Started):
+    fits = started(jobs.answer)
     assert run(fits).data_hash not in ("", str(os.getpid()))
     assert run(fits).data_hash == run(fits).data_hash, "one process does them all"
 
@@ -133,12 +128,13 @@ def test_closing_ends_the_process_in_the_middle_of_a_fit(started: Started, tmp_p
         time.sleep(0.01)
 
 
-def test_closing_does_not_wait_for_a_process_that_is_still_starting(started_cold: Started):
+@pytest.mark.usefixtures("cold")
+def test_closing_does_not_wait_for_a_process_that_is_still_starting(started: Started):
     """It imports for seconds where others keep the machine busy, and a stop of the server would wait for it."""
     beginning = time.monotonic()
-    run(started_cold(jobs.answer))
+    run(started(jobs.answer))
     whole_start = time.monotonic() - beginning
-    fits = started_cold(jobs.answer)
+    fits = started(jobs.answer)
     fits.start()
     closing = time.monotonic()
     fits.close()
