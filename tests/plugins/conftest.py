@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from support.searched import with_path
+from support.searched import with_path, write_package
 from support.server import ServerProcess, running_server
 
 ROOT = Path(__file__).parents[2]
@@ -18,11 +16,10 @@ EXAMPLES = sorted((ROOT / "examples" / "plugins").iterdir())
 
 @pytest.fixture(scope="session")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the example packages, installed as pip does it, and packages that are broken."""
+    """A folder with the example packages, and packages that are broken."""
     folder = tmp_path_factory.mktemp("site")
-    options = ["--quiet", "--no-deps", "--no-build-isolation", "--disable-pip-version-check", "--target", str(folder)]
-    packages = [str(example) for example in EXAMPLES]
-    subprocess.run([sys.executable, "-m", "pip", "install", *options, *packages], check=True, capture_output=True)
+    for example in EXAMPLES:
+        write_package(example, folder)
     for kind in ("acquisition", "model"):
         broken = folder / f"broken_{kind}-1.0.dist-info"
         broken.mkdir()

@@ -12,6 +12,8 @@ import httpx
 import pytest
 
 from support.server import ServerProcess
+from support.teaching import teach
+from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import pendulum
 from surrogym_server.models.registry import MODELS
 from surrogym_server.testing import LAWS_OF_MODELS, ModelCase, model_cases
@@ -22,9 +24,9 @@ EXAMPLE = ROOT / "examples" / "plugins" / "model"
 CASES = ("learned reward", "learned end", "discrete actions")
 
 
-def designed(model: str | ModelChoice, budget: int = 16) -> EnvironmentSpec:
-    changes = {"model": model, "budget": budget, "initial": 12}
-    return pendulum().model_copy(update={"design": pendulum().design.model_copy(update=changes)})
+def designed(model: str | ModelChoice) -> EnvironmentSpec:
+    design = pendulum().design.model_copy(update={"model": model})
+    return pendulum().model_copy(update={"design": design})
 
 
 def surrogym(server: ServerProcess, folder: Path, *words: str) -> str:
@@ -37,12 +39,10 @@ def surrogym(server: ServerProcess, folder: Path, *words: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def taught(plugin_server: ServerProcess, tmp_path_factory: pytest.TempPathFactory) -> str:
+def taught(plugin_server: ServerProcess) -> str:
     """Name of a Pendulum that the installed family has learned."""
-    folder = tmp_path_factory.mktemp("taught")
-    (folder / "spec.json").write_text(designed("bayesian_linear").model_dump_json())
-    surrogym(plugin_server, folder, "register", "--spec", "spec.json", "--name", "linear")
-    surrogym(plugin_server, folder, "sample", "linear", "--env", "Pendulum-v1", "--until-done", "--quiet")
+    with Api(plugin_server.url) as api:
+        teach(api, "linear", designed("bayesian_linear"), queries=16, initial=12)
     return "linear"
 
 

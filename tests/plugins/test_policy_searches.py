@@ -12,6 +12,7 @@ import pytest
 
 from support.models import learn
 from support.real_steps import random_steps
+from support.searched import write_package
 from support.server import ServerProcess, running_server
 from surrogym_sampler.diagnosis.doctor import installation
 from surrogym_sampler.original.classic import pendulum
@@ -38,10 +39,9 @@ SEARCHED = {  # small enough to take a second each
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the example package, installed as pip does it, and packages that are broken."""
+    """A folder with the example package, and packages that are broken."""
     folder = tmp_path_factory.mktemp("site")
-    options = ["--quiet", "--no-deps", "--no-build-isolation", "--disable-pip-version-check", "--target", str(folder)]
-    subprocess.run([sys.executable, "-m", "pip", "install", *options, str(EXAMPLE)], check=True, capture_output=True)
+    write_package(EXAMPLE, folder)
     broken(folder, "missing_module", "nowhere_to_be_found:Missing")
     broken(folder, "no_search", "json:JSONDecoder")
     broken(folder, "ppo", "json:JSONDecoder")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,8 +26,9 @@ def define(spec: dict) -> EnvironmentDefinition:
 
 
 @pytest.fixture
-def storage(tmp_path: Path) -> Iterator[Storage]:
+def storage(tmp_path: Path, prepared_file: Path) -> Iterator[Storage]:
     """With one surrogate whose initial queries are open."""
+    shutil.copy(prepared_file, tmp_path / "surrogym.db")
     opened = open_storage(f"sqlite:///{tmp_path / 'surrogym.db'}")
     spec = pendulum.spec()
     state, q, u, _ = initial_queries(define(spec), pendulum.BUDGET)
