@@ -21,7 +21,7 @@ from surrogym_trainer.deployment.targets import deploy
 from surrogym_trainer.deployment.vectors import sensors_of
 
 PAST = {"changes": 2, "actions": 1, "largest": {"angle": 0.5, "slide": 0.2}, "at_start": {"angle": 0.3}}
-STEPS, RESTARTS = 200, (0, 60)
+STEPS, RESTARTS = 80, (0, 60)
 
 
 def decided(controller: Controller, real: str) -> list[float]:

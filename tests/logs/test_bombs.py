@@ -23,27 +23,26 @@ def refused(path: Path, says: str) -> None:
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 * 1024, "KiB"
 
 
-def zeros(file: zipfile.ZipFile, name: str, rows: int) -> None:
-    """An array of zeros, written in pieces."""
+def zeros(file: zipfile.ZipFile, name: str, rows: int, written: int | None = None) -> None:
+    """An array of zeros, as its header says; fewer may be written."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": (rows,)})
     with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
         entry.write(header.getvalue())
-        for _ in range(rows // MIB):
-            entry.write(bytes(MIB))
-        entry.write(bytes(rows % MIB))
+        entry.write(bytes(rows if written is None else written))
 
 
 def test_rows_of_an_npz_are_counted_in_its_headers(tmp_path: Path):
     with zipfile.ZipFile(tmp_path / "log.npz", "w", zipfile.ZIP_DEFLATED) as file:
         for name in ("x", "action"):
-            zeros(file, name, 60 * MIB)
+            zeros(file, name, 60 * MIB, written=1)
     refused(tmp_path / "log.npz", "expected at most 2,000,000 rows in .*, got 62,914,560")
 
 
 def test_bytes_of_an_npz_are_counted_in_its_directory(tmp_path: Path):
     with zipfile.ZipFile(tmp_path / "log.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
-        zeros(file, "x", 1025 * MIB)
+        zeros(file, "x", MIB)
+        file.getinfo("x.npy").file_size = 1025 * MIB + 128  # of the directory, which is written last
     refused(tmp_path / "log.npz", "expected at most 1073741824 bytes inside, got 1074790")
 
 
@@ -71,7 +70,8 @@ def test_cells_of_lists_in_parquet_are_counted(tmp_path: Path):
     from pyarrow import parquet
 
     one = pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(np.zeros(52_000_000, np.int8)), 26_000_000)
-    parquet.write_table(pyarrow.table({"obs": one, "action": [0.0, 1.0]}), tmp_path / "log.parquet")
+    table = pyarrow.table({"obs": one, "action": [0.0, 1.0]})
+    parquet.write_table(table, tmp_path / "log.parquet", use_dictionary=False)
     refused(tmp_path / "log.parquet", "expected at most 50,000,000 cells in .*, got 52,000,002")
 
 

@@ -24,6 +24,7 @@ from surrogym_shared import wire
 
 STEP_SECONDS = 0.1
 PATIENCE_SECONDS = 180.0
+LONGEST_LOOK_SECONDS = 0.2
 
 Point = tuple[float, ...]
 
@@ -90,12 +91,13 @@ def finished(api: Api, name: str) -> bool:
 
 
 def until(holds: Callable[[], object], seconds: float = PATIENCE_SECONDS) -> bool:
-    """Whether it holds before the time is over."""
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
+    """Whether it holds before the time is over. Looks are ever rarer: a server that answers them has a core less for
+    what is waited for."""
+    started = time.monotonic()
+    while (waited := time.monotonic() - started) < seconds:
         if holds():
             return True
-        time.sleep(0.005)
+        time.sleep(min(LONGEST_LOOK_SECONDS, max(0.005, waited / 10)))
     return False
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -82,6 +83,7 @@ def test_a_server_that_is_away_stops_nothing_and_hears_of_it_later():
         reporter.trained(progress(1))
         while len(jobs.states) < 4:
             reporter.at("training")
+            time.sleep(0.005)  # else its thread hardly gets a turn
     assert (reporter.cancelled, reporter.taken) == (False, False)
     assert [point.steps for point in jobs.states[2].curve] == [1]
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from surrogym_server.engine import occupancy
 from surrogym_server.engine.occupancy import CAPACITY, Reservoir
 
 
@@ -21,9 +23,11 @@ def test_all_are_kept_while_there_is_room():
     assert reservoir.seen == 100
 
 
-def test_the_sample_does_not_depend_on_the_batches():
-    visits = 2 * CAPACITY + 11
+def test_the_sample_does_not_depend_on_the_batches(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(occupancy, "CAPACITY", 100)  # batches of one take seconds to fill it
+    visits = 211
     kept = [visit(batch, visits).states for batch in (1, 3, 64, visits)]
+    assert len(kept[0]) == 100
     for other in kept[1:]:
         np.testing.assert_array_equal(other, kept[0])
 
