@@ -3,7 +3,8 @@
 # make help      the rest
 
 PYTHON ?= python3
-WORKERS ?= 2
+# One more than cores: tests wait for processes a quarter of their time.
+WORKERS ?= 3
 ARGS ?=
 
 BIN := .venv/bin
@@ -23,8 +24,8 @@ demo: .venv/demo  ## Solve Pendulum with server, sampler and trainer on this mac
 install: .venv/all  ## Everything a user may want into .venv: MuJoCo, pictures and exports as well
 	@echo "next: . .venv/bin/activate"
 
-test: format-check lint imports audit  ## Everything that guards the project
-	@$(MAKE) --no-print-directory --jobs 2 types unit
+test: format-check lint  ## Everything that guards the project
+	@$(MAKE) --no-print-directory --jobs 2 unit types imports audit
 
 format-check: .venv/dev
 	$(BIN)/ruff format --check
@@ -45,7 +46,7 @@ lab-test: .venv/dev  ## The tests of the lab: studies, peers, unseen tasks (ARGS
 	$(BIN)/pytest lab/tests --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-all: test lab-test .venv-extras .venv-adapters  ## make test, every command of the docs, and trainers and trackers with packages of their own
-	$(BIN)/pytest -m long --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest -m long tests lab/tests --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 	DOCS=full $(BIN)/pytest -m "" --durations 0 tests/docs tests/examples
 	.venv-adapters/bin/python -m pytest -m "" tests/original/test_adapters.py tests/original/test_describing.py
 
