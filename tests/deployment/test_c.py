@@ -22,7 +22,7 @@ from surrogym_trainer.deployment.controller import Choices, Controller, NotDeplo
 from surrogym_trainer.deployment.reading import controller_of
 from surrogym_trainer.deployment.reference import begin, decide
 from surrogym_trainer.deployment.targets import deploy
-from surrogym_trainer.deployment.vectors import sensors_of
+from surrogym_trainer.deployment.vectors import sensors_of, vectors_of
 from surrogym_trainer.policies import load_policy
 
 pytestmark = NEEDS_C
@@ -63,6 +63,21 @@ def test_a_wrong_weight_fails_the_vectors(tmp_path: Path):
     assert source.read_text() != text
     program = compile_c("cc", sorted(folder.glob("*.c")), tmp_path / "vectors")
     assert subprocess.run([program], capture_output=True, check=False).returncode == 1
+
+
+@pytest.mark.parametrize(
+    "ranges",
+    [{"angle": (3.14, 3.15)}, {"angle": (-1e37, 1e37)}, {"slide": (300.0, 300.001)}, {"slide": (0.0, 1e30)}],
+    ids=str,
+)
+def test_vectors_of_narrow_and_wide_sensors_pass_in_both_types(tmp_path: Path, ranges):
+    path = network(tmp_path, plant(**HISTORY), (8,))
+    controller = controller_of(path, choices=Choices(ranges=ranges))
+    assert sum(vector.status == 0 for vector in vectors_of(controller)) >= 40
+    (tmp_path / "c").mkdir()
+    write(controller, tmp_path / "c")
+    for flags in ((), ("-DARM_FLOAT",)):
+        run(compile_c("cc", sorted((tmp_path / "c").glob("*.c")), tmp_path / "vectors", *flags))
 
 
 @pytest.mark.parametrize(("single", "tolerance"), [(False, 1e-6), (True, 1e-4)], ids=["double", "float"])
@@ -159,6 +174,15 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path):
     with pytest.raises(NotDeployable, match=r"expected the target c, arduino, .*got 'plc'"):
         deploy(controller, "plc", tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_that_can_not_be_written_keeps_none_of_the_files(tmp_path: Path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "arm_main.c").symlink_to("/nonexistent/arm_main.c")  # written last
+    with pytest.raises(OSError, match=r"arm_main\.c"):
+        deploy(made(tmp_path, "linear"), "c", out)
+    assert [path.name for path in out.iterdir()] == ["arm_main.c"]
 
 
 def test_the_arduino_layout_has_what_its_tools_read_and_a_sketch_that_compiles(tmp_path: Path):

@@ -75,6 +75,8 @@ def test_what_can_not_be_written_or_checked_is_refused_and_nothing_is_written(su
         ([str(path), "--target", "plc", "--out", "c"], "expected the target c, arduino"),
         ([str(path), *to, "--fallback", "3"], "expected a fallback of 1 entries"),
         ([str(path), *to, "--check"], "--check needs --env"),
+        ([str(path), *to, "--env", "Pendulum-v1"], "--env together with --check"),
+        ([str(path), "--target", "st", "--out", "c", "--check"], "got st"),
     ]:
         said = surrogym("deploy", *arguments)
         assert (said.code, words in said.err.replace("\n", " ")) == (1, True), said.err
@@ -98,7 +100,54 @@ def test_a_report_takes_no_check_of_another_policy(surrogym, pendulum_server, tm
 
 def test_a_check_without_a_compiler_says_what_is_missing(surrogym, tmp_path, monkeypatch):
     path = policy_for(tmp_path, pendulum(), None)
+    monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("PATH", "/nonexistent")
-    said = surrogym("deploy", str(path), "--target", "c", "--out", "c", "--check", "--env", "Pendulum-v1")
-    assert (said.code, "expected a C compiler (cc, gcc, clang)" in said.err) == (1, True)
+    for target in ("c", "fmu"):
+        check = ["deploy", str(path), "--target", target, "--out", "c", "--period", "0.05", "--check"]
+        said = surrogym(*check, "--env", "Pendulum-v1")
+        assert (said.code, "expected a C compiler (cc, gcc, clang)" in said.err) == (1, True)
+        assert not (tmp_path / "c").exists()
+
+
+@NEEDS_C
+def test_a_check_takes_the_compiler_that_cc_names(surrogym, tmp_path, monkeypatch):
+    check = ["deploy", str(policy_for(tmp_path, pendulum(), None)), "--target", "c", "--out", "c"]
+    check += ["--check", "--episodes", "1", "--env", "Pendulum-v1"]
+    monkeypatch.setenv("CC", "/nonexistent/cc")
+    said = surrogym(*check)
+    assert (said.code, "got '/nonexistent/cc'" in said.err) == (1, True)
     assert not (tmp_path / "c").exists()
+    compiler = tmp_path / "own-compiler"
+    compiler.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/calls\nexec {shutil.which("cc")} "$@"\n')
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CC", f"{compiler} -DBY_CC")
+    assert surrogym(*check).code == 0
+    assert "-DBY_CC" in (tmp_path / "calls").read_text()
+
+
+@NEEDS_C
+def test_a_folder_with_its_own_check_is_deployed_to_again(surrogym, tmp_path):
+    path = policy_for(tmp_path, pendulum(), None)
+    deploy = ["deploy", str(path), "--target", "c", "--out", "c"]
+    check = ["--check", "--episodes", "1", "--env", "Pendulum-v1"]
+    assert surrogym(*deploy, *check).code == 0
+    made = {file: file.read_bytes() for file in (tmp_path / "c").iterdir()}
+    assert tmp_path / "c" / "check.json" in made
+    assert surrogym(*deploy).code == 0
+    assert {file: file.read_bytes() for file in (tmp_path / "c").iterdir()} == made
+    assert surrogym(*deploy, *check).code == 0
+    (tmp_path / "c" / "pendulum_main.c").unlink(missing_ok=True)
+    (tmp_path / "c" / "policy_main.c").unlink(missing_ok=True)
+    said = surrogym(*deploy)
+    assert (said.code, "check.json: nothing was written" in said.err.replace("\n", " ")) == (1, True)
+
+
+def test_a_surrogate_where_a_policy_is_meant_is_refused_with_how_policies_are_named(surrogym, tmp_path):
+    for arguments, words in [
+        (["pendulum", "--target", "c"], "pendulum@1 or pendulum@production"),
+        (["twin.surrogate", "--target", "onnx"], "of a surrogate only an fmu"),
+        (["pendulum", "--target", "fmu", "--trust-policy"], "no option of a policy"),
+        (["pendulum", "--target", "fmu", "--env", "Pendulum-v1"], "no option of a policy"),
+    ]:
+        said = surrogym("deploy", *arguments, "--out", "c")
+        assert (said.code, words in said.err.replace("\n", " ")) == (1, True), said.err

@@ -120,6 +120,8 @@ def test_policies_without_a_feed_forward_network_are_refused_with_what_can(tmp_p
         controller_of(path, trust=True)
     with pytest.raises(UnusablePolicy, match="pickled objects"):
         controller_of(path)
+    with pytest.raises(UnusablePolicy, match="is not a policy of DQN: expected --algorithm PPO"):
+        controller_of(path, algorithm="DQN", trust=True)
     with pytest.raises(NotDeployable, match=r"RECURRENTPPO.*feed-forward network can"):
         controller_of(path, algorithm="RECURRENTPPO", trust=True)
 
@@ -138,6 +140,11 @@ def test_a_policy_with_weights_that_are_not_numbers_is_refused(tmp_path: Path):
         path = network(tmp_path, plant(), (8,), gain)
         with pytest.raises(NotDeployable, match="finite numbers"):
             controller_of(path)
+
+
+def test_a_network_that_is_too_large_for_a_controller_is_refused(tmp_path: Path):
+    with pytest.raises(NotDeployable, match="at most 1,000,000 weights, got 1,008,002, which need 8 MB"):
+        controller_of(network(tmp_path, plant(), (1000, 1000), 0.01))
 
 
 def test_a_policy_that_learned_in_a_vecnormalize_keeps_its_statistics_and_its_clip(tmp_path: Path):
@@ -168,8 +175,10 @@ def test_choices_that_do_not_fit_are_refused(tmp_path: Path):
         (Choices(fallback=(0.0, 11.0)), r"got \[0.0, 11.0\]"),
         (Choices(timeout=0.0), "more than 0 s"),
         (Choices(ranges={"speed": (0.0, 1.0)}), r"angle, slide, target\), got speed"),
-        (Choices(ranges={"slide": (1.0, 1.0)}), "that rises, got 1 to 1"),
-        (Choices(ranges={"slide": (0.0, np.inf)}), "a finite range of slide that rises, got 0 to inf"),
+        (Choices(ranges={"slide": (1.0, 1.0)}), "that rises, .* got 1 to 1"),
+        (Choices(ranges={"slide": (0.0, np.inf)}), "a range of slide that rises, within .* got 0 to inf"),
+        (Choices(ranges={"slide": (0.0, 1e39)}), r"within -1e\+37 to 1e\+37, got 0 to 1e\+39"),
+        (Choices(timeout=1e38), r"finite numbers up to 1e\+37, for float, got 1e\+38"),
     ]:
         with pytest.raises(NotDeployable, match=words):
             controller_of(path, choices=wrong)

@@ -15,7 +15,7 @@ from surrogym_sampler.original.rollouts import answering
 from surrogym_trainer.deployment.controller import Choices
 from surrogym_trainer.deployment.reading import controller_of
 from surrogym_trainer.deployment.running import Comparison
-from surrogym_trainer.deployment.targets import RUNNERS
+from surrogym_trainer.deployment.targets import TARGETS
 from surrogym_trainer.policies import load_policy
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -31,12 +31,12 @@ def vessel():
     return RolloutEpisode(answering(Vessel()))
 
 
-@pytest.mark.parametrize("target", RUNNERS)
+@pytest.mark.parametrize("target", [name for name, one in TARGETS.items() if one.running])
 def test_a_controller_with_lags_earns_the_returns_of_its_policy(tmp_path: Path, target: str):
     episode = vessel()
     path = network(tmp_path, episode.spec, (32,), 0.5)
-    controller, shares = controller_of(path), []
-    with RUNNERS[target](controller) as running:
+    controller, shares = controller_of(path, choices=Choices(period=1.0)), []
+    with TARGETS[target].running(controller) as running:
         checked = Comparison(controller, running, load_policy(path), episode).over(range(5), shares.append)
     assert shares == [0.2, 0.4, 0.6, 0.8, 1.0]
     assert (checked.steps, checked.faults, checked.different) == (250, 0, 0)
@@ -48,6 +48,6 @@ def test_a_reading_outside_of_its_range_is_counted_as_a_fault(tmp_path: Path):
     episode = vessel()
     path = network(tmp_path, episode.spec, (32,), 0.5)
     controller = controller_of(path, choices=Choices(ranges={"level": (-0.01, 0.01)}))
-    with RUNNERS["c"](controller) as running:
+    with TARGETS["c"].running(controller) as running:
         checked = Comparison(controller, running, load_policy(path), episode).over(range(1), [].append)
     assert checked.faults > 0

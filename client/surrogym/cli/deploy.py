@@ -15,11 +15,14 @@ from surrogym.cli.groups import Output, PolicyReading, Service, add
 from surrogym.cli.options import NAMES, SpecFile
 
 if TYPE_CHECKING:
+    from surrogym_client.transport import Api
     from surrogym_sampler.original.episodes import Episode
     from surrogym_trainer.deployment.controller import Choices, Controller
     from surrogym_trainer.deployment.running import Checked, Comparison
+    from surrogym_trainer.deployment.targets import Target
     from surrogym_trainer.policies.card import PolicyCard
     from surrogym_trainer.policies.controller_check import StoredCheck
+    from surrogym_trainer.policies.predict import Predict
 
 
 def register(app: typer.Typer) -> None:
@@ -72,32 +75,46 @@ class Checking:
         bool,
         typer.Option(
             "--check",
-            help="Compile the controller, and run it beside the policy in the virtual environment, or in --env.",
+            help="Run the controller beside the policy in the virtual environment, or in --env. A C compiler is needed "
+            "for c, arduino and fmu, fmpy for fmu, onnxruntime for onnx. There is no check of st.",
         ),
     ] = False
     env: Annotated[str | None, typer.Option(help=f"Original environment of --check: {NAMES}.")] = None
     episodes: Annotated[int, typer.Option(min=1, help="Number of episodes of --check.")] = 10
 
-    def require_possible(self, target: str, card: PolicyCard) -> None:
-        """Refuse a check that can't be made, before anything is written.
+    @contextmanager
+    def comparison(self, target: Target, controller: Controller, policy: LocalPolicy) -> Iterator[Comparison | None]:
+        """Start the controller, and open the environment. Real steps are entered at the end, also after a fault.
+        Without ``--check``, yield None.
 
         Raises:
-            CommandError: the target does not run on this machine, or no environment is known.
-            NotDeployable: there is no compiler.
+            CommandError: nothing runs the target, or no environment is known.
+            CannotCompile: there is no C compiler.
+            ModuleNotFoundError: a package that runs the target is missing.
         """
         from surrogym.cli.errors import CommandError
-        from surrogym_trainer.deployment.c.compiling import c_compiler
-        from surrogym_trainer.deployment.targets import RUNNERS
+        from surrogym_client.runtime.lifetime import terminations_as_interrupts
+        from surrogym_trainer.deployment.running import Comparison
 
-        if self.check and target not in RUNNERS:
-            raise CommandError(f"expected --check with a target that runs here ({', '.join(RUNNERS)}), got {target}")
-        if self.check and self.env is None and card.surrogate is None:
+        if not self.check:
+            if self.env is not None:
+                raise CommandError("expected --env together with --check, got --env alone")
+            yield None
+            return
+        if target.running is None:
+            raise CommandError("expected --check with a target that runs on this machine, got st: check it on the PLC")
+        if self.env is None and policy.card.surrogate is None:
             raise CommandError("--check needs --env, because no card beside the policy names its surrogate")
-        if self.check:
-            c_compiler()
+        with terminations_as_interrupts(), target.running(controller) as running, self._episode(policy) as episode:
+            comparison = Comparison(controller, running, policy.load(), episode)
+            try:
+                yield comparison
+            finally:
+                if self.env is not None:
+                    policy.enter(comparison)
 
     @contextmanager
-    def episode(self, context: typer.Context, card: PolicyCard, service: Service, output: Output) -> Iterator[Episode]:
+    def _episode(self, policy: LocalPolicy) -> Iterator[Episode]:
         """Open the original environment, or the virtual one if none is named."""
         from surrogym.cli.opening import opener_for_policy
         from surrogym_client.transport.http_surrogate import HttpSurrogate
@@ -105,11 +122,13 @@ class Checking:
 
         with ExitStack() as stack:
             if self.env is not None:
-                episode = opener_for_policy(self.env, None, card, quiet=output.quiet)()
+                episode = opener_for_policy(self.env, None, policy.card, quiet=policy.output.quiet)()
             else:
-                api = stack.enter_context(service.connect(context))
-                port = stack.enter_context(HttpSurrogate(api.url, str(card.surrogate), service.token_for(context)))
-                episode = VirtualEpisode(port, api)
+                api = stack.enter_context(policy.connect())
+                token = policy.service.token_for(policy.context)
+                episode = VirtualEpisode(
+                    stack.enter_context(HttpSurrogate(api.url, str(policy.card.surrogate), token)), api
+                )
             stack.callback(episode.close)
             yield episode
 
@@ -121,6 +140,53 @@ class Checking:
         seeds = range(FIRST_SEED, FIRST_SEED + self.episodes)
         with progress("check", quiet=output.quiet) as update:
             return comparison.over(seeds, lambda share: update(share, f"{self.episodes} episodes of each"))
+
+    def stored(self, checked: Checked, target: str, controller: Controller, card: PolicyCard) -> StoredCheck:
+        """Return the check as a file has it."""
+        from surrogym_trainer.policies.controller_check import StoredCheck
+
+        return StoredCheck(
+            target=target,
+            environment=self.env or f"virtual environment of {card.surrogate}",
+            policy=controller.digests["policy"],
+            episodes=len(checked.returns),
+            steps=checked.steps,
+            largest_difference=checked.largest,
+            different_actions=checked.different,
+            faults=checked.faults,
+            mean_return=float(checked.returns.mean()),
+            mean_return_of_policy=float(checked.policy_returns.mean()),
+            microseconds=checked.microseconds,
+        )
+
+
+@dataclass(frozen=True)
+class LocalPolicy:
+    """A policy's file on this machine, its card, and the options of the command."""
+
+    path: Path
+    card: PolicyCard
+    context: typer.Context
+    reading: PolicyReading
+    service: Service
+    output: Output
+
+    def connect(self) -> Api:
+        """Connect to the server."""
+        return self.service.connect(self.context)
+
+    def load(self) -> Predict:
+        """Load the policy as a function of observations."""
+        return self.reading.load(self.path, self.card)
+
+    def enter(self, comparison: Comparison) -> None:
+        """Enter the real steps of a check into the surrogate's ledger."""
+        from surrogym.cli.evaluate import enter_steps, ledger_of
+
+        server, token = self.service.server, self.service.token_for(self.context)
+        ledger = ledger_of(None, server, self.card, self.path, quiet=self.output.quiet)
+        note = "check of a deployed controller, beside its policy"
+        enter_steps(ledger, server, token, comparison.begun, comparison.ended, note, quiet=self.output.quiet)
 
 
 def command(
@@ -161,54 +227,53 @@ def command(
     from surrogym.cli.options import read_spec
     from surrogym.cli.twins import in_words, is_surrogate, write_twin
     from surrogym_trainer.deployment.reading import controller_of
-    from surrogym_trainer.deployment.running import Comparison
-    from surrogym_trainer.deployment.targets import RUNNERS, deploy
-    from surrogym_trainer.policies.card import read_card
+    from surrogym_trainer.deployment.targets import deploy, target_of
     from surrogym_trainer.policies.controller_check import write_check
 
-    twins = target == "fmu" and is_surrogate(policy)
-    if twins and (checking.check or faults != Faults()):
-        raise CommandError("expected --check, --fallback, --timeout and --range with a policy, got a surrogate")
-    if twins:
+    to, named = target_of(target), is_surrogate(policy)
+    if named and target != "fmu":
+        raise CommandError(
+            f"expected a policy for --target {target}, such as policy.zip, pendulum@1 or pendulum@production, got "
+            f"{policy!r}; of a surrogate only an fmu can be made"
+        )
+    if named and (checking != Checking() or faults != Faults() or reading != PolicyReading() or spec is not None):
+        raise CommandError("expected no option of a policy with a surrogate: only --out and --period")
+    if named:
         twin = write_twin(context, policy, out, period, service)
         output.give(twin, lambda: in_words(twin))
         return
-    with _local(context, policy, service) as path:
-        card = read_card(path)
-        checking.require_possible(target, card)
+    with _local(context, policy, reading, service, output) as local:
         controller = controller_of(
-            path, read_spec(spec), reading.algorithm, trust=reading.trust_policy, choices=faults.choices(period)
+            local.path, read_spec(spec), reading.algorithm, trust=reading.trust_policy, choices=faults.choices(period)
         )
-        written = deploy(controller, target, out)
-        result: dict[str, Any] = {"target": target, "files": [str(file) for file in written]}
-        words = [f"{out}: {', '.join(str(file.relative_to(out)) for file in written)}"]
-        if not isfinite(controller.timeout):
-            words.append("no timeout, so a sensor that stops is no fault: --timeout or --period sets one")
-        if checking.check:
-            with checking.episode(context, card, service, output) as episode, RUNNERS[target](controller) as running:
-                comparison = Comparison(controller, running, reading.load(path, card), episode)
-                try:
-                    checked = checking.run(comparison, output)
-                finally:
-                    if checking.env is not None:
-                        _enter(context, comparison.begun, checking, card, path, service, output)
-            stored = _stored(checked, target, checking.env or f"virtual environment of {card.surrogate}", controller)
-            result["check"] = stored.model_dump(mode="json")
-            result["files"].append(str(write_check(out, stored)))
-            words += _in_words(checked)
+        with checking.comparison(to, controller, local) as comparison:
+            written = deploy(controller, target, out)
+            result: dict[str, Any] = {"target": target, "files": [str(file) for file in written]}
+            words = [f"{out}: {', '.join(str(file.relative_to(out)) for file in written)}"]
+            if not isfinite(controller.timeout):
+                words.append("no timeout, so a sensor that stops is no fault: --timeout or --period sets one")
+            if comparison is not None:
+                checked = checking.run(comparison, output)
+                stored = checking.stored(checked, target, controller, local.card)
+                result["check"] = stored.model_dump(mode="json")
+                result["files"].append(str(write_check(out, stored)))
+                words += _in_words(checked)
     output.give(result, lambda: "\n".join(words))
 
 
 @contextmanager
-def _local(context: typer.Context, policy: str, service: Service) -> Iterator[Path]:
-    """Yield the path of a policy file. A stored policy is downloaded for as long as the command runs."""
+def _local(
+    context: typer.Context, policy: str, reading: PolicyReading, service: Service, output: Output
+) -> Iterator[LocalPolicy]:
+    """Yield a policy file. A stored policy is downloaded for as long as the command runs."""
     from tempfile import TemporaryDirectory
 
     from surrogym.cli.policy import parsed, stored_card
     from surrogym_trainer.policies.card import write_card
+    from surrogym_trainer.policies.files import card_of_policy
 
     if Path(policy).is_file() or "@" not in policy:
-        yield Path(policy)
+        yield LocalPolicy(Path(policy), card_of_policy(Path(policy)), context, reading, service, output)
         return
     name, which = parsed(policy)
     with TemporaryDirectory() as folder:
@@ -217,26 +282,7 @@ def _local(context: typer.Context, policy: str, service: Service) -> Iterator[Pa
             found, card = stored_card(api, name, which)
             path.write_bytes(api.policies.file(name, found.version, "zip"))
         write_card(path, card)
-        yield path
-
-
-def _enter(
-    context: typer.Context,
-    steps: int,
-    checking: Checking,
-    card: PolicyCard,
-    policy: Path,
-    service: Service,
-    output: Output,
-) -> None:
-    """Enter the real steps of the check into the surrogate's ledger."""
-    from surrogym.cli.evaluate import enter_steps, ledger_of
-
-    ledger = ledger_of(None, service.server, card, policy, quiet=output.quiet)
-    note = "check of a deployed controller, beside its policy"
-    enter_steps(
-        ledger, service.server, service.token_for(context), steps, 2 * checking.episodes, note, quiet=output.quiet
-    )
+        yield LocalPolicy(path, card, context, reading, service, output)
 
 
 def _range(text: str) -> tuple[str, tuple[float, float]]:
@@ -249,24 +295,6 @@ def _range(text: str) -> tuple[str, tuple[float, float]]:
         return name, (float(low), float(high))
     except ValueError as error:
         raise CommandError(f"--range: expected NAME=LOW:HIGH, such as level=0:2, got {text!r}") from error
-
-
-def _stored(checked: Checked, target: str, environment: str, controller: Controller) -> StoredCheck:
-    from surrogym_trainer.policies.controller_check import StoredCheck
-
-    return StoredCheck(
-        target=target,
-        environment=environment,
-        policy=controller.digests["policy"],
-        episodes=len(checked.returns),
-        steps=checked.steps,
-        largest_difference=checked.largest,
-        different_actions=checked.different,
-        faults=checked.faults,
-        mean_return=float(checked.returns.mean()),
-        mean_return_of_policy=float(checked.policy_returns.mean()),
-        microseconds=checked.microseconds,
-    )
 
 
 def _in_words(checked: Checked) -> list[str]:

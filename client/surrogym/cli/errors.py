@@ -22,6 +22,7 @@ def sentence(error: Exception) -> str | None:
     from surrogym_client.errors import SurrogymClientError
     from surrogym_client.runtime.ray_cluster import NoCluster
     from surrogym_sampler.original.errors import OriginalError
+    from surrogym_shared.c_compiler import CannotCompile
     from surrogym_shared.logs.errors import UnusableLog
     from surrogym_shared.surrogate_file import NotASurrogateFile
 
@@ -29,6 +30,8 @@ def sentence(error: Exception) -> str | None:
         case SurrogymClientError():
             return f"{error}{_way_out(error)}"
         case CommandError() | OriginalError() | NotRenderable() | NotASurrogateFile() | UnusableLog() | NoCluster():
+            return str(error)
+        case CannotCompile():
             return str(error)
         case ModuleNotFoundError(name=str(name)):
             return missing(name.partition(".")[0])

@@ -6,6 +6,7 @@ index of a coordinate among all C.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -21,6 +22,8 @@ Activation = Literal["none", "tanh", "relu"]
 
 NOT_FINITE, OUT_OF_RANGE, LATE, NO_ACTION = 1, 2, 4, 8  # bits of a status; 0: the action is the policy's
 PERIODS = 2  # age of a measurement in sampling periods that is no fault: its time varies
+LARGEST = 1e37  # number of a controller: float has it, and sums of a few
+MOST_WEIGHTS = 1_000_000  # of a network: 8 MB in double, and about 20 MB of source
 TURNS = 100  # turns of an angle that a sensor may count, as wrapping loses digits
 
 
@@ -197,9 +200,9 @@ def controller_from(
     """Return the controller of a network and the specification that it was trained for.
 
     Raises:
-        NotDeployable: they don't fit, or a choice does not.
+        NotDeployable: they don't fit, a choice does not, or a number is too large for float.
     """
-    _require_finite(decision)
+    _require_small(decision)
     low, high = _limits(spec.action)
     outputs = sum(_counts(spec.action)) or len(low)
     shape, expected = (len(decision.mean), len(decision.layers[-1].bias)), (len(spec.observation), outputs)
@@ -209,7 +212,7 @@ def controller_from(
             f"{shape[0]} and {shape[1]}"
         )
     period = _period(spec, choices.period)
-    return Controller(
+    made = Controller(
         name=name,
         coordinates=spec.coordinate_names,
         measurements=_measurements(spec, dict(choices.ranges or {})),
@@ -223,14 +226,43 @@ def controller_from(
         period=period,
         digests=digests,
     )
+    _require_in_float("a specification", [number for number in _numbers(made) if np.isfinite(number)])
+    return made
 
 
-def _require_finite(decision: Decision) -> None:
-    layers = (array for layer in decision.layers for array in (layer.weights, layer.bias))
+def _numbers(controller: Controller) -> Iterator[float]:
+    """Yield the numbers of a controller but for its network; infinite ones are limits that do not exist."""
+    for measurement in controller.measurements:
+        yield from (measurement.low, measurement.high)
+    for entry in controller.observation:
+        yield from (entry.low, entry.high)
+    for lag in controller.lags:
+        yield from (lag.start, lag.low, lag.high)
+    for part in (part for entry in controller.observation for part in entry.parts):
+        yield from (part.coefficient, *(weight for _, weight in part.weights))
+    yield from (*controller.low, *controller.high, *controller.fallback, controller.timeout)
+
+
+def _require_small(decision: Decision) -> None:
+    """Refuse a network that is too large for a controller, or that has numbers which are not finite in float."""
+    layers = [array for layer in decision.layers for array in (layer.weights, layer.bias)]
+    size = sum(array.size for array in layers)
+    if size > MOST_WEIGHTS:
+        raise NotDeployable(
+            f"expected a network of at most {MOST_WEIGHTS:,} weights, got {size:,}, which need {8 * size // 10**6} MB: "
+            "surrogym export-policy writes it for a larger machine"
+        )
+    if not (decision.deviation > 0).all():
+        raise NotDeployable("expected a policy with positive deviations, got others")
     arrays = (decision.mean, decision.deviation, decision.centre, decision.reach, *layers)
-    largest = np.finfo(np.float32).max
-    if not all((np.abs(array) <= largest).all() for array in arrays) or not (decision.deviation > 0).all():
-        raise NotDeployable("expected a policy of finite numbers in float32 and positive deviations, got others")
+    _require_in_float("a policy", *arrays)
+
+
+def _require_in_float(what: str, *arrays: Any) -> None:
+    """Refuse numbers that a controller in float can't have."""
+    for values in map(np.ravel, arrays):
+        if len(wrong := values[~(np.abs(values) <= LARGEST)]):
+            raise NotDeployable(f"expected {what} of finite numbers up to {LARGEST:g}, for float, got {wrong[0]:g}")
 
 
 def _measurements(spec: EnvironmentSpec, ranges: dict[str, tuple[float, float]]) -> tuple[Measurement, ...]:
@@ -242,8 +274,11 @@ def _measurements(spec: EnvironmentSpec, ranges: dict[str, tuple[float, float]])
         if c.lag is not None:
             continue
         lowest, highest = ranges.get(c.name) or _readable(c)
-        if not -np.inf < lowest < highest < np.inf:
-            raise NotDeployable(f"expected a finite range of {c.name} that rises, got {lowest:g} to {highest:g}")
+        if not -LARGEST <= lowest < highest <= LARGEST:
+            raise NotDeployable(
+                f"expected a range of {c.name} that rises, within {-LARGEST:g} to {LARGEST:g}, got {lowest:g} to "
+                f"{highest:g}"
+            )
         found.append(Measurement(c.name, c.unit, place, c.kind == "angle", *_bounds(c), lowest, highest))
     return tuple(found)
 

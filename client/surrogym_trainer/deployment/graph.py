@@ -6,6 +6,9 @@ Shapes: N rows, D observation entries, A outputs, F action entries.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_trainer.deployment.c.files import prefix_of
-from surrogym_trainer.deployment.controller import Controller, Observed, Remembered
+from surrogym_trainer.deployment.controller import Array, Controller, Observed, Remembered
+from surrogym_trainer.deployment.reference import begin, decide, observe
+from surrogym_trainer.deployment.running import Running
 from surrogym_trainer.policies.onnx_files import INPUT, OUTPUT
 
 OPSET = 17
@@ -60,6 +65,45 @@ def description(controller: Controller) -> dict[str, Any]:
         "timeout": _finite(controller.timeout),
         "sha256": controller.digests,
     }
+
+
+class RunningGraph(Running):
+    """The ONNX file in onnxruntime. The reference computes the observation, as the file has the network alone.
+
+    Args:
+        controller: what the file was made from.
+        act: the network, from observations (N, D) in float32 to actions (N, F).
+    """
+
+    single = True
+
+    def __init__(self, controller: Controller, act: Callable[[NDArray[np.float32]], NDArray[Any]]) -> None:
+        self._controller, self._act = controller, act
+        self._memory = begin(controller)
+
+    def reset(self) -> None:
+        self._memory = begin(self._controller)
+
+    def step(self, measurement: Array, age: float = 0.0) -> tuple[int, Array]:
+        self._memory, action, (status,) = decide(self._controller, self._memory, measurement[None], age)
+        if status == 0:
+            shown = observe(self._controller, self._memory.coordinates).astype(np.float32)
+            action = self._act(shown).astype(np.float64)
+            self._memory = replace(self._memory, action=action.astype(np.float32).astype(np.float64))
+        return int(status), action[0]
+
+
+@contextmanager
+def running(controller: Controller) -> Iterator[RunningGraph]:
+    """Write the file of a controller, and load it in onnxruntime.
+
+    Raises:
+        ModuleNotFoundError: the extra ``export`` is missing.
+    """
+    from onnxruntime import InferenceSession
+
+    session = InferenceSession(_model(controller).SerializeToString(), providers=["CPUExecutionProvider"])
+    yield RunningGraph(controller, lambda observations: session.run([OUTPUT], {INPUT: observations})[0])
 
 
 def _model(controller: Controller) -> Any:

@@ -17,13 +17,19 @@ from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_trainer.deployment.controller import Array, Controller
 from surrogym_trainer.policies.predict import Predict
 
-NEGLIGIBLE = 1e-6  # difference of actions, as a share of their range
+NEGLIGIBLE = 1e-6, 1e-4  # difference of actions in double and in float, as a share of their range
 
 
 class Running(ABC):
-    """A running controller."""
+    """A running controller.
 
-    microseconds: float | None = None  # of one decision; None if it was not measured
+    Attributes:
+        microseconds: of one decision; None if it was not measured.
+        single: whether it computes in float.
+    """
+
+    microseconds: float | None = None
+    single = False
 
     @abstractmethod
     def reset(self) -> None:
@@ -42,7 +48,7 @@ class Checked:
     policy_returns: Array  # (N,)
     steps: int  # of the controller
     largest: float  # largest difference of their actions in the states of the controller, as a share of the range
-    different: int  # steps with another choice, or a difference above 1e-6 of the range
+    different: int  # steps with another choice, or a difference above 1e-6 of the range, 1e-4 in float
     faults: int  # steps in which the controller took its fallback
     microseconds: float | None
 
@@ -59,6 +65,7 @@ class Comparison:
 
     def __init__(self, controller: Controller, running: Running, policy: Predict, episode: Episode) -> None:
         self.begun = 0  # steps of the environment, of both
+        self.ended = 0  # episodes, of both
         self._running, self._policy, self._episode = running, policy, episode
         self._places = [m.place for m in controller.measurements]
         self._width = controller.high - controller.low
@@ -77,7 +84,7 @@ class Comparison:
             policy_returns=np.array([original for original, _ in returns]),
             steps=len(differences),
             largest=float(differences.max()),
-            different=int((differences > NEGLIGIBLE).sum()),
+            different=int((differences > NEGLIGIBLE[self._running.single]).sum()),
             faults=self._faults,
             microseconds=self._running.microseconds,
         )
@@ -95,6 +102,7 @@ class Comparison:
             total += moment.reward
             if moment.terminated or moment.truncated:
                 break
+        self.ended += 1
         return total
 
     def _decided(self, moment: Moment, expected: Array) -> Array:

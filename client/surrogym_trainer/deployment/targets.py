@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,54 +13,90 @@ from surrogym_trainer.deployment.c import running as running_c
 from surrogym_trainer.deployment.c import write as write_c
 from surrogym_trainer.deployment.c import write_arduino
 from surrogym_trainer.deployment.controller import Controller, NotDeployable
+from surrogym_trainer.deployment.fmu import running as running_fmu
 from surrogym_trainer.deployment.fmu import write as write_fmu
+from surrogym_trainer.deployment.graph import running as running_onnx
 from surrogym_trainer.deployment.graph import write as write_onnx
 from surrogym_trainer.deployment.running import Running
 from surrogym_trainer.deployment.st import write as write_st
+from surrogym_trainer.policies.controller_check import FILE
 
-Runner = Callable[[Controller], AbstractContextManager[Running]]
-"""Run a controller as the target does, for ``surrogym deploy --check``."""
 
-Writer = Callable[[Controller, Path], None]
-"""Write the files of a controller into an empty folder."""
+@dataclass(frozen=True)
+class Target:
+    """What a controller can be written as.
 
-TARGETS: dict[str, Writer] = {
-    "c": write_c,
-    "arduino": write_arduino,
-    "fmu": write_fmu,
-    "onnx": write_onnx,
-    "st": write_st,
+    Attributes:
+        write: write the files of a controller into an empty folder.
+        running: run the controller as the target does; None if nothing on this machine can.
+    """
+
+    write: Callable[[Controller, Path], None]
+    running: Callable[[Controller], AbstractContextManager[Running]] | None = None
+
+
+TARGETS = {
+    "c": Target(write_c, running_c),
+    "arduino": Target(write_arduino, partial(running_c, single=True)),
+    "fmu": Target(write_fmu, running_fmu),
+    "onnx": Target(write_onnx, running_onnx),
+    "st": Target(write_st),
 }
-RUNNERS: dict[str, Runner] = {"c": running_c, "arduino": running_c}
+
+
+def target_of(name: str) -> Target:
+    """Return a target by its name. Raises ``NotDeployable`` if there is none."""
+    if name not in TARGETS:
+        raise NotDeployable(f"expected the target {', '.join(TARGETS)}, got {name!r}")
+    return TARGETS[name]
 
 
 def deploy(controller: Controller, target: str, out: Path) -> list[Path]:
     """Write a controller's files to a folder, and return their paths.
 
-    A folder that already has exactly these files stays as it is. Any other folder with files is left alone.
+    A folder that already has exactly these files, and a check of them, stays as it is. Any other folder with files is
+    left alone.
 
     Raises:
         NotDeployable: the target is unknown, it can't express the controller, or the folder has other files.
+        CannotCompile: the C compiler refused the sources of an FMU.
     """
-    if target not in TARGETS:
-        raise NotDeployable(f"expected the target {', '.join(TARGETS)}, got {target!r}")
     with TemporaryDirectory() as made:
-        TARGETS[target](controller, Path(made))
+        target_of(target).write(controller, Path(made))
         names = sorted(path.relative_to(made) for path in Path(made).rglob("*") if path.is_file())
         if other := _other(out, Path(made), names):
             raise NotDeployable(f"expected a new or an empty folder, got {out} with {other}: nothing was written")
-        shutil.copytree(made, out, dirs_exist_ok=True)
+        _copy(Path(made), out, names)
     return [out / name for name in names]
 
 
+def _copy(made: Path, out: Path, names: list[Path]) -> None:
+    """Copy the files that are not there yet: all of them, or none."""
+    written = []
+    try:
+        for name in (name for name in names if not (out / name).exists()):
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
+            with (out / name).open("xb") as file:
+                written.append(out / name)
+                file.write((made / name).read_bytes())
+    except BaseException:
+        for path in written:
+            path.unlink(missing_ok=True)
+        raise
+
+
 def _other(out: Path, made: Path, names: list[Path]) -> str:
-    """Return the name of a file in the folder that is not one of the files made; empty if there is none."""
+    """Return the name of a file in the folder that is not one of the files made; empty if there is none. A check is one
+    of them where all the others are."""
     if not out.exists():
         return ""
     if not out.is_dir():
         return "a file of this name"
+    whole = all((out / name).is_file() for name in names)
     for path in sorted(out.rglob("*")):
         name = path.relative_to(out)
+        if whole and str(name) == FILE:
+            continue
         if path.is_file() and (name not in names or path.read_bytes() != (made / name).read_bytes()):
             return str(name)
     return ""

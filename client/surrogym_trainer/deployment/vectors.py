@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from surrogym_trainer.deployment.controller import Array, Controller
-from surrogym_trainer.deployment.reference import Memory, begin, decide
+from surrogym_trainer.deployment.reference import Memory, begin, decide, judged
 
 EPISODES, STEPS, TRIES = 3, 16, 20
+WALKED = 20.0  # rad
 ROUNDING = 1e-6  # share of a measurement
 STEADY = 2e-5  # share of an action's range by which rounding a measurement may change the action
 
@@ -32,22 +33,32 @@ class Vector:
 def vectors_of(controller: Controller, seed: int = 0) -> list[Vector]:
     """Return vectors: random walks, ends of the sensors, and each kind of fault, with steps after it.
 
-    A measurement whose rounding to float32 would change the action is left out, such as one at half a turn.
+    A measurement whose rounding to float32 would change the action is left out, such as one at half a turn. If that
+    leaves none without a fault, it stays: then float is not precise enough for this policy, and fails the vectors.
     """
-    rng = np.random.default_rng(seed)
+    vectors = _vectors_of(controller, np.random.default_rng(seed), only_steady=True)
+    if all(vector.status for vector in vectors):
+        return _vectors_of(controller, np.random.default_rng(seed), only_steady=False)
+    return vectors
+
+
+def _vectors_of(controller: Controller, rng: np.random.Generator, *, only_steady: bool) -> list[Vector]:
     low, high = sensors_of(controller)
+    narrow = _walked(controller)
     inside = low + ROUNDING * (high - low), high - ROUNDING * (high - low)
     vectors: list[Vector] = []
     for _ in range(EPISODES):
         memory, first = begin(controller), True
-        walk = rng.uniform(low, high)
+        walk = rng.uniform(*narrow)
         for step in range(STEPS):
             for _ in range(TRIES):
-                drawn = np.clip(walk + rng.normal(0, 0.05, len(low)) * (high - low), *inside)
+                drawn = np.clip(walk + rng.normal(0, 0.05, len(low)) * (narrow[1] - narrow[0]), *inside)
                 read = drawn.astype(np.float32).astype(np.float64)
                 if step == 5:
                     read = (low if rng.random() < 0.5 else high).copy()
-                if _is_steady(controller, memory, read):
+                elif judged(controller, read[None], np.zeros(1))[0]:
+                    continue  # rounded past an end
+                if _is_steady(controller, memory, read) or not only_steady:
                     walk = read
                     memory, vector = _answered(controller, memory, first, read, 0.0)
                     vectors.append(vector)
@@ -68,12 +79,20 @@ def sensors_of(controller: Controller) -> tuple[Array, Array]:
     return np.array([m.lowest for m in measurements]), np.array([m.highest for m in measurements])
 
 
+def _walked(controller: Controller) -> tuple[Array, Array]:
+    """Return the range (R,) of random walks: a few turns of an angle whose sensor counts many."""
+    low, high = sensors_of(controller)
+    near = np.clip(0.0, low, high)
+    angle = np.array([m.angle for m in controller.measurements])
+    return np.where(angle, np.maximum(low, near - WALKED), low), np.where(angle, np.minimum(high, near + WALKED), high)
+
+
 def _faults(controller: Controller, rng: np.random.Generator, low: Array, high: Array) -> Iterator[tuple[Array, float]]:
     """Yield measurements and their ages: faults, each with two sound steps after it."""
-    middle = (low + high) / 2
+    begun, ended = _walked(controller)
 
     def sound() -> tuple[Array, float]:
-        read = middle + rng.uniform(-0.1, 0.1, len(low)) * (high - low)
+        read = (begun + ended) / 2 + rng.uniform(-0.1, 0.1, len(low)) * (ended - begun)
         return read.astype(np.float32).astype(np.float64), 0.0
 
     for wrong in (np.nan, np.inf, -np.inf):

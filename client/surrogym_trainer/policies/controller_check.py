@@ -32,7 +32,7 @@ class StoredCheck(BaseModel):
     episodes: Count
     steps: Count = Field(description="steps of the controller")
     largest_difference: float = Field(ge=0, description="of the actions, as a share of their range")
-    different_actions: Count = Field(description="steps whose actions differ by more than 1e-6 of the range")
+    different_actions: Count = Field(description="steps that differ by more than 1e-6 of the range, 1e-4 in float")
     faults: Count = Field(description="steps in which the controller took its fallback")
     mean_return: float
     mean_return_of_policy: float

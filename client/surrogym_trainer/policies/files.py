@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
 BUFFERLESS = {"n_envs": 1, "n_steps": 1, "buffer_size": 1}  # a policy that only acts needs no memory for experience
+FAMILIES = ("PPO", "SAC", "TD3", "DQN")  # of networks; A2C has PPO's, DDPG has TD3's
 ONNX = ".onnx"
 
 
@@ -140,7 +141,20 @@ def read_learner(path: Path, algorithm: str, trust: bool, changes: dict[str, Any
             read_learner(path, algorithm, trust, {})
             given = [f"{name}={value!r}" for name, value in changes.items() if name not in ("env", "seed")]
             raise UnusablePolicy(f"{path} does not fit {', '.join([*given, 'this surrogate'])}: {error}") from error
-        raise UnusablePolicy(f"{path} is not a policy of {algorithm}: {error}") from error
+        fitting = [other for other in FAMILIES if other != algorithm.upper() and _fits(other, path, trust)]
+        meant = f"expected --algorithm {' or '.join(fitting)}" if fitting else str(error)
+        raise UnusablePolicy(f"{path} is not a policy of {algorithm}: {meant}") from error
+
+
+def _fits(algorithm: str, path: Path, trust: bool) -> bool:
+    """Whether a file is a policy of an algorithm of Stable-Baselines3."""
+    import stable_baselines3
+
+    try:
+        _loaded(getattr(stable_baselines3, algorithm), path, trust, BUFFERLESS)
+    except Exception:  # as in read_learner
+        return False
+    return True
 
 
 def _loaded(kind: type[BaseAlgorithm], path: Path, trust: bool, changes: dict[str, Any]) -> BaseAlgorithm:

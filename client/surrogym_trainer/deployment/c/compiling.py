@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import shutil
 import subprocess
 import time
 from collections.abc import Iterator
@@ -13,8 +12,8 @@ from tempfile import TemporaryDirectory
 
 from surrogym_sampler.original.executables.messages import numbers
 from surrogym_sampler.original.executables.program import Program
-from surrogym_shared.fmu import COMPILERS
-from surrogym_trainer.deployment.c.files import write
+from surrogym_shared.c_compiler import CannotCompile, compile_c, require_c_compiler
+from surrogym_trainer.deployment.c.files import prefix_of, write
 from surrogym_trainer.deployment.controller import Array, Controller, NotDeployable
 from surrogym_trainer.deployment.running import Running
 
@@ -29,11 +28,12 @@ class CompiledController(Running):
         program: executable of the controller's sources.
         actions: number of entries of an action, F.
         microseconds: of one decision.
+        single: whether it computes in float.
     """
 
-    def __init__(self, program: Program, actions: int, microseconds: float) -> None:
+    def __init__(self, program: Program, actions: int, microseconds: float, single: bool) -> None:
         self._program, self._actions = program, actions
-        self.microseconds = microseconds
+        self.microseconds, self.single = microseconds, single
 
     def reset(self) -> None:
         self._program.ask("reset", time.monotonic() + SECONDS)
@@ -45,46 +45,30 @@ class CompiledController(Running):
 
 
 @contextmanager
-def running(controller: Controller) -> Iterator[CompiledController]:
-    """Compile a controller, run its test vectors and start it.
+def running(controller: Controller, *, single: bool = False) -> Iterator[CompiledController]:
+    """Compile a controller, run its test vectors and start it. With ``single`` it computes in float.
 
     Raises:
-        NotDeployable: there is no C compiler, or the vectors fail.
+        CannotCompile: there is no C compiler, or it refuses the controller.
+        NotDeployable: the vectors fail.
     """
     with TemporaryDirectory() as made:
         folder = Path(made)
         write(controller, folder)
-        executable = compiled(sorted(folder.glob("*.c")), folder / "controller")
-        vectors = subprocess.run([executable], capture_output=True, text=True, check=False)
+        executable = folder / "controller"
+        sources = sorted(path.name for path in folder.glob("*.c"))
+        flags = (*FLAGS, f"-D{prefix_of(controller).upper()}_FLOAT") if single else FLAGS
+        compile_c(require_c_compiler(), flags, sources, executable, folder)
+        try:
+            vectors = subprocess.run([executable], capture_output=True, text=True, check=False)
+        except OSError as error:
+            raise CannotCompile(f"expected a C compiler for this machine: {error.strerror}") from error
         if vectors.returncode != 0:
             raise NotDeployable(f"the compiled controller fails its vectors: {vectors.stdout[-400:]}")
         timed = subprocess.run([executable, "time"], capture_output=True, text=True, check=True)
         program = Program(shlex.join([str(executable), "lines"]), "the compiled controller")
         program.start()
         try:
-            yield CompiledController(program, len(controller.low), float(timed.stdout) / 1000)
+            yield CompiledController(program, len(controller.low), float(timed.stdout) / 1000, single)
         finally:
             program.close()
-
-
-def compiled(sources: list[Path], out: Path) -> Path:
-    """Compile C sources for this machine.
-
-    Raises:
-        NotDeployable: there is none, or it refuses the sources.
-    """
-    compiler = c_compiler()
-    command = [compiler, *FLAGS, *map(str, sources), "-lm", "-o", str(out)]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    if result.returncode != 0:
-        said = result.stderr[-400:] or f"exit status {result.returncode}"
-        raise NotDeployable(f"{compiler} refuses the controller: {said}")
-    return out
-
-
-def c_compiler() -> str:
-    """Return the first C compiler on the path. Raises ``NotDeployable`` if there is none."""
-    compiler = next((found for name in COMPILERS if (found := shutil.which(name))), None)
-    if compiler is None:
-        raise NotDeployable(f"expected a C compiler ({', '.join(COMPILERS)}) on the path to check the controller")
-    return compiler

@@ -9,7 +9,7 @@ from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
 
-from surrogym_shared.fmu import Block, CannotCompile, Names, Variable, write_fmu
+from surrogym_shared.fmu import Block, Names, Variable, write_fmu
 from surrogym_trainer.deployment.c.files import prefix_of, write_sources
 from surrogym_trainer.deployment.c.source import number
 from surrogym_trainer.deployment.controller import Controller, NotDeployable
@@ -21,12 +21,12 @@ def write(controller: Controller, folder: Path) -> None:
     """Write the FMU, with native code if a C compiler is at hand.
 
     Raises:
-        NotDeployable: nobody declared the sampling period, two variables have the same name, or the compiler refused
-            the sources.
+        NotDeployable: nobody declared the sampling period, or two variables have the same name.
+        CannotCompile: the compiler refused the sources.
     """
     try:
         write_fmu(block_of(controller), folder / f"{prefix_of(controller)}_controller.fmu")
-    except (CannotCompile, ValueError) as error:
+    except ValueError as error:
         raise NotDeployable(str(error)) from error
 
 

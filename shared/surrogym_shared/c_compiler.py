@@ -1,0 +1,64 @@
+"""The C compiler of this machine."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+COMPILERS = ("cc", "gcc", "clang")
+SECONDS = 600  # for a compilation
+SHOWN = 2_000  # characters of a compiler's errors
+
+
+class CannotCompile(RuntimeError):
+    """There is no C compiler, or it refused the sources. The message has what it printed."""
+
+
+def c_compiler() -> tuple[str, ...] | None:
+    """Return the command of the C compiler: the variable ``CC``, or the first of cc, gcc and clang on the search path.
+    None without one.
+
+    Raises:
+        CannotCompile: ``CC`` names no program.
+    """
+    if named := os.environ.get("CC", "").strip():
+        try:
+            command = tuple(shlex.split(named))
+        except ValueError:  # an open quote
+            command = ()
+        if not command or shutil.which(command[0]) is None:
+            raise CannotCompile(f"expected the variable CC to name a C compiler on the search path, got {named!r}")
+        return command
+    return next(((name,) for name in COMPILERS if shutil.which(name)), None)
+
+
+def require_c_compiler() -> tuple[str, ...]:
+    """Return the command of the C compiler. Raises ``CannotCompile`` without one."""
+    if (command := c_compiler()) is None:
+        raise CannotCompile(f"expected a C compiler ({', '.join(COMPILERS)}) on the search path, or the variable CC")
+    return command
+
+
+def compile_c(command: Sequence[str], flags: Sequence[str], sources: Sequence[str], out: Path, folder: Path) -> None:
+    """Compile C sources.
+
+    Args:
+        command: of the compiler.
+        sources: file names in the folder.
+        out: file to write.
+
+    Raises:
+        CannotCompile: the compiler refused the sources.
+    """
+    whole = [*command, *flags, "-o", str(out), *sources, "-lm"]
+    try:
+        done = subprocess.run(whole, cwd=folder, capture_output=True, text=True, timeout=SECONDS, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise CannotCompile(f"expected a C compiler, got {command[0]!r}: {error}") from error
+    if done.returncode:
+        said = done.stderr[:SHOWN].strip() or f"exit status {done.returncode}"
+        raise CannotCompile(f"{command[0]} refused the sources: {said}")
