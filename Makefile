@@ -16,7 +16,7 @@ PINS := pyproject.toml constraints.txt
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: demo install test lab-test audit test-all docs docs-serve format-check lint types imports unit chaos bench bench-memory acquisition audit-power compare format postgresql haproxy chromium languages screenshots picture clean help
+.PHONY: demo install test lab-test release audit test-all docs docs-serve format-check lint types imports unit chaos bench bench-memory acquisition audit-power compare format postgresql haproxy chromium languages screenshots picture clean help
 
 demo: .venv/demo  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
@@ -55,6 +55,11 @@ docs: .venv/dev  ## Build the site into build/docs; warnings are errors
 
 docs-serve: .venv/dev  ## Show the site while its pages are written
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve
+
+release: .venv/dev  ## Build wheel and source distribution into dist/ and check that each works alone; nothing is published
+	rm -rf dist
+	$(BIN)/python -m hatchling build --target sdist --target wheel
+	$(BIN)/python tests/release.py dist
 
 audit: .venv/dev  ## Ask for known holes of the pinned packages, where that can be asked
 	@$(BIN)/python tests/audit.py
