@@ -23,6 +23,7 @@ from contextlib import suppress
 from functools import cache
 from multiprocessing import context, forkserver
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import IO, Any
 
 MODULES = (
@@ -153,9 +154,13 @@ def main(asked: socket.socket, path: list[str]) -> None:
         asked: its other end sends the requests.
         path: where servers look for modules; not where tests do.
     """
+    from surrogym_server.storage.sql import open_storage  # here: a fork of this process has imported it already
+
     sys.path[:] = path
     forkserver._forkserver.ensure_running = lambda: None  # type: ignore[attr-defined]  # the one this is a fork of
     context._concrete_contexts = CONTEXTS | {"spawn": CONTEXTS["forkserver"]}  # type: ignore[attr-defined]
+    with TemporaryDirectory() as folder:
+        open_storage(f"sqlite:///{folder}/surrogym.db").close()  # it imports, and compiles statements, at its first use
     gc.freeze()
     children: dict[int, tuple[int, int]] = {}  # by a descriptor that is readable at its end: its process, its status
     with selectors.DefaultSelector() as waiting:
