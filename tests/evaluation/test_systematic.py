@@ -7,7 +7,7 @@ import pytest
 
 from surrogym_sampler.original.classic import pendulum
 from surrogym_trainer.evaluation.audit import Consequence
-from surrogym_trainer.evaluation.systematic import Inputs, Systematic, region, systematic
+from surrogym_trainer.evaluation.systematic import DEGREES, Inputs, Systematic, region, systematic
 from surrogym_trainer.policies.evidence import Promise
 
 PROMISE = Promise(median=180.0, low=170.0, high=190.0, functions=32, episodes=256)
@@ -46,6 +46,27 @@ def test_an_error_that_all_steps_share_is_found_in_forty(shift: float, tilt: flo
     found = [jointly(seed, 40, shift=shift, tilt=tilt) for seed in range(20)]
     assert sum(one.evidence >= 20 for one in found) >= 19
     assert all(int(np.argmax(one.chances)) == 1 for one in found if one.evidence >= 20)
+
+
+def test_the_evidence_is_the_ratio_of_the_densities_of_the_errors():
+    """Both are written out, with matrices of the size of the steps."""
+    rng, steps = np.random.default_rng(0), 12
+    x = np.concatenate([np.ones((steps, 1)), rng.standard_normal((steps, INPUTS))], 1)
+    errors, deviation = 1.5 + 0.5 * rng.standard_normal((steps, 1)), rng.uniform(0.1, 2.0, (steps, 1))
+    claimed, inputs = np.array([0.7]), Inputs(np.zeros(INPUTS), np.ones(INPUTS))
+    [forms] = systematic("a", errors, deviation, claimed, inputs, x).forms
+    e, kernel = errors[:, 0] / claimed, (np.eye(steps) + x @ x.T / (1 + INPUTS)) / 2
+    right = np.eye(steps) + deviation * kernel * deviation.T / claimed**2
+
+    def log_density(covariance: np.ndarray) -> float:
+        squares = DEGREES + e @ np.linalg.solve(covariance, e)
+        return -0.5 * ((DEGREES + steps) * np.log(squares) + np.linalg.slogdet(covariance)[1])
+
+    for form in forms:
+        wrong = right + x * form.variances @ x.T
+        assert np.log(form.evidence) == pytest.approx(log_density(wrong) - log_density(right))
+        expected = form.variances[:, None] * x.T @ np.linalg.solve(wrong, e) * claimed
+        np.testing.assert_allclose(form.mean, expected, atol=1e-9)
 
 
 def test_draws_are_the_shift_and_its_uncertainty():

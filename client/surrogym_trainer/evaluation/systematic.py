@@ -89,24 +89,20 @@ class _Form(NamedTuple):
     root: Array  # (1 + P, 1 + P) square root of their covariance
 
     @classmethod
-    def of(cls, errors: Array, right: Array, x: Array, variances: Array) -> Self:
-        """Explain errors (n,), in units of what the model claims, at inputs x (n, 1 + P). Their covariance without a
-        shared part is ``right`` (n, n), times an unknown factor."""
-        spread = x * variances
-        wrong = right + spread @ x.T
-        log_density, scale = _density(errors, wrong)
-        ratio = np.exp(min(log_density - _density(errors, right)[0], 600.0))
-        gain = np.linalg.solve(wrong, spread).T  # (1 + P, n)
-        values, vectors = np.linalg.eigh(np.diag(variances) - gain @ spread)
-        return cls(variances, float(ratio), gain @ errors, scale * vectors * np.sqrt(np.maximum(values, 0.0)))
-
-
-def _density(errors: Array, covariance: Array) -> tuple[float, float]:
-    """Logarithm of the density of errors (n,) whose scale is integrated out, without its constant, and the scale that
-    they suggest."""
-    factor, n = np.linalg.cholesky(covariance), len(errors)
-    squares = DEGREES + float(np.sum(np.linalg.solve(factor, errors) ** 2))
-    return float(-0.5 * (DEGREES + n) * np.log(squares) - np.log(np.diag(factor)).sum()), sqrt(squares / (DEGREES + n))
+    def of(cls, errors: Array, x: Array, variances: Array) -> Self:
+        """Explain errors (n,) at inputs x (n, 1 + P). Both are whitened: without a shared part, the covariance of the
+        errors is the identity, times an unknown factor. With one it is I + x diag(variances) x', whose inverse and
+        determinant follow from matrices of the size of the weights (Woodbury)."""
+        scales, n = np.sqrt(variances), len(errors)
+        precision = np.eye(len(scales)) + scales[:, None] * (x.T @ x) * scales
+        covariance = scales[:, None] * np.linalg.solve(precision, np.diag(scales))  # of the weights
+        score = x.T @ errors
+        right = DEGREES + float(errors @ errors)
+        wrong = max(right - float(score @ covariance @ score), DEGREES)
+        log_ratio = 0.5 * ((DEGREES + n) * np.log(right / wrong) - np.linalg.slogdet(precision)[1])
+        values, vectors = np.linalg.eigh(covariance)
+        root = sqrt(wrong / (DEGREES + n)) * vectors * np.sqrt(np.maximum(values, 0.0))
+        return cls(variances, float(np.exp(min(log_ratio, 600.0))), covariance @ score, root)
 
 
 @dataclass(frozen=True)
@@ -181,8 +177,11 @@ def systematic(
     smooth = (np.eye(len(x)) + x @ x.T / x.shape[1]) / 2
     forms = []
     for e, deviation, own in zip(errors.T, deviations.T, claimed, strict=True):
-        right = np.eye(len(x)) + smooth * deviation[:, None] * deviation / own**2
-        found = [_Form.of(e / own, right, x, size**2 * part) for part in (constant, tilted) for size in SIZES]
+        right = np.linalg.cholesky(np.eye(len(x)) + smooth * deviation[:, None] * deviation / own**2)
+        whitened = np.linalg.solve(right, np.column_stack([e / own, x]))
+        found = [
+            _Form.of(whitened[:, 0], whitened[:, 1:], size**2 * part) for part in (constant, tilted) for size in SIZES
+        ]
         forms.append(tuple(one._replace(mean=own * one.mean, root=own * one.root) for one in found))
     return Systematic(tuple(names), inputs, tuple(forms))
 
