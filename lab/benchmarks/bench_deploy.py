@@ -83,6 +83,7 @@ int main(void)
 }}
 """
 ROWS = 50_000  # states at once in the reference
+LOOP = 100  # steps of a closed loop
 M4 = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-Os", "-ffunction-sections")
 
 
@@ -191,31 +192,34 @@ def bulk(
 
 
 def visited(folder: Path, count: int, *, single: bool) -> None:
-    """Closed loops of a plant with lags: in double, lags are equal, and observations to 2 units in the last place."""
+    """Closed loops of a plant with lags, compared afterwards, all states at once: in double, lags are equal, and
+    observations to 2 units in the last place."""
     spec = plant(**HISTORY)
     path = network(folder, spec)
     controller, policy = controller_of(path), load_policy(path)
     compiled = Compiled(controller, folder / f"visited{single}", single=single)
-    rng, other_lags, ulps, largest = np.random.default_rng(1), 0, 0, 0.0
-    for _ in range(count // 100):
-        state, q, last = rng.uniform([-3, -1, 0], [3, 2, 1]), None, None
-        compiled.reset()
-        for _ in range(100):
-            q = begun(spec, state) if q is None else followed(spec, q, last, state)
-            _, action = compiled.step(state)
-            other_lags += int(not np.array_equal(compiled.coordinates, q))
-            shown = declared(spec, q[None]).astype(np.float32)
-            bits = compiled.observed().astype(np.float32).view(np.int32) - shown[0].view(np.int32)
-            ulps = max(ulps, int(np.abs(bits).max()))
-            expected = decode_actions(spec, policy(shown), 1)[0]
-            largest = max(largest, float((np.abs(action - expected) / (controller.high - controller.low)).max()))
-            last = action.astype(np.float32).astype(np.float64)
-            state = state + np.array([0.3 * last[0] + rng.normal(0, 0.1), 0.05 * (last[1] - 5), 0.0])
-            state[1] = np.clip(state[1], -1.2, 2.2)
-    print(f"visited, {'float' if single else 'double'}: {count} states, {other_lags} with other lags")
+    rng, size = np.random.default_rng(1), (count, len(spec.coordinates))
+    lags, kept, shown = np.empty(size), np.empty(size), np.empty((count, len(spec.observation)), np.float32)
+    actions = np.empty((count, len(controller.low)))
+    for step in range(count):
+        if step % LOOP == 0:
+            state, last = rng.uniform([-3, -1, 0], [3, 2, 1]), None
+            compiled.reset()
+        lags[step] = begun(spec, state) if last is None else followed(spec, lags[step - 1], last, state)
+        _, actions[step] = compiled.step(state)
+        kept[step], shown[step] = compiled.coordinates, compiled.observed()
+        last = actions[step].astype(np.float32).astype(np.float64)
+        state = state + np.array([0.3 * last[0] + rng.normal(0, 0.1), 0.05 * (last[1] - 5), 0.0])
+        state[1] = np.clip(state[1], -1.2, 2.2)
+    meant = declared(spec, lags).astype(np.float32)
+    expected = decode_actions(spec, policy(meant), count)
+    largest = (np.abs(actions - expected) / (controller.high - controller.low)).max()
+    off = np.abs(kept - lags).max()
+    print(f"visited, {'float' if single else 'double'}: {count} states, lags differ by at most {off:.2g}", end="")
     if not single:  # in float, a change is the difference of two rounded numbers
-        print(f"  observations within {ulps} units in the last place of float32")
-    print(f"  largest difference from the policy {largest:.2g} of the range")
+        ulps = int(np.abs(shown.view(np.int32) - meant.view(np.int32)).max())
+        print(f", observations by {ulps} units in the last place of float32", end="")
+    print(f", actions from the policy's by {largest:.2g} of their range")
 
 
 def strict(folder: Path, options: Any) -> None:
