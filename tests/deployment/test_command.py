@@ -76,6 +76,7 @@ def test_what_can_not_be_written_or_checked_is_refused_and_nothing_is_written(su
         ([str(path), *to, "--fallback", "3"], "expected a fallback of 1 entries"),
         ([str(path), *to, "--check"], "--check needs --env"),
         ([str(path), *to, "--env", "Pendulum-v1"], "--env together with --check"),
+        ([str(path), *to, "--check", "--env", "MountainCarContinuous-v0"], "does not fit the environment"),
         ([str(path), "--target", "st", "--out", "c", "--check"], "got st"),
     ]:
         said = surrogym("deploy", *arguments)

@@ -75,7 +75,8 @@ def test_the_description_has_what_a_program_on_a_machine_needs(tmp_path: Path):
     session = onnxruntime.InferenceSession(tmp_path / "arm.onnx", providers=["CPUExecutionProvider"])
     about = json.loads(session.get_modelmeta().custom_metadata_map["surrogym"])
     assert [m["name"] for m in about["measurements"]] == ["angle", "slide", "target"]
-    assert about["measurements"][1] == {"name": "slide", "unit": "m", "angle": False, "low": -1.0, "high": 2.0}
+    slide = {"name": "slide", "unit": "m", "angle": False, "low": -1.0, "high": 2.0, "sensor": [-4.0, 5.0]}
+    assert about["measurements"][1] == slide
     assert [lag["is"] for lag in about["lags"]] == [
         *("change of angle in the last step, by at most half a turn", "change of slide in the last step"),
         *("entry 0 of the last action", "entry 1 of the last action"),

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from support.controllers import LEARNERS, Idle, learner, network, plant
 from surrogym_sampler.original.actions import decode_actions
+from surrogym_sampler.original.errors import PolicyMisfit
 from surrogym_sampler.original.lags import begun, followed, read_names
 from surrogym_shared.spec import DiscreteAction
 from surrogym_shared.terms import observe as declared
@@ -19,7 +20,7 @@ from surrogym_trainer.deployment.controller import LATE, NOT_FINITE, OUT_OF_RANG
 from surrogym_trainer.deployment.reading import controller_of
 from surrogym_trainer.deployment.reference import begin, decide, observe
 from surrogym_trainer.policies import UnusablePolicy, load_policy
-from surrogym_trainer.policies.card import PolicyCard, write_card
+from surrogym_trainer.policies.card import PolicyCard, card_path, write_card
 
 ANY = Choices(fallback=(0.0,))
 HISTORY = {"changes": 2, "actions": 2, "largest": {"angle": 0.5, "slide": 0.2}, "at_start": {"angle": 0.3}}
@@ -173,12 +174,13 @@ def test_choices_that_do_not_fit_are_refused(tmp_path: Path):
     for wrong, words in [
         (Choices(fallback=(0.0,)), "fallback of 2 entries"),
         (Choices(fallback=(0.0, 11.0)), r"got \[0.0, 11.0\]"),
-        (Choices(timeout=0.0), "more than 0 s"),
+        (Choices(timeout=0.0), "a timeout of 1e-06 s"),
         (Choices(ranges={"speed": (0.0, 1.0)}), r"angle, slide, target\), got speed"),
         (Choices(ranges={"slide": (1.0, 1.0)}), "that rises, .* got 1 to 1"),
         (Choices(ranges={"slide": (0.0, np.inf)}), "a range of slide that rises, within .* got 0 to inf"),
         (Choices(ranges={"slide": (0.0, 1e39)}), r"within -1e\+37 to 1e\+37, got 0 to 1e\+39"),
-        (Choices(timeout=1e38), r"finite numbers up to 1e\+37, for float, got 1e\+38"),
+        (Choices(timeout=1e38), r"a timeout of 1e-06 s to 1e\+37 s, got 1e\+38"),
+        (Choices(period=1e-9), r"a period of 1e-06 s"),
     ]:
         with pytest.raises(NotDeployable, match=words):
             controller_of(path, choices=wrong)
@@ -186,5 +188,15 @@ def test_choices_that_do_not_fit_are_refused(tmp_path: Path):
     with pytest.raises(NotDeployable, match="expected --fallback with 1 of the numbers"):
         controller_of(discrete)
     assert controller_of(discrete, choices=Choices(fallback=(2.0,))).fallback == 2
-    with pytest.raises(NotDeployable, match="network of 4 inputs and 3 outputs for this specification, got 4 and 2"):
+    with pytest.raises(PolicyMisfit, match="expected coordinates"):
         controller_of(network(tmp_path, plant()), plant(DiscreteAction(n=3)), choices=ANY)
+    card_path(network(tmp_path, plant())).unlink()
+    with pytest.raises(NotDeployable, match="network of 4 inputs and 3 outputs for this specification, got 4 and 2"):
+        controller_of(path, plant(DiscreteAction(n=3)), choices=ANY)
+
+
+def test_a_file_with_a_wrong_checksum_is_no_policy(tmp_path: Path):
+    path = network(tmp_path, plant())
+    path.write_bytes(bytes(b ^ 0xFF if 200 < i < 260 else b for i, b in enumerate(path.read_bytes())))
+    with pytest.raises(UnusablePolicy, match="not a network of arrays"):
+        controller_of(path)

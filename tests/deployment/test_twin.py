@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import zipfile
 from dataclasses import replace
@@ -215,6 +216,14 @@ def test_a_compiler_that_fails_leaves_the_earlier_file(surrogate, tmp_path, monk
         write_twin(surrogate.to_bytes(), path)
     assert path.read_bytes() == b"earlier"
     assert os.listdir(tmp_path) == ["tanks.fmu"]
+
+
+@pytest.mark.skipif(shutil.which("arm-linux-gnueabihf-gcc") is None, reason="no compiler for another machine")
+def test_a_compiler_for_another_machine_is_refused(surrogate, tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", "arm-linux-gnueabihf-gcc")
+    with pytest.raises(c_compiler.CannotCompile, match="for this machine"):
+        write_twin(surrogate.to_bytes(), tmp_path / "tanks.fmu")
+    assert os.listdir(tmp_path) == []
 
 
 def test_the_same_surrogate_gives_the_same_description_and_another_one_another_token(surrogate):

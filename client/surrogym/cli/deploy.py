@@ -17,6 +17,7 @@ from surrogym.cli.options import NAMES, SpecFile
 if TYPE_CHECKING:
     from surrogym_client.transport import Api
     from surrogym_sampler.original.episodes import Episode
+    from surrogym_shared.spec import EnvironmentSpec
     from surrogym_trainer.deployment.controller import Choices, Controller
     from surrogym_trainer.deployment.running import Checked, Comparison
     from surrogym_trainer.deployment.targets import Target
@@ -115,14 +116,19 @@ class Checking:
 
     @contextmanager
     def _episode(self, policy: LocalPolicy) -> Iterator[Episode]:
-        """Open the original environment, or the virtual one if none is named."""
+        """Open the original environment, or the virtual one if none is named.
+
+        Raises:
+            PolicyMisfit: the policy is for another environment.
+        """
         from surrogym.cli.opening import opener_for_policy
         from surrogym_client.transport.http_surrogate import HttpSurrogate
+        from surrogym_sampler.original.fitting import check_policy
         from surrogym_trainer.deployment.virtual import VirtualEpisode
 
         with ExitStack() as stack:
             if self.env is not None:
-                episode = opener_for_policy(self.env, None, policy.card, quiet=policy.output.quiet)()
+                episode = opener_for_policy(self.env, policy.given, policy.card, quiet=policy.output.quiet)()
             else:
                 api = stack.enter_context(policy.connect())
                 token = policy.service.token_for(policy.context)
@@ -130,6 +136,8 @@ class Checking:
                     stack.enter_context(HttpSurrogate(api.url, str(policy.card.surrogate), token)), api
                 )
             stack.callback(episode.close)
+            if (meant := policy.given or policy.card.spec) is not None:
+                check_policy(meant, episode.spec)
             yield episode
 
     def run(self, comparison: Comparison, output: Output) -> Checked:
@@ -162,10 +170,12 @@ class Checking:
 
 @dataclass(frozen=True)
 class LocalPolicy:
-    """A policy's file on this machine, its card, and the options of the command."""
+    """A policy's file on this machine, its card, and the options of the command. ``given`` is the specification of
+    --spec."""
 
     path: Path
     card: PolicyCard
+    given: EnvironmentSpec | None
     context: typer.Context
     reading: PolicyReading
     service: Service
@@ -219,9 +229,9 @@ def command(
 
     Example: surrogym deploy policy.zip --target c --out controller --check
 
-    Example: surrogym deploy pendulum@production --target arduino --out pendulum_controller
+    Example: surrogym deploy pendulum@production --target arduino --period 0.05 --out pendulum_controller
 
-    Example: surrogym deploy pendulum --target fmu --out twin
+    Example: surrogym deploy pendulum --target fmu --period 0.05 --out twin
     """
     from surrogym.cli.errors import CommandError
     from surrogym.cli.options import read_spec
@@ -242,9 +252,9 @@ def command(
         twin = write_twin(context, policy, out, period, service)
         output.give(twin, lambda: in_words(twin))
         return
-    with _local(context, policy, reading, service, output) as local:
+    with _local(policy, read_spec(spec), context, reading, service, output) as local:
         controller = controller_of(
-            local.path, read_spec(spec), reading.algorithm, trust=reading.trust_policy, choices=faults.choices(period)
+            local.path, local.given, reading.algorithm, trust=reading.trust_policy, choices=faults.choices(period)
         )
         with checking.comparison(to, controller, local) as comparison:
             written = deploy(controller, target, out)
@@ -263,26 +273,41 @@ def command(
 
 @contextmanager
 def _local(
-    context: typer.Context, policy: str, reading: PolicyReading, service: Service, output: Output
+    policy: str,
+    spec: EnvironmentSpec | None,
+    context: typer.Context,
+    reading: PolicyReading,
+    service: Service,
+    output: Output,
 ) -> Iterator[LocalPolicy]:
-    """Yield a policy file. A stored policy is downloaded for as long as the command runs."""
+    """Yield a policy file. A stored policy is downloaded for as long as the command runs.
+
+    Raises:
+        CommandError: the surrogate's specification has changed since the policy was stored.
+    """
     from tempfile import TemporaryDirectory
 
+    from surrogym.cli.errors import CommandError
     from surrogym.cli.policy import parsed, stored_card
     from surrogym_trainer.policies.card import write_card
     from surrogym_trainer.policies.files import card_of_policy
 
     if Path(policy).is_file() or "@" not in policy:
-        yield LocalPolicy(Path(policy), card_of_policy(Path(policy)), context, reading, service, output)
+        yield LocalPolicy(Path(policy), card_of_policy(Path(policy)), spec, context, reading, service, output)
         return
     name, which = parsed(policy)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "policy.zip"
         with service.connect(context) as api:
             found, card = stored_card(api, name, which)
+            if card.spec is None and spec is None:
+                raise CommandError(
+                    f"expected --spec with the specification that {policy} was trained for, because that of {name!r} "
+                    f"has changed: {found.differs}"
+                )
             path.write_bytes(api.policies.file(name, found.version, "zip"))
         write_card(path, card)
-        yield LocalPolicy(path, card, context, reading, service, output)
+        yield LocalPolicy(path, card, spec, context, reading, service, output)
 
 
 def _range(text: str) -> tuple[str, tuple[float, float]]:

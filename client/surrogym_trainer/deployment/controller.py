@@ -23,6 +23,7 @@ Activation = Literal["none", "tanh", "relu"]
 NOT_FINITE, OUT_OF_RANGE, LATE, NO_ACTION = 1, 2, 4, 8  # bits of a status; 0: the action is the policy's
 PERIODS = 2  # age of a measurement in sampling periods that is no fault: its time varies
 LARGEST = 1e37  # number of a controller: float has it, and sums of a few
+SHORTEST = 1e-6  # s
 MOST_WEIGHTS = 1_000_000  # of a network: 8 MB in double, and about 20 MB of source
 TURNS = 100  # turns of an angle that a sensor may count, as wrapping loses digits
 
@@ -240,7 +241,7 @@ def _numbers(controller: Controller) -> Iterator[float]:
         yield from (lag.start, lag.low, lag.high)
     for part in (part for entry in controller.observation for part in entry.parts):
         yield from (part.coefficient, *(weight for _, weight in part.weights))
-    yield from (*controller.low, *controller.high, *controller.fallback, controller.timeout)
+    yield from (*controller.low, *controller.high, *controller.fallback)
 
 
 def _require_small(decision: Decision) -> None:
@@ -373,16 +374,19 @@ def _period(spec: EnvironmentSpec, chosen: float | None) -> float | None:
     declared = spec.sampling_period
     if chosen is None:
         return declared
-    if not 0 < chosen < np.inf:
-        raise NotDeployable(f"expected a period of more than 0 s, got {chosen:g}")
+    _require_seconds("period", chosen)
     if declared is not None and declared != chosen:
         raise NotDeployable(f"expected the period that the specification declares, {declared:g} s, got {chosen:g}")
     return chosen
 
 
 def _timeout(period: float | None, chosen: float | None) -> float:
-    if chosen is not None and not chosen > 0:
-        raise NotDeployable(f"expected a timeout of more than 0 s, got {chosen:g}")
     if chosen is not None:
+        _require_seconds("timeout", chosen)
         return chosen
     return np.inf if period is None else PERIODS * period
+
+
+def _require_seconds(what: str, seconds: float) -> None:
+    if not SHORTEST <= seconds <= LARGEST:
+        raise NotDeployable(f"expected a {what} of {SHORTEST:g} s to {LARGEST:g} s, got {seconds:g}")

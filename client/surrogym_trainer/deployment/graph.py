@@ -46,6 +46,7 @@ def description(controller: Controller) -> dict[str, Any]:
     return {
         "measurements": [
             {"name": m.name, "unit": m.unit, "angle": m.angle, "low": _finite(m.low), "high": _finite(m.high)}
+            | {"sensor": [m.lowest, m.highest]}  # beyond it: a fault
             for m in controller.measurements
         ],
         "lags": [{"name": lag.name, "is": _lag(lag, names), "start": lag.start} for lag in controller.lags],

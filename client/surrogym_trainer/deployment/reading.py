@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_sampler.original.actions import decode_actions
+from surrogym_sampler.original.fitting import check_policy
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.deployment.controller import (
@@ -28,7 +29,7 @@ from surrogym_trainer.deployment.controller import (
 )
 from surrogym_trainer.deployment.reference import act, scores
 from surrogym_trainer.policies.card import UnusablePolicy, read_card
-from surrogym_trainer.policies.files import ONNX, load_policy, require_policy
+from surrogym_trainer.policies.files import ONNX, load_network, load_policy, require_policy
 from surrogym_trainer.policies.predict import Predict
 
 if TYPE_CHECKING:
@@ -62,6 +63,7 @@ def controller_of(
     Raises:
         NotDeployable: the policy has another form, no specification is known, or a choice does not fit.
         UnusablePolicy: the file is not a policy of the algorithm, or it needs ``trust``.
+        PolicyMisfit: the card has another specification.
     """
     require_policy(policy)
     if policy.suffix.lower() == ONNX:
@@ -70,6 +72,8 @@ def controller_of(
     meant = spec or card.spec
     if meant is None:
         raise NotDeployable(f"expected --spec with the specification of {policy}: no card beside it has one")
+    if card.spec is not None:
+        check_policy(card.spec, meant)
     chosen = algorithm or card.algorithm
     decision, predict = _network(policy, chosen, trust=trust)
     digests = {
@@ -86,7 +90,7 @@ def controller_of(
 def _network(policy: Path, algorithm: str, *, trust: bool) -> tuple[Decision, Predict]:
     """Return the network of a policy file, and the policy as a function of observations."""
     if Network.is_at(policy):
-        network = Network.load(policy)
+        network = load_network(policy)
         return _of_arrays(network), network
     try:
         predict = load_policy(policy, algorithm, trust=trust)

@@ -66,7 +66,9 @@ def twin_of(file: SurrogateFile, period: float | None = None) -> Block:
 
 def _period(seconds: float | None) -> float:
     if seconds is None:
-        raise InvalidInput("period: expected the seconds of one step, because the specification has no sampling_period")
+        raise InvalidInput(
+            "expected --period with the seconds of one step, because the specification has no sampling_period"
+        )
     if not 0 < seconds < math.inf:
         raise InvalidInput(f"period: expected the seconds of one step, above 0, got {seconds}")
     return seconds

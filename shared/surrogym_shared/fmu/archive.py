@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import subprocess
 import sys
 import tempfile
 import zipfile
@@ -10,12 +11,13 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-from surrogym_shared.c_compiler import c_compiler, compile_c
+from surrogym_shared.c_compiler import CannotCompile, c_compiler, compile_c
 from surrogym_shared.fmu.block import Block
 from surrogym_shared.fmu.description import build_description, model_description
 
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off")
 WRAPPER = "fmi3.c"
+LOADS = "import ctypes, sys; ctypes.CDLL(sys.argv[1])"  # CC may compile for another machine
 EPOCH = (1980, 1, 1, 0, 0, 0)  # so that the same block gives the same bytes
 SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("windows", ".dll")}
 MACHINES = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}
@@ -73,4 +75,8 @@ def _compiled(command: tuple[str, ...], sources: dict[str, str], names: list[str
             Path(folder, name).write_text(text, encoding="utf-8")
         library = Path(folder, "library")
         compile_c(command, FLAGS, names, library, Path(folder))
+        if subprocess.run([sys.executable, "-c", LOADS, str(library)], capture_output=True, check=False).returncode:
+            raise CannotCompile(
+                f"expected a C compiler for this machine, got {command[0]}: its library can't be loaded"
+            )
         return library.read_bytes()
