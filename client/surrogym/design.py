@@ -24,15 +24,17 @@ from surrogym import checks
 from surrogym.files import existing
 from surrogym_sampler.original.protocol import RealStep
 from surrogym_server.convert import default_budget, definition_from_spec
-from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, judge_stored, run_design_job
+from surrogym_server.engine.design_job import DesignJob, DesignResult, judge_stored, run_design_job
 from surrogym_server.errors import InvalidInput
 from surrogym_server.local import LocalSurrogate
+from surrogym_server.sampling.design import initial_queries
+from surrogym_shared import nouns
+from surrogym_shared.nouns import Phase
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 
 Floats = NDArray[np.float64]
 LEAST_SAMPLES = 2  # fewest samples that a model can be fitted to
-Phase = Literal["collecting", "sampling", "ready", "over_budget", "unsure", "from_log"]
 
 
 class QueriesOpen(RuntimeError):
@@ -43,22 +45,14 @@ class QueriesOpen(RuntimeError):
         super().__init__(f"expected the answers to the queries {list(ids)} first: tell() them, or give_up() them")
 
 
-@dataclass(frozen=True)
-class Query:
+@dataclass(frozen=True, kw_only=True)
+class Query(nouns.Query):
     """A query: one step from ``coordinates``, or several ``actions`` from a snapshot or a reset if not any state can be
-    set."""
+    set. An action has continuous values, or the number of each discrete action."""
 
     id: int
     purpose: Literal["initial", "adaptive"]
-    coordinates: tuple[float, ...]  # (C,); empty for a rollout
-    actions: tuple[tuple[float, ...], ...]  # (T, F); T is 1 for a step
-    snapshot: str | None = None  # name of the snapshot to begin at; None: at a reset
     design: str = field(default="", repr=False)  # identifies the design: equal specifications begin with equal queries
-
-    @property
-    def action(self) -> tuple[float, ...]:
-        """Action of a one-step query, (F,): continuous values, or the number of each discrete action."""
-        return self.actions[0]
 
 
 class Design:
@@ -103,9 +97,9 @@ class Design:
         self._phase: Phase = "collecting"
         self._result: DesignResult | None = None
         self._settled = 0  # number of samples and abandoned queries at the last fit
-        self._state, q, u, rollouts = initial_queries(self._definition, self.budget)
-        self._snapshots: dict[str, tuple[float, ...]] = {}  # coordinates (C,) by name
-        self._queue = deque(self._queries("initial", q, u, rollouts, ()))
+        self._state: dict[str, Any] = {}
+        self._snapshots: dict[str, nouns.Vector] = {}  # coordinates (C,) by name
+        self._queue = deque(self._numbered("initial", initial_queries(self._definition, self.budget)))
 
     @property
     def phase(self) -> Phase:
@@ -167,7 +161,7 @@ class Design:
         taken = checks.steps_of(steps)
         if query is not None:
             self._require_open(query)
-        if not taken or (query is not None and len(taken) > len(query.actions)):
+        if not taken or (query is not None and len(taken) > query.steps):
             raise InvalidInput(f"expected {_count_of(query)}, got {len(taken)}")
         if snapshots and len(snapshots) != len(taken):
             raise InvalidInput(f"snapshots: expected one entry for each of {len(taken)} steps, got {len(snapshots)}")
@@ -274,7 +268,7 @@ class Design:
             self._phase, self._settled = self._result.phase, len(self._samples)
 
     def _spec_to_save(self) -> EnvironmentSpec:
-        budget = max(2, self.budget - sum(len(query.actions) for query in self._given_up))
+        budget = max(2, self.budget - sum(query.steps for query in self._given_up))
         initial = self.spec.design.initial
         changed = {
             "budget": budget,
@@ -293,21 +287,11 @@ class Design:
             torch.set_num_threads(threads)
         self._state, self._result, self._extra = result.state, result, 0
         self._settled = len(self._samples) + len(self._given_up)
-        self._queue.extend(
-            self._queries(
-                "adaptive",
-                result.query_coordinates,
-                result.query_action,
-                result.query_rollouts,
-                result.query_snapshots,
-            )
-        )
+        self._queue.extend(self._numbered("adaptive", result.queries))
         self._phase = result.phase
 
     def _job(self) -> DesignJob:
         q, u, q_next, reward, terminated = self._arrays()
-        steps = [query for query in self._given_up if query.coordinates]
-        rollouts = [query for query in self._given_up if not query.coordinates]
         return DesignJob(
             definition=self._definition,
             coordinates=q,
@@ -318,10 +302,7 @@ class Design:
             state=self._state,
             budget=self.budget,
             target=self.target,
-            pending_coordinates=np.array([query.coordinates for query in steps]) if steps else None,
-            pending_action=np.array([query.action for query in steps]) if steps else None,
-            pending_rollouts=tuple(np.array(query.actions) for query in rollouts),
-            pending_snapshots=tuple(query.snapshot for query in rollouts),
+            pending=tuple(self._given_up),
             snapshots=dict(self._snapshots),
             extra_queries=self._extra,
             occupancy=self._visited,
@@ -336,20 +317,11 @@ class Design:
         ended = np.array([step.terminated for step in self._samples], dtype=np.bool_)
         return rows("coordinates"), rows("action"), rows("next_coordinates"), rows("reward"), ended
 
-    def _queries(
-        self,
-        purpose: Literal["initial", "adaptive"],
-        q: Floats,
-        u: Floats,
-        rollouts: Sequence[Floats],
-        snapshots: Sequence[str | None],
-    ) -> list[Query]:
-        asked: list[tuple[tuple[float, ...], tuple[tuple[float, ...], ...], str | None]] = [
-            (tuple(row), (tuple(action),), None) for row, action in zip(q.tolist(), u.tolist(), strict=True)
+    def _numbered(self, purpose: Literal["initial", "adaptive"], queries: Sequence[nouns.Query]) -> list[Query]:
+        return [
+            Query(q.coordinates, q.actions, q.snapshot, id=next(self._ids), purpose=purpose, design=self._name)
+            for q in queries
         ]
-        begun = snapshots or (None,) * len(rollouts)
-        asked += [((), tuple(map(tuple, u.tolist())), at) for u, at in zip(rollouts, begun, strict=True)]
-        return [Query(next(self._ids), purpose, at, actions, start, self._name) for at, actions, start in asked]
 
     def _require_open(self, query: Query) -> None:
         if not isinstance(query, Query):
@@ -362,7 +334,7 @@ class Design:
 
     def _spoken_for(self) -> int:
         waiting = [*self._queue, *self._open.values(), *self._given_up]
-        return len(self._samples) + sum(len(query.actions) for query in waiting)
+        return len(self._samples) + sum(query.steps for query in waiting)
 
     def _last(self) -> DesignResult:
         if self._result is None:
@@ -373,4 +345,4 @@ class Design:
 def _count_of(query: Query | None) -> str:
     if query is None:
         return "at least 1 step"
-    return "1 step" if len(query.actions) == 1 else f"1 to {len(query.actions)} steps"
+    return "1 step" if query.steps == 1 else f"1 to {query.steps} steps"

@@ -29,15 +29,14 @@ matplotlib.use("Agg")
 from matplotlib.figure import Figure
 
 from support.models import learn
-from support.real_steps import answer, join, random_steps
+from support.real_steps import answer, arrays, join, random_steps
 from surrogym_client.runtime.versions import commit
 from surrogym_lab.reproduce.statistics import bootstrap_interval, difference_interval
 from surrogym_sampler.original import make
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
-from surrogym_server.sampling.design import advance, initial_design
+from surrogym_server.sampling.design import advance, initial_queries
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_shared.spec import Design, EnvironmentSpec
 from surrogym_trainer.evaluation.evaluator import interquartile_mean
@@ -105,19 +104,18 @@ def designed(spec: EnvironmentSpec, counts: Sequence[int]) -> Iterator[tuple[Gau
     definition = definition_from_spec(spec)
     if definition.design.acquisition.name == "latin_hypercube":
         for count in counts:
-            yield learn(definition, answer(spec, *initial_design(definition, count))).model, count
+            yield learn(definition, answer(spec, *arrays(initial_queries(definition, count)))).model, count
         return
-    samples, state = answer(spec, *initial_design(definition, counts[0])), DesignState()
-    nothing = Points(samples.q[:0], samples.u[:0])
+    samples, state = answer(spec, *arrays(initial_queries(definition, counts[0]))), DesignState()
     while True:
         next_count = min((count for count in counts if count > len(samples)), default=len(samples))
         wanted = min(next_count - len(samples), len(definition.outputs))
-        made = advance(definition, samples, state, Request(len(samples), 0.999, nothing, extra=wanted))
+        made = advance(definition, samples, state, Request(len(samples), 0.999, extra=wanted))
         if len(samples) in counts:
             yield made.model, len(samples)
-        if not len(made.q):
+        if not made.queries:
             return
-        samples, state = join(samples, answer(spec, made.q, made.u)), made.state
+        samples, state = join(samples, answer(spec, *arrays(made.queries))), made.state
 
 
 def error(model: GaussianProcessModel, test: Samples) -> float:

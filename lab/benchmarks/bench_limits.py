@@ -29,15 +29,14 @@ from torch import Tensor
 
 from support.models import gaussian_processes
 from support.reactor import MAPPING, example
-from support.real_steps import join
+from support.real_steps import arrays, join
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples, increments, saturated
 from surrogym_server.models.gaussian_process.learning import learn as learning
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
-from surrogym_server.sampling.design import advance, initial_design
+from surrogym_server.sampling.design import advance, initial_queries
 from surrogym_server.sampling.latin_hypercube import latin_hypercube
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_shared.spec import Bounds, Design, EnvironmentSpec
@@ -135,10 +134,9 @@ def designed(spec: EnvironmentSpec, seeds: list[int]) -> Iterator[tuple[dict[str
             ("inequalities", "latin_hypercube"),
         ):
             definition = learn_by(spec, way, acquisition, seed)
-            samples, state = steps(*initial_design(definition, BUDGET)), DesignState()
-            nothing = Points(samples.q[:0], samples.u[:0])
-            while len((made := advance(definition, samples, state, Request(BUDGET, 0.999, nothing))).q):
-                samples, state = join(samples, steps(made.q, made.u)), made.state
+            samples, state = steps(*arrays(initial_queries(definition, BUDGET))), DesignState()
+            while len((made := advance(definition, samples, state, Request(BUDGET, 0.999))).queries):
+                samples, state = join(samples, steps(*arrays(made.queries))), made.state
             model = made.model
             assert isinstance(model, GaussianProcessModel)
             yield {"seed": seed, "with": way, "acquisition": acquisition}, model, samples

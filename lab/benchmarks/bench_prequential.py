@@ -27,16 +27,15 @@ import torch
 from common import parser, started, write
 from scipy.stats import binom
 
-from support.real_steps import join, samples_of
+from support.real_steps import arrays, join, samples_of
 from surrogym_lab.tasks import EVERY_TASK
 from surrogym_sampler.original import make
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.several import FunctionsOfSeveral
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.design import Decision, advance, initial_design
+from surrogym_server.sampling.design import Decision, advance, initial_queries
 from surrogym_server.sampling.latin_hypercube import random_points
 from surrogym_server.sampling.prequential import Prediction, Predictions, continued, half_width, predicted, scores_of
 from surrogym_server.sampling.state import DesignState, Request
@@ -111,16 +110,15 @@ def rows_of(task: str, seed: int, *, judged: bool) -> list[Row]:
 def replay(machine: Machine, budget: int, *, judged: bool) -> tuple[Decision, Samples, Predictions]:
     """The last round of a design, its samples, and the predictions of the mixture."""
     definition = definition_from_spec(machine.spec)
-    samples, state, mixed = machine.answer(*initial_design(definition, budget)), DesignState(), Predictions()
-    nothing = Points(samples.q[:0], samples.u[:0])
+    samples, state, mixed = machine.answer(*arrays(initial_queries(definition, budget))), DesignState(), Predictions()
     while True:
-        request = Request(budget, machine.spec.design.target, nothing)
+        request = Request(budget, machine.spec.design.target)
         made = advance(definition, samples, state, request)
         if judged and made.verdict == "ready" and len(samples) < budget and _miscalibrated(made):
             made = advance(definition, samples, state, replace(request, extra=1))
-        if not len(made.q):
+        if not made.queries:
             return made, samples, mixed
-        new = machine.answer(made.q, made.u)
+        new = machine.answer(*arrays(made.queries))
         state = replace(made.state, predictions=continued(made.state.predictions, predicted(made.model, new)))
         mixed = continued(mixed, mixture_of(made.model, new))
         samples = join(samples, new)

@@ -24,11 +24,10 @@ import torch
 from support.changing import MACHINES, Machine
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.guard import learn
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.design import advance, initial_rollouts
+from surrogym_server.sampling.design import advance, initial_queries
 from surrogym_server.sampling.rollouts import random_sequences
 from surrogym_server.sampling.serial import SensorNoise, sensor_noise
 from surrogym_server.sampling.state import DesignState, Request
@@ -97,14 +96,14 @@ def design(machine: Machine, given: argparse.Namespace) -> None:
     for kind in given.kinds:
         for seed in given.all_seeds:
             definition, rng, state = of(machine, seed), np.random.default_rng([seed, 9]), DesignState()
-            actions = [one.numpy() for one in initial_rollouts(definition, given.budget)]
+            actions = [np.array(query.actions) for query in initial_queries(definition, given.budget)]
             rows: list[Row] = []
             while actions:
                 rows += [row for one in actions for row in play(machine, one, KINDS[kind], rng)]
                 samples = samples_of(rows)
-                request = Request(given.budget, 0.999, Points(samples.q[:0], samples.u[:0]))
+                request = Request(given.budget, 0.999)
                 decided = advance(definition, samples, state, request)
-                state, actions = decided.state, [one.actions.numpy() for one in decided.rollouts]
+                state, actions = decided.state, [np.array(query.actions) for query in decided.queries]
             judged = decided.confidences
             words = [f"{c.confidence_index:.4f}, noise {c.noise:.3g}, sensor {c.sensor_noise:.3g}" for c in judged]
             print(

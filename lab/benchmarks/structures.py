@@ -12,11 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from support.real_steps import join
+from support.real_steps import arrays, join
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import REWARD, EnvironmentDefinition, wrap
 from surrogym_server.environment.features import encode, features, leading
-from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples, increments
 from surrogym_server.gp import FitOptions, Fitted, Reflection, condition, fit
 from surrogym_server.gp.kernel import Hyperparameters
@@ -24,7 +23,7 @@ from surrogym_server.gp.search import Evidence, minimum
 from surrogym_server.models.gaussian_process.censoring import usable
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
-from surrogym_server.sampling.design import advance, initial_design
+from surrogym_server.sampling.design import advance, initial_queries
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.sampling.prequential import half_width
 from surrogym_server.sampling.state import DesignState, Request
@@ -241,10 +240,10 @@ def designed(original: Any, seed: int, settings: Mapping[str, Any]) -> dict[str,
     """Real steps of an adaptive design without a policy, its error on unseen steps, and its processor time."""
     definition = definition_of(original, settings, seed=seed)
     unseen = real_steps(original, *random_points(definition, UNSEEN, np.random.default_rng(UNSEEN_SEED)))
-    samples, state = real_steps(original, *initial_design(definition, BUDGET)), DesignState()
-    nothing, begun = Points(samples.q[:0], samples.u[:0]), time.process_time()
-    while len((made := advance(definition, samples, state, Request(BUDGET, 0.999, nothing))).q):
-        samples, state = join(samples, real_steps(original, made.q, made.u)), made.state
+    samples, state = real_steps(original, *arrays(initial_queries(definition, BUDGET))), DesignState()
+    begun = time.process_time()
+    while len((made := advance(definition, samples, state, Request(BUDGET, 0.999))).queries):
+        samples, state = join(samples, real_steps(original, *arrays(made.queries))), made.state
     seconds = time.process_time() - begun
     off = made.model.transition(unseen.q, unseen.u).q_next - unseen.q_next
     off[:, definition.angles] = wrap(off[:, definition.angles])

@@ -39,7 +39,7 @@ from surrogym_server.api.stepping.routes import router as stepping
 from surrogym_server.api.turns import Turns, Waiting
 from surrogym_server.convert import definition_from_spec, stored_definition
 from surrogym_server.convert.stored import read_stored
-from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
+from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.fits import Fits
 from surrogym_server.engine.local import LocalEngine
 from surrogym_server.engine.models import ModelCache
@@ -54,6 +54,7 @@ from surrogym_server.features.ray.pool import CLUSTER as ray
 from surrogym_server.models.registry import MODELS
 from surrogym_server.private import keep_private
 from surrogym_server.sampling.acquisition import ACQUISITIONS
+from surrogym_server.sampling.design import initial_queries
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import Designer

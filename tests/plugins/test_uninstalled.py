@@ -20,10 +20,11 @@ from support.server import ServerProcess, running_server
 from surrogym.cli import build
 from surrogym_client.transport import Api
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
+from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.models.port import DynamicsModel
+from surrogym_server.sampling.design import initial_queries
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import Designer
 from surrogym_server.services.metrics import ProcessMetrics
@@ -60,8 +61,8 @@ def define(spec: dict[str, object]) -> EnvironmentDefinition:
 
 def teach(storage: Storage, name: str, spec: dict[str, object]) -> None:
     """Register a surrogate, and answer its queries: a round is due."""
-    state, q, u, _ = initial_queries(define(spec), pendulum.INITIAL)
-    storage.surrogates.create(records.NewSurrogate(name, spec, pendulum.INITIAL, TARGET, state, q, u))
+    queries = initial_queries(define(spec), pendulum.INITIAL)
+    storage.surrogates.create(records.NewSurrogate(name, spec, pendulum.INITIAL, TARGET, queries))
     for query in storage.queries.claim(name, "tester", pendulum.INITIAL, 60):
         step = pendulum.real_step(list(query.coordinates), list(query.action))
         answer = records.NewSample(**step, query_id=query.id, lease_token=query.token)

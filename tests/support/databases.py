@@ -13,10 +13,12 @@ import pytest
 import sqlalchemy as sa
 
 from support.postgresql import Postgresql, running_postgresql
+from support.queries import steps
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSurrogate
 from surrogym_server.storage.sql import open_storage
 from surrogym_server.storage.sql.tables import metadata
+from surrogym_shared.nouns import Query
 
 SPEC = {"environment": "Pendulum-v1", "coordinates": [{"name": "angle"}, {"name": "speed"}]}
 NAME = "pendulum"
@@ -59,18 +61,13 @@ def storage(request: pytest.FixtureRequest, url: str) -> Iterator[Storage]:
 
 @pytest.fixture
 def make(storage: Storage) -> Callable[..., str]:
-    """Create a surrogate with m queries of C = 2 and F = 1."""
+    """Create a surrogate with these queries, or with as many of C = 2 and F = 1."""
 
-    def create(queries: int = 3, name: str = NAME, **changes: Any) -> str:
-        coordinates = np.arange(2.0 * queries).reshape(queries, 2)
-        action = np.full((queries, 1), 0.5)
-        storage.surrogates.create(
-            NewSurrogate(
-                **{"name": name, "spec": SPEC, "budget": 30, "target": 0.999, "state": {"round": 0}} | changes,
-                query_coordinates=coordinates,
-                query_action=action,
-            )
-        )
+    def create(queries: int | tuple[Query, ...] = 3, name: str = NAME, **changes: Any) -> str:
+        if isinstance(queries, int):
+            queries = steps(np.arange(2.0 * queries).reshape(queries, 2), np.full((queries, 1), 0.5))
+        values: dict[str, Any] = {"name": name, "spec": SPEC, "budget": 30, "target": 0.999, "queries": queries}
+        storage.surrogates.create(NewSurrogate(**values | changes))
         return name
 
     return create

@@ -8,8 +8,6 @@ from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.errors import ChoiceFailed, InvalidInput
 
@@ -26,8 +24,6 @@ def result(**changes: Any) -> DesignResult:
         "state": {},
         "verdict": "ready",
         "seconds": 0.0,
-        "query_coordinates": np.zeros((0, 2)),
-        "query_action": np.zeros((0, 1)),
     }
     return DesignResult(**values | changes)
 

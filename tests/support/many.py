@@ -9,6 +9,7 @@ import numpy as np
 import sqlalchemy as sa
 
 from support import pendulum
+from support.queries import steps
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewModel, NewSample, NewSurrogate
 from surrogym_server.storage.sql import open_storage
@@ -76,8 +77,8 @@ def finish(storage: Storage, name: str) -> None:
 
 
 def create(storage: Storage, name: str) -> None:
-    coordinates, action = np.zeros((QUERIES, 2)), np.zeros((QUERIES, 1))
-    storage.surrogates.create(NewSurrogate(name, pendulum.spec(), 40, 0.999, {}, coordinates, action))
+    queries = steps(np.zeros((QUERIES, 2)), np.zeros((QUERIES, 1)))
+    storage.surrogates.create(NewSurrogate(name, pendulum.spec(), 40, 0.999, queries))
 
 
 def model() -> NewModel:

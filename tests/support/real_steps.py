@@ -13,7 +13,14 @@ from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples
 from surrogym_server.sampling.latin_hypercube import random_points
+from surrogym_shared.nouns import Query
 from surrogym_shared.spec import EnvironmentSpec
+
+
+def arrays(queries: Sequence[Query]) -> tuple[Tensor, Tensor]:
+    """Coordinates (n, C) and actions (n, F) of queries for single steps."""
+    q, u = ([getattr(query, name) for query in queries] for name in ("coordinates", "action"))
+    return torch.tensor(q, dtype=torch.float64), torch.tensor(u, dtype=torch.float64)
 
 
 def answer(spec: EnvironmentSpec, q: Tensor, u: Tensor) -> Samples:
@@ -34,12 +41,12 @@ def samples_of(steps: Sequence[RealStep]) -> Samples:
     )
 
 
-def roll(spec: EnvironmentSpec, actions: Tensor, seed: int) -> Samples:
+def roll(spec: EnvironmentSpec, actions: Tensor | Sequence[Sequence[float]], seed: int) -> Samples:
     """The real steps of one action sequence (T, F) from a reset, up to the end of the episode."""
     original = GymnasiumEnvironment(spec)
     original.begin(seed)
     steps = []
-    for action in actions.numpy():
+    for action in np.asarray(actions, dtype=np.float64):
         steps.append(original.act(action))
         if steps[-1].terminated:
             break

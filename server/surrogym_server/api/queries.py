@@ -5,10 +5,8 @@ from __future__ import annotations
 from functools import partial
 from typing import Annotated
 
-import numpy as np
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
-from numpy.typing import NDArray
 
 from surrogym_server.api import examples
 from surrogym_server.api.auth import READ, SAMPLE, TRAIN
@@ -18,7 +16,6 @@ from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.api.turns import require_present
 from surrogym_server.convert import resources
-from surrogym_server.convert.numbers import numbers
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     AddQueries,
@@ -33,8 +30,6 @@ from surrogym_shared.wire import (
     WithdrawnQueries,
     WithdrawQueries,
 )
-
-Floats = NDArray[np.float64]
 
 router = APIRouter(prefix="/v1/surrogates/{name}", tags=["queries"], route_class=DoorRoute)
 
@@ -99,7 +94,7 @@ def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.F
 )
 def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUERIES)], use: Use) -> QueryList:
     """Queue queries behind those of the design. The model learns from their answers too."""
-    return resources.query_list(use.queries.add(name, *_asked(body)))
+    return resources.query_list(use.queries.add(name, resources.requested(body), body.idempotency_key))
 
 
 @router.post(
@@ -113,7 +108,8 @@ def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUER
 def audit(name: str, body: Annotated[AuditModel, example(examples.ADD_QUERIES)], use: Use) -> QueryList:
     """Queue real steps on a policy's way, to compare them with the model. They don't count towards the budget, and the
     model learns from them too."""
-    return resources.query_list(use.queries.add(name, *_asked(body), purpose="audit"))
+    queries = resources.requested(body)
+    return resources.query_list(use.queries.add(name, queries, body.idempotency_key, purpose="audit"))
 
 
 @router.post(
@@ -136,10 +132,3 @@ def withdraw(name: str, body: Annotated[WithdrawQueries, example(examples.WITHDR
 def list_all(name: str, use: Use, status: Annotated[list[QueryStatus], Query()] = []) -> QueryList:  # noqa: B006
     """List queries, oldest first. ``status`` may be given several times."""
     return resources.query_list(use.queries.list(name, status))
-
-
-def _asked(body: AddQueries) -> tuple[Floats, Floats, str | None, list[Floats]]:
-    """From a body: coordinates (m, C), actions (m, F), the idempotency key and action sequences, (T, F) each."""
-    q = numbers("coordinates", body.coordinates or ())
-    u = numbers("action", body.action or ())
-    return q, u, body.idempotency_key, [numbers("rollouts", actions) for actions in body.rollouts or ()]

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_server.convert.numbers import as_tuple
+from surrogym_server.convert.numbers import as_tuple, numbers
 from surrogym_server.convert.stored import read_stored
+from surrogym_server.errors import InvalidInput
 from surrogym_server.sampling.uncertainty import UncertaintyResult
 from surrogym_server.services.models import Said
 from surrogym_server.services.queries import Claim
@@ -28,6 +29,7 @@ from surrogym_server.virtual.imagined import Imagined, ImaginedEpisode
 from surrogym_server.virtual.single_step import PointPrediction
 from surrogym_shared import spec as wire
 from surrogym_shared import wire as replies
+from surrogym_shared.nouns import Query, Vector
 
 FIDELITY = "the fidelity of a model"  # name in the error if it is damaged
 
@@ -107,6 +109,19 @@ def _ledger_fields(record: LedgerRecord) -> dict[str, int]:
     return {**vars(record), "total": record.total}
 
 
+def requested(body: replies.AddQueries) -> list[Query]:
+    """The queries that a person or a program chose: single steps, then rollouts.
+
+    Raises:
+        InvalidInput: rows of different lengths, or another number of actions than of coordinates.
+    """
+    q, u = numbers("coordinates", body.coordinates or ()), numbers("action", body.action or ())
+    if len(q) != len(u):
+        raise InvalidInput(f"expected as many actions as coordinates, got {len(u)} actions and {len(q)} coordinates")
+    steps = [Query.step(*step) for step in zip(q.tolist(), u.tolist(), strict=True)]
+    return steps + [Query.rollout(numbers("rollouts", actions).tolist()) for actions in body.rollouts or ()]
+
+
 def claimed(claim: Claim, lease_seconds: float) -> replies.ClaimedQueries:
     queries = [_leased(query, lease_seconds) for query in claim.queries]
     return replies.ClaimedQueries(queries=queries, phase=claim.phase, paused=claim.paused)
@@ -122,7 +137,7 @@ def _leased(query: LeasedQuery, lease_seconds: float) -> replies.Query:
         "lease_seconds": lease_seconds,
     }
     if query.kind == "rollout":
-        return replies.RolloutQuery(**common, actions=query.actions.tolist(), snapshot=query.snapshot)
+        return replies.RolloutQuery(**common, actions=_rows(query.actions), snapshot=query.snapshot)
     return replies.StepQuery(**common, coordinates=list(query.coordinates), action=list(query.action))
 
 
@@ -138,13 +153,17 @@ def query_view(record: QueryRecord) -> replies.QueryView:
         round=record.round,
         kind=record.kind,
         coordinates=list(record.coordinates) or None,
-        actions=record.actions.tolist(),
+        actions=_rows(record.actions),
         snapshot=record.snapshot,
         attempts=record.attempts,
         sampler=record.sampler,
         error=record.error,
         lease_seconds_left=record.lease_seconds_left,
     )
+
+
+def _rows(actions: Iterable[Vector]) -> list[list[float]]:
+    return [list(action) for action in actions]
 
 
 def new_sample(sample: replies.NewSample) -> NewSample:

@@ -9,7 +9,7 @@ import json
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,18 +18,17 @@ from threadpoolctl import threadpool_limits
 
 from surrogym_server.engine.fidelity import fidelity_fields
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.guard import plugin_calls
-from surrogym_server.sampling.design import Decision, advance, initial_design, initial_rollouts
+from surrogym_server.sampling.design import Decision, advance
 from surrogym_server.sampling.judging import judge_model
 from surrogym_server.sampling.limits import reached_limits
 from surrogym_server.sampling.prequential import KEPT, Predictions, continued, predicted
-from surrogym_server.sampling.rollouts import Rollout
-from surrogym_server.sampling.state import DesignState, Request, Verdict
+from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import usual_tolerances
+from surrogym_shared.nouns import Phase, Query, Verdict
 
 Array = NDArray[np.float64]
 
@@ -47,14 +46,9 @@ class DesignJob:
     state: dict[str, Any]  # DesignState as JSON; {} before the first round
     budget: int  # limit of the design's real steps
     target: float  # confidence index
-    pending_coordinates: Array | None = None  # (p, C) unanswered queries: open, or set aside
-    pending_action: Array | None = None  # (p, F)
-    pending_rollouts: tuple[Array, ...] = ()  # unanswered rollouts, each (T, F)
-    pending_snapshots: tuple[str | None, ...] = ()  # where each of them begins; None, or a name not known: a reset
-    open_steps: int = 0  # of the unanswered queries, real steps that may still be taken
-    refused_coordinates: Array | None = None  # (r, C) queries that the environment refused
-    refused_action: Array | None = None  # (r, F)
-    refused_rollouts: tuple[Array, ...] = ()  # each (T, F)
+    pending: tuple[Query, ...] = ()  # queries without an answer: open, or set aside
+    open_steps: int = 0  # real steps of the pending queries that may still be taken
+    refused: tuple[Query, ...] = ()  # queries that the environment refused
     snapshots: dict[str, tuple[float, ...]] = field(default_factory=dict)  # coordinates (C,) of each, by name
     extra_queries: int = 0  # real steps requested with improve, chosen even if the design has ended
     occupancy: Array | None = None  # (m, C) states that policies visited
@@ -76,33 +70,12 @@ class DesignResult:
     state: dict[str, Any]
     verdict: Verdict
     seconds: float
-    query_coordinates: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, C)
-    query_action: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, F)
-    query_rollouts: tuple[Array, ...] = ()  # each (T, F)
-    query_snapshots: tuple[str | None, ...] = ()  # where each of them begins; None: at a reset
+    queries: tuple[Query, ...] = ()  # of the next round
 
     @property
-    def phase(self) -> Literal["sampling", "ready", "over_budget", "unsure", "from_log"]:
+    def phase(self) -> Phase:
         """Next phase of the design: it takes the chosen or the open queries, or it has ended."""
-        if self.verdict == "continue" or len(self.query_coordinates) or self.query_rollouts:
-            return "sampling"
-        return self.verdict
-
-
-def initial_queries(
-    definition: EnvironmentDefinition, budget: int
-) -> tuple[dict[str, Any], Array, Array, tuple[Array, ...]]:
-    """Choose the queries of the first round: (state, coordinates (m, C), action (m, F), rollouts (T, F) each).
-
-    They are a Latin hypercube, or rollouts if the environment can't be set to a state.
-    """
-    state, none = DesignState().to_json(), np.zeros((0, 0))
-    if budget == 0:
-        return state, none, none, ()
-    if definition.max_rollout is not None:
-        return state, none, none, tuple(actions.numpy() for actions in initial_rollouts(definition, budget))
-    q, u = initial_design(definition, budget)
-    return state, q.numpy(), u.numpy(), ()
+        return "sampling" if self.verdict == "continue" or self.queries else self.verdict
 
 
 def run_design_job(job: DesignJob) -> DesignResult:
@@ -113,7 +86,6 @@ def run_design_job(job: DesignJob) -> DesignResult:
         decision, samples = _decide(job)
     with plugin_calls(job.definition):
         stored = to_bytes(decision.model)
-    names = list(job.snapshots)
     return DesignResult(
         model=stored,
         description=json.loads(json.dumps(decision.model.description)),  # plain data, whatever a family returns
@@ -128,10 +100,7 @@ def run_design_job(job: DesignJob) -> DesignResult:
         state=decision.state.to_json(),
         verdict=decision.verdict,
         seconds=time.perf_counter() - started,
-        query_coordinates=decision.q.numpy(),
-        query_action=decision.u.numpy(),
-        query_rollouts=tuple(rollout.actions.numpy() for rollout in decision.rollouts),
-        query_snapshots=tuple(None if r.snapshot is None else names[r.snapshot] for r in decision.rollouts),
+        queries=decision.queries,
     )
 
 
@@ -198,36 +167,16 @@ def _known(job: DesignJob) -> torch.Tensor:
 
 
 def _request(job: DesignJob) -> Request:
-    def rows(array: Array | None, width: int) -> torch.Tensor:
-        return torch.zeros(0, width, dtype=torch.float64) if array is None else torch.from_numpy(array)
-
     return Request(
         budget=job.budget,
         target=job.target,
-        pending=Points(
-            rows(job.pending_coordinates, len(job.definition.coordinates)),
-            rows(job.pending_action, job.definition.action.size),
-        ),
-        pending_rollouts=_pending(job),
-        snapshots=rows(np.array(list(job.snapshots.values())), 0) if job.snapshots else None,
+        pending=job.pending,
+        refused=job.refused,
+        snapshots=job.snapshots,
         extra=job.extra_queries,
         states=None if job.occupancy is None else torch.from_numpy(job.occupancy),
         logged=job.logged,
         audited=job.audited,
         unlearned=int((~_known(job)).sum()),
         open=job.open_steps,
-        refused=Points(
-            rows(job.refused_coordinates, len(job.definition.coordinates)),
-            rows(job.refused_action, job.definition.action.size),
-        ),
-        refused_rollouts=tuple(Rollout(torch.from_numpy(actions)) for actions in job.refused_rollouts),
-    )
-
-
-def _pending(job: DesignJob) -> tuple[Rollout, ...]:
-    places = {name: number for number, name in enumerate(job.snapshots)}
-    snapshots = job.pending_snapshots or (None,) * len(job.pending_rollouts)
-    return tuple(
-        Rollout(torch.from_numpy(actions), places.get(snapshot or ""))
-        for actions, snapshot in zip(job.pending_rollouts, snapshots, strict=True)
     )

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_shared.nouns import Query
+
 
 @dataclass(frozen=True)
 class Points:
@@ -21,6 +24,18 @@ class Points:
 
     def __getitem__(self, index: slice | Tensor | list[int]) -> Points:
         return Points(self.q[index], self.u[index])
+
+    @classmethod
+    def of(cls, definition: EnvironmentDefinition, queries: Sequence[Query]) -> Points:
+        """Return the states and actions of queries for single steps."""
+        q = torch.tensor([query.coordinates for query in queries], dtype=torch.float64)
+        u = torch.tensor([query.action for query in queries], dtype=torch.float64)
+        return cls(q.reshape(-1, len(definition.coordinates)), u.reshape(-1, definition.action.size))
+
+    @property
+    def queries(self) -> tuple[Query, ...]:
+        """A query of a single step for each point."""
+        return tuple(Query.step(*step) for step in zip(self.q.tolist(), self.u.tolist(), strict=True))
 
     @classmethod
     def joined(cls, parts: Sequence[Points]) -> Points:

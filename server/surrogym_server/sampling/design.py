@@ -7,9 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torch import Tensor
-
 from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.guard import learn
 from surrogym_server.models.port import DynamicsModel
@@ -17,46 +16,41 @@ from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.confidence import OutputConfidence
 from surrogym_server.sampling.judging import judge_model, outcome_of
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube
-from surrogym_server.sampling.rollouts import Rollout, first_rollouts
+from surrogym_server.sampling.rollouts import first_rollouts
 from surrogym_server.sampling.round import Round
-from surrogym_server.sampling.rules import ROLLOUT_RULES, STEP_RULES, Chosen
+from surrogym_server.sampling.rules import ROLLOUT_RULES, STEP_RULES
 from surrogym_server.sampling.seeds import generator_for
-from surrogym_server.sampling.state import DesignState, Request, Verdict
+from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
+from surrogym_shared.nouns import Query, Verdict
 
 FEW_POINTS = 500  # more points leave no large gap, and comparing all pairs takes memory in the square of their number
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What a round decides. O outputs, m queries of single steps, C coordinates, F action entries."""
+    """What a round decides. O outputs."""
 
     model: DynamicsModel
     confidences: tuple[OutputConfidence, ...]  # per output
     tolerances: tuple[float, ...]  # (O,) used for the verdict
     state: DesignState
     verdict: Verdict
-    q: Tensor  # (m, C) next queries
-    u: Tensor  # (m, F)
-    rollouts: tuple[Rollout, ...] = ()  # next rollouts if the environment can't be set to any state
+    queries: tuple[Query, ...]  # next ones
 
 
-def initial_design(definition: EnvironmentDefinition, budget: int) -> tuple[Tensor, Tensor]:
-    """Draw the initial Latin hypercube: coordinates (n, C), actions (n, F), n at most the budget."""
-    count = min(definition.design.initial, budget)
-    if not acquisition_of(definition.design.acquisition).adaptive:
-        count = budget
-    tries = 1 if count > FEW_POINTS else definition.design.hypercube_tries
+def initial_queries(definition: EnvironmentDefinition, budget: int) -> tuple[Query, ...]:
+    """Return the queries before the first fit, with at most ``budget`` real steps: a Latin hypercube, or random
+    rollouts if the environment can't be set to any state."""
+    adaptive = acquisition_of(definition.design.acquisition).adaptive
+    steps = min(definition.design.initial, budget) if adaptive else budget
     rng = generator_for(definition, "initial")
-    return going_on(definition, *latin_hypercube(definition, count, rng, tries), rng)
-
-
-def initial_rollouts(definition: EnvironmentDefinition, budget: int) -> list[Tensor]:
-    """Draw the initial rollouts of an environment that can't be set to a state: action sequences (T, F), with at most
-    as many steps as the budget has."""
-    planned = acquisition_of(definition.design.acquisition).adaptive
-    steps = min(definition.design.initial, budget) if planned else budget
-    return first_rollouts(definition, steps, generator_for(definition, "initial"))
+    if definition.max_rollout is not None:
+        return first_rollouts(definition, steps, rng)
+    if not steps:
+        return ()
+    tries = 1 if steps > FEW_POINTS else definition.design.hypercube_tries
+    return Points(*going_on(definition, *latin_hypercube(definition, steps, rng, tries), rng)).queries
 
 
 def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignState, request: Request) -> Decision:
@@ -81,10 +75,10 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     # Choose.
     continues = outcome == "continue" or testing
     round = Round(state.round, learned.model, samples, request, judged, default.tolerances, continues, testing)
-    chosen = _choose(round)
-    verdict = _verdict(round, outcome, chosen)
+    queries = _choose(round)
+    verdict = _verdict(round, outcome, queries)
 
-    ended = verdict != "continue" and not chosen
+    ended = verdict != "continue" and not queries
     tested_at = len(samples) if testing else state.tested_at
     following = DesignState(
         round=state.round + 1,
@@ -96,19 +90,16 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         predictions=state.predictions,
         tested_at=tested_at if outcome == "ready" else 0,
     )
-    points = judged.candidates.points[:0] if chosen.points is None else chosen.points
-    return Decision(
-        learned.model, judged.confidences, judged.tolerances, following, verdict, points.q, points.u, chosen.rollouts
-    )
+    return Decision(learned.model, judged.confidences, judged.tolerances, following, verdict, queries)
 
 
-def _choose(round: Round) -> Chosen:
+def _choose(round: Round) -> tuple[Query, ...]:
     """Let the first rule that applies choose the queries. The last rule of each kind always applies."""
     rules = STEP_RULES if round.definition.max_rollout is None else ROLLOUT_RULES
-    return next(chosen for rule in rules if (chosen := rule(round)) is not None)
+    return next(queries for rule in rules if (queries := rule(round)) is not None)
 
 
-def _verdict(round: Round, outcome: Verdict, chosen: Chosen) -> Verdict:
+def _verdict(round: Round, outcome: Verdict, queries: tuple[Query, ...]) -> Verdict:
     """Decide the verdict of a round: the outcome of its judgement, unless the design may continue.
 
     A design that may continue can't if it has nothing to ask and nothing to wait for: no distinct query is left,
@@ -116,7 +107,7 @@ def _verdict(round: Round, outcome: Verdict, chosen: Chosen) -> Verdict:
     """
     if not round.continues:
         return outcome
-    if chosen or round.request.open:
+    if queries or round.request.open:
         return "continue"
     return "unsure" if round.spent < round.request.budget else "over_budget"
 

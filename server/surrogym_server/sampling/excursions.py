@@ -7,6 +7,7 @@ design is ready, one sequence leads away from all samples.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
@@ -17,17 +18,19 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import distances
 from surrogym_server.environment.points import Points
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.rollouts import Rollout, Sequences, best_rollout, predict_paths
+from surrogym_server.sampling.rollouts import Sequences, best_rollout, predict_paths
+from surrogym_shared.nouns import Query, Vector
 
 FAR = 0.5  # deviations of the sampling range between the end of an excursion and the nearest sample
 LONGEST = 16  # actions in an excursion
 
 
 def excursion(
-    model: DynamicsModel, samples: Tensor, snapshots: Tensor | None, longest: int, rng: np.random.Generator
-) -> Rollout:
+    model: DynamicsModel, samples: Tensor, snapshots: Mapping[str, Vector], longest: int, rng: np.random.Generator
+) -> Query:
     """Plan the shortest sequence whose predicted state is ``FAR`` from all sampled states (n, C); if none is, the
-    sequence that leads farthest. It begins at a reset or at one of the snapshots (s, C)."""
+    sequence that leads farthest. It begins at a reset or at one of the snapshots, whose coordinates (C,) are given by
+    name."""
     longest = min(longest, LONGEST, model.definition.max_rollout or 1)
     return best_rollout(model.definition, partial(_reach, model, samples), longest, snapshots, rng)
 

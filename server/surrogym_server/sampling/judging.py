@@ -24,7 +24,8 @@ from surrogym_server.sampling.peaks import highest
 from surrogym_server.sampling.prequential import scores_of
 from surrogym_server.sampling.seeds import generator_for
 from surrogym_server.sampling.serial import noise_of_sensors, sensor_noise
-from surrogym_server.sampling.state import DesignState, Request, Verdict
+from surrogym_server.sampling.state import DesignState, Request
+from surrogym_shared.nouns import Verdict
 
 
 @dataclass(frozen=True)

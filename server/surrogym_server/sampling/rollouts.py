@@ -10,8 +10,8 @@ predicted.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -27,6 +27,7 @@ from surrogym_server.sampling.acquisition import PathView, path_value_of
 from surrogym_server.sampling.endings import edge_in_doubt, in_doubt
 from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.outlook import as_if_answered, path_outlook
+from surrogym_shared.nouns import Query, Vector
 
 STARTS = 6  # drawn from the start distribution for each plan
 POPULATION = 48  # action sequences compared at once
@@ -45,21 +46,10 @@ class Aim:
     columns: Sequence[int]  # numbers of the outputs to learn
     tolerances: Sequence[float]  # of every output
     longest: int  # actions in a sequence
-    snapshots: Tensor | None = None  # (s, C) states at which a sequence may begin, besides a reset
+    snapshots: Mapping[str, Vector] = field(default_factory=dict)  # states at which a sequence may begin, by name
     states: Tensor | None = None  # (v, C) visited by policies: information is weighted by their density
     ending: bool = False  # look first for an end of the episode, or an edge of the reward, if one is within reach
     ended: bool = False  # an end was seen, so a declared one need not be looked for
-
-
-@dataclass(frozen=True)
-class Rollout:
-    """An action sequence, and where it begins."""
-
-    actions: Tensor  # (T, F)
-    snapshot: int | None = None  # number of the snapshot; None: a reset
-
-    def __len__(self) -> int:
-        return len(self.actions)
 
 
 @dataclass(frozen=True)
@@ -74,37 +64,37 @@ class Paths:
     drift: Tensor  # (b, T) squared deviation of the mean path before the step, in those of the sampling range
 
 
-def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random.Generator) -> list[Tensor]:
-    """Random sequences of 1, 2, 3, ... actions, each (T, F), with ``steps`` actions in all. Each sequence holds its
-    actions for a different time, so that states spread. Steps from which nothing is learned come in addition."""
-    rollouts: list[Tensor] = []
+def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random.Generator) -> tuple[Query, ...]:
+    """Draw random sequences of 1, 2, 3, ... actions, with ``steps`` actions in all. Each sequence holds its actions
+    for a different time, so that states spread. Steps from which nothing is learned come in addition."""
+    rollouts: list[Query] = []
     while steps > definition.unknown_steps:
         length = min(len(rollouts) + 1 + definition.unknown_steps, steps, definition.max_rollout or 1)
-        rollouts.append(torch.from_numpy(random_sequences(definition, 1, length, rng)[0]))
+        rollouts += map(Query.rollout, random_sequences(definition, 1, length, rng).tolist())
         steps -= length
-    return rollouts
+    return tuple(rollouts)
 
 
 def plan_round(
-    model: DynamicsModel, aim: Aim, steps: int, pending: Sequence[Rollout], rng: np.random.Generator
-) -> list[Rollout]:
-    """Plan action sequences with ``steps`` real steps in all. Each one is planned as if the earlier and the pending
+    model: DynamicsModel, aim: Aim, steps: int, unanswered: Sequence[Query], rng: np.random.Generator
+) -> list[Query]:
+    """Plan action sequences with ``steps`` real steps in all. Each one is planned as if the earlier and the unanswered
     ones had already been answered."""
-    rollouts: list[Rollout] = []
-    done = list(pending)
+    rollouts: list[Query] = []
+    done = list(unanswered)
     while steps > model.definition.unknown_steps:
         for rollout in done:
             model = as_if_done(model, rollout, aim.snapshots, rng)
         done = [plan_rollout(model, replace(aim, longest=min(steps, aim.longest)), rng)]
         rollouts += done
-        steps -= len(done[0])
+        steps -= done[0].steps
         aim = replace(aim, ending=False)
     return rollouts
 
 
-def plan_rollout(model: DynamicsModel, aim: Aim, rng: np.random.Generator) -> Rollout:
-    """The sequence (T, F), 1 <= T <= ``aim.longest``, with the highest value per expected real step, from a reset or
-    from the best snapshot. It is found by random shooting and by varying the best sequences."""
+def plan_rollout(model: DynamicsModel, aim: Aim, rng: np.random.Generator) -> Query:
+    """Plan the sequence of at most ``aim.longest`` actions with the highest value per expected real step, from a reset
+    or from the best snapshot. It is found by random shooting and by varying the best sequences."""
     return best_rollout(model.definition, partial(_worth, model, aim), aim.longest, aim.snapshots, rng)
 
 
@@ -112,16 +102,18 @@ def best_rollout(
     definition: EnvironmentDefinition,
     worth: Worth,
     longest: int,
-    snapshots: Tensor | None,
+    snapshots: Mapping[str, Vector],
     rng: np.random.Generator,
-) -> Rollout:
-    """The best sequence of at most ``longest`` actions, from a reset or from one of the snapshots (s, C)."""
+) -> Query:
+    """Search the best sequence of at most ``longest`` actions, from a reset or from one of the snapshots."""
     starts = start_points(definition, STARTS, rng)[None]
-    best, value = _search(definition, worth, longest, starts, POPULATION, rng)
-    if snapshots is None or not len(snapshots):
-        return best
-    returned, known = _search(definition, worth, longest, snapshots[:, None], POPULATION * STARTS, rng)
-    return best if value >= known else returned
+    actions, _, value = _search(definition, worth, longest, starts, POPULATION, rng)
+    if snapshots:
+        origins = torch.tensor(list(snapshots.values()), dtype=torch.float64)[:, None]
+        others, place, known = _search(definition, worth, longest, origins, POPULATION * STARTS, rng)
+        if known > value:
+            return Query.rollout(others.tolist(), list(snapshots)[place])
+    return Query.rollout(actions.tolist())
 
 
 def _search(
@@ -131,9 +123,9 @@ def _search(
     origins: Tensor,
     population: int,
     rng: np.random.Generator,
-) -> tuple[Rollout, float]:
-    """The best sequence from one of k origins, each of several equally likely states (k, s, C), and its value. The
-    number of the origin is the rollout's snapshot if there is one state each."""
+) -> tuple[NDArray[np.float64], int, float]:
+    """Search the best sequence (T, F) from one of k origins, each of several equally likely states (k, s, C). Also
+    return the number of its origin, and its value."""
     sequences = random_sequences(definition, population, longest, rng)
     places = np.resize(rng.permutation(len(origins)), population)
     elite = population * ELITE // POPULATION
@@ -145,19 +137,18 @@ def _search(
         vary(definition, sequences[elite:], rng)
         value, length = worth(origins[places], sequences)
     best = int(value.argmax())
-    snapshot = int(places[best]) if origins.shape[1] == 1 else None
-    return Rollout(torch.from_numpy(sequences[best, : int(length[best])]), snapshot), float(value[best])
+    return sequences[best, : int(length[best])], int(places[best]), float(value[best])
 
 
 def as_if_done(
-    model: DynamicsModel, rollout: Rollout, snapshots: Tensor | None, rng: np.random.Generator
+    model: DynamicsModel, query: Query, snapshots: Mapping[str, Vector], rng: np.random.Generator
 ) -> DynamicsModel:
-    """Condition the model on a rollout along a predicted path: variances shrink, means stay. ``snapshots`` (s, C) are
-    those that rollouts may begin at."""
+    """Condition the model on a rollout along a predicted path: variances shrink, means stay. A rollout from a snapshot
+    that is not among ``snapshots`` begins at a reset."""
     start = start_points(model.definition, 1, rng)
-    if rollout.snapshot is not None and snapshots is not None:
-        start = snapshots[rollout.snapshot][None]
-    path = predict_paths(model, start, rollout.actions[None])
+    if (at := snapshots.get(query.snapshot or "")) is not None:
+        start = torch.tensor([at], dtype=torch.float64)
+    path = predict_paths(model, start, torch.tensor([query.actions], dtype=torch.float64))
     taken = (path.running[0] > 0) & model.definition.known(path.q[0])
     return as_if_answered(model, PredictedSteps(path.q[0, taken], path.u[0, taken], path.q_next[0, taken]))
 
@@ -246,7 +237,7 @@ def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tenso
     and on to states that hardly count for the verdict.
     """
     weight = paths.running * definition.in_range(paths.q) * definition.known(paths.q) * (-0.5 * paths.drift).exp()
-    if aim.snapshots is not None:
+    if aim.snapshots:
         columns = zip(definition.coordinates, paths.q.unbind(-1), strict=True)
         weight = weight * (0.5 * torch.stack([c.sampling.log_density(q) for c, q in columns]).sum(0)).exp()
     if aim.states is None or not len(aim.states):

@@ -39,8 +39,7 @@ class Round:
     @property
     def room(self) -> int:
         """Real steps that the budget has left beside those of the unanswered queries."""
-        pending = len(self.request.pending) + sum(map(len, self.request.pending_rollouts))
-        return max(0, self.request.budget - self.spent - pending)
+        return max(0, self.request.budget - self.spent - self.request.pending_steps)
 
     @property
     def may_examine(self) -> bool:

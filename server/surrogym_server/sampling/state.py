@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogym_server.environment.points import Points
 from surrogym_server.sampling.prequential import Predictions, from_pairs, pairs_of
-from surrogym_server.sampling.rollouts import Rollout
-
-Verdict = Literal["continue", "ready", "over_budget", "unsure", "from_log"]
+from surrogym_shared.nouns import Query, Vector
 
 
 @dataclass(frozen=True)
@@ -56,17 +54,15 @@ class Request:
 
     budget: int
     target: float
-    pending: Points  # p
+    pending: tuple[Query, ...] = ()
+    refused: tuple[Query, ...] = ()
     extra: int = 0  # real steps to choose even if the design has ended
     states: Tensor | None = None  # (v, C) visited by policies
-    pending_rollouts: tuple[Rollout, ...] = ()
-    snapshots: Tensor | None = None  # (s, C) states to which the environment can return
+    snapshots: Mapping[str, Vector] = field(default_factory=dict)  # coordinates (C,) to which one can return, by name
     logged: int = 0  # of the samples, from a log
     audited: int = 0  # of the samples, steps of audits
     unlearned: int = 0  # further real steps, whose lags were not known
     open: int = 0  # real steps of the pending queries that may still be answered
-    refused: Points | None = None  # queries that the environment refused
-    refused_rollouts: tuple[Rollout, ...] = ()
     surprises: Predictions = ()  # predictions of the samples that the last model had not learned from
 
     @property
@@ -75,14 +71,18 @@ class Request:
         return self.logged + self.audited - self.unlearned
 
     @property
-    def assumed(self) -> Points:
+    def unanswered(self) -> tuple[Query, ...]:
         """Queries without an answer, which the acquisition treats as answered."""
-        return self.pending if self.refused is None else Points.joined([self.pending, self.refused])
+        return (*self.pending, *self.refused)
+
+    @property
+    def pending_steps(self) -> int:
+        """Number of real steps of the pending queries."""
+        return sum(query.steps for query in self.pending)
 
     def is_mostly_refused(self, spent: float) -> bool:
         """Whether the environment refused as many steps as it has taken, ``spent``, and the budget has in addition.
 
         Without this limit, a design whose queries are all refused would never end.
         """
-        steps = (0 if self.refused is None else len(self.refused)) + sum(map(len, self.refused_rollouts))
-        return steps >= self.budget + spent
+        return sum(query.steps for query in self.refused) >= self.budget + spent

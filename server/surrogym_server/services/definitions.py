@@ -16,6 +16,7 @@ from surrogym_server.models.registry import MODELS
 from surrogym_server.sampling.acquisition import ACQUISITIONS
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import SurrogateRecord
+from surrogym_shared.nouns import Query
 
 Array = NDArray[np.float64]
 Define = Callable[[dict[str, Any]], EnvironmentDefinition]
@@ -106,17 +107,30 @@ def check_points(definition: EnvironmentDefinition, q: Array, u: Array) -> tuple
     return q, model_actions(definition.action, u)
 
 
-def check_rollouts(definition: EnvironmentDefinition, rollouts: Sequence[Array]) -> list[Array]:
-    """Check action sequences, each (T, F), and return them in the model's units.
+def check_steps(definition: EnvironmentDefinition, queries: Sequence[Query]) -> list[Query]:
+    """Check queries of single steps, and return them in the model's units.
+
+    Raises:
+        InvalidInput: another shape, a state to which a sampler does not set its environment, or an action out of
+            bounds.
+    """
+    q = check_settable(definition, np.array([query.coordinates for query in queries]))
+    u = model_actions(definition.action, np.array([query.action for query in queries]))
+    return [Query.step(*step) for step in zip(q.tolist(), u.tolist(), strict=True)]
+
+
+def check_rollouts(definition: EnvironmentDefinition, queries: Sequence[Query]) -> list[Query]:
+    """Check queries of rollouts, and return them in the model's units.
 
     Raises:
         InvalidInput: one that is too long, of another shape, or out of bounds.
     """
     longest = definition.max_rollout or 0
-    for actions in rollouts:
-        if len(actions) > longest:
-            raise InvalidInput(f"rollouts: expected at most {longest} actions, got {len(actions)}")
-    return [model_actions(definition.action, actions) for actions in rollouts]
+    for query in queries:
+        if query.steps > longest:
+            raise InvalidInput(f"rollouts: expected at most {longest} actions, got {query.steps}")
+    actions = (model_actions(definition.action, np.array(query.actions)) for query in queries)
+    return [Query.rollout(u.tolist(), query.snapshot) for u, query in zip(actions, queries, strict=True)]
 
 
 def check_settable(definition: EnvironmentDefinition, q: Array) -> Array:

@@ -34,12 +34,10 @@ from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import (
     FREE,
     OPEN_STATUSES,
-    Array,
     FitLease,
     Granted,
     NewDesign,
     NewModel,
-    QueryRecord,
 )
 
 logger = logging.getLogger(__name__)
@@ -281,7 +279,6 @@ class Designer:
         refused = [query for query in unanswered if query.status == "refused"]
         logged, audited = (samples.purpose.count(purpose) for purpose in ("logged", "audit"))
         spoken = len(samples.reward) - logged - audited + sum(query.steps for query in pending)
-        steps, refused_steps = (_steps_of(queries) for queries in (pending, refused))
         chosen = np.array([purpose not in UNCHOSEN for purpose in samples.purpose], dtype=np.bool_)
         visited = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
         definition = self._definitions.for_design(name).with_tolerances(record.tolerances)
@@ -295,14 +292,9 @@ class Designer:
             state=record.state,
             budget=record.budget,
             target=record.target,
-            pending_coordinates=steps[0],
-            pending_action=steps[1],
-            pending_rollouts=tuple(query.actions for query in pending if query.kind == "rollout"),
-            pending_snapshots=tuple(query.snapshot for query in pending if query.kind == "rollout"),
+            pending=tuple(pending),
             open_steps=sum(query.steps for query in pending if query.status != "set_aside"),
-            refused_coordinates=refused_steps[0],
-            refused_action=refused_steps[1],
-            refused_rollouts=tuple(query.actions for query in refused if query.kind == "rollout"),
+            refused=tuple(refused),
             snapshots=self._storage.snapshots.all(name) if definition.snapshots else {},
             extra_queries=min(lease.extra_queries, max(0, record.budget - spoken)),  # it may be lower by now
             occupancy=None if visited is None else visited.states,
@@ -333,10 +325,7 @@ class Designer:
             model=model,
             state=result.state,
             phase=result.phase,
-            query_coordinates=result.query_coordinates,
-            query_action=result.query_action,
-            query_rollouts=result.query_rollouts,
-            query_snapshots=result.query_snapshots,
+            queries=result.queries,
             extra=result.verdict != "continue",
         )
         surrogate = self._storage.surrogates.get(lease.surrogate).id
@@ -364,17 +353,8 @@ class Designer:
         for name in unbegun:
             with suppress(SurrogymError):  # deleted meanwhile, or the storage is away
                 budget = self._storage.surrogates.get(name).budget
-                _, coordinates, action, rollouts = self._plan(self._definitions.get(name), budget)
-                self._storage.designs.ask_first(name, coordinates, action, rollouts)
+                self._storage.designs.ask_first(name, self._plan(self._definitions.get(name), budget))
                 self._notices.post(name)
-
-
-def _steps_of(queries: Sequence[QueryRecord]) -> tuple[Array | None, Array | None]:
-    """Coordinates (m, C) and actions (m, F) of the queries for single steps; None without any."""
-    steps = [query for query in queries if query.kind == "step"]
-    if not steps:
-        return None, None
-    return np.array([query.coordinates for query in steps]), np.array([query.action for query in steps])
 
 
 def _failure(name: str, error: Exception) -> str:

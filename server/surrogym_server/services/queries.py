@@ -5,20 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from surrogym_server.errors import InvalidInput
 from surrogym_server.services.activity import Samplers
-from surrogym_server.services.definitions import Definitions, check_points, check_rollouts, check_settable
+from surrogym_server.services.definitions import Definitions, check_rollouts, check_steps
 from surrogym_server.services.lines import Lines, Present
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import LeasedQuery, Phase, Purpose, QueryRecord, QueryStatus
+from surrogym_server.storage.records import LeasedQuery, QueryRecord
+from surrogym_shared.nouns import Phase, Purpose, Query, QueryStatus
 
-Array = NDArray[np.float64]
-
-NO_STEPS = (np.zeros((0, 0)), np.zeros((0, 0)))
 FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "unsure", "from_log", "failed")
 
 
@@ -85,16 +80,9 @@ class QueryService:
         return record
 
     def add(
-        self,
-        name: str,
-        coordinates: Array,
-        action: Array,
-        key: str | None,
-        rollouts: Sequence[Array] = (),
-        *,
-        purpose: Purpose = "manual",
+        self, name: str, queries: Sequence[Query], key: str | None, *, purpose: Purpose = "manual"
     ) -> list[QueryRecord]:
-        """Queue queries by hand, or of an audit: coordinates (m, C) and action (m, F), or action sequences (T, F).
+        """Queue queries by hand, or of an audit.
 
         Raises:
             InvalidInput: wrong shape, out of bounds, or a kind that the original environment can't answer.
@@ -102,21 +90,20 @@ class QueryService:
             BeyondBudget: all audits together would take more real steps than the design may.
         """
         definition = self._definitions.get(name)
+        kinds = {query.kind for query in queries}
         if definition.max_rollout is None:
-            if len(rollouts) or not len(coordinates):
+            if kinds != {"step"}:
                 raise InvalidInput(
                     "expected coordinates and actions, no rollouts: the original environment can be set to any state"
                 )
-            q, u = check_points(definition, check_settable(definition, coordinates), action)
-            ids = self._storage.queries.enqueue(name, q, u, purpose=purpose, key=key)
+            queries = check_steps(definition, queries)
         else:
-            if len(coordinates) or len(action) or not len(rollouts):
+            if kinds != {"rollout"}:
                 raise InvalidInput(
                     "expected rollouts, no coordinates: the original environment can't be set to a state"
                 )
-            ids = self._storage.queries.enqueue(
-                name, *NO_STEPS, check_rollouts(definition, rollouts), purpose=purpose, key=key
-            )
+            queries = check_rollouts(definition, queries)
+        ids = self._storage.queries.enqueue(name, queries, purpose=purpose, key=key)
         self._notices.post(name)
         return [self._storage.queries.get(name, id) for id in ids]
 

@@ -15,7 +15,8 @@ from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions, check_coordinates
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import LedgerRecord, NewSample, SampleRecord, Vector
+from surrogym_server.storage.records import LedgerRecord, NewSample, SampleRecord
+from surrogym_shared.nouns import Vector
 
 PAGE = 10_000
 BATCH = 500  # steps of a log in one transaction

@@ -9,9 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, NoModel, SpecConflict, UnknownSurrogate
@@ -25,9 +22,9 @@ from surrogym_server.storage.records import (
     SurrogateRecord,
     SurrogateSummary,
 )
+from surrogym_shared.nouns import Query
 
-Array = NDArray[np.float64]
-Plan = Callable[[EnvironmentDefinition, int], tuple[dict[str, Any], Array, Array, tuple[Array, ...]]]
+Plan = Callable[[EnvironmentDefinition, int], tuple[Query, ...]]
 Complete = Callable[[dict[str, Any]], dict[str, Any]]
 
 ABSENT = object()
@@ -80,7 +77,7 @@ class SurrogateService:
             definitions: of those in it.
             define: the definition of a new spec; raises ``InvalidSpec`` where it asks for what is not installed.
             complete: a spec with every field that this program knows, as JSON; an older one lacked some.
-            plan: the first queries under a budget: (state, coordinates (m, C), action (m, F), rollouts (T, F) each).
+            plan: the first queries of a design with a budget.
             engine: has their sessions.
             notices, samplers: of this process.
         """
@@ -102,19 +99,8 @@ class SurrogateService:
             SpecConflict: the name exists with another specification.
             InvalidSpec: the preset can't represent the specification.
         """
-        state, coordinates, action, rollouts = self._plan(self._define(spec), budget)
-        present, created = self._storage.surrogates.create(
-            NewSurrogate(
-                name=name,
-                spec=spec,
-                budget=budget,
-                target=target,
-                state=state,
-                query_coordinates=coordinates,
-                query_action=action,
-                query_rollouts=rollouts,
-            )
-        )
+        queries = self._plan(self._define(spec), budget)
+        present, created = self._storage.surrogates.create(NewSurrogate(name, spec, budget, target, queries))
         if not created:
             check_same(name, self._complete(present.spec), self._complete(spec))
         self._notices.post(name)
@@ -123,7 +109,7 @@ class SurrogateService:
     def check(self, name: str, spec: dict[str, Any], budget: int) -> Checked:
         """Check what ``create`` would do, without doing it. Raises as ``create``."""
         definition = self._define(spec)
-        _, coordinates, _, rollouts = self._plan(definition, budget)
+        initial = sum(query.steps for query in self._plan(definition, budget))
         try:
             present = self._storage.surrogates.get(name)
         except UnknownSurrogate:
@@ -131,7 +117,7 @@ class SurrogateService:
         else:
             check_same(name, self._complete(present.spec), self._complete(spec))
             exists = True
-        return Checked(len(coordinates) + sum(map(len, rollouts)), definition.outputs, exists)
+        return Checked(initial, definition.outputs, exists)
 
     def status(self, name: str) -> SurrogateStatus:
         """Return the status of a surrogate. Raises ``UnknownSurrogate``."""

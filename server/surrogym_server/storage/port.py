@@ -35,19 +35,16 @@ from surrogym_server.storage.records import (
     NewSample,
     NewSurrogate,
     OccupancyRecord,
-    Phase,
-    Purpose,
     QueryCounts,
     QueryRecord,
-    QueryStatus,
     SampleArrays,
     SampleRecord,
     SavedSession,
     Standing,
     SurrogateRecord,
     SurrogateSummary,
-    Vector,
 )
+from surrogym_shared.nouns import Phase, Purpose, Query, QueryStatus, Vector
 
 MAX_ATTEMPTS = 3
 LATEST = "latest"  # the alias of the newest policy
@@ -187,7 +184,7 @@ class Designs(ABC):
         """
 
     @abstractmethod
-    def ask_first(self, name: str, coordinates: Array, action: Array, rollouts: Sequence[Array]) -> None:
+    def ask_first(self, name: str, queries: Sequence[Query]) -> None:
         """Queue the initial queries of an ``unbegun`` surrogate that are missing. If none are, nothing changes."""
 
     @abstractmethod
@@ -234,16 +231,12 @@ class Queries(ABC):
     def enqueue(
         self,
         name: str,
-        coordinates: Array,
-        action: Array,
-        rollouts: Sequence[Array] = (),
+        wanted: Sequence[Query],
         *,
         purpose: Purpose = "manual",
         key: str | None = None,
     ) -> list[int]:
         """Queue queries by hand, or of an audit, and return their ids.
-
-        They are steps from coordinates (m, C) under action (m, F), and rollouts of action sequences, each (T, F).
 
         Raises:
             BeyondBudget: all audits of the surrogate together would have more steps than its budget, and than 64.

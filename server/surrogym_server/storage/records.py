@@ -14,15 +14,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_shared.nouns import Phase, Purpose, Query, QueryStatus, SamplePurpose, Vector
+
 Array = NDArray[np.float64]
 JSON = dict[str, Any]
-Vector = tuple[float, ...]
-Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "unsure", "from_log", "failed"]
-Purpose = Literal["initial", "adaptive", "manual", "audit"]  # of queries
-SamplePurpose = Literal["initial", "adaptive", "manual", "audit", "logged"]
 FREE = ("audit", "logged")  # purposes of samples that don't count towards the budget
-QueryStatus = Literal["pending", "leased", "answered", "set_aside", "refused"]
-QueryKind = Literal["step", "rollout"]
 Synchronous = Literal["full", "normal"]  # of a SQLite file: whether every commit waits for the disk
 EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy", "job"]
 
@@ -44,10 +40,7 @@ class NewSurrogate:
     spec: JSON
     budget: int
     target: float
-    state: JSON = field(default_factory=dict)  # of the design
-    query_coordinates: Array = field(default_factory=no_rows)  # (m, C)
-    query_action: Array = field(default_factory=no_rows)  # (m, F)
-    query_rollouts: tuple[Array, ...] = ()  # action sequences from a reset, each (T, F)
+    queries: tuple[Query, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -132,35 +125,17 @@ class NewDesign:
     model: NewModel
     state: JSON
     phase: Phase
-    query_coordinates: Array = field(default_factory=no_rows)  # (m, C)
-    query_action: Array = field(default_factory=no_rows)  # (m, F)
-    query_rollouts: tuple[Array, ...] = ()  # action sequences, each (T, F)
-    query_snapshots: tuple[str | None, ...] = ()  # where each of them begins instead of a reset; empty: none
+    queries: tuple[Query, ...] = ()
     extra: bool = False  # the queries come from ``Designs.improve``, and the design itself would not have chosen them
 
 
 # Queries and samples
 
 
-@dataclass(frozen=True)
-class Asked:
-    """Content of a stored query, without its state and lease: one real step from given coordinates, or an action
-    sequence from a snapshot or a reset."""
+@dataclass(frozen=True, kw_only=True)
+class QueryRecord(Query):
+    """A stored query and its state."""
 
-    kind: QueryKind
-    coordinates: Vector  # (C,) of a step; () of a rollout
-    action: Vector  # (F,) of a step; (T * F,) of a rollout, action after action
-    steps: int  # T: largest number of its real steps; 1 for a step
-    snapshot: str | None  # where a rollout begins; None: at a reset
-
-    @property
-    def actions(self) -> Array:
-        """(T, F)."""
-        return np.array(self.action).reshape(self.steps, -1)
-
-
-@dataclass(frozen=True)
-class QueryRecord(Asked):
     id: int
     purpose: Purpose
     status: QueryStatus
@@ -171,8 +146,10 @@ class QueryRecord(Asked):
     lease_seconds_left: float | None = None  # of the open lease, by the database's clock; negative if it has expired
 
 
-@dataclass(frozen=True)
-class LeasedQuery(Asked):
+@dataclass(frozen=True, kw_only=True)
+class LeasedQuery(Query):
+    """A stored query and the lease under which a sampler answers it."""
+
     id: int
     number: int  # number of the surrogate's earlier queries
     purpose: Purpose

@@ -224,9 +224,9 @@ def every_variant_steps(case: ModelCase) -> None:
 
 
 def a_round_of_the_design_asks_for_more(case: ModelCase) -> None:
-    request = Request(budget=len(case.samples) + 6, target=1 - 1e-9, pending=case.points[:1])
+    request = Request(budget=len(case.samples) + 6, target=1 - 1e-9, pending=case.points[:1].queries)
     decision = advance(case.definition, case.samples, DesignState(), request)
-    assert len(decision.q) or decision.rollouts or decision.verdict == "ready"
+    assert decision.queries or decision.verdict == "ready"
     assert len(decision.confidences) == len(case.definition.outputs)
     json.dumps([decision.state.to_json(), fidelity_of(decision.model, (), 0.9)], allow_nan=False)
 

@@ -8,6 +8,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from surrogym_shared.acting import MAX_ROLLOUT as MAX_ROLLOUT  # for modules that only import the wire
 from surrogym_shared.bounded import FailFast
+from surrogym_shared.nouns import Phase as Phase
+from surrogym_shared.nouns import Purpose as Purpose
+from surrogym_shared.nouns import QueryKind as QueryKind
+from surrogym_shared.nouns import QueryStatus as QueryStatus
+from surrogym_shared.nouns import SamplePurpose as SamplePurpose
 from surrogym_shared.spec import MAX_DIMENSIONS, NAME_PATTERN
 
 PROTOCOL = 1
@@ -20,11 +25,6 @@ MAX_IMAGINED = 500  # most steps of an imagined episode
 MAX_DRAWS = 64
 MAX_MEASURED = 1e30  # variances overflow beyond it, so one larger sample would prevent every fit
 
-Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "unsure", "from_log", "failed"]
-Purpose = Literal["initial", "adaptive", "manual", "audit"]
-SamplePurpose = Literal["initial", "adaptive", "manual", "audit", "logged"]
-QueryKind = Literal["step", "rollout"]
-QueryStatus = Literal["pending", "leased", "answered", "set_aside", "refused"]
 Variant = Literal["deterministic", "probabilistic", "pathwise"]
 AutoresetMode = Literal["next_step", "same_step", "disabled"]
 Role = Literal["read", "train", "sample", "admin"]

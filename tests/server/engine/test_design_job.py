@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from support.real_steps import answer
+from support.real_steps import answer, arrays
 from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
+from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.models.files import from_bytes
+from surrogym_server.sampling.design import initial_queries
+from surrogym_shared.nouns import Query
 from surrogym_shared.spec import Design
 from surrogym_shared.wire import Fidelity
 
@@ -22,17 +24,16 @@ SPEC = pendulum().model_copy(update={"design": Design(monte_carlo=64)})
 @pytest.fixture(scope="module")
 def job() -> DesignJob:
     definition = definition_from_spec(SPEC)
-    state, q, u, _ = initial_queries(definition, budget=20)
-    steps = answer(SPEC, torch.from_numpy(q), torch.from_numpy(u))
-    arrays = (steps.q, steps.u, steps.q_next, steps.reward, steps.terminated)
-    return DesignJob(definition, *(a.numpy() for a in arrays), state=state, budget=20, target=0.999)
+    steps = answer(SPEC, *arrays(initial_queries(definition, budget=20)))
+    columns = (steps.q, steps.u, steps.q_next, steps.reward, steps.terminated)
+    return DesignJob(definition, *(column.numpy() for column in columns), state={}, budget=20, target=0.999)
 
 
 def test_the_same_job_in_another_process_form_gives_the_same_result(job):
     one, two = run_design_job(job), run_design_job(pickle.loads(pickle.dumps(job)))
     assert one.model == two.model
     assert one.fidelity == two.fidelity
-    np.testing.assert_array_equal(one.query_coordinates, two.query_coordinates)
+    assert one.queries == two.queries
     assert one.data_hash == two.data_hash
 
 
@@ -55,25 +56,24 @@ def test_the_model_is_complete_and_the_fidelity_is_the_wires(job):
 
 def test_queries_are_inside_the_sampling_range(job):
     result = run_design_job(replace(job, extra_queries=4))
-    assert result.query_coordinates.shape[1:] == (2,)
-    assert result.query_action.shape == (len(result.query_coordinates), 1)
-    assert np.abs(result.query_coordinates[:, 0]).max() <= np.pi
-    assert np.abs(result.query_coordinates[:, 1]).max() <= 8
-    assert np.abs(result.query_action).max() <= 2
+    q, u = arrays(result.queries)
+    assert (q.shape, u.shape) == ((4, 2), (4, 1))
+    assert (q.abs() <= torch.tensor([torch.pi, 8])).all()
+    assert (u.abs() <= 2).all()
 
 
 def test_pending_queries_and_occupancy_are_passed_on(job):
     hungry = replace(job, budget=len(job.coordinates) + 2, state={"round": 1, "usual": [1e-12] * 3})
-    assert len(run_design_job(hungry).query_coordinates) == 2
-    pending = replace(hungry, pending_coordinates=np.array([[1.0, 1.0]]), pending_action=np.array([[0.0]]))
-    assert len(run_design_job(pending).query_coordinates) == 1
+    assert len(run_design_job(hungry).queries) == 2
+    pending = replace(hungry, pending=(Query.step((1.0, 1.0), (0.0,)),))
+    assert len(run_design_job(pending).queries) == 1
     visited = replace(hungry, occupancy=np.random.default_rng(0).normal([1, -3], [0.5, 1.5], (100, 2)))
-    assert not np.array_equal(run_design_job(visited).query_coordinates, run_design_job(hungry).query_coordinates)
+    assert run_design_job(visited).queries != run_design_job(hungry).queries
 
 
 def answered(job: DesignJob, result: DesignResult) -> DesignJob:
     """The job of the next round, with the answers to the queries of the last one."""
-    steps = answer(SPEC, torch.from_numpy(result.query_coordinates), torch.from_numpy(result.query_action))
+    steps = answer(SPEC, *arrays(result.queries))
     fields = {"coordinates": steps.q, "action": steps.u, "next_coordinates": steps.q_next}
     joined = {
         name: np.concatenate([getattr(job, name), new.numpy()])
@@ -94,10 +94,10 @@ def test_new_samples_are_predicted_by_the_model_before(job):
     assert scored(first) == [0, 0, 0]
     following = answered(job, first)
     second = run_design_job(replace(following, extra_queries=2))
-    new = len(first.query_coordinates)
+    new = len(first.queries)
     assert scored(second) == [new] * 3
     third = run_design_job(answered(following, second))
-    assert scored(third) == [new + len(second.query_coordinates)] * 3
+    assert scored(third) == [new + len(second.queries)] * 3
     error, deviation = second.state["predictions"][0][0]
     model = from_bytes(job.definition, first.model)
     point = (torch.from_numpy(a[len(job.reward) :][:1]) for a in (following.coordinates, following.action))
@@ -112,7 +112,7 @@ def test_scores_change_neither_the_model_nor_the_queries(job):
     assert scored(none) == [0, 0, 0]
     assert scores.model == none.model
     assert scores.verdict == none.verdict
-    np.testing.assert_array_equal(scores.query_coordinates, none.query_coordinates)
+    assert scores.queries == none.queries
 
 
 def test_only_chosen_samples_are_predicted_and_only_by_a_model_of_the_samples_before(job):

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from support.models import learn
-from support.real_steps import answer, random_steps
+from support.real_steps import answer, arrays, random_steps
 from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
-from surrogym_server.sampling.design import initial_design
+from surrogym_server.sampling.design import initial_queries
 
 
 @pytest.fixture(scope="session")
@@ -23,7 +23,7 @@ def definition() -> EnvironmentDefinition:
 @pytest.fixture(scope="session")
 def few(definition: EnvironmentDefinition) -> Samples:
     """The answers to the initial design."""
-    return answer(pendulum(), *initial_design(definition, 20))
+    return answer(pendulum(), *arrays(initial_queries(definition, 20)))
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ from support import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.sampling.coverage import covered
-from surrogym_server.sampling.design import initial_design
+from surrogym_server.sampling.design import initial_queries
 from surrogym_shared.spec import EnvironmentSpec
 
 QUERIES = 20
@@ -22,8 +22,8 @@ def definition() -> EnvironmentDefinition:
 
 @pytest.fixture
 def asked(definition: EnvironmentDefinition) -> tuple[np.ndarray, np.ndarray]:
-    q, u = initial_design(definition, 40)
-    return q.numpy(), u.numpy()
+    queries = initial_queries(definition, 40)
+    return np.array([query.coordinates for query in queries]), np.array([query.action for query in queries])
 
 
 def drawn(definition: EnvironmentDefinition, count: int, share: float) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from support.real_steps import answer, join, random_steps
+from support.real_steps import answer, arrays, join, random_steps
 from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition, wrap
@@ -17,7 +17,7 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.sampling import batch
 from surrogym_server.sampling.batch import NEAR, nearest
 from surrogym_server.sampling.confidence import OutputConfidence
-from surrogym_server.sampling.design import Decision, advance, initial_design
+from surrogym_server.sampling.design import Decision, advance, initial_queries
 from surrogym_server.sampling.judging import judge, monte_carlo
 from surrogym_server.sampling.prequential import Prediction
 from surrogym_server.sampling.state import DesignState, Request
@@ -32,8 +32,7 @@ def designed(**design: object) -> EnvironmentSpec:
 
 
 def request(budget: int = 20, pending: Samples | None = None, **options: object) -> Request:
-    none = Points(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 1, dtype=torch.float64))
-    return Request(budget, 0.999, none if pending is None else Points(pending.q, pending.u), **options)
+    return Request(budget, 0.999, () if pending is None else Points(pending.q, pending.u).queries, **options)
 
 
 def usual_of(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
@@ -58,7 +57,7 @@ class Finished:
 def design(spec: EnvironmentSpec, budget: int, state: DesignState | None = None) -> Finished:
     """Rounds until the verdict, every query answered by the real environment."""
     definition = definition_from_spec(spec)
-    samples, state = answer(spec, *initial_design(definition, budget)), state or DesignState()
+    samples, state = answer(spec, *arrays(initial_queries(definition, budget))), state or DesignState()
     finished = Finished(samples, len(samples), [])
     while True:
         decision = advance(definition, finished.samples, state, request(budget))
@@ -66,7 +65,7 @@ def design(spec: EnvironmentSpec, budget: int, state: DesignState | None = None)
         if decision.verdict != "continue":
             return finished
         state = DesignState.from_json(json.loads(json.dumps(decision.state.to_json())))
-        finished.samples = join(finished.samples, answer(spec, decision.q, decision.u))
+        finished.samples = join(finished.samples, answer(spec, *arrays(decision.queries)))
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -76,7 +75,7 @@ def test_a_real_pendulum_is_known_within_twenty_steps(seed, unseen):
     assert last.verdict == "ready"
     assert len(finished.samples) <= 20
     assert len(finished.samples) - finished.initial >= len(finished.samples) / 3, "a third of them adaptive"
-    assert len(last.q) == 0
+    assert len(last.queries) == 0
     predicted = last.model.transition(unseen.q, unseen.u)
     q_next, reward = predicted.q_next, predicted.reward
     error = torch.cat([q_next - unseen.q_next, (reward - unseen.reward)[:, None]], 1)
@@ -109,25 +108,26 @@ def test_the_budget_is_spent_and_never_overspent():
     finished = design(spec, budget=7, state=NEVER)
     assert finished.decisions[-1].verdict == "over_budget"
     assert len(finished.samples) == 7
-    assert len(initial_design(definition_from_spec(spec), 3)[0]) == 3
+    assert len(initial_queries(definition_from_spec(spec), 3)) == 3
 
 
 def test_pending_queries_count_against_the_budget(definition, few, unseen):
-    chosen = [len(advance(definition, few, NEVER, request(len(few) + 2, first(unseen, p))).q) for p in (0, 1, 2, 3)]
+    chosen = [
+        len(advance(definition, few, NEVER, request(len(few) + 2, first(unseen, p))).queries) for p in (0, 1, 2, 3)
+    ]
     assert chosen == [2, 1, 0, 0]
 
 
 def test_pending_queries_are_not_chosen_again(definition, few):
-    asked = advance(definition, few, NEVER, request())
-    pending = Samples(asked.q, asked.u, asked.q, few.reward[:0], few.terminated[:0])
-    again = advance(definition, few, NEVER, request(pending=pending))
-    assert len(again.q) == 3
-    assert not near(definition, Points(again.q, again.u), Points(asked.q, asked.u)).any()
+    asked = advance(definition, few, NEVER, request()).queries
+    again = advance(definition, few, NEVER, replace(request(), pending=asked)).queries
+    assert len(again) == 3
+    assert not near(definition, Points.of(definition, again), Points.of(definition, asked)).any()
 
 
 def test_one_round_asks_once_for_each_unsure_output_and_never_twice_the_same(definition, few):
     made = advance(definition, few, NEVER, request())
-    asked = Points(made.q, made.u)
+    asked = Points.of(definition, made.queries)
     assert len(asked) == 3
     for i in range(3):
         others = [j for j in range(3) if j != i]
@@ -137,7 +137,7 @@ def test_one_round_asks_once_for_each_unsure_output_and_never_twice_the_same(def
 
 def test_certain_outputs_get_no_queries(definition, few):
     generous = DesignState(1, (1e3, 1e3, 1e-12))
-    assert len(advance(definition, few, generous, request()).q) == 1
+    assert len(advance(definition, few, generous, request()).queries) == 1
 
 
 def test_where_nothing_distinct_is_left_to_ask_the_design_ends():
@@ -145,7 +145,7 @@ def test_where_nothing_distinct_is_left_to_ask_the_design_ends():
     definition = definition_from_spec(spec)
     samples = answer(spec, *monte_carlo(definition))
     made = advance(definition, samples, NEVER, request(100))
-    assert len(made.q) == 0
+    assert len(made.queries) == 0
     assert made.verdict == "unsure", "84 steps of its budget are left"
 
 
@@ -154,7 +154,7 @@ def test_extra_queries_are_chosen_whatever_the_verdict(definition, few, unseen, 
     generous = DesignState(1, (1e3,) * 3)
     made = advance(definition, join(few, first(unseen, 4)), generous, request(budget, extra=5))
     assert made.verdict == verdict
-    assert len(made.q) == 5
+    assert len(made.queries) == 5
 
 
 def test_the_reward_of_an_ending_is_queried_first():
@@ -163,27 +163,26 @@ def test_the_reward_of_an_ending_is_queried_first():
     steps = random_steps(spec, 60, seed=0)
     going = Samples(*(getattr(steps, n)[~steps.terminated][:8] for n in steps.__dataclass_fields__))
     state = DesignState(1, (1e-12,) * 5)
-    none = Points(torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0, 1, dtype=torch.float64))
-    made = advance(definition, going, state, Request(50, 0.999, none))
-    assert bool(definition.terminated(made.model.transition(made.q, made.u).q_next)[0])
-    assert not bool(definition.terminated(made.q)[0])
+    made = advance(definition, going, state, Request(50, 0.999))
+    q, u = arrays(made.queries)
+    assert bool(definition.terminated(made.model.transition(q, u).q_next)[0])
+    assert not bool(definition.terminated(q)[0])
 
 
 def test_the_same_round_asks_the_same(definition, few):
     one, two = (advance(definition, few, DesignState(), request()) for _ in range(2))
-    assert torch.equal(one.q, two.q)
-    assert torch.equal(one.u, two.u)
+    assert one.queries == two.queries
 
 
 def test_another_seed_is_another_design():
-    one, same, other = (initial_design(definition_from_spec(designed(seed=s)), 20)[0] for s in (0, 0, 1))
-    assert torch.equal(one, same)
-    assert not torch.equal(one, other)
+    one, same, other = (initial_queries(definition_from_spec(designed(seed=s)), 20) for s in (0, 0, 1))
+    assert one == same
+    assert one != other
 
 
 def test_the_paper_starts_with_ten_points_a_dimension_and_tolerance_one():
     definition = definition_from_spec(designed(preset="paper"))
-    q, u = initial_design(definition, 125)
+    q, u = arrays(initial_queries(definition, 125))
     assert len(q) == len(u) == 10 * (3 + 1)
     samples = answer(pendulum(), q, u)
     assert usual_of(definition, samples) == (1.0,) * 4
@@ -203,12 +202,12 @@ def test_the_papers_tolerance_can_be_relative_to_what_its_outputs_do():
 
 def test_a_latin_hypercube_design_asks_for_its_whole_budget_at_once():
     definition = definition_from_spec(designed(acquisition="latin_hypercube"))
-    assert len(initial_design(definition, 17)[0]) == 17
+    assert len(initial_queries(definition, 17)) == 17
 
 
 def test_a_large_design_compares_no_pairs():
     """A spec may ask for 100,000 initial queries; the distances of all pairs would take 40 GB."""
-    q, u = initial_design(definition_from_spec(designed(initial=30_000)), 30_000)
+    q, u = arrays(initial_queries(definition_from_spec(designed(initial=30_000)), 30_000))
     assert q.shape == (30_000, 2)
     assert u.shape == (30_000, 1)
 
@@ -225,7 +224,7 @@ def test_more_extra_queries_than_there_are_distinct_points_end_soon(definition, 
     monkeypatch.setattr(batch, "candidate_view", counted)
     small = replace(definition, design=replace(definition.design, monte_carlo=64))
     decision = advance(small, few, DesignState(), request(budget=len(few), extra=10_000))
-    assert len(decision.q) <= len(calls) <= 64
+    assert len(decision.queries) <= len(calls) <= 64
 
 
 def test_declared_tolerances_hold(few):
@@ -266,12 +265,12 @@ def test_what_never_changes_is_known(outputs):
     """An output that never varied has no deviation to choose queries by; the design is ready all the same."""
     spec = designed(initial=4, monte_carlo=64)
     definition = definition_from_spec(spec)
-    state, samples = DesignState(), still(answer(spec, *initial_design(definition, 20)), outputs)
+    state, samples = DesignState(), still(answer(spec, *arrays(initial_queries(definition, 20))), outputs)
     for _ in range(20):
         made = advance(definition, samples, state, request())
         if made.verdict != "continue":
             break
-        samples, state = join(samples, still(answer(spec, made.q, made.u), outputs)), made.state
+        samples, state = join(samples, still(answer(spec, *arrays(made.queries)), outputs)), made.state
     assert made.verdict == "ready"
     assert 6 <= len(samples) < 20
     assert made.confidences[2].confidence_index == 1
@@ -316,15 +315,15 @@ def test_queries_go_where_policies_went(acquisition):
     """Or where those would have gone that are their mirror images, which tells as much."""
     spec = designed(seed=0, initial=5, acquisition=acquisition)
     definition = definition_from_spec(spec)
-    samples = answer(spec, *initial_design(definition, 5))
+    samples = answer(spec, *arrays(initial_queries(definition, 5)))
     visited = torch.tensor([[2.0, 6.0]], dtype=torch.float64) + 0.2 * torch.randn(
         400, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
     )
     wide = advance(definition, samples, NEVER, request())
     near_them = advance(definition, samples, NEVER, request(states=visited))
-    assert len(near_them.q) == len(wide.q) == 3
+    assert len(near_them.queries) == len(wide.queries) == 3
     there = torch.tensor([[[2.0, 6.0]], [[-2.0, -6.0]]])
-    distance, anywhere = ((made.q - there).abs().amax(-1).amin(0) for made in (near_them, wide))
+    distance, anywhere = ((arrays(made.queries)[0] - there).abs().amax(-1).amin(0) for made in (near_them, wide))
     assert int((distance < 1).sum()) >= 2
     assert int((anywhere < 1).sum()) == 0
 
@@ -334,13 +333,13 @@ def test_an_ended_design_adds_no_queries_after_an_audit(definition, few):
     assert first.verdict == "over_budget"
     state = DesignState.from_json(first.state.to_json())
     audited = replace(request(budget=len(few) + 8), audited=0)
-    assert len(advance(definition, few, state, audited).q), "another budget opens it again"
+    assert advance(definition, few, state, audited).queries, "another budget opens it again"
     more = random_steps(pendulum(), len(few) + 4, seed=0)
     same = replace(request(budget=len(few)), audited=4)
     after = advance(definition, more, state, same)
-    assert (after.verdict, len(after.q)) == ("over_budget", 0)
+    assert (after.verdict, len(after.queries)) == ("over_budget", 0)
     open_again = advance(definition, more, replace(state, ended_with=()), replace(same, budget=len(few) + 8))
-    assert len(open_again.q) > 0
+    assert open_again.queries
 
 
 GENEROUS = 1e3  # tolerance of each output
@@ -372,32 +371,32 @@ def after_audit(before: Decision, errors: float, budget: int = 100) -> Decision:
 
 def test_a_design_that_was_ready_stays_ready_after_steps_that_agree():
     after = after_audit(ready(), errors=0.9)
-    assert (after.verdict, len(after.q), after.state.ended_as) == ("ready", 0, "ready")
+    assert (after.verdict, len(after.queries), after.state.ended_as) == ("ready", 0, "ready")
 
 
 def test_a_design_that_was_ready_is_unsure_after_steps_that_differ():
     after = after_audit(ready(), errors=2.0)
-    assert (after.verdict, len(after.q)) == ("unsure", 0), "92 steps of its budget are left"
+    assert (after.verdict, len(after.queries)) == ("unsure", 0), "92 steps of its budget are left"
 
 
 def test_a_design_that_was_ready_is_judged_anew_once_more_is_asked():
     after = after_audit(ready(), errors=0.9, budget=101)
     assert after.verdict == "continue"
-    assert len(after.q)
+    assert after.queries
 
 
 def test_refused_queries_leave_the_budget_and_are_not_asked_again(definition, few, unseen):
-    refused = first(unseen, 3)
+    refused = Points(unseen.q[:3], unseen.u[:3])
     budget = len(few) + 2
-    made = advance(definition, few, NEVER, request(budget, refused=Points(refused.q, refused.u)))
-    assert len(made.q) == 2
-    assert not near(definition, Points(made.q, made.u), Points(refused.q, refused.u)).any()
+    made = advance(definition, few, NEVER, request(budget, refused=refused.queries))
+    assert len(made.queries) == 2
+    assert not near(definition, Points.of(definition, made.queries), refused).any()
 
 
 def test_a_design_ends_unsure_where_the_environment_refuses_everything(definition, few):
     def verdict(refusals: int) -> str:
         refused = random_steps(pendulum(), refusals, seed=3)
-        return advance(definition, few, NEVER, request(10, refused=Points(refused.q, refused.u))).verdict
+        return advance(definition, few, NEVER, request(10, refused=Points(refused.q, refused.u).queries)).verdict
 
     assert (verdict(10 + len(few)), verdict(9 + len(few))) == ("unsure", "continue")
 
@@ -405,4 +404,4 @@ def test_a_design_ends_unsure_where_the_environment_refuses_everything(definitio
 def test_a_design_with_open_queries_has_not_ended(definition, few, unseen):
     """A log may come while the rest of the budget is being answered."""
     made = advance(definition, few, NEVER, request(len(few) + 2, first(unseen, 2), open=2))
-    assert (made.verdict, len(made.q)) == ("continue", 0)
+    assert (made.verdict, len(made.queries)) == ("continue", 0)

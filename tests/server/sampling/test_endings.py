@@ -5,12 +5,12 @@ import torch
 
 from support.models import learn
 from support.plane import drifting, plane
-from support.real_steps import answer, join, random_steps
+from support.real_steps import answer, arrays, join, random_steps
 from surrogym_sampler.original.classic import cartpole
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.sampling.design import advance, initial_design
+from surrogym_server.sampling.design import advance, initial_queries
 from surrogym_server.sampling.endings import ending, in_doubt
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.virtual.environment import VirtualSettings, create, reset, step
@@ -71,13 +71,13 @@ def test_a_design_finds_where_episodes_end(seed):
     """At most 30 real steps, the ends of CartPole not declared: better than calling no step an end."""
     spec = LEARNED.model_copy(update={"design": cartpole().design.model_copy(update={"seed": seed, "budget": 30})})
     definition, state = definition_from_spec(spec), DesignState()
-    samples = answer(spec, *initial_design(definition, 30))
+    samples = answer(spec, *arrays(initial_queries(definition, 30)))
     while True:
-        decision = advance(definition, samples, state, Request(30, 0.999, Points(samples.q[:0], samples.u[:0])))
+        decision = advance(definition, samples, state, Request(30, 0.999))
         if decision.verdict != "continue":
             break
         state, left = decision.state, 30 - len(samples)
-        samples = join(samples, answer(spec, decision.q[:left], decision.u[:left]))
+        samples = join(samples, answer(spec, *arrays(decision.queries[:left])))
     model, unseen = decision.model, random_steps(spec, 500, seed=20_000)
     predicted = model.terminated(model.transition(unseen.q, unseen.u).q_next)
     assert int((predicted != unseen.terminated).sum()) < int(unseen.terminated.sum())

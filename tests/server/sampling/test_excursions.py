@@ -26,7 +26,6 @@ STILL = {"kind": "uniform", "low": -0.01, "high": 0.01}  # resets lead to the to
 CHANGES = {"query": "rollout", "snapshots": True, "start": {"theta": STILL, "speed": STILL}}
 SPEC = EnvironmentSpec.model_validate(pendulum().model_dump() | CHANGES)
 DEFINITION = definition_from_spec(SPEC)
-NOTHING = Points(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 1, dtype=torch.float64))
 
 
 def rng(seed: int = 0) -> np.random.Generator:
@@ -54,38 +53,37 @@ def away(model: GaussianProcessModel, start: torch.Tensor, actions: torch.Tensor
 
 def test_an_excursion_ends_at_the_first_state_far_from_all_samples(model: GaussianProcessModel):
     known = torch.zeros(1, 2, dtype=torch.float64)
-    found = excursion(model, known, known, 16, rng())
-    gone = away(model, known[0], found.actions, known)
+    found = excursion(model, known, {"top": (0.0, 0.0)}, 16, rng())
+    gone = away(model, known[0], torch.tensor(found.actions, dtype=torch.float64), known)
     assert gone[-1] >= FAR
     assert (gone[:-1] < FAR).all()
-    shorter = torch.from_numpy(random_sequences(DEFINITION, 300, len(found) - 1, rng(1)))
+    shorter = torch.from_numpy(random_sequences(DEFINITION, 300, found.steps - 1, rng(1)))
     assert all(away(model, known[0], actions, known).amax() < FAR for actions in shorter)
 
 
 def test_an_excursion_that_cannot_get_far_goes_as_far_as_it_can(model: GaussianProcessModel):
     known = torch.zeros(1, 2, dtype=torch.float64)
-    found = excursion(model, known, torch.tensor([[0.0, 0.0], [0.0, 0.4]], dtype=torch.float64), 2, rng())
-    assert len(found) == 2
-    assert found.snapshot == 1, "it moves away already"
-    torch.testing.assert_close(found.actions.abs(), torch.full_like(found.actions, 2.0))  # all the torque that there is
+    found = excursion(model, known, {"still": (0.0, 0.0), "moving": (0.0, 0.4)}, 2, rng())
+    assert found.snapshot == "moving", "it moves away already"
+    assert np.abs(found.actions) == pytest.approx(np.full((2, 1), 2.0)), "all the torque that there is"
 
 
 def test_without_a_snapshot_an_excursion_begins_at_a_reset(model: GaussianProcessModel, samples: Samples):
-    for snapshots in (None, samples.q[:0]):
-        assert excursion(model, samples.q, snapshots, 4, rng()).snapshot is None
+    assert excursion(model, samples.q, {}, 4, rng()).snapshot is None
 
 
 def request(samples: Samples, budget: int = 60) -> Request:
-    return Request(budget=budget, target=0.9, pending=NOTHING, snapshots=samples.q_next)
+    snapshots = {str(number): tuple(state) for number, state in enumerate(samples.q_next.tolist())}
+    return Request(budget=budget, target=0.9, snapshots=snapshots)
 
 
 def test_a_sure_design_with_snapshots_is_ready_once_an_excursion_was_answered(samples: Samples):
     first = advance(DEFINITION, samples, DesignState(), request(samples))
     assert first.verdict == "continue"
-    (rollout,) = first.rollouts
+    (rollout,) = first.queries
     lost = advance(DEFINITION, samples, first.state, request(samples))
     assert lost.verdict == "continue", "its query was withdrawn, so another excursion is due"
-    assert len(lost.rollouts) == 1
+    assert len(lost.queries) == 1
     answered = join(samples, roll(SPEC, rollout.actions, 7))
     state = DesignState.from_json(first.state.to_json())
     assert advance(DEFINITION, answered, state, request(answered)).verdict == "ready"
@@ -94,9 +92,9 @@ def test_a_sure_design_with_snapshots_is_ready_once_an_excursion_was_answered(sa
 def test_a_sure_design_without_room_for_an_excursion_is_not_ready(samples: Samples):
     decision = advance(DEFINITION, samples, DesignState(), request(samples, len(samples)))
     assert decision.verdict == "over_budget"
-    assert not decision.rollouts
+    assert not decision.queries
     raised = advance(DEFINITION, samples, decision.state, request(samples))
-    assert len(raised.rollouts) == 1, "once there is room, the excursion is due"
+    assert len(raised.queries) == 1, "once there is room, the excursion is due"
 
 
 def test_with_resets_alone_and_in_preset_paper_no_excursion_is_needed(samples: Samples):

@@ -14,7 +14,8 @@ from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.confidence import confidences_of, deviations
 from surrogym_server.sampling.endings import edge_in_doubt
 from surrogym_server.sampling.outlook import as_if_answered, outlook_of, path_outlook
-from surrogym_server.sampling.rollouts import Aim, Rollout, plan_round
+from surrogym_server.sampling.rollouts import Aim, plan_round
+from surrogym_shared.nouns import Query
 
 TOLERANCES = [0.1, 0.1, 0.1]
 
@@ -79,8 +80,8 @@ def test_steps_of_a_path_count_one_by_one(plain, candidates):
 
 def test_rollouts_are_planned_all_the_same(plain):
     aim = Aim([0, 1], TOLERANCES, longest=5)
-    rollouts = plan_round(plain, aim, 8, [Rollout(torch.zeros(3, 1, dtype=torch.float64))], np.random.default_rng(0))
-    assert sum(map(len, rollouts)) == 8
+    rollouts = plan_round(plain, aim, 8, [Query.rollout([[0.0]] * 3)], np.random.default_rng(0))
+    assert sum(query.steps for query in rollouts) == 8
 
 
 def test_no_edge_is_in_doubt(plain, candidates):

@@ -141,9 +141,9 @@ def test_a_noisy_design_repeats_steps_and_comes_to_be_ready(model: ClaimsNoise):
     low, high = torch.tensor([[-np.pi, -8.0, -2.0], [np.pi, 8.0, 2.0]])
     points = low + (high - low) * torch.tensor(rng.random((24, 3)))
     taken, state = real(Points(points[:, :2], points[:, 2:])), DesignState()
-    request = Request(budget=48, target=0.99, pending=Points(taken.q[:0], taken.u[:0]))
+    request = Request(budget=48, target=0.99)
     while (decision := advance(model.definition, taken, state, request)).verdict == "continue":
-        state, more = decision.state, real(Points(decision.q, decision.u))
+        state, more = decision.state, real(Points.of(model.definition, decision.queries))
         fields = ("q", "u", "q_next", "reward", "terminated")
         taken = Samples(*(torch.cat([getattr(taken, name), getattr(more, name)]) for name in fields))
     assert decision.verdict == "ready"

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.guard import learn
 from surrogym_server.sampling.design import advance
@@ -77,7 +76,7 @@ def judged(follow: Next, seed: int = 0) -> Judged:
     taken = Samples(q, u, q_next, -(q[:, 0] ** 2), torch.zeros(len(rows), dtype=torch.bool))
     model = learn(DEFINITION, taken, {}).model
     usual = usual_tolerances(DEFINITION, model.scales.tolist())
-    return judge_model(model, taken, usual, Request(COUNT, 0.9, Points(taken.q[:0], taken.u[:0])), DesignState())
+    return judge_model(model, taken, usual, Request(COUNT, 0.9), DesignState())
 
 
 def longer_dead_time(s: np.ndarray, u: float, before: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:
@@ -115,9 +114,9 @@ def test_a_design_of_single_steps_takes_longer_rollouts_in_its_second_half(budge
     taken = single_steps()
     lacking = pairs_lacking(DEFINITION, taken)
     assert lacking > 0
-    request = Request(budget, 0.999, Points(taken.q[:0], taken.u[:0]))
-    planned = advance(DEFINITION, taken, DesignState(), request).rollouts
-    gained = sum(len(rollout) - 1 for rollout in planned)
+    request = Request(budget, 0.999)
+    planned = advance(DEFINITION, taken, DesignState(), request).queries
+    gained = sum(query.steps - 1 for query in planned)
     assert (gained >= min(lacking, (budget - len(taken)) // LONGER * (LONGER - 1))) is longer
 
 

@@ -15,16 +15,14 @@ from surrogym_sampler.original.classic import acrobot, cartpole, pendulum
 from surrogym_server.convert import default_budget, definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, run_design_job
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import PredictedSteps
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.lookahead import process_inputs
 from surrogym_server.sampling.confidence import deviations
-from surrogym_server.sampling.design import advance, initial_rollouts
+from surrogym_server.sampling.design import advance, initial_queries
 from surrogym_server.sampling.rollouts import (
     Aim,
-    Rollout,
     as_if_done,
     first_rollouts,
     path_values,
@@ -35,9 +33,9 @@ from surrogym_server.sampling.rollouts import (
     start_points,
 )
 from surrogym_server.sampling.state import DesignState, Request
+from surrogym_shared.nouns import Query
 from surrogym_shared.spec import EnvironmentSpec, Uniform
 
-NOTHING = Points(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 1, dtype=torch.float64))
 ALL = (0, 1, 2)
 
 
@@ -52,6 +50,11 @@ def rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
+def planned(model: GaussianProcessModel, aim: Aim) -> torch.Tensor:
+    """Actions (T, F) of the best sequence."""
+    return torch.tensor(plan_rollout(model, aim, rng()).actions, dtype=torch.float64)
+
+
 @pytest.fixture(scope="module")
 def swinging() -> EnvironmentDefinition:
     return definition_from_spec(SPEC)
@@ -60,7 +63,7 @@ def swinging() -> EnvironmentDefinition:
 @pytest.fixture(scope="module")
 def begun(swinging: EnvironmentDefinition) -> Samples:
     """The answers to the first rollouts, cut to so few that the model has something left to learn."""
-    return join(*(roll(SPEC, actions, seed) for seed, actions in enumerate(first_rollouts(swinging, 6, rng())[:2])))
+    return join(*(roll(SPEC, query.actions, seed) for seed, query in enumerate(first_rollouts(swinging, 6, rng())[:2])))
 
 
 @pytest.fixture(scope="module")
@@ -76,9 +79,9 @@ def aim(model: GaussianProcessModel) -> Aim:
 
 def test_first_rollouts_are_short_first_and_take_the_steps_they_may(swinging: EnvironmentDefinition):
     rollouts = first_rollouts(swinging, 12, rng())
-    assert [len(actions) for actions in rollouts] == [1, 2, 3, 4, 2]
-    assert all(actions.shape[1] == 1 and bool((actions.abs() <= 2).all()) for actions in rollouts)
-    assert [len(a) for a in first_rollouts(replace(swinging, max_rollout=2), 7, rng())] == [1, 2, 2, 2]
+    assert [query.steps for query in rollouts] == [1, 2, 3, 4, 2]
+    assert all(len(action) == 1 and abs(action[0]) <= 2 for query in rollouts for action in query.actions)
+    assert [query.steps for query in first_rollouts(replace(swinging, max_rollout=2), 7, rng())] == [1, 2, 2, 2]
 
 
 def test_sequences_are_held_for_times_of_their_own(swinging: EnvironmentDefinition):
@@ -163,9 +166,9 @@ def test_a_planned_rollout_gives_more_per_step_than_random_ones():
     spec = only_resets(acrobot())
     definition = definition_from_spec(spec)
     rollouts = first_rollouts(definition, 12, rng())
-    model = learn(definition, join(*(roll(spec, actions, seed) for seed, actions in enumerate(rollouts)))).model
+    model = learn(definition, join(*(roll(spec, query.actions, seed) for seed, query in enumerate(rollouts)))).model
     aim = Aim((0, 1, 2, 3), [0.05 * output.scale for output in model.transitions], longest=12)
-    actions = plan_rollout(model, aim, rng()).actions
+    actions = planned(model, aim)
     assert 1 <= len(actions) <= aim.longest
     starts = start_points(definition, 32, rng(7))
 
@@ -179,12 +182,12 @@ def test_a_planned_rollout_gives_more_per_step_than_random_ones():
 
 
 def test_the_same_plan_again_for_the_same_seed(model: GaussianProcessModel, aim: Aim):
-    torch.testing.assert_close(plan_rollout(model, aim, rng(3)).actions, plan_rollout(model, aim, rng(3)).actions)
+    assert plan_rollout(model, aim, rng(3)) == plan_rollout(model, aim, rng(3))
 
 
 def test_a_rollout_that_is_pending_leaves_less_to_learn(model: GaussianProcessModel, aim: Aim):
     actions = torch.full((6, 1), 2.0, dtype=torch.float64)
-    done = as_if_done(model, Rollout(actions), None, rng())
+    done = as_if_done(model, Query.rollout(actions.tolist()), {}, rng())
     paths = predict_paths(model, start_points(model.definition, 1, rng()), actions[None])
     again, first = (float(path_values(m, aim, paths)[0, -1]) for m in (done, model))
     assert again < 0.1 * first
@@ -195,16 +198,18 @@ def test_a_rollout_that_is_pending_leaves_less_to_learn(model: GaussianProcessMo
 
 
 def test_a_round_takes_its_steps_and_no_more(model: GaussianProcessModel, aim: Aim):
-    rollouts = plan_round(model, replace(aim, longest=3), 7, [Rollout(torch.ones(2, 1, dtype=torch.float64))], rng())
-    assert sum(len(actions) for actions in rollouts) == 7
-    assert max(len(actions) for actions in rollouts) <= 3
+    rollouts = plan_round(model, replace(aim, longest=3), 7, [Query.rollout([[1.0]] * 2)], rng())
+    assert sum(query.steps for query in rollouts) == 7
+    assert max(query.steps for query in rollouts) <= 3
 
 
 def test_an_end_of_the_episode_is_looked_for_until_one_was_seen():
     """Mirrored samples would tell all of the pole, and what is planned without need pushes it over as well."""
     spec = only_resets(cartpole(), design={"symmetry": "none"})
     definition = definition_from_spec(spec)
-    samples = join(*(roll(spec, actions, seed) for seed, actions in enumerate(first_rollouts(definition, 20, rng()))))
+    samples = join(
+        *(roll(spec, query.actions, seed) for seed, query in enumerate(first_rollouts(definition, 20, rng())))
+    )
     assert not bool(samples.terminated.any())
     learned = learn(definition, samples).model
     aim = Aim(tuple(range(5)), [0.05] * 5, longest=30, ending=True)
@@ -213,9 +218,9 @@ def test_an_end_of_the_episode_is_looked_for_until_one_was_seen():
     def ends(sequence: torch.Tensor) -> float:
         return float(predict_paths(learned, starts, sequence.expand(16, -1, -1)).ended[:, -1].mean())
 
-    assert ends(plan_rollout(learned, aim, rng()).actions) > 0.75
-    assert ends(plan_rollout(learned, replace(aim, ending=False), rng()).actions) < 0.5
-    assert ends(plan_rollout(learned, replace(aim, ended=True), rng()).actions) < 0.5, "one was seen"
+    assert ends(planned(learned, aim)) > 0.75
+    assert ends(planned(learned, replace(aim, ending=False))) < 0.5
+    assert ends(planned(learned, replace(aim, ended=True))) < 0.5, "one was seen"
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -227,7 +232,7 @@ def test_a_rewards_edge_in_doubt_is_driven_to(side: int):
     learned = learn(definition, samples).model
     assert learned.jumps
     aim = Aim((1,), [0.05] * 3, longest=8, ending=True, ended=True)
-    driven = plan_rollout(learned, aim, rng()).actions
+    driven = planned(learned, aim)
     assert side * float(driven.mean()) > 0.5
 
 
@@ -235,15 +240,15 @@ def test_a_design_without_teleport_spends_its_budget_in_real_steps(swinging: Env
     complete = replace(swinging, design=replace(swinging.design, initial=len(begun)))
 
     def ask(**options: object) -> list[int]:
-        values = {"budget": len(begun) + 9, "target": 1 - 1e-12, "pending": NOTHING} | options
-        decision = advance(complete, begun, DesignState(), Request(**values))
-        assert len(decision.q) == 0
-        return [len(actions) for actions in decision.rollouts]
+        values = {"budget": len(begun) + 9, "target": 1 - 1e-12} | options
+        queries = advance(complete, begun, DesignState(), Request(**values)).queries
+        assert {query.kind for query in queries} <= {"rollout"}
+        return [query.steps for query in queries]
 
     assert sum(ask()) == 4, "a round is a quarter of the samples, four at least"
     assert sum(ask(budget=len(begun) + 2)) == 2
-    pending = (Rollout(torch.ones(7, 1, dtype=torch.float64)),)
-    assert sum(ask(pending_rollouts=pending)) == 2, "its seven steps are spoken for"
+    pending = (Query.rollout([[1.0]] * 7),)
+    assert sum(ask(pending=pending)) == 2, "its seven steps are spoken for"
     assert sum(ask(budget=len(begun), extra=5)) == 5
     assert ask(budget=len(begun)) == []
 
@@ -255,20 +260,20 @@ def test_steps_of_the_initial_design_that_early_ends_left_over_are_taken_in_one_
     assert (swinging.design.initial, len(begun)) == (12, 3)
 
     def ask(**options) -> list[int]:
-        request = Request(**{"budget": 60, "target": 1 - 1e-12, "pending": NOTHING} | options)
-        return [len(actions) for actions in advance(swinging, begun, DesignState(), request).rollouts]
+        request = Request(**{"budget": 60, "target": 1 - 1e-12} | options)
+        return [query.steps for query in advance(swinging, begun, DesignState(), request).queries]
 
     assert ask() == [1, 2, 3, 3]
     assert sum(ask(budget=8)) == 5, "the budget has no more"
     assert sum(ask(logged=3)) == 9, "a log is free, and replaces as many initial steps"
-    pending = (Rollout(torch.ones(7, 1, dtype=torch.float64)),)
-    assert sum(ask(pending_rollouts=pending)) == 4, "two are missing, which is less than a usual round"
+    pending = (Query.rollout([[1.0]] * 7),)
+    assert sum(ask(pending=pending)) == 4, "two are missing, which is less than a usual round"
 
 
 def test_the_latin_hypercube_arm_is_random_rollouts_alone():
     spec = only_resets(pendulum(), design={"acquisition": "latin_hypercube"})
-    assert sum(len(a) for a in initial_rollouts(definition_from_spec(spec), 30)) == 30
-    assert sum(len(a) for a in initial_rollouts(definition_from_spec(SPEC), 30)) == 12
+    assert sum(query.steps for query in initial_queries(definition_from_spec(spec), 30)) == 30
+    assert sum(query.steps for query in initial_queries(definition_from_spec(SPEC), 30)) == 12
 
 
 def test_the_budget_is_counted_from_the_dimensions():
@@ -292,7 +297,7 @@ def counted(spec: EnvironmentSpec, steps: int) -> EnvironmentSpec:
 
 def test_first_rollouts_reach_beyond_steps_with_unknown_lags():
     definition = definition_from_spec(counted(SPEC, 2))
-    assert [len(actions) for actions in first_rollouts(definition, 14, rng())] == [3, 4, 5]
+    assert [query.steps for query in first_rollouts(definition, 14, rng())] == [3, 4, 5]
 
 
 def test_a_plan_reaches_beyond_steps_with_unknown_lags():
@@ -306,7 +311,7 @@ def test_a_plan_reaches_beyond_steps_with_unknown_lags():
     value = path_values(model, aim, paths)
     assert not value[:, :2].any()
     assert (value[:, 2] > 0).all()
-    assert all(len(actions) > 2 for actions in plan_round(model, aim, 8, (), rng()))
+    assert all(query.steps > 2 for query in plan_round(model, aim, 8, (), rng()))
 
 
 def random_sequences_of(length: int) -> torch.Tensor:
@@ -322,7 +327,7 @@ def test_steps_with_unknown_lags_count_and_are_not_learned_from():
     job = DesignJob(definition, q, *others, state=DesignState().to_json(), budget=10, target=0.999)
     result = run_design_job(job)
     assert result.fidelity["samples"] == 6
-    assert 0 < sum(map(len, result.query_rollouts)) <= 2 or result.phase in ("over_budget", "unsure")
+    assert 0 < sum(query.steps for query in result.queries) <= 2 or result.phase in ("over_budget", "unsure")
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -337,37 +342,38 @@ def test_a_tolerance_below_the_noise_floor_still_values_plans(model: GaussianPro
 
 def test_a_plan_begins_at_the_snapshot_from_where_it_learns_more(model: GaussianProcessModel, aim: Aim):
     """Far from what is known, beside the states that a reset leads to."""
-    known = torch.zeros(3, 2, dtype=torch.float64)
-    fast = torch.tensor([[2.0, 7.0]], dtype=torch.float64)
-    plan = plan_rollout(model, replace(aim, snapshots=torch.cat([known, fast])), rng())
-    assert plan.snapshot == 3
+    snapshots = {"one": (0.0, 0.0), "two": (0.0, 0.0), "three": (0.0, 0.0), "fast": (2.0, 7.0)}
+    plan = plan_rollout(model, replace(aim, snapshots=snapshots), rng())
+    assert plan.snapshot == "fast"
     reset = plan_rollout(model, aim, rng())
     assert reset.snapshot is None
 
 
 def test_no_snapshot_so_far_means_a_plan_from_a_reset(model: GaussianProcessModel, aim: Aim):
-    plan = plan_rollout(model, replace(aim, snapshots=torch.zeros(0, 2, dtype=torch.float64)), rng())
+    plan = plan_rollout(model, replace(aim, snapshots={}), rng())
     assert plan.snapshot is None
-    torch.testing.assert_close(plan.actions, plan_rollout(model, aim, rng()).actions)
+    assert plan == plan_rollout(model, aim, rng())
 
 
 def test_a_pending_query_from_a_snapshot_is_done_there(model: GaussianProcessModel):
-    snapshots = torch.tensor([[2.0, 6.0]], dtype=torch.float64)
-    actions = torch.full((1, 1), 2.0, dtype=torch.float64)
-    done = as_if_done(model, Rollout(actions, 0), snapshots, rng())
-    before, after = (deviations(m, snapshots, actions)[0, 1] for m in (model, done))
+    place, actions = torch.tensor([[2.0, 6.0]], dtype=torch.float64), torch.full((1, 1), 2.0, dtype=torch.float64)
+    done = as_if_done(model, Query.rollout([[2.0]], "fast"), {"fast": (2.0, 6.0)}, rng())
+    before, after = (deviations(m, place, actions)[0, 1] for m in (model, done))
     assert after < 0.2 * before
 
 
 def test_a_design_with_snapshots_takes_shorter_rounds_of_known_states():
     spec = only_resets(pendulum(), snapshots=True)
     definition = definition_from_spec(spec)
-    first = initial_rollouts(definition, 60)
-    assert sum(map(len, first)) == 4, "as few as single steps"
-    samples = join(*(roll(spec, actions, seed) for seed, actions in enumerate(first)))
-    request = Request(budget=60, target=1 - 1e-12, pending=NOTHING, snapshots=samples.q_next)
+    first = initial_queries(definition, 60)
+    assert sum(query.steps for query in first) == 4, "as few as single steps"
+    samples = join(*(roll(spec, query.actions, seed) for seed, query in enumerate(first)))
+    snapshots = {str(number): tuple(state) for number, state in enumerate(samples.q_next.tolist())}
+    request = Request(budget=60, target=1 - 1e-12, snapshots=snapshots)
     decision = advance(definition, samples, DesignState(), request)
     below = sum(output.confidence_index < request.target for output in decision.confidences)
-    assert sum(map(len, decision.rollouts)) == max(1, below), "one step for each output below its target"
-    assert any(rollout.snapshot is not None for rollout in decision.rollouts)
-    assert all(rollout.snapshot is None or rollout.snapshot < len(samples) for rollout in decision.rollouts)
+    steps = sum(query.steps for query in decision.queries)
+    assert steps == max(1, below), "one step for each output below its target"
+    begins = {query.snapshot for query in decision.queries} - {None}
+    assert begins
+    assert begins <= snapshots.keys()

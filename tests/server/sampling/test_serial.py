@@ -8,7 +8,6 @@ import scipy
 import torch
 
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples, preceding
 from surrogym_server.models.guard import learn
 from surrogym_server.sampling.judging import judge_model
@@ -90,7 +89,7 @@ def test_a_learned_model_tells_the_sensors_noise_and_allows_for_it(seed: int) ->
     taken = steps(0.0, 0.04, seed)
     model = learn(DEFINITION, taken, {}).model
     usual = usual_tolerances(DEFINITION, model.scales.tolist())
-    request = Request(budget=COUNT, target=0.9, pending=Points(taken.q[:0], taken.u[:0]))
+    request = Request(budget=COUNT, target=0.9)
     position, _ = judge_model(model, taken, usual, request, DesignState()).confidences
     assert position.sensor_noise == pytest.approx(0.04, rel=0.35)
     assert position.noise == pytest.approx(0.04 * np.hypot(1, SLOPE), rel=0.35)

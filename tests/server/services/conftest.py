@@ -10,8 +10,8 @@ import pytest
 
 from support import pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.engine.design_job import initial_queries
 from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.sampling.design import initial_queries
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSurrogate
@@ -31,8 +31,8 @@ def storage(tmp_path: Path, prepared_file: Path) -> Iterator[Storage]:
     shutil.copy(prepared_file, tmp_path / "surrogym.db")
     opened = open_storage(f"sqlite:///{tmp_path / 'surrogym.db'}")
     spec = pendulum.spec()
-    state, q, u, _ = initial_queries(define(spec), pendulum.BUDGET)
-    opened.surrogates.create(NewSurrogate(NAME, spec, pendulum.BUDGET, 0.999, state, q, u))
+    queries = initial_queries(define(spec), pendulum.BUDGET)
+    opened.surrogates.create(NewSurrogate(NAME, spec, pendulum.BUDGET, 0.999, queries))
     yield opened
     opened.close()
 

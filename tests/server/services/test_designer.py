@@ -16,9 +16,10 @@ import pytest
 
 from support import pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
+from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.errors import ChoiceFailed, InvalidInput, NoModel, NumericalFailure, Unavailable
+from surrogym_server.sampling.design import initial_queries
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import ATTEMPTS, Designer
 from surrogym_server.services.metrics import ProcessMetrics
@@ -26,6 +27,7 @@ from surrogym_server.services.models import load_model
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSample, NewSurrogate, SurrogateRecord
+from surrogym_shared.nouns import Query
 from surrogym_shared.spec import EnvironmentSpec
 
 NAME = "pendulum"
@@ -358,8 +360,8 @@ def test_a_surrogate_that_becomes_due_during_a_fit_is_fitted_beside_it(answered:
 def teach_another(storage: Storage, budget: int) -> None:
     """A second surrogate whose fit is due."""
     spec = pendulum.spec()
-    state, q, u, _ = initial_queries(definition_from_spec(EnvironmentSpec.model_validate(spec)), budget)
-    storage.surrogates.create(NewSurrogate("another", spec, budget, 0.999, state, q, u))
+    queries = initial_queries(definition_from_spec(EnvironmentSpec.model_validate(spec)), budget)
+    storage.surrogates.create(NewSurrogate("another", spec, budget, 0.999, queries))
     for query in storage.queries.claim("another", "tester", 100, 60):
         step = pendulum.real_step(list(query.coordinates), list(query.action))
         storage.samples.add("another", "tester", [NewSample(**step, query_id=query.id, lease_token=query.token)])
@@ -367,8 +369,7 @@ def teach_another(storage: Storage, budget: int) -> None:
 
 def test_a_budget_that_comes_later_gets_initial_queries(answered: Storage, designer):
     spec = pendulum.spec()
-    definition = definition_from_spec(EnvironmentSpec.model_validate(spec))
-    answered.surrogates.create(NewSurrogate("late", spec, 0, 0.999, initial_queries(definition, 0)[0]))
+    answered.surrogates.create(NewSurrogate("late", spec, 0, 0.999))
     fit_all(designer)
     assert answered.queries.counts("late").pending == 0
     answered.designs.improve("late", 3, raise_budget=True)
@@ -461,7 +462,7 @@ def test_improve_takes_the_latest_occupancy_unless_one_is_named(answered: Storag
 def test_the_phase_after_a_fit(answered: Storage, designer, runner: Runner, verdict: str, queries: int, phase: str):
     fit_all(designer)
     result = run_design_job(runner.jobs[0])
-    changed = replace(result, verdict=verdict, query_coordinates=np.zeros((queries, 2)))
+    changed = replace(result, verdict=verdict, queries=(Query.step((0.0, 0.0), (0.0,)),) * queries)
     assert changed.phase == phase
 
 

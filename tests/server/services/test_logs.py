@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from support import pendulum
-from surrogym_server.engine.design_job import initial_queries, run_design_job
+from surrogym_server.engine.design_job import run_design_job
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.errors import InvalidInput
+from surrogym_server.sampling.design import initial_queries
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import Designer
 from surrogym_server.services.metrics import ProcessMetrics
@@ -72,8 +73,7 @@ def _tuple(value):
 def alone(storage: Storage, definitions: Definitions) -> str:
     """A surrogate that asks for no real step."""
     spec = pendulum.spec(budget=0)
-    state, q, u, _ = initial_queries(definitions._define(spec), 0)
-    storage.surrogates.create(NewSurrogate("alone", spec, 0, 0.999, state, q, u))
+    storage.surrogates.create(NewSurrogate("alone", spec, 0, 0.999))
     return "alone"
 
 

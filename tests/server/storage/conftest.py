@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from support.queries import steps
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, NewDesign, NewModel, NewSample
+from surrogym_shared.nouns import Query
 
 SECONDS = 60.0  # a lease no test outlives
 
@@ -58,9 +60,9 @@ def answer_all(storage: Storage, answer: Callable[..., NewSample]) -> Callable[[
 
 @pytest.fixture
 def design() -> Callable[..., NewDesign]:
-    """What a fit gives, with m next queries."""
+    """What a fit gives, with these next queries, or with as many."""
 
-    def make_design(queries: int = 0, **changes: Any) -> NewDesign:
+    def make_design(queries: int | tuple[Query, ...] = 0, **changes: Any) -> NewDesign:
         model = NewModel(
             samples=3,
             data_hash="abc",
@@ -70,7 +72,8 @@ def design() -> Callable[..., NewDesign]:
             blob=b"\0model",
         )
         values: dict[str, Any] = {"model": model, "state": {"round": 1}, "phase": "sampling"}
-        chosen = {"query_coordinates": np.ones((queries, 2)), "query_action": np.ones((queries, 1))}
-        return NewDesign(**values | chosen | changes)
+        if isinstance(queries, int):
+            queries = steps(np.ones((queries, 2)), np.ones((queries, 1)))
+        return NewDesign(**values | changes, queries=queries)
 
     return make_design

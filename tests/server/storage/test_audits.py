@@ -7,18 +7,19 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from support.queries import steps
 from surrogym_server.errors import BeyondBudget
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSample
 from surrogym_server.storage.sql.queries import LEAST_AUDITED
 
 Make = Callable[..., str]
-Q, U = np.zeros((4, 2)), np.zeros((4, 1))
+FOUR = steps(np.zeros((4, 2)), np.zeros((4, 1)))
 
 
 def test_audits_cost_none_of_the_budget(storage: Storage, make: Make, answer: Callable[..., NewSample]) -> None:
     name = make(queries=0, budget=3)
-    storage.queries.enqueue(name, Q, U, purpose="audit")
+    storage.queries.enqueue(name, FOUR, purpose="audit")
     assert storage.designs.left(name) == 3
     leased = storage.queries.claim(name, "a", 4, 60.0)
     storage.samples.add(name, "a", [answer(query) for query in leased])
@@ -31,13 +32,13 @@ def test_audits_cost_none_of_the_budget(storage: Storage, make: Make, answer: Ca
 
 def test_all_audits_together_are_bounded(storage: Storage, make: Make) -> None:
     name = make(queries=0, budget=3)
-    many = np.zeros((LEAST_AUDITED, 2)), np.zeros((LEAST_AUDITED, 1))
-    ids = storage.queries.enqueue(name, *many, purpose="audit", key="k")
-    assert storage.queries.enqueue(name, *many, purpose="audit", key="k") == ids, "the same again asks for nothing"
+    many = steps(np.zeros((LEAST_AUDITED, 2)), np.zeros((LEAST_AUDITED, 1)))
+    ids = storage.queries.enqueue(name, many, purpose="audit", key="k")
+    assert storage.queries.enqueue(name, many, purpose="audit", key="k") == ids, "the same again asks for nothing"
     with pytest.raises(BeyondBudget, match="at most 0 more real steps of audits, got 4"):
-        storage.queries.enqueue(name, Q, U, purpose="audit")
+        storage.queries.enqueue(name, FOUR, purpose="audit")
     assert storage.queries.counts(name).pending == LEAST_AUDITED
-    storage.queries.enqueue(name, Q, U)
+    storage.queries.enqueue(name, FOUR)
 
 
 def test_the_range_of_rewards_is_that_of_all_samples(

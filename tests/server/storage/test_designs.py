@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sqlalchemy as sa
 
+from support.queries import steps
 from surrogym_server.errors import (
     BeyondBudget,
     IdempotencyConflict,
-    InvalidInput,
     LeaseExpired,
     NoModel,
     UnknownModel,
@@ -21,6 +22,7 @@ from surrogym_server.errors import (
 )
 from surrogym_server.storage.port import MAX_ATTEMPTS, Storage
 from surrogym_server.storage.records import FitLease, NewDesign, NewSample
+from surrogym_shared.nouns import Query
 
 LONG = 60.0
 SHORT = 0.02
@@ -162,7 +164,7 @@ def test_queries_for_an_older_target_are_withdrawn_unless_begun(
     lost, behind = storage.queries.claim(due, "a", 2, LONG)
     storage.queries.fail(due, lost.id, lost.token, "unreachable")
     storage.queries.fail(due, behind.id, behind.token, "the sampler was stopped", begun=False)
-    by_hand = storage.queries.enqueue(due, np.ones((1, 2)), np.ones((1, 1)))
+    by_hand = storage.queries.enqueue(due, steps([[1.0, 1.0]], [[1.0]]))
     storage.surrogates.change(due, budget=60)
     assert len(storage.queries.list(due, ("pending",))) == 4, "more room is no reason to choose anew"
     storage.surrogates.change(due, **change)
@@ -256,7 +258,7 @@ def test_a_budget_that_is_large_enough_stays(storage: Storage, due: str) -> None
 
 def test_without_the_right_to_raise_the_budget_its_rest_is_granted(storage: Storage, due: str) -> None:
     """The budget is the owner's: steps taken, queries open or set aside, and what was promised before all count."""
-    storage.queries.enqueue(due, np.zeros((2, 2)), np.zeros((2, 1)))
+    storage.queries.enqueue(due, steps(np.zeros((2, 2)), np.zeros((2, 1))))
     for _ in range(MAX_ATTEMPTS):
         [leased] = storage.queries.claim(due, "a", 1, LONG)
         storage.queries.fail(due, leased.id, leased.token, "unreachable")
@@ -299,13 +301,13 @@ def test_a_fit_of_a_deleted_surrogate_goes_nowhere(
 
 def test_a_refused_commit_leaves_nothing_behind(storage: Storage, due: str, design: Callable[..., NewDesign]) -> None:
     lease = begun(storage, due)
-    uneven = design(queries=2)
-    broken = NewDesign(uneven.model, uneven.state, "sampling", uneven.query_coordinates, uneven.query_action[:1])
-    with pytest.raises(InvalidInput, match="got 2 queries and 1 actions"):
-        storage.designs.commit(lease, broken)
+    whole = design(queries=2)
+    wrong = (Query.step((1.0, 1.0), ("no number",)),)  # type: ignore[arg-type]
+    with pytest.raises(sa.exc.StatementError, match="no number"):
+        storage.designs.commit(lease, design(queries=wrong))
     assert storage.models.list(due) == []
     assert storage.surrogates.get(due).round == 0
-    assert storage.designs.commit(lease, uneven) == 1
+    assert storage.designs.commit(lease, whole) == 1
 
 
 def test_models_are_numbered_from_one_in_each_surrogate(

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 
 from surrogym_server.errors import IdempotencyConflict, InvalidInput
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, LedgerRecord, NewDesign, NewSample, QueryCounts
+from surrogym_shared.nouns import Query
 
 LONG = 60.0
 SHORT = 0.02
-ACTIONS = (np.array([[0.5], [-0.5], [1 / 3]]), np.array([[2.0]]))  # two rollouts, of three steps and of one
+ROLLOUTS = (Query.rollout([[0.5], [-0.5], [1 / 3]]), Query.rollout([[2.0]]))  # of three steps and of one
 Wait = Callable[[Callable[[], bool]], None]
 Answer = Callable[..., NewSample]
 
 
 @pytest.fixture
 def name(make: Callable[..., str]) -> str:
-    return make(queries=0, query_rollouts=ACTIONS)
+    return make(queries=ROLLOUTS)
 
 
 @pytest.fixture
@@ -31,17 +31,18 @@ def long(storage: Storage, name: str) -> LeasedQuery:
 def test_an_action_sequence_comes_back_bit_for_bit(storage: Storage, name: str) -> None:
     long, short = storage.queries.claim(name, "a", 2, LONG)
     assert [(q.kind, q.coordinates, q.steps) for q in (long, short)] == [("rollout", (), 3), ("rollout", (), 1)]
-    assert [q.actions.tobytes() for q in (long, short)] == [a.tobytes() for a in ACTIONS]
-    assert storage.queries.get(name, long.id).actions.tolist() == ACTIONS[0].tolist()
+    assert [q.actions for q in (long, short)] == [q.actions for q in ROLLOUTS]
+    assert storage.queries.get(name, long.id).actions == ROLLOUTS[0].actions
 
 
 def test_rollouts_by_hand_wait_beside_steps(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=0)
-    step, rollout = storage.queries.enqueue(name, np.ones((1, 2)), np.ones((1, 1)), ACTIONS[:1], key="k")
-    assert storage.queries.enqueue(name, np.ones((1, 2)), np.ones((1, 1)), ACTIONS[:1], key="k") == [step, rollout]
+    by_hand = Query.step((1.0, 1.0), (1.0,))
+    step, rollout = storage.queries.enqueue(name, [by_hand, ROLLOUTS[0]], key="k")
+    assert storage.queries.enqueue(name, [by_hand, ROLLOUTS[0]], key="k") == [step, rollout]
     assert [q.kind for q in storage.queries.list(name)] == ["step", "rollout"]
     with pytest.raises(IdempotencyConflict):
-        storage.queries.enqueue(name, np.ones((1, 2)), np.ones((1, 1)), ACTIONS[1:], key="k")
+        storage.queries.enqueue(name, [by_hand, ROLLOUTS[1]], key="k")
 
 
 def test_every_step_of_a_rollout_is_a_sample_of_one_trajectory(
@@ -127,6 +128,6 @@ def test_a_design_asks_for_rollouts(
         storage.samples.add(name, "a", [answer(query)])
     lease = storage.designs.begin(name, "server", LONG)
     assert lease is not None
-    storage.designs.commit(lease, design(query_rollouts=ACTIONS[:1]))
+    storage.designs.commit(lease, design(queries=ROLLOUTS[:1]))
     [query] = storage.queries.claim(name, "a", 5, LONG)
-    assert (query.purpose, query.actions.tolist()) == ("adaptive", ACTIONS[0].tolist())
+    assert (query.purpose, query.actions) == ("adaptive", ROLLOUTS[0].actions)

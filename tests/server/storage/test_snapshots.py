@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, NewDesign, NewSample, QueryCounts
+from surrogym_shared.nouns import Query
 
 LONG = 60.0
-FIRST = (np.array([[0.5], [-0.5], [1 / 3]]),)
-ACTIONS = (np.array([[0.5], [0.25]]), np.array([[2.0]]), np.array([[1.0]]))
+FIRST = (Query.rollout([[0.5], [-0.5], [1 / 3]]),)
+NEXT = (Query.rollout([[0.5], [0.25]], "one"), Query.rollout([[2.0]], "two"), Query.rollout([[1.0]]))
 Answer = Callable[..., NewSample]
 
 
 @pytest.fixture
 def name(make: Callable[..., str]) -> str:
-    return make(queries=0, query_rollouts=FIRST)
+    return make(queries=FIRST)
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def chosen(storage: Storage, name: str, known: list[NewSample], design: Callable
     del known
     lease = storage.designs.begin(name, "server", LONG)
     assert lease is not None
-    storage.designs.commit(lease, design(query_rollouts=ACTIONS, query_snapshots=("one", "two", None)))
+    storage.designs.commit(lease, design(queries=NEXT))
     queries = storage.queries.claim(name, "a", 3, LONG)
     for query in queries:
         storage.queries.fail(name, query.id, query.token, "later", begun=False)

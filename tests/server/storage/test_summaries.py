@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
+from support.queries import steps
 from surrogym_server.storage.port import MAX_ATTEMPTS, Storage
 from surrogym_server.storage.records import NewDesign, NewModel, NewSample, SurrogateSummary
 
@@ -146,7 +147,7 @@ def test_a_design_is_unbegun_while_it_has_a_budget_and_never_had_a_query(
     storage.samples.add(sampled, "a", [by_hand()])
     assert storage.designs.unbegun() == [late]
     for name in (late, late, sampled):  # the second time changes nothing
-        storage.designs.ask_first(name, np.zeros((2, 2)), np.zeros((2, 1)), ())
+        storage.designs.ask_first(name, steps(np.zeros((2, 2)), np.zeros((2, 1))))
     assert storage.designs.unbegun() == []
     assert [storage.queries.counts(name).pending for name in (late, sampled)] == [2, 0]
 

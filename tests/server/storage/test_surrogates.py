@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
+from support.queries import steps
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewSurrogate
@@ -24,7 +25,7 @@ def test_a_new_surrogate_is_collecting_with_its_initial_queries(storage: Storage
     name = make(queries=3)
     record = storage.surrogates.get(name)
     assert (record.phase, record.paused, record.round, record.error) == ("collecting", False, 0, None)
-    assert (record.budget, record.target, record.state) == (30, 0.999, {"round": 0})
+    assert (record.budget, record.target, record.state) == (30, 0.999, {})
     first, *_, last = storage.queries.list(name)
     assert (first.purpose, first.status, first.round) == ("initial", "pending", 0)
     assert (first.coordinates, last.coordinates, last.action) == ((0.0, 1.0), (4.0, 5.0), (0.5,))
@@ -34,7 +35,7 @@ def test_creating_again_with_the_same_spec_changes_nothing(storage: Storage) -> 
     new = NewSurrogate("a", {"x": [1, 2.5], "y": None}, 30, 0.9)
     first, created = storage.surrogates.create(new)
     assert created
-    repeat = NewSurrogate("a", {"y": None, "x": [1, 2.5]}, 99, 0.5, {}, np.ones((4, 2)), np.ones((4, 1)))
+    repeat = NewSurrogate("a", {"y": None, "x": [1, 2.5]}, 99, 0.5, steps(np.ones((4, 2)), np.ones((4, 1))))
     assert storage.surrogates.create(repeat) == (first, False)
     assert storage.queries.counts("a").pending == 0
 
@@ -125,7 +126,7 @@ def test_every_operation_refuses_an_unknown_surrogate(storage: Storage, by_hand:
         lambda: storage.surrogates.delete("no"),
         lambda: storage.designs.improve("no", 1),
         lambda: storage.designs.begin("no", "me", 1),
-        lambda: storage.queries.enqueue("no", none, none),
+        lambda: storage.queries.enqueue("no", ()),
         lambda: storage.queries.claim("no", "w", 1, 1),
         lambda: storage.queries.renew("no", 1, "t", 1),
         lambda: storage.queries.fail("no", 1, "t", "e"),
@@ -157,7 +158,7 @@ def test_many_initial_queries_are_queued_in_bounded_transactions_and_after_a_cra
     monkeypatch.setattr(initial, "BATCH", 10)
     unbegun = sa.select(surrogates.c.name).where(designs.IS_UNBEGUN | initial.IS_INCOMPLETE)
     monkeypatch.setattr(designs, "UNBEGUN", unbegun)  # without the minute in which the creating server may be alive
-    planned = np.arange(70.0).reshape(35, 2), np.full((35, 1), 0.5)
+    planned = steps(np.arange(70.0).reshape(35, 2), np.full((35, 1), 0.5))
     with committed(storage) as commits:
         whole = make(queries=35, name="whole")
     assert len(commits) >= 4
@@ -169,10 +170,10 @@ def test_many_initial_queries_are_queued_in_bounded_transactions_and_after_a_cra
     answer_all(NAME)
     assert storage.designs.due() == []
     assert storage.designs.unbegun() == [NAME]
-    storage.designs.ask_first(NAME, *planned, ())
+    storage.designs.ask_first(NAME, planned)
     assert storage.designs.unbegun() == []
     for name in (whole, NAME):
-        assert [query.coordinates for query in storage.queries.list(name)] == [tuple(row) for row in planned[0]]
+        assert [query.coordinates for query in storage.queries.list(name)] == [query.coordinates for query in planned]
     answer_all(NAME)
     assert storage.designs.due() == [NAME]
 

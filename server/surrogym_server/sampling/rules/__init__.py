@@ -1,6 +1,6 @@
 """Rules for what may be asked next: a file for each, and their order in ``order``."""
 
 from surrogym_server.sampling.rules.order import ROLLOUT_RULES, STEP_RULES
-from surrogym_server.sampling.rules.rule import Chosen, Rule
+from surrogym_server.sampling.rules.rule import Rule
 
-__all__ = ["ROLLOUT_RULES", "STEP_RULES", "Chosen", "Rule"]
+__all__ = ["ROLLOUT_RULES", "STEP_RULES", "Rule"]

@@ -6,14 +6,14 @@ import torch
 
 from surrogym_server.sampling.excursions import excursion
 from surrogym_server.sampling.round import Round
-from surrogym_server.sampling.rules.rule import Chosen
+from surrogym_shared.nouns import Query
 
 
-def take_excursion(round: Round) -> Chosen | None:
+def take_excursion(round: Round) -> tuple[Query, ...] | None:
     """Take an excursion, if the budget has room for it."""
     if not round.testing:
         return None
     if not round.room:
-        return Chosen()
+        return ()
     visited = torch.cat([round.samples.q, round.samples.q_next])
-    return Chosen(rollouts=(excursion(round.model, visited, round.request.snapshots, round.room, round.generator()),))
+    return (excursion(round.model, visited, round.request.snapshots, round.room, round.generator()),)

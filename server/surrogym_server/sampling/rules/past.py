@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import torch
-
 from surrogym_server.sampling.judging import agrees
 from surrogym_server.sampling.past import pairs_lacking
-from surrogym_server.sampling.rollouts import Rollout, random_sequences
+from surrogym_server.sampling.rollouts import random_sequences
 from surrogym_server.sampling.round import Round
-from surrogym_server.sampling.rules.rule import Chosen
+from surrogym_shared.nouns import Query
 
 LENGTH = 8  # steps of a rollout
 
 
-def see_the_past(round: Round) -> Chosen | None:
+def see_the_past(round: Round) -> tuple[Query, ...] | None:
     """Take random rollouts that give enough consecutive steps for the test, if an error exceeds its tolerance. With
     snapshots none are needed, because they keep the past."""
     definition, judged = round.definition, round.judged
-    if not round.may_examine or definition.snapshots or round.request.pending_rollouts:
+    if not round.may_examine or definition.snapshots or round.request.pending:
         return None
     if all(agrees(c, t) for c, t in zip(judged.confidences[:-1], judged.tolerances, strict=False)):
         return None
@@ -29,4 +27,4 @@ def see_the_past(round: Round) -> Chosen | None:
     if not count:
         return None
     sequences = random_sequences(definition, count, length, round.generator())
-    return Chosen(rollouts=tuple(Rollout(torch.from_numpy(sequence)) for sequence in sequences))
+    return tuple(map(Query.rollout, sequences.tolist()))

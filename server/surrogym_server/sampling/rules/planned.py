@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from surrogym_server.sampling.rollouts import Aim, plan_round
 from surrogym_server.sampling.round import Round
-from surrogym_server.sampling.rules.rule import Chosen
+from surrogym_shared.nouns import Query
 
 SHORTEST = 4  # real steps of a round
 
 
-def plan_rollouts(round: Round) -> Chosen:
+def plan_rollouts(round: Round) -> tuple[Query, ...]:
     """Plan rollouts for the outputs below their target."""
     request, judged = round.request, round.judged
     aim = Aim(
@@ -22,8 +22,7 @@ def plan_rollouts(round: Round) -> Chosen:
         ended=bool(round.samples.terminated.any()),
     )
     steps = min(round.room, steps_of_a_round(round)) if round.continues else request.extra
-    unanswered = (*request.pending_rollouts, *request.refused_rollouts)
-    return Chosen(rollouts=tuple(plan_round(round.model, aim, steps, unanswered, round.generator())))
+    return tuple(plan_round(round.model, aim, steps, request.unanswered, round.generator()))
 
 
 def steps_of_a_round(round: Round) -> int:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from surrogym_server.models.guard import plugin_calls
 from surrogym_server.sampling.noise import to_repeat
 from surrogym_server.sampling.round import Round
-from surrogym_server.sampling.rules.rule import Chosen
+from surrogym_shared.nouns import Query
 
 
-def repeat_steps(round: Round) -> Chosen | None:
+def repeat_steps(round: Round) -> tuple[Query, ...] | None:
     """Repeat the steps with the largest errors, if they were not repeated yet."""
     if not round.may_examine:
         return None
@@ -17,4 +17,4 @@ def repeat_steps(round: Round) -> Chosen | None:
         again = to_repeat(round.model, round.samples, limits)
     if again is None or not round.room:
         return None
-    return Chosen(again[: round.room])
+    return again[: round.room].queries

@@ -5,13 +5,14 @@ from __future__ import annotations
 from surrogym_server.environment.points import Points
 from surrogym_server.sampling.batch import choose
 from surrogym_server.sampling.round import Round
-from surrogym_server.sampling.rules.rule import Chosen
+from surrogym_shared.nouns import Query
 
 
-def ask_best_candidates(round: Round) -> Chosen:
+def ask_best_candidates(round: Round) -> tuple[Query, ...]:
     """Choose one query for each output below its target, the least confident first. The first query is a reserved
     candidate, if there is one."""
-    below, judged, assumed = round.below_target, round.judged, round.request.assumed
+    below, judged = round.below_target, round.judged
+    assumed = Points.of(round.definition, round.request.unanswered)
     if round.continues:
         outputs = below[: round.room]
     else:
@@ -19,4 +20,4 @@ def ask_best_candidates(round: Round) -> Chosen:
     taken = Points.joined([Points(round.samples.q, round.samples.u), assumed])
     candidates = judged.candidates
     picks = choose(round.model, candidates, taken, assumed, outputs, judged.tolerances, judged.reserved)
-    return Chosen(candidates.points[picks])
+    return candidates.points[picks].queries

@@ -14,10 +14,11 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import IdempotencyConflict, InvalidInput
-from surrogym_server.storage.records import NewSample, Purpose, SamplePurpose, fingerprint
+from surrogym_server.storage.records import NewSample, fingerprint
 from surrogym_server.storage.sql.leases import foreign_lease, set_outcome, unknown_query
 from surrogym_server.storage.sql.rows import append_event
 from surrogym_server.storage.sql.tables import leases, queries, samples
+from surrogym_shared.nouns import Purpose, SamplePurpose
 
 ASKED: sa.Select[Any] = (
     sa.select(queries.c.id, queries.c.purpose, queries.c.steps)

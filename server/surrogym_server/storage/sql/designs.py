@@ -14,11 +14,9 @@ from surrogym_server.errors import BeyondBudget, LeaseExpired, UnknownSurrogate
 from surrogym_server.storage import port
 from surrogym_server.storage.records import (
     OPEN_STATUSES,
-    Array,
     FitLease,
     Granted,
     NewDesign,
-    Phase,
     SurrogateRecord,
     fingerprint,
 )
@@ -29,6 +27,7 @@ from surrogym_server.storage.sql.models import insert_model
 from surrogym_server.storage.sql.removal import NO_RIGHT
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, recall, remember, touch
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
+from surrogym_shared.nouns import Phase, Query
 
 INTERRUPTED_SECONDS = 60.0  # after which initial queries that are not all queued are those of a server that has died
 # conditions on a row of surrogates
@@ -112,12 +111,12 @@ class SqlDesigns(port.Designs):
         with self._database.read() as connection:
             return list(connection.execute(UNBEGUN).scalars())
 
-    def ask_first(self, name: str, coordinates: Array, action: Array, rollouts: Sequence[Array]) -> None:
+    def ask_first(self, name: str, queries: Sequence[Query]) -> None:
         with self._database.write() as connection:
             held = hold(connection, name)
             if connection.execute(sa.select(surrogates.c.id).where(surrogates.c.id == held.id, IS_UNBEGUN)).first():
-                initial.begin(connection, held, coordinates, action, rollouts)
-        initial.ask(self._database, name, coordinates, action, rollouts)
+                initial.begin(connection, held, queries)
+        initial.ask(self._database, name, queries)
 
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
         with self._database.write() as connection:
@@ -146,8 +145,7 @@ class SqlDesigns(port.Designs):
             held = _hold_right(connection, lease)
             version = insert_model(connection, held, design.model)
             _finish(connection, held, lease, design)
-            chosen = (design.query_coordinates, design.query_action, design.query_rollouts, design.query_snapshots)
-            insert_queries(connection, held, "adaptive", held.round + 1, *chosen, extra=design.extra)
+            insert_queries(connection, held, design.queries, "adaptive", held.round + 1, extra=design.extra)
             append_event(connection, held, "phase", phase=design.phase, error=None)
             return version
 

@@ -12,10 +12,10 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
-from surrogym_server.storage.records import Array
 from surrogym_server.storage.sql.database import BATCH, Database
 from surrogym_server.storage.sql.rows import NAMED, hold, insert_queries, remember
 from surrogym_server.storage.sql.tables import requests, surrogates
+from surrogym_shared.nouns import Query
 
 OPERATION, KEY = "initial", ""  # no request of a client has an empty key
 _OF_DESIGN = (requests.c.operation == OPERATION) & (requests.c.key == KEY)
@@ -24,10 +24,10 @@ IS_INCOMPLETE = sa.exists(  # a condition on a row of surrogates
 )
 
 
-def begin(connection: Connection, held: Row[Any], coordinates: Array, action: Array, rollouts: Sequence[Array]) -> None:
+def begin(connection: Connection, held: Row[Any], queries: Sequence[Query]) -> None:
     """Queue as many as one transaction may, and note whether others are missing."""
     remember(connection, held, OPERATION, KEY, "", 0)
-    _ask_some(connection, held, coordinates, action, rollouts)
+    _ask_some(connection, held, queries)
 
 
 def end(connection: Connection, held: Row[Any]) -> None:
@@ -35,11 +35,11 @@ def end(connection: Connection, held: Row[Any]) -> None:
     connection.execute(sa.delete(requests).where(requests.c.surrogate_id == held.id, _OF_DESIGN))
 
 
-def ask(database: Database, name: str, coordinates: Array, action: Array, rollouts: Sequence[Array]) -> None:
+def ask(database: Database, name: str, queries: Sequence[Query]) -> None:
     """Queue the initial queries that are missing. If none are, nothing changes. Raises ``UnknownSurrogate``."""
 
     def batch(connection: Connection) -> int:
-        return _ask_some(connection, hold(connection, name), coordinates, action, rollouts)
+        return _ask_some(connection, hold(connection, name), queries)
 
     with database.read() as connection:
         missing = connection.execute(sa.select(surrogates.c.id).where(NAMED, IS_INCOMPLETE), {"named": name}).first()
@@ -47,18 +47,15 @@ def ask(database: Database, name: str, coordinates: Array, action: Array, rollou
         database.write_in_batches(batch)
 
 
-def _ask_some(
-    connection: Connection, held: Row[Any], coordinates: Array, action: Array, rollouts: Sequence[Array]
-) -> int:
-    """Returns how many were queued; 0 if none was missing."""
+def _ask_some(connection: Connection, held: Row[Any], queries: Sequence[Query]) -> int:
+    """Queue a batch of those that are missing. Returns how many were queued; 0 if none was missing."""
     own = (requests.c.surrogate_id == held.id) & _OF_DESIGN
     queued = connection.execute(sa.select(requests.c.result).where(own)).scalar()
     if queued is None:
         return 0
-    steps, first, last = len(coordinates), int(queued), int(queued) + BATCH
-    some = rollouts[max(0, first - steps) : max(0, last - steps)]
-    ids = insert_queries(connection, held, "initial", 0, coordinates[first:last], action[first:last], some)
-    if last >= steps + len(rollouts):
+    first, last = int(queued), int(queued) + BATCH
+    ids = insert_queries(connection, held, queries[first:last], "initial", 0)
+    if last >= len(queries):
         end(connection, held)
     else:
         connection.execute(sa.update(requests).where(own).values(result=last))

@@ -14,7 +14,7 @@ from surrogym_server.storage.port import MAX_ATTEMPTS
 from surrogym_server.storage.records import LeasedQuery
 from surrogym_server.storage.sql import expiry
 from surrogym_server.storage.sql.database import NOW, constant
-from surrogym_server.storage.sql.rows import NAMED, append_event, hold, touch, unknown_surrogate
+from surrogym_server.storage.sql.rows import NAMED, append_event, hold, query_in, touch, unknown_surrogate
 from surrogym_server.storage.sql.tables import leases, queries, surrogates
 
 Returned = Literal["failed", "expired", "unbegun", "refused"]  # outcome of a lease that ended without an answer
@@ -47,13 +47,9 @@ def begin(
         return []
     leased = [
         LeasedQuery(
+            **query_in(row),
             id=row.id,
             purpose=row.purpose,
-            kind=row.kind,
-            coordinates=row.coordinates,
-            action=row.action,
-            steps=row.steps,
-            snapshot=row.snapshot,
             number=row.number,
             attempt=row.attempts + 1,
             token=secrets.token_urlsafe(16),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import sqlalchemy as sa
@@ -12,29 +13,31 @@ from sqlalchemy.engine import Connection, Row
 from surrogym_server.errors import BeyondBudget, LeaseExpired, UnknownSurrogate
 from surrogym_server.storage import port
 from surrogym_server.storage.records import (
-    Array,
     LeasedQuery,
-    Purpose,
     QueryCounts,
     QueryRecord,
-    QueryStatus,
     fingerprint,
 )
 from surrogym_server.storage.sql import expiry
 from surrogym_server.storage.sql import leases as leasing
 from surrogym_server.storage.sql.database import NOW, Database
-from surrogym_server.storage.sql.rows import Span, append_event, find, hold, insert_queries, recall, remember, within
+from surrogym_server.storage.sql.rows import (
+    Span,
+    append_event,
+    find,
+    hold,
+    insert_queries,
+    query_in,
+    recall,
+    remember,
+    within,
+)
 from surrogym_server.storage.sql.snapshots import give_up_lost
 from surrogym_server.storage.sql.tables import leases, queries, surrogates
+from surrogym_shared.nouns import Purpose, Query, QueryStatus
 
-COLUMNS = [
-    getattr(queries.c, name)
-    for name in (
-        *("id", "purpose", "status", "round", "kind", "coordinates", "action", "steps", "snapshot"),
-        *("attempts", "sampler", "error"),
-    )
-]
-
+CONTENT = [getattr(queries.c, name) for name in ("coordinates", "action", "steps", "snapshot")]
+STATE = [getattr(queries.c, name) for name in ("id", "purpose", "status", "round", "attempts", "sampler", "error")]
 
 _EARLIER = queries.alias()
 NUMBER = (
@@ -43,7 +46,7 @@ NUMBER = (
     .scalar_subquery()
 )
 OLDEST_FREE: sa.Select[Any] = (
-    sa.select(*COLUMNS, NUMBER.label("number"))
+    sa.select(*STATE, *CONTENT, NUMBER.label("number"))
     .where(queries.c.surrogate_id == sa.bindparam("owner"), queries.c.status == "pending")
     .order_by(queries.c.id)
     .limit(sa.bindparam("most", type_=sa.Integer()))
@@ -59,23 +62,20 @@ class SqlQueries(port.Queries):
     def enqueue(
         self,
         name: str,
-        coordinates: Array,
-        action: Array,
-        rollouts: Sequence[Array] = (),
+        wanted: Sequence[Query],
         *,
         purpose: Purpose = "manual",
         key: str | None = None,
     ) -> list[int]:
-        parts = [coordinates.tolist(), action.tolist(), *(actions.tolist() for actions in rollouts)]
-        body = fingerprint(purpose, *parts)
+        body = fingerprint(purpose, *(asdict(query) for query in wanted))
         with self._database.write() as connection:
             held = hold(connection, name)
             before: list[int] | None = recall(connection, held, "enqueue", key, body)
             if before is not None:
                 return before
             if purpose == "audit":
-                _require_room(connection, held, len(coordinates) + sum(map(len, rollouts)))
-            ids = insert_queries(connection, held, purpose, held.round, coordinates, action, rollouts)
+                _require_room(connection, held, sum(query.steps for query in wanted))
+            ids = insert_queries(connection, held, wanted, purpose, held.round)
             remember(connection, held, "enqueue", key, body, ids)
             return ids
 
@@ -137,7 +137,7 @@ class SqlQueries(port.Queries):
             if statuses:
                 wanted = wanted.where(queries.c.status.in_(statuses))
             rows = connection.execute(wanted.order_by(queries.c.id).limit(limit))
-            return [QueryRecord(**row._mapping) for row in rows]
+            return [_record(row) for row in rows]
 
     def counts(self, name: str) -> QueryCounts:
         with self._database.read() as connection:
@@ -198,7 +198,7 @@ def _records() -> sa.Select[Any]:
     """Queries, with the time left of their open lease. A query has at most one."""
     left = (leases.c.expires - NOW).label("lease_seconds_left")
     is_open = (leases.c.query_id == queries.c.id) & (leases.c.outcome == "open")
-    return sa.select(*COLUMNS, left).outerjoin(leases, is_open)
+    return sa.select(*STATE, *CONTENT, left).outerjoin(leases, is_open)
 
 
 def _read(connection: Connection, surrogate_id: int, query_id: int) -> QueryRecord:
@@ -206,4 +206,9 @@ def _read(connection: Connection, surrogate_id: int, query_id: int) -> QueryReco
     row = connection.execute(wanted).one_or_none()
     if row is None:
         raise leasing.unknown_query(query_id)
-    return QueryRecord(**row._mapping)
+    return _record(row)
+
+
+def _record(row: Row[Any]) -> QueryRecord:
+    state = {column.name: row._mapping[column.name] for column in STATE}
+    return QueryRecord(**query_in(row), **state, lease_seconds_left=row.lease_seconds_left)

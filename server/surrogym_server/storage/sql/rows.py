@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
-import numpy as np
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
-from surrogym_server.errors import IdempotencyConflict, InvalidInput, UnknownSurrogate
-from surrogym_server.storage.records import Array, EventKind, Purpose
+from surrogym_server.errors import IdempotencyConflict, UnknownSurrogate
+from surrogym_server.storage.records import EventKind
 from surrogym_server.storage.sql.database import NOW
 from surrogym_server.storage.sql.tables import events, queries, requests, surrogates
+from surrogym_shared.nouns import Purpose, Query
 
 Span = tuple[int, int]  # of ids of surrogates: the first and the last
 
@@ -95,40 +96,37 @@ def remember(connection: Connection, held: Row[Any], operation: str, key: str | 
 def insert_queries(
     connection: Connection,
     held: Row[Any],
+    wanted: Sequence[Query],
     purpose: Purpose,
     round: int,
-    coordinates: Array,
-    action: Array,
-    rollouts: Sequence[Array] = (),
-    snapshots: Sequence[str | None] = (),
     *,
     extra: bool = False,
 ) -> list[int]:
-    """Queue coordinates (m, C) with action (m, F), then action sequences, each (T, F). Returns the ids in order.
-
-    ``snapshots`` says where each action sequence begins: at a snapshot, or None at a reset. Empty: all at a reset.
-
-    Raises:
-        InvalidInput: the numbers of coordinates and actions differ.
-    """
-    if len(coordinates) != len(action):
-        raise InvalidInput(
-            f"expected one action for each query, got {len(coordinates)} queries and {len(action)} actions"
-        )
-    asked = [
-        {"kind": "step", "coordinates": q, "action": u, "steps": 1, "snapshot": None}
-        for q, u in zip(np.asarray(coordinates), np.asarray(action), strict=True)
-    ]
-    asked += [
-        {"kind": "rollout", "coordinates": (), "action": np.ravel(u), "steps": len(u), "snapshot": snapshot}
-        for u, snapshot in zip(rollouts, snapshots or (None,) * len(rollouts), strict=True)
-    ]
-    if not asked:
+    """Queue queries, and return their ids in the same order. ``extra``: the design alone would not have made them."""
+    if not wanted:
         return []
     common = {"surrogate_id": held.id, "purpose": purpose, "round": round, "status": "pending", "attempts": 0}
     common["extra"] = extra
-    rows = [common | query for query in asked]
+    rows = [common | _columns(query) for query in wanted]
     insert = sa.insert(queries).returning(queries.c.id, sort_by_parameter_order=True)
     ids = [int(id) for id in connection.execute(insert, rows).scalars()]
     append_event(connection, held, "queries", count=len(ids), purpose=purpose, round=round)
     return ids
+
+
+def _columns(query: Query) -> dict[str, Any]:
+    """Columns of a query; its actions (T, F) are stored one after the other."""
+    return {
+        "kind": query.kind,
+        "coordinates": query.coordinates,
+        "action": tuple(chain.from_iterable(query.actions)),
+        "steps": query.steps,
+        "snapshot": query.snapshot,
+    }
+
+
+def query_in(row: Row[Any]) -> dict[str, Any]:
+    """Fields of the ``Query`` in a row with the columns ``coordinates``, ``action``, ``steps`` and ``snapshot``."""
+    size = max(1, len(row.action) // row.steps)
+    actions = tuple(row.action[first : first + size] for first in range(0, len(row.action), size))
+    return {"coordinates": row.coordinates, "actions": actions, "snapshot": row.snapshot}

@@ -18,7 +18,6 @@ from surrogym_server.storage.records import (
     NewSample,
     SampleArrays,
     SampleRecord,
-    Vector,
     fingerprint,
     no_rows,
 )
@@ -28,6 +27,7 @@ from surrogym_server.storage.sql.logged import complete_log, store_logged
 from surrogym_server.storage.sql.rows import find, hold, recall, remember, touch
 from surrogym_server.storage.sql.snapshots import insert_snapshots
 from surrogym_server.storage.sql.tables import queries, samples
+from surrogym_shared.nouns import Vector
 
 _COLUMNS: dict[str, sa.ColumnElement[Any]] = {
     "requested_coordinates": sa.case((queries.c.kind == "step", queries.c.coordinates)),

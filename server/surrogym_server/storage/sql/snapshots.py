@@ -9,11 +9,12 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.storage import port
-from surrogym_server.storage.records import QueryRecord, Vector
+from surrogym_server.storage.records import QueryRecord
 from surrogym_server.storage.sql import leases as leasing
 from surrogym_server.storage.sql.database import Database, conflict_insert
 from surrogym_server.storage.sql.rows import append_event, find, hold, touch
 from surrogym_server.storage.sql.tables import queries, snapshots, surrogates
+from surrogym_shared.nouns import Vector
 
 GONE = "its snapshot is gone"
 

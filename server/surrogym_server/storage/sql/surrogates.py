@@ -9,7 +9,7 @@ from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage import port
-from surrogym_server.storage.records import FREE, NewSurrogate, Phase, Standing, SurrogateRecord, SurrogateSummary
+from surrogym_server.storage.records import FREE, NewSurrogate, Standing, SurrogateRecord, SurrogateSummary
 from surrogym_server.storage.sql import initial, removal
 from surrogym_server.storage.sql.database import NOW, Database, conflict_insert
 from surrogym_server.storage.sql.leases import is_unbegun, requeue_set_aside
@@ -17,6 +17,7 @@ from surrogym_server.storage.sql.rows import NAMED, append_event, hold, touch, u
 from surrogym_server.storage.sql.sample_counts import CountedSamples
 from surrogym_server.storage.sql.summaries import Counted, read_summaries
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
+from surrogym_shared.nouns import Phase
 
 COLUMNS = [
     getattr(surrogates.c, name)
@@ -40,9 +41,8 @@ class SqlSurrogates(port.Surrogates):
                 return read(connection, new.name), False
             held = hold(connection, new.name)
             append_event(connection, held, "created", name=new.name)
-            queries = (new.query_coordinates, new.query_action, new.query_rollouts)
-            initial.begin(connection, held, *queries)
-        initial.ask(self._database, new.name, *queries)
+            initial.begin(connection, held, new.queries)
+        initial.ask(self._database, new.name, new.queries)
         return self.get(new.name), True
 
     def get(self, name: str) -> SurrogateRecord:
@@ -155,7 +155,7 @@ def _insert(connection: Connection, new: NewSurrogate) -> bool:
         spec=new.spec,
         budget=new.budget,
         target=new.target,
-        state=new.state,
+        state={},
         phase="collecting",
         paused=False,
         round=0,

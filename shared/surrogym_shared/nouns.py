@@ -1,0 +1,67 @@
+"""The nouns of the loop, which the wire, the storage, the design and the sampler share.
+
+They are plain values without checks: the wire's models check what arrives. This file imports the standard library
+alone, so that the pure core may import it.
+
+Shapes: C coordinates, F action entries, T actions of a query.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+Vector = tuple[float, ...]
+
+Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "unsure", "from_log", "failed"]
+"""Phase of a design. From ``ready`` on it has ended."""
+
+Verdict = Literal["continue", "ready", "over_budget", "unsure", "from_log"]
+"""Verdict of one round. Unless it is ``continue``, it is also the phase of the design that ends with the round."""
+
+Purpose = Literal["initial", "adaptive", "manual", "audit"]
+"""Why a query was made."""
+
+SamplePurpose = Literal["initial", "adaptive", "manual", "audit", "logged"]
+"""Why the real step of a sample was taken: the purpose of its query, or ``logged``."""
+
+QueryKind = Literal["step", "rollout"]
+QueryStatus = Literal["pending", "leased", "answered", "set_aside", "refused"]
+
+
+@dataclass(frozen=True)
+class Query:
+    """Real steps that are wanted: where they begin, and the actions to apply from there.
+
+    They begin at coordinates to which the original environment is set, at a snapshot to which it returns, or at a
+    reset. A query that begins at coordinates has one action.
+    """
+
+    coordinates: Vector  # (C,) state to set; () for a query that begins at a snapshot or a reset
+    actions: tuple[Vector, ...]  # (T, F)
+    snapshot: str | None = None  # name of the snapshot to begin at
+
+    @staticmethod
+    def step(coordinates: Iterable[float], action: Iterable[float]) -> Query:
+        """Return the query of one step from coordinates (C,) under an action (F,)."""
+        return Query(tuple(coordinates), (tuple(action),))
+
+    @staticmethod
+    def rollout(actions: Iterable[Iterable[float]], snapshot: str | None = None) -> Query:
+        """Return the query of an action sequence (T, F) from a snapshot, or from a reset."""
+        return Query((), tuple(map(tuple, actions)), snapshot)
+
+    @property
+    def kind(self) -> QueryKind:
+        return "step" if self.coordinates else "rollout"
+
+    @property
+    def action(self) -> Vector:
+        """The first action (F,), which is the only one of a single step."""
+        return self.actions[0]
+
+    @property
+    def steps(self) -> int:
+        """Largest number of real steps of the answer, T."""
+        return len(self.actions)
