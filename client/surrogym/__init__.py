@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from surrogym_client.transport.api import Api as Client
     from surrogym_sampler.logs import Imported, UnusableLog, import_log
     from surrogym_sampler.original.errors import StepRefused
-    from surrogym_sampler.original.protocol import RealStep
+    from surrogym_shared.nouns import RealStep
     from surrogym_shared.spec import (
         AcquisitionChoice,
         AllOf,
@@ -97,7 +97,7 @@ _LAZY = {  # name: module, its name there, the extra that brings what the module
     "make": ("surrogym.environments", "make", ""),
     "make_sb3": ("surrogym.environments", "make_sb3", ""),
     "make_vec": ("surrogym.environments", "make_vec", ""),
-    "RealStep": ("surrogym_sampler.original.protocol", "RealStep", ""),
+    "RealStep": ("surrogym_shared.nouns", "RealStep", ""),
     "StepRefused": ("surrogym_sampler.original.errors", "StepRefused", ""),
     "Imported": ("surrogym_sampler.logs", "Imported", ""),
     "UnusableLog": ("surrogym_sampler.logs", "UnusableLog", ""),

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_sampler.original.protocol import RealStep
 from surrogym_server.environment.actions import model_actions
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.services.definitions import check_coordinates
 from surrogym_shared.checks import LARGEST
+from surrogym_shared.nouns import RealStep
 
 Floats = NDArray[np.float64]
 

@@ -22,14 +22,13 @@ from numpy.typing import NDArray
 
 from surrogym import checks
 from surrogym.files import existing
-from surrogym_sampler.original.protocol import RealStep
 from surrogym_server.convert import default_budget, definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, DesignResult, judge_stored, run_design_job
 from surrogym_server.errors import InvalidInput
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.sampling.design import initial_queries
 from surrogym_shared import nouns
-from surrogym_shared.nouns import Phase
+from surrogym_shared.nouns import Phase, RealStep
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 
@@ -217,8 +216,10 @@ class Design:
             InvalidInput: there is no model yet.
             OSError: the file can't be written.
         """
-        result, arrays = self._last(), self._arrays()
-        samples = RealSamples(*arrays, truncated=np.array([step.truncated for step in self._samples], dtype=np.bool_))
+        result, steps = self._last(), self._steps()
+        truncated = np.array([step.truncated for step in self._samples], dtype=np.bool_)
+        columns = (steps.coordinates, steps.action, steps.next_coordinates, steps.reward, steps.terminated)
+        samples = RealSamples(*columns, truncated)
         tolerances = {output["name"]: output["tolerance"] for output in result.fidelity["outputs"]}
         predictions = self._state.get("predictions", [])
         file = SurrogateFile(name, self._spec_to_save(), result.model, samples, tolerances, predictions=predictions)
@@ -291,14 +292,9 @@ class Design:
         self._phase = result.phase
 
     def _job(self) -> DesignJob:
-        q, u, q_next, reward, terminated = self._arrays()
         return DesignJob(
             definition=self._definition,
-            coordinates=q,
-            action=u,
-            next_coordinates=q_next,
-            reward=reward,
-            terminated=terminated,
+            samples=self._steps(),
             state=self._state,
             budget=self.budget,
             target=self.target,
@@ -310,12 +306,8 @@ class Design:
             previous=None if self._result is None else self._result.model,
         )
 
-    def _arrays(self) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.bool_]]:
-        def rows(field: str) -> Floats:
-            return np.array([getattr(step, field) for step in self._samples], dtype=np.float64)
-
-        ended = np.array([step.terminated for step in self._samples], dtype=np.bool_)
-        return rows("coordinates"), rows("action"), rows("next_coordinates"), rows("reward"), ended
+    def _steps(self) -> nouns.RealSteps:
+        return nouns.RealSteps.of(self._samples, "manual")
 
     def _numbered(self, purpose: Literal["initial", "adaptive"], queries: Sequence[nouns.Query]) -> list[Query]:
         return [

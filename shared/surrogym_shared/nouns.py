@@ -1,16 +1,19 @@
 """The nouns of the loop, which the wire, the storage, the design and the sampler share.
 
 They are plain values without checks: the wire's models check what arrives. This file imports the standard library
-alone, so that the pure core may import it.
+and NumPy alone, so that the pure core may import it.
 
-Shapes: C coordinates, F action entries, T actions of a query.
+Shapes: C coordinates, F action entries, D observation entries, T actions of a query, n real steps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 Vector = tuple[float, ...]
 
@@ -65,3 +68,44 @@ class Query:
     def steps(self) -> int:
         """Largest number of real steps of the answer, T."""
         return len(self.actions)
+
+
+@dataclass(frozen=True)
+class RealStep:
+    """One real step. ``coordinates`` and ``action`` are the achieved values, not the requested ones."""
+
+    coordinates: ArrayLike  # (C,)
+    action: ArrayLike  # (F,)
+    next_coordinates: ArrayLike  # (C,)
+    reward: float
+    terminated: bool = False
+    truncated: bool = False
+    observation: ArrayLike | None = None  # (D,)
+    next_observation: ArrayLike | None = None  # (D,)
+
+
+@dataclass(frozen=True)
+class RealSteps:
+    """Real steps as columns, in order of arrival: the samples from which a model is learned."""
+
+    coordinates: NDArray[np.float64]  # (n, C)
+    action: NDArray[np.float64]  # (n, F)
+    next_coordinates: NDArray[np.float64]  # (n, C)
+    reward: NDArray[np.float64]  # (n,)
+    terminated: NDArray[np.bool_]  # (n,)
+    purpose: tuple[SamplePurpose, ...]  # (n,)
+
+    def __len__(self) -> int:
+        return len(self.reward)
+
+    @classmethod
+    def of(cls, steps: Sequence[RealStep], purpose: SamplePurpose) -> Self:
+        """Return the columns of steps that were taken for one purpose."""
+        return cls(
+            coordinates=np.array([step.coordinates for step in steps], dtype=np.float64),
+            action=np.array([step.action for step in steps], dtype=np.float64),
+            next_coordinates=np.array([step.next_coordinates for step in steps], dtype=np.float64),
+            reward=np.array([step.reward for step in steps], dtype=np.float64),
+            terminated=np.array([step.terminated for step in steps], dtype=np.bool_),
+            purpose=(purpose,) * len(steps),
+        )

@@ -13,7 +13,7 @@ from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples
 from surrogym_server.sampling.latin_hypercube import random_points
-from surrogym_shared.nouns import Query
+from surrogym_shared.nouns import Query, RealSteps, SamplePurpose
 from surrogym_shared.spec import EnvironmentSpec
 
 
@@ -52,6 +52,12 @@ def roll(spec: EnvironmentSpec, actions: Tensor | Sequence[Sequence[float]], see
             break
     original.close()
     return samples_of(steps)
+
+
+def columns(samples: Samples, purpose: SamplePurpose = "manual") -> RealSteps:
+    """Samples of the core as columns of a job."""
+    arrays = (getattr(samples, name).numpy() for name in ("q", "u", "q_next", "reward", "terminated"))
+    return RealSteps(*arrays, (purpose,) * len(samples))
 
 
 def random_steps(spec: EnvironmentSpec, count: int, seed: int) -> Samples:

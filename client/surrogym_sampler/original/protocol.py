@@ -7,31 +7,17 @@ Shapes: C coordinates, F action entries, D observation entries.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from surrogym_shared.nouns import RealStep as RealStep
 from surrogym_shared.spec import EnvironmentSpec
 
 Array = NDArray[np.float64]
 
 LONGEST_EPISODE = 1_000  # steps, if there is no time limit
-
-
-@dataclass(frozen=True)
-class RealStep:
-    """One real step. ``coordinates`` and ``action`` are the achieved values, not the requested ones."""
-
-    coordinates: ArrayLike  # (C,)
-    action: ArrayLike  # (F,)
-    next_coordinates: ArrayLike  # (C,)
-    reward: float
-    terminated: bool = False
-    truncated: bool = False
-    observation: ArrayLike | None = None  # (D,)
-    next_observation: ArrayLike | None = None  # (D,)
 
 
 @runtime_checkable

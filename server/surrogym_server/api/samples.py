@@ -15,6 +15,7 @@ from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.api.tables import CSV, NPZ, as_csv, as_npz
 from surrogym_server.convert import resources
+from surrogym_server.storage.records import LogPart
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     AddedSamples,
@@ -50,9 +51,8 @@ def add_sample(name: str, body: Annotated[AddSamples, example(examples.ADD_SAMPL
     repeat is harmless: a sample of a query is identified by its lease token, a logged one by its place in its log,
     others by the idempotency key."""
     samples = [resources.new_sample(sample) for sample in body.samples]
-    logged, key = body.purpose == "logged", body.idempotency_key
-    added = use.samples.add(name, body.sampler, samples, key, logged=logged, complete=body.complete, after=body.after)
-    return resources.added_samples(added)
+    log = LogPart(body.after, body.complete) if body.purpose == "logged" else None
+    return resources.added_samples(use.samples.add(name, body.sampler, samples, body.idempotency_key, log))
 
 
 @router.get(

@@ -28,9 +28,11 @@ from surrogym_server.sampling.limits import reached_limits
 from surrogym_server.sampling.prequential import KEPT, Predictions, continued, predicted
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import usual_tolerances
-from surrogym_shared.nouns import Phase, Query, Verdict
+from surrogym_shared.nouns import Phase, Query, RealSteps, SamplePurpose, Verdict
 
 Array = NDArray[np.float64]
+
+UNCHOSEN: tuple[SamplePurpose, ...] = ("initial", "logged")  # purposes of samples that nobody chose to test a model
 
 
 @dataclass(frozen=True)
@@ -38,11 +40,7 @@ class DesignJob:
     """Input of one round."""
 
     definition: EnvironmentDefinition
-    coordinates: Array  # (n, C) samples so far, in order of arrival
-    action: Array  # (n, F)
-    next_coordinates: Array  # (n, C)
-    reward: Array  # (n,)
-    terminated: NDArray[np.bool_]  # (n,)
+    samples: RealSteps  # so far
     state: dict[str, Any]  # DesignState as JSON; {} before the first round
     budget: int  # limit of the design's real steps
     target: float  # confidence index
@@ -53,10 +51,7 @@ class DesignJob:
     extra_queries: int = 0  # real steps requested with improve, chosen even if the design has ended
     occupancy: Array | None = None  # (m, C) states that policies visited
     threads: int = 1
-    logged: int = 0  # number of samples from logs, which don't count towards the budget
-    audited: int = 0  # number of samples from audits, which don't count either
     previous: bytes | None = None  # model of the round before, which predicts the samples that are new to it
-    chosen: NDArray[np.bool_] | None = None  # (n,) samples that are worth a prediction; None: all
 
 
 @dataclass(frozen=True)
@@ -146,9 +141,7 @@ def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
     with suppress(InvalidInput), plugin_calls(job.definition):
         model = from_bytes(job.definition, job.previous)
         if model.digest == samples.at(torch.arange(min(model.samples, len(samples)))).digest:
-            chosen = (
-                torch.ones(len(job.reward), dtype=torch.bool) if job.chosen is None else torch.from_numpy(job.chosen)
-            )
+            chosen = torch.tensor([purpose not in UNCHOSEN for purpose in job.samples.purpose])
             new = chosen[_known(job)].index_fill(0, torch.arange(model.samples), value=False).nonzero()[-KEPT:, 0]
             return predicted(model, samples.at(new))
     return ()
@@ -156,14 +149,14 @@ def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
 
 def _samples(job: DesignJob) -> Samples:
     """The samples to learn from: those with known lags."""
-    known = _known(job)
-    arrays = (job.coordinates, job.action, job.next_coordinates, job.reward, job.terminated)
-    return Samples(*(torch.from_numpy(a)[known] for a in arrays))
+    known, steps = _known(job), job.samples
+    columns = (steps.coordinates, steps.action, steps.next_coordinates, steps.reward, steps.terminated)
+    return Samples(*(torch.from_numpy(column)[known] for column in columns))
 
 
 def _known(job: DesignJob) -> torch.Tensor:
     """Which samples (n,) begin where all lags are known."""
-    return job.definition.known(torch.from_numpy(job.coordinates))
+    return job.definition.known(torch.from_numpy(job.samples.coordinates))
 
 
 def _request(job: DesignJob) -> Request:
@@ -175,8 +168,8 @@ def _request(job: DesignJob) -> Request:
         snapshots=job.snapshots,
         extra=job.extra_queries,
         states=None if job.occupancy is None else torch.from_numpy(job.occupancy),
-        logged=job.logged,
-        audited=job.audited,
+        logged=job.samples.purpose.count("logged"),
+        audited=job.samples.purpose.count("audit"),
         unlearned=int((~_known(job)).sum()),
         open=job.open_steps,
     )

@@ -8,9 +8,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 
-import numpy as np
-
-from surrogym_server.engine.design_job import DesignJob, DesignResult
+from surrogym_server.engine.design_job import UNCHOSEN, DesignJob, DesignResult
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.port import Compute
 from surrogym_server.errors import (
@@ -48,7 +46,6 @@ ATTEMPTS = 5  # of a fit whose process died, or whose result could not be stored
 LONG_SECONDS = 60.0  # the log names a fit that takes longer
 PASSED_SECONDS = 5.0  # other fits start beside one that takes longer
 MOST_PASSED = 3  # long fits that don't count towards ``fit_workers``; each is a process
-UNCHOSEN = ("initial", "logged")  # purposes of samples that nobody chose to test a model
 PAUSE_SECONDS = 1.0  # between checks whether a fit is still wanted
 
 
@@ -277,18 +274,12 @@ class Designer:
         unanswered = [query for query in unanswered if query.purpose not in FREE]
         pending = [query for query in unanswered if query.status != "refused"]
         refused = [query for query in unanswered if query.status == "refused"]
-        logged, audited = (samples.purpose.count(purpose) for purpose in ("logged", "audit"))
-        spoken = len(samples.reward) - logged - audited + sum(query.steps for query in pending)
-        chosen = np.array([purpose not in UNCHOSEN for purpose in samples.purpose], dtype=np.bool_)
+        spoken = sum(purpose not in FREE for purpose in samples.purpose) + sum(query.steps for query in pending)
         visited = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
         definition = self._definitions.for_design(name).with_tolerances(record.tolerances)
         return DesignJob(
             definition=definition,
-            coordinates=samples.coordinates,
-            action=samples.action,
-            next_coordinates=samples.next_coordinates,
-            reward=samples.reward,
-            terminated=samples.terminated,
+            samples=samples,
             state=record.state,
             budget=record.budget,
             target=record.target,
@@ -299,10 +290,7 @@ class Designer:
             extra_queries=min(lease.extra_queries, max(0, record.budget - spoken)),  # it may be lower by now
             occupancy=None if visited is None else visited.states,
             threads=self._threads,
-            logged=logged,
-            audited=audited,
-            previous=self._previous(name) if chosen.any() else None,
-            chosen=chosen,
+            previous=self._previous(name) if set(samples.purpose).difference(UNCHOSEN) else None,
         )
 
     def _previous(self, name: str) -> bytes | None:

@@ -15,7 +15,7 @@ from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions, check_coordinates
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import LedgerRecord, NewSample, SampleRecord
+from surrogym_server.storage.records import LedgerRecord, LogPart, NewSample, SampleRecord
 from surrogym_shared.nouns import Vector
 
 PAGE = 10_000
@@ -56,15 +56,12 @@ class SampleService:
         sampler: str,
         samples: Sequence[NewSample],
         key: str | None,
-        *,
-        logged: bool = False,
-        complete: bool = True,
-        after: str | None = None,
+        log: LogPart | None = None,
     ) -> Added:
         """Store real steps, all or nothing. They are committed when it returns.
 
-        ``logged`` steps were recorded before the design. When their log is ``complete``, the initial queries that it
-        covers are withdrawn.
+        Steps of a ``log`` were recorded before the design. When the log is complete, the initial queries that it covers
+        are withdrawn.
 
         Raises:
             InvalidInput: wrong shape, an action out of bounds, or samples without a query and without a key. The
@@ -74,12 +71,10 @@ class SampleService:
         definition = self._definitions.get(name)
         checked = [_checked(definition, index, sample) for index, sample in enumerate(samples)]
         check_trajectories(checked)
-        if key is None and not logged and any(sample.query_id is None for sample in checked):
+        if key is None and log is None and any(sample.query_id is None for sample in checked):
             raise InvalidInput("samples without a query_id: expected an idempotency_key, got none")
-        added = self._storage.samples.add(
-            name, sampler, checked, key=key, logged=logged, complete=complete, after=after
-        )
-        if logged and complete and added.restart is None:
+        added = self._storage.samples.add(name, sampler, checked, key=key, log=log)
+        if log is not None and log.complete and added.restart is None:
             self._withdraw_covered(name, definition)
         self._samplers.heard(name, sampler)
         self._notices.post(name)
@@ -93,8 +88,7 @@ class SampleService:
         first, duplicates, after = 0, 0, origin
         while first < len(samples):
             batch = samples[first : first + BATCH]
-            complete = first + BATCH >= len(samples)
-            added = self.add(name, LOG, batch, None, logged=True, complete=complete, after=after)
+            added = self.add(name, LOG, batch, None, LogPart(after, complete=first + BATCH >= len(samples)))
             if added.restart is not None:
                 first, duplicates, after = 0, 0, added.restart
             else:

@@ -29,6 +29,7 @@ from surrogym_server.storage.records import (
     Granted,
     LeasedQuery,
     LedgerRecord,
+    LogPart,
     ModelRecord,
     NewDesign,
     NewModel,
@@ -37,14 +38,13 @@ from surrogym_server.storage.records import (
     OccupancyRecord,
     QueryCounts,
     QueryRecord,
-    SampleArrays,
     SampleRecord,
     SavedSession,
     Standing,
     SurrogateRecord,
     SurrogateSummary,
 )
-from surrogym_shared.nouns import Phase, Purpose, Query, QueryStatus, Vector
+from surrogym_shared.nouns import Phase, Purpose, Query, QueryStatus, RealSteps, Vector
 
 MAX_ATTEMPTS = 3
 LATEST = "latest"  # the alias of the newest policy
@@ -308,9 +308,7 @@ class Samples(ABC):
         samples: Sequence[NewSample],
         *,
         key: str | None = None,
-        logged: bool = False,
-        complete: bool = True,
-        after: str | None = None,
+        log: LogPart | None = None,
     ) -> AddedSamples:
         """Store a batch of samples, all or nothing, and answer the queries that it names. It is committed when this
         returns.
@@ -320,11 +318,10 @@ class Samples(ABC):
         has one answer: a sample, or the first samples of a rollout, with ``step`` 0, 1, ... up to the query's
         ``steps``. Sending it again is a duplicate and gets the same id.
 
-        ``logged`` samples answer no query, and don't count towards the budget. Each is identified by its numbers and by
-        all samples of its log before it. So a log that comes again, or has grown, adds only what is new. Equal steps of
-        one log all count, and those of two logs too. A part of a log comes ``after`` the digest in the reply to the
-        part before; None if the log begins with it. A log that differs from a stored one in a later part has to
-        restart, see ``AddedSamples``. Until a log is ``complete``, its samples make no fit due.
+        Samples of a ``log`` answer no query, and don't count towards the budget. Each is identified by its numbers and
+        by all samples of its log before it. So a log that comes again, or has grown, adds only what is new. Equal steps
+        of one log all count, and those of two logs too. A log that differs from a stored one in a later part has to
+        restart, see ``AddedSamples``. Until a log is complete, its samples make no fit due.
 
         Raises:
             UnknownQuery: there is no such query.
@@ -334,8 +331,8 @@ class Samples(ABC):
         """
 
     @abstractmethod
-    def arrays(self, name: str) -> SampleArrays:
-        """Return all samples, in order of arrival."""
+    def arrays(self, name: str) -> RealSteps:
+        """Return all samples, in order of arrival; (0, 0) arrays while there are none."""
 
     @abstractmethod
     def page(self, name: str, after: int, limit: int) -> list[SampleRecord]:

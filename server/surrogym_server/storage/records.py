@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_shared.nouns import Phase, Purpose, Query, QueryStatus, SamplePurpose, Vector
+from surrogym_shared.nouns import Phase, Purpose, Query, QueryStatus, RealStep, SamplePurpose, Vector
 
 Array = NDArray[np.float64]
 JSON = dict[str, Any]
@@ -23,10 +23,6 @@ Synchronous = Literal["full", "normal"]  # of a SQLite file: whether every commi
 EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy", "job"]
 
 OPEN_STATUSES: tuple[QueryStatus, ...] = ("pending", "leased")
-
-
-def no_rows() -> Array:
-    return np.zeros((0, 0))
 
 
 # Surrogates and their design
@@ -172,21 +168,32 @@ class QueryCounts:
 
 
 @dataclass(frozen=True)
-class NewSample:
-    """One real step of a report. ``query_id`` and ``lease_token`` are both present or both absent."""
+class Sample(RealStep):
+    """A real step as a sample: its entries are floats, and it may answer a query."""
 
-    coordinates: Vector  # (C,)
-    action: Vector  # (F,)
-    next_coordinates: Vector  # (C,)
-    reward: float
-    terminated: bool
-    truncated: bool = False
-    observation: Vector | None = None  # (D,)
-    next_observation: Vector | None = None  # (D,)
+    coordinates: Vector
+    action: Vector
+    next_coordinates: Vector
+    observation: Vector | None = None
+    next_observation: Vector | None = None
     query_id: int | None = None
-    lease_token: str | None = None
     step: int = 0  # place in the rollout that it is part of
+
+
+@dataclass(frozen=True)
+class NewSample(Sample):
+    """A sample of a report. ``query_id`` and ``lease_token`` are both present or both absent."""
+
+    lease_token: str | None = None
     snapshot: str | None = None  # name of the snapshot that the sampler made after the step
+
+
+@dataclass(frozen=True)
+class LogPart:
+    """Place in a log of the samples of a report."""
+
+    after: str | None = None  # ``digest`` of the reply to the part before; None: the log begins with this part
+    complete: bool = True  # no further part follows
 
 
 @dataclass(frozen=True)
@@ -203,38 +210,18 @@ class AddedSamples:
     restart: str | None = None
 
 
-@dataclass(frozen=True)
-class SampleRecord:
+@dataclass(frozen=True, kw_only=True)
+class SampleRecord(Sample):
+    """A stored sample."""
+
     id: int
     purpose: SamplePurpose
-    query_id: int | None
     sampler: str
     attempt: int  # 0 without a query
     late: bool  # answered under a lease that had ended
     trajectory: int | None  # equal for the samples of one rollout, each beginning where the one before ended
-    step: int  # place in it
     requested_coordinates: Vector | None  # (C,); None without a query, and in a rollout
-    coordinates: Vector  # (C,)
-    action: Vector  # (F,)
-    next_coordinates: Vector  # (C,)
-    reward: float
-    terminated: bool
-    truncated: bool
-    observation: Vector | None  # (D,)
-    next_observation: Vector | None  # (D,)
     created_at: float
-
-
-@dataclass(frozen=True)
-class SampleArrays:
-    """All samples of a surrogate in order of arrival; (0, 0) arrays while there are none."""
-
-    coordinates: Array  # (n, C)
-    action: Array  # (n, F)
-    next_coordinates: Array  # (n, C)
-    reward: Array  # (n,)
-    terminated: NDArray[np.bool_]  # (n,)
-    purpose: tuple[SamplePurpose, ...]  # (n,)
 
 
 # The rest

@@ -17,6 +17,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.models.files import from_bytes
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.virtual import VirtualSettings
+from surrogym_shared.nouns import RealStep, RealSteps
 from surrogym_shared.spec import EnvironmentSpec
 
 Fitted = Callable[[int], GaussianProcessModel]
@@ -58,11 +59,7 @@ def _job(definition: EnvironmentDefinition, samples: int) -> DesignJob:
     threads = torch.get_num_threads()
     return DesignJob(
         definition=definition,
-        coordinates=q,
-        action=u,
-        next_coordinates=np.array([step["next_coordinates"] for step in steps]),
-        reward=np.array([step["reward"] for step in steps]),
-        terminated=np.zeros(samples, dtype=bool),
+        samples=RealSteps.of([RealStep(**step) for step in steps], "manual"),
         state={},
         budget=samples,
         target=0.999,

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from support.real_steps import answer, arrays
+from support.real_steps import answer, arrays, columns, join
 from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
+from surrogym_server.environment.samples import Samples
 from surrogym_server.models.files import from_bytes
 from surrogym_server.sampling.design import initial_queries
 from surrogym_shared.nouns import Query
@@ -25,8 +26,7 @@ SPEC = pendulum().model_copy(update={"design": Design(monte_carlo=64)})
 def job() -> DesignJob:
     definition = definition_from_spec(SPEC)
     steps = answer(SPEC, *arrays(initial_queries(definition, budget=20)))
-    columns = (steps.q, steps.u, steps.q_next, steps.reward, steps.terminated)
-    return DesignJob(definition, *(column.numpy() for column in columns), state={}, budget=20, target=0.999)
+    return DesignJob(definition, columns(steps), state={}, budget=20, target=0.999)
 
 
 def test_the_same_job_in_another_process_form_gives_the_same_result(job):
@@ -46,7 +46,7 @@ def test_a_result_is_pickled_and_its_state_json(job):
 def test_the_model_is_complete_and_the_fidelity_is_the_wires(job):
     result = run_design_job(job)
     model = from_bytes(job.definition, result.model)
-    assert model.samples == len(job.coordinates) == result.fidelity["samples"]
+    assert model.samples == len(job.samples) == result.fidelity["samples"]
     assert model.digest == result.data_hash
     fidelity = Fidelity.model_validate(result.fidelity)
     assert [o.name for o in fidelity.outputs] == list(job.definition.outputs)
@@ -63,7 +63,7 @@ def test_queries_are_inside_the_sampling_range(job):
 
 
 def test_pending_queries_and_occupancy_are_passed_on(job):
-    hungry = replace(job, budget=len(job.coordinates) + 2, state={"round": 1, "usual": [1e-12] * 3})
+    hungry = replace(job, budget=len(job.samples) + 2, state={"round": 1, "usual": [1e-12] * 3})
     assert len(run_design_job(hungry).queries) == 2
     pending = replace(hungry, pending=(Query.step((1.0, 1.0), (0.0,)),))
     assert len(run_design_job(pending).queries) == 1
@@ -74,12 +74,14 @@ def test_pending_queries_and_occupancy_are_passed_on(job):
 def answered(job: DesignJob, result: DesignResult) -> DesignJob:
     """The job of the next round, with the answers to the queries of the last one."""
     steps = answer(SPEC, *arrays(result.queries))
-    fields = {"coordinates": steps.q, "action": steps.u, "next_coordinates": steps.q_next}
-    joined = {
-        name: np.concatenate([getattr(job, name), new.numpy()])
-        for name, new in (fields | {"reward": steps.reward, "terminated": steps.terminated}).items()
-    }
-    return replace(job, **joined, state=json.loads(json.dumps(result.state)), previous=result.model)
+    samples = columns(join(samples_in(job), steps))
+    return replace(job, samples=samples, state=json.loads(json.dumps(result.state)), previous=result.model)
+
+
+def samples_in(job: DesignJob) -> Samples:
+    steps = job.samples
+    arrays = (steps.coordinates, steps.action, steps.next_coordinates, steps.reward, steps.terminated)
+    return Samples(*map(torch.from_numpy, arrays))
 
 
 def scored(result: DesignResult) -> list[int]:
@@ -100,9 +102,9 @@ def test_new_samples_are_predicted_by_the_model_before(job):
     assert scored(third) == [new + len(second.queries)] * 3
     error, deviation = second.state["predictions"][0][0]
     model = from_bytes(job.definition, first.model)
-    point = (torch.from_numpy(a[len(job.reward) :][:1]) for a in (following.coordinates, following.action))
-    truth = following.next_coordinates[len(job.reward), 0] - following.coordinates[len(job.reward), 0]
-    assert error == pytest.approx(truth - float(model.means(*point)[0, 0]), abs=1e-9)
+    answers = samples_in(following).at(torch.arange(len(job.samples), len(following.samples)))
+    truth = float(answers.q_next[0, 0] - answers.q[0, 0])
+    assert error == pytest.approx(truth - float(model.means(answers.q[:1], answers.u[:1])[0, 0]), abs=1e-9)
     assert deviation > 0
 
 
@@ -117,9 +119,11 @@ def test_scores_change_neither_the_model_nor_the_queries(job):
 
 def test_only_chosen_samples_are_predicted_and_only_by_a_model_of_the_samples_before(job):
     following = answered(job, run_design_job(replace(job, extra_queries=3)))
-    chosen = np.arange(len(following.reward)) != len(following.reward) - 1
-    new = len(following.reward) - len(job.reward)
-    assert scored(run_design_job(replace(following, chosen=chosen))) == [new - 1] * 3
-    other = run_design_job(replace(job, coordinates=job.coordinates + 0.01)).model
+    purpose = (*following.samples.purpose[:-1], "logged")
+    new = len(following.samples) - len(job.samples)
+    one_logged = replace(following, samples=replace(following.samples, purpose=purpose))
+    assert scored(run_design_job(one_logged)) == [new - 1] * 3
+    moved = replace(job.samples, coordinates=job.samples.coordinates + 0.01)
+    other = run_design_job(replace(job, samples=moved)).model
     assert scored(run_design_job(replace(following, previous=other))) == [0, 0, 0]
     assert scored(run_design_job(replace(following, previous=b"damaged"))) == [0, 0, 0]

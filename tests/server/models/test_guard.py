@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 
 from support import pendulum, unruly
-from support.real_steps import arrays
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, run_design_job
 from surrogym_server.environment.samples import Samples
@@ -16,16 +14,15 @@ from surrogym_server.models import guard
 from surrogym_server.plugins import in_one_line
 from surrogym_server.sampling.design import initial_queries
 from surrogym_server.virtual.single_step import predict_points
+from surrogym_shared.nouns import RealStep, RealSteps
 from surrogym_shared.spec import EnvironmentSpec
 
 
 def job(**changes: object) -> DesignJob:
     definition = definition_from_spec(EnvironmentSpec.model_validate(pendulum.spec()))
-    q, u = (tensor.numpy() for tensor in arrays(initial_queries(definition, pendulum.BUDGET)))
-    steps = [pendulum.real_step(list(at), list(action)) for at, action in zip(q, u, strict=True)]
-    reward = np.array([step["reward"] for step in steps])
-    q_next = np.array([step["next_coordinates"] for step in steps])
-    return DesignJob(definition, q, u, q_next, reward, np.zeros(len(q), dtype=bool), {}, pendulum.BUDGET, 0.999)
+    queries = initial_queries(definition, pendulum.BUDGET)
+    steps = [RealStep(**pendulum.real_step(list(query.coordinates), list(query.action))) for query in queries]
+    return DesignJob(definition, RealSteps.of(steps, "manual"), {}, pendulum.BUDGET, 0.999)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import torch
 
 from support.models import learn
 from support.plane import drifting, plane
-from support.real_steps import join, roll
+from support.real_steps import columns, join, roll
 from surrogym_sampler.original.classic import acrobot, cartpole, pendulum
 from surrogym_server.convert import default_budget, definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, run_design_job
@@ -321,10 +321,9 @@ def random_sequences_of(length: int) -> torch.Tensor:
 def test_steps_with_unknown_lags_count_and_are_not_learned_from():
     definition = definition_from_spec(counted(SPEC, 2))
     walked = roll(SPEC, random_sequences_of(8), 0)
-    count = np.minimum(np.arange(9.0), 2.0)[:, None]
-    q, q_next = (np.hstack([a.numpy(), c]) for a, c in ((walked.q, count[:-1]), (walked.q_next, count[1:])))
-    others = (walked.u.numpy(), q_next, walked.reward.numpy(), walked.terminated.numpy())
-    job = DesignJob(definition, q, *others, state=DesignState().to_json(), budget=10, target=0.999)
+    count = torch.arange(9.0, dtype=torch.float64).clamp_max(2.0)[:, None]
+    q, q_next = (torch.hstack(pair) for pair in ((walked.q, count[:-1]), (walked.q_next, count[1:])))
+    job = DesignJob(definition, columns(replace(walked, q=q, q_next=q_next)), state={}, budget=10, target=0.999)
     result = run_design_job(job)
     assert result.fidelity["samples"] == 6
     assert 0 < sum(query.steps for query in result.queries) <= 2 or result.phase in ("over_budget", "unsure")

@@ -136,9 +136,9 @@ def test_the_job_has_what_the_design_knows(answered: Storage, designer, runner: 
     answered.designs.improve(NAME, 2, checkpoint="visited")
     fit_all(designer)
     job = runner.jobs[0]
-    assert (len(job.reward), job.extra_queries, job.budget) == (pendulum.INITIAL, 2, pendulum.BUDGET)
+    assert (len(job.samples), job.extra_queries, job.budget) == (pendulum.INITIAL, 2, pendulum.BUDGET)
     np.testing.assert_array_equal(job.occupancy, np.ones((3, 2)))
-    assert (job.previous, job.chosen.tolist()) == (None, [False] * pendulum.INITIAL)
+    assert (job.previous, job.samples.purpose) == (None, ("initial",) * pendulum.INITIAL)
 
 
 def test_answers_are_scored_before_they_are_learned_and_the_scores_are_stored(

@@ -20,7 +20,7 @@ from surrogym_server.services.models import load_model
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.samples import SampleService
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import LedgerRecord, NewSample, NewSurrogate
+from surrogym_server.storage.records import LedgerRecord, LogPart, NewSample, NewSurrogate
 
 NAME = "pendulum"
 
@@ -79,7 +79,7 @@ def alone(storage: Storage, definitions: Definitions) -> str:
 
 def test_a_log_alone_gives_a_model(storage: Storage, definitions: Definitions, service: SampleService, fit):
     name = alone(storage, definitions)
-    service.add(name, "log", logged(30), None, logged=True)
+    service.add(name, "log", logged(30), None, log=LogPart())
     fit()
     record = storage.surrogates.get(name)
     assert (record.phase, record.error) == ("from_log", None)
@@ -88,7 +88,7 @@ def test_a_log_alone_gives_a_model(storage: Storage, definitions: Definitions, s
 
 
 def test_a_log_over_the_range_leaves_the_budget_to_adaptive_queries(storage: Storage, service: SampleService, fit):
-    service.add(NAME, "log", logged(60), None, logged=True)
+    service.add(NAME, "log", logged(60), None, log=LogPart())
     assert storage.queries.list(NAME) == [], "all initial queries are covered"
     fit()
     assert storage.surrogates.get(NAME).phase == "sampling", "nobody chose the log to disprove the model"
@@ -97,7 +97,7 @@ def test_a_log_over_the_range_leaves_the_budget_to_adaptive_queries(storage: Sto
 
 
 def test_a_log_of_a_corner_leaves_initial_queries(storage: Storage, service: SampleService):
-    service.add(NAME, "log", logged(60, speed=0.5), None, logged=True)
+    service.add(NAME, "log", logged(60, speed=0.5), None, log=LogPart())
     assert 0 < len(storage.queries.list(NAME, ("pending",))) < pendulum.INITIAL
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from surrogym_server.errors import InvalidInput
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import LedgerRecord, NewDesign, NewSample, QueryCounts
+from surrogym_server.storage.records import LedgerRecord, LogPart, NewDesign, NewSample, QueryCounts
 
 SECONDS = 60.0
 Make = Callable[..., str]
@@ -18,7 +18,7 @@ Sample = Callable[..., NewSample]
 
 def test_logged_samples_have_their_own_line_and_cost_no_budget(storage: Storage, make: Make, by_hand: Sample) -> None:
     name = make(queries=0, budget=3)
-    storage.samples.add(name, "log", [by_hand(reward=float(i)) for i in range(10)], logged=True)
+    storage.samples.add(name, "log", [by_hand(reward=float(i)) for i in range(10)], log=LogPart())
     assert storage.ledger.read(name) == LedgerRecord(logged=10)
     assert (storage.ledger.read(name).total, storage.ledger.read(name).samples) == (0, 10)
     assert storage.designs.left(name) == 3
@@ -28,7 +28,7 @@ def test_logged_samples_have_their_own_line_and_cost_no_budget(storage: Storage,
 
 def test_arrays_tell_logged_samples_from_others(storage: Storage, make: Make, by_hand: Sample) -> None:
     name = make(queries=0)
-    storage.samples.add(name, "log", [by_hand(reward=1.0)], logged=True)
+    storage.samples.add(name, "log", [by_hand(reward=1.0)], log=LogPart())
     storage.samples.add(name, "hand", [by_hand(reward=1.0)], key="one")
     assert storage.samples.arrays(name).purpose == ("logged", "manual")
     assert storage.ledger.read(name) == LedgerRecord(manual=1, logged=1)
@@ -37,9 +37,9 @@ def test_arrays_tell_logged_samples_from_others(storage: Storage, make: Make, by
 def test_the_same_log_in_other_batches_changes_nothing(storage: Storage, make: Make, by_hand: Sample) -> None:
     name = make(queries=0)
     log = [by_hand(reward=float(i)) for i in range(4)]
-    first = storage.samples.add(name, "log", log, logged=True)
-    begin = storage.samples.add(name, "other", log[:1], logged=True, complete=False)
-    end = storage.samples.add(name, "other", log[1:], logged=True, after=begin.digest)
+    first = storage.samples.add(name, "log", log, log=LogPart())
+    begin = storage.samples.add(name, "other", log[:1], log=LogPart(complete=False))
+    end = storage.samples.add(name, "other", log[1:], log=LogPart(begin.digest))
     assert begin.ids + end.ids == first.ids
     assert (begin.duplicates, end.duplicates, end.digest) == (1, 3, first.digest)
     assert storage.samples.count(name) == 4
@@ -49,7 +49,7 @@ def test_equal_samples_of_a_log_all_count(storage: Storage, make: Make, by_hand:
     """1,864 of 1,999 steps were dropped because they had the numbers of others."""
     name = make(queries=0)
     for _ in range(2):
-        added = storage.samples.add(name, "log", [by_hand()] * 3, logged=True)
+        added = storage.samples.add(name, "log", [by_hand()] * 3, log=LogPart())
         assert len(set(added.ids)) == 3
     assert (added.duplicates, storage.samples.count(name)) == (3, 3)
 
@@ -59,7 +59,7 @@ def sent(storage: Storage, name: str, log: list[NewSample], size: int, after: st
     first, duplicates, place = 0, 0, after
     while first < len(log):
         part = log[first : first + size]
-        added = storage.samples.add(name, "log", part, logged=True, complete=first + size >= len(log), after=place)
+        added = storage.samples.add(name, "log", part, log=LogPart(place, complete=first + size >= len(log)))
         if added.restart is not None:
             first, duplicates, place = 0, 0, added.restart
         else:
@@ -105,21 +105,21 @@ def test_a_log_is_fitted_while_queries_wait_for_a_sampler(
 ) -> None:
     name = make(queries=3)
     assert storage.designs.due() == []
-    storage.samples.add(name, "log", [by_hand()], logged=True)
+    storage.samples.add(name, "log", [by_hand()], log=LogPart())
     assert storage.designs.due() == [name]
     lease = storage.designs.begin(name, "me", SECONDS)
     assert lease is not None
     storage.designs.commit(lease, design(queries=1))
     assert storage.designs.due() == [], "the log has been looked at, and queries are open"
-    storage.samples.add(name, "log", [by_hand(reward=2.0)], logged=True)
+    storage.samples.add(name, "log", [by_hand(reward=2.0)], log=LogPart())
     assert storage.designs.due() == [name]
 
 
 def test_no_fit_is_due_before_the_log_is_complete(storage: Storage, make: Make, by_hand: Sample) -> None:
     name = make(queries=0)
-    storage.samples.add(name, "log", [by_hand()], logged=True, complete=False)
+    storage.samples.add(name, "log", [by_hand()], log=LogPart(complete=False))
     assert storage.designs.due() == []
-    storage.samples.add(name, "log", [by_hand()], logged=True)  # nothing new comes with the end
+    storage.samples.add(name, "log", [by_hand()], log=LogPart())  # nothing new comes with the end
     assert storage.designs.due() == [name]
 
 
@@ -127,11 +127,11 @@ def test_a_repeated_complete_log_makes_no_fit_due(
     storage: Storage, make: Make, by_hand: Sample, design: Callable[..., NewDesign]
 ) -> None:
     name = make(queries=0)
-    storage.samples.add(name, "log", [by_hand()], logged=True)
+    storage.samples.add(name, "log", [by_hand()], log=LogPart())
     lease = storage.designs.begin(name, "me", SECONDS)
     assert lease is not None
     storage.designs.commit(lease, design(phase="from_log"))
-    storage.samples.add(name, "log", [by_hand()], logged=True)
+    storage.samples.add(name, "log", [by_hand()], log=LogPart())
     assert storage.designs.due() == []
     assert storage.surrogates.get(name).phase == "from_log"
 
@@ -142,7 +142,7 @@ def test_a_logged_sample_of_a_query_is_refused_by_its_index(
     name = make(queries=1)
     [leased] = storage.queries.claim(name, "a", 1, SECONDS)
     with pytest.raises(InvalidInput, match=r"samples\.1: expected a logged sample without a query_id"):
-        storage.samples.add(name, "log", [by_hand(), answer(leased)], logged=True)
+        storage.samples.add(name, "log", [by_hand(), answer(leased)], log=LogPart())
     assert storage.samples.count(name) == 0
 
 

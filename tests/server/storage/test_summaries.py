@@ -11,7 +11,7 @@ import sqlalchemy as sa
 
 from support.queries import steps
 from surrogym_server.storage.port import MAX_ATTEMPTS, Storage
-from surrogym_server.storage.records import NewDesign, NewModel, NewSample, SurrogateSummary
+from surrogym_server.storage.records import LogPart, NewDesign, NewModel, NewSample, SurrogateSummary
 
 LONG = 60.0
 
@@ -172,7 +172,7 @@ def test_a_second_list_shows_what_came_since_the_first(
     require_fresh()
     logged = [answer(third, query_id=None, lease_token=None, reward=float(reward)) for reward in range(3)]
     for batch in logged:
-        storage.samples.add(name, "log", [batch], logged=True, complete=False)
+        storage.samples.add(name, "log", [batch], log=LogPart(complete=False))
         require_fresh()
     storage.samples.add(name, "a", [answer(third)])
     require_fresh()

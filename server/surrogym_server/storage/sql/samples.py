@@ -15,11 +15,10 @@ from surrogym_server.storage import port
 from surrogym_server.storage.records import (
     AddedSamples,
     Array,
+    LogPart,
     NewSample,
-    SampleArrays,
     SampleRecord,
     fingerprint,
-    no_rows,
 )
 from surrogym_server.storage.sql.answers import Answered, insert_samples, read_answered, row_of, settle
 from surrogym_server.storage.sql.database import Database
@@ -27,13 +26,14 @@ from surrogym_server.storage.sql.logged import complete_log, store_logged
 from surrogym_server.storage.sql.rows import find, hold, recall, remember, touch
 from surrogym_server.storage.sql.snapshots import insert_snapshots
 from surrogym_server.storage.sql.tables import queries, samples
-from surrogym_shared.nouns import Vector
+from surrogym_shared.nouns import RealSteps, Vector
 
 _COLUMNS: dict[str, sa.ColumnElement[Any]] = {
     "requested_coordinates": sa.case((queries.c.kind == "step", queries.c.coordinates)),
     "trajectory": sa.case((queries.c.kind == "rollout", samples.c.lease_id)),
 }
-IN_ORDER = [_COLUMNS[field.name] if field.name in _COLUMNS else samples.c[field.name] for field in fields(SampleRecord)]
+_NAMES = [field.name for field in fields(SampleRecord)]
+_FIELDS = [(_COLUMNS[name] if name in _COLUMNS else samples.c[name]).label(name) for name in _NAMES]
 
 Identity = tuple[int | None, int]
 
@@ -49,17 +49,15 @@ class SqlSamples(port.Samples):
         samples: Sequence[NewSample],
         *,
         key: str | None = None,
-        logged: bool = False,
-        complete: bool = True,
-        after: str | None = None,
+        log: LogPart | None = None,
     ) -> AddedSamples:
         told = [asdict(sample) for sample in samples] if key else []
         body = fingerprint(sampler, told)  # compared only if there is a key
         with self._database.write() as connection:
             held = hold(connection, name)
-            if logged:  # their log identifies them
-                added = store_logged(connection, held, sampler, samples, after)
-                if complete and added.restart is None:
+            if log is not None:  # the log identifies its samples
+                added = store_logged(connection, held, sampler, samples, log.after)
+                if log.complete and added.restart is None:
                     complete_log(connection, held)
                 return added
             before: list[int] | None = recall(connection, held, "add_samples", key, body)
@@ -70,14 +68,14 @@ class SqlSamples(port.Samples):
             remember(connection, held, "add_samples", key, body, added.ids)
             return added
 
-    def arrays(self, name: str) -> SampleArrays:
+    def arrays(self, name: str) -> RealSteps:
         with self._database.read() as connection:
             rows = connection.execute(_raw_arrays(find(connection, name))).all()
         if not rows:
-            none = np.zeros(0, dtype=np.bool_)
-            return SampleArrays(no_rows(), no_rows(), no_rows(), np.zeros(0), none, ())
+            none = np.zeros((0, 0))
+            return RealSteps(none, none, none, np.zeros(0), np.zeros(0, dtype=np.bool_), ())
         q, u, q_next, reward, terminated, purpose = zip(*rows, strict=True)
-        return SampleArrays(
+        return RealSteps(
             coordinates=_matrix(q),
             action=_matrix(u),
             next_coordinates=_matrix(q_next),
@@ -90,13 +88,13 @@ class SqlSamples(port.Samples):
         with self._database.read() as connection:
             own = samples.c.surrogate_id == find(connection, name)
             rows = connection.execute(
-                sa.select(*IN_ORDER)
+                sa.select(*_FIELDS)
                 .select_from(samples.outerjoin(queries, samples.c.query_id == queries.c.id))
                 .where(own, samples.c.id > after)
                 .order_by(samples.c.id)
                 .limit(limit)
             )
-            return [SampleRecord(*row) for row in rows.all()]
+            return [SampleRecord(**row._mapping) for row in rows]
 
     def count(self, name: str) -> int:
         with self._database.read() as connection:

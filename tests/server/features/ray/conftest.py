@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from support.postgresql import Postgresql
+from support.real_steps import columns
 from surrogym_sampler.original import classic
 from surrogym_server.convert import stored_definition
 from surrogym_server.engine.design_job import DesignJob, run_design_job
@@ -27,9 +28,8 @@ LEASE = 6.0  # a busy machine may keep a host from renewing for some seconds
 @pytest.fixture(scope="session")
 def model(pendulum_samples: Samples) -> NewModel:
     samples = pendulum_samples
-    arrays = (samples.q, samples.u, samples.q_next, samples.reward, samples.terminated)
     definition = stored_definition(classic.pendulum())
-    job = DesignJob(definition, *(a.numpy() for a in arrays), state={}, budget=len(samples), target=0.999)
+    job = DesignJob(definition, columns(samples), state={}, budget=len(samples), target=0.999)
     done = run_design_job(job)
     return NewModel(len(samples), done.data_hash, done.fidelity, done.description, 0.0, done.model)
 

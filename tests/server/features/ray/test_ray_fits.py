@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from support.real_steps import columns
 from surrogym_sampler.original import classic
 from surrogym_server.convert import stored_definition
 from surrogym_server.engine.design_job import DesignJob, DesignResult
@@ -41,9 +42,8 @@ def cluster() -> Iterator[None]:
 @pytest.fixture
 def job(pendulum_samples: Samples) -> DesignJob:
     samples = pendulum_samples
-    arrays = (samples.q, samples.u, samples.q_next, samples.reward, samples.terminated)
     definition = stored_definition(classic.pendulum())
-    return DesignJob(definition, *(a.numpy() for a in arrays), state={}, budget=len(samples), target=0.999)
+    return DesignJob(definition, columns(samples), state={}, budget=len(samples), target=0.999)
 
 
 @pytest.mark.parametrize("law", LAWS_OF_COMPUTE, ids=lambda law: law.__name__)
