@@ -18,7 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 Vector = tuple[float, ...]
 
 Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "unsure", "from_log", "failed"]
-"""Phase of a design. From ``ready`` on it has ended."""
+"""Phase of a design."""
+
+COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "unsure", "from_log")  # the model will not improve by itself
+ENDED: tuple[Phase, ...] = (*COMPLETED, "failed")  # a sampler has nothing left to do
 
 Verdict = Literal["continue", "ready", "over_budget", "unsure", "from_log"]
 """Verdict of one round. Unless it is ``continue``, it is also the phase of the design that ends with the round."""
@@ -31,6 +34,7 @@ SamplePurpose = Literal["initial", "adaptive", "manual", "audit", "logged"]
 
 QueryKind = Literal["step", "rollout"]
 QueryStatus = Literal["pending", "leased", "answered", "set_aside", "refused"]
+EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy", "job"]
 
 
 @dataclass(frozen=True)

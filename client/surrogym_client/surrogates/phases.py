@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from surrogym_shared.wire import Phase, SurrogateView
+from surrogym_shared.nouns import COMPLETED as COMPLETED
+from surrogym_shared.nouns import ENDED as ENDED
+from surrogym_shared.nouns import Phase
+from surrogym_shared.wire import SurrogateView
 
-COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "unsure", "from_log")  # the model will not improve by itself
-ENDED: tuple[Phase, ...] = (*COMPLETED, "failed")  # a sampler has nothing left to do
 IN_WORDS: dict[Phase, str] = {
     "ready": "the design is ready",
     "over_budget": "the design has spent its budget without being certain of its model",

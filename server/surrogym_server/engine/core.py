@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from surrogym_server.engine.occupancy import Reservoir
 from surrogym_server.engine.requests import Advance, Open, Opening, PolicySteps, Reset, Rollout, SampledRewards, Step
 from surrogym_server.engine.rollouts import parts_of, roll, roll_policy
 from surrogym_server.engine.session import (
@@ -20,7 +21,6 @@ from surrogym_server.engine.session import (
     Outcome,
     Session,
     digest_of,
-    open_session,
     reset_session,
     step_session,
 )
@@ -29,7 +29,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, NotReset, SurrogymError, TooLarge
 from surrogym_server.models.guard import failure_of
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.virtual import VirtualSettings, in_fastest_form, reward_limits
+from surrogym_server.virtual import VirtualSettings, create, in_fastest_form, reward_limits
 from surrogym_server.virtual.sensors import check as check_sensors
 from surrogym_shared.port import StepResult
 
@@ -78,15 +78,18 @@ def opened(
     opening = request.opening
     settings = _limited(resolved(opening, definition), request.rewards, model)
     settings = replace(settings, visited=_visited(settings, definition, request.visited))
-    return open_session(
-        secrets.token_urlsafe(SESSION_ID_BYTES) + place,
-        request.surrogate,
-        definition,
-        in_fastest_form(settings, model),
-        seed=secrets.randbits(63) if opening.seed is None else opening.seed,
+    settings = in_fastest_form(settings, model)
+    seed = secrets.randbits(63) if opening.seed is None else opening.seed
+    return Session(
+        id=secrets.token_urlsafe(SESSION_ID_BYTES) + place,
+        surrogate=request.surrogate,
+        definition=definition,
+        settings=settings,
+        seed=seed,
         model=opening.model,
-        version=version,
-        occupancy=opening.occupancy,
+        lanes=create(definition, settings, seed),
+        versions=np.full(settings.num_envs, version, dtype=np.int64),
+        visited=Reservoir(seed) if opening.occupancy else None,
         opened_by=None if opening.key is None else (opening.key, digest),
         surrogate_id=request.surrogate_id,
     )

@@ -61,7 +61,7 @@ class LocalEngine(SessionEngine):
         place: ending of the ids of its sessions, where engines in several processes have to be told apart.
     """
 
-    def __init__(
+    def __init__(  # seven parameters: each is one that its builder reads from the settings, or shares with others
         self,
         models: ModelCache,
         tolerances: Tolerances,

@@ -17,7 +17,7 @@ from surrogym_server.engine.occupancy import Reservoir
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import IdempotencyConflict, InvalidInput, SeqConflict
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.virtual import LaneState, LaneTransition, VirtualSettings, create, reset, step, within
+from surrogym_server.virtual import LaneState, LaneTransition, VirtualSettings, reset, step, within
 from surrogym_shared.port import PolicyRollout, ResetResult, StepResult, quick
 
 Bools = NDArray[np.bool_]
@@ -105,35 +105,6 @@ class Session:
 def steps_of(outcome: Outcome) -> int:
     """Number of steps in an outcome; a reset counts as one."""
     return 1 if isinstance(outcome, ResetResult) else len(outcome)
-
-
-def open_session(
-    id: str,
-    surrogate: str,
-    definition: EnvironmentDefinition,
-    settings: VirtualSettings,
-    *,
-    seed: int,
-    model: WantedVersion,
-    version: int,
-    occupancy: bool,
-    opened_by: tuple[str, str] | None = None,
-    surrogate_id: int = 0,
-) -> Session:
-    """Open a session whose lanes are not reset yet, all under one model version."""
-    return Session(
-        id=id,
-        surrogate=surrogate,
-        definition=definition,
-        settings=settings,
-        seed=seed,
-        model=model,
-        lanes=create(definition, settings, seed),
-        versions=np.full(settings.num_envs, version, dtype=np.int64),
-        visited=Reservoir(seed) if occupancy else None,
-        opened_by=opened_by,
-        surrogate_id=surrogate_id,
-    )
 
 
 def replay(session: Session, seq: int | None, request: Fingerprint) -> Answer | None:

@@ -26,18 +26,16 @@ def choose(
     assumed: Points,
     wanted: Sequence[int],
     tolerances: Sequence[float],
-    reserved: Tensor | None = None,
 ) -> list[int]:
     """Choose a greedy batch: for each output in ``wanted`` the best candidate, given answers to those chosen before it.
 
     Args:
         model: the model whose deviations the batch should lower.
-        candidates: points to choose from.
+        candidates: points to choose from; the first query is a reserved one, if there is one.
         taken: all queries so far, answered or not; no query close to one of them is chosen.
         assumed: unanswered queries, which are treated as answered.
         wanted: for each query, the number of the output that it is chosen for.
         tolerances: (O,) in each output's unit.
-        reserved: (m,) bool, the candidates from which the first query is chosen.
 
     Returns:
         Indices of candidates; fewer than wanted if no distinct candidate is left.
@@ -58,8 +56,8 @@ def choose(
         if output is not None:
             view = candidate_view(model, candidates, column, output, tolerances[column], distance)
             value = value_of(acquisition, view)
-        if reserved is not None and not picks and bool((allowed & reserved).any()):
-            allowed &= reserved
+        if candidates.reserved is not None and not picks and bool((allowed & candidates.reserved).any()):
+            allowed &= candidates.reserved
         elif output is not None:
             allowed &= output.learns
         pick = int(torch.where(allowed, value, -torch.inf).argmax())

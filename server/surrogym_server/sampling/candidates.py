@@ -28,6 +28,7 @@ class Candidates:
     log_p: Tensor  # (m,) log P_i; 0 unless the acquisition reads it
     reference: Points  # r
     weights: Tensor  # (r,) add up to 1
+    reserved: Tensor | None = None  # (m,) bool: those to be queried first; see ``endings`` and ``peaks``
 
 
 def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, rng: np.random.Generator) -> Candidates:
@@ -52,11 +53,12 @@ def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, r
     return Candidates(points, log_p, reference, weights / weights.sum())
 
 
-def with_more(candidates: Candidates, points: Points) -> tuple[Candidates, Tensor]:
-    """Add k candidates, each as likely as the likeliest one. Also return which candidates they are, (m + k,) bool."""
+def with_reserved(candidates: Candidates, points: Points) -> Candidates:
+    """Add k candidates, each as likely as the likeliest one, and reserve them alone."""
     log_p = torch.cat([candidates.log_p, candidates.log_p.max().expand(len(points))])
     joined = Points.joined([candidates.points, points])
-    return replace(candidates, points=joined, log_p=log_p), torch.arange(len(joined)) >= len(candidates.points)
+    reserved = torch.arange(len(joined)) >= len(candidates.points)
+    return replace(candidates, points=joined, log_p=log_p, reserved=reserved)
 
 
 def input_probability(model: DynamicsModel, points: Points, states: Tensor | None) -> Tensor:

@@ -14,7 +14,7 @@ from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.guard import plugin_calls, require_deviations
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.candidates import Candidates, candidates_of, with_more
+from surrogym_server.sampling.candidates import Candidates, candidates_of, with_reserved
 from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
 from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, random_points
@@ -36,7 +36,6 @@ class Judged:
     tolerances: tuple[float, ...]  # per output
     verdict: Verdict
     candidates: Candidates  # m
-    reserved: Tensor | None  # (m,) bool: candidates to be queried first; see ``endings`` and ``peaks``
 
 
 def judge_model(
@@ -71,8 +70,8 @@ def judge_model(
         for i, (c, w, one) in enumerate(zip(judged, noise, sensors, strict=True))
     )
     candidates = candidates_of(model, points, request.states, generator_for(definition, f"visited {state.round}"))
-    reserved = ending(model, samples, candidates.points)
-    settled = reserved is None or not definition.learns_termination
+    candidates = replace(candidates, reserved=ending(model, samples, candidates.points))
+    settled = candidates.reserved is None or not definition.learns_termination
     peak = None
     if definition.design.stopping == "tested_confidence":
         peak = highest(
@@ -80,10 +79,10 @@ def judge_model(
         )
     if peak is not None:
         settled = False
-        if reserved is None or state.round % 2:  # the two alternate
-            candidates, reserved = with_more(candidates, peak)
+        if candidates.reserved is None or state.round % 2:  # the two alternate
+            candidates = with_reserved(candidates, peak)
     verdict = judge(definition, confidences, tolerances, len(samples), request, settled)
-    return Judged(confidences, tolerances, verdict, candidates, reserved)
+    return Judged(confidences, tolerances, verdict, candidates)
 
 
 def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:

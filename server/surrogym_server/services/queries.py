@@ -12,9 +12,7 @@ from surrogym_server.services.lines import Lines, Present
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, QueryRecord
-from surrogym_shared.nouns import Phase, Purpose, Query, QueryStatus
-
-FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "unsure", "from_log", "failed")
+from surrogym_shared.nouns import ENDED, Phase, Purpose, Query, QueryStatus
 
 
 @dataclass(frozen=True)
@@ -123,4 +121,4 @@ class QueryService:
 
 
 def _finished_since(first: Claim, now: Claim) -> bool:
-    return now.phase != first.phase and now.phase in FINISHED
+    return now.phase != first.phase and now.phase in ENDED

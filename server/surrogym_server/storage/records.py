@@ -14,13 +14,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_shared.nouns import Phase, Purpose, Query, QueryStatus, RealStep, SamplePurpose, Vector
+from surrogym_shared.nouns import EventKind, Phase, Purpose, Query, QueryStatus, RealStep, SamplePurpose, Vector
 
 Array = NDArray[np.float64]
 JSON = dict[str, Any]
 FREE = ("audit", "logged")  # purposes of samples that don't count towards the budget
 Synchronous = Literal["full", "normal"]  # of a SQLite file: whether every commit waits for the disk
-EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy", "job"]
 
 OPEN_STATUSES: tuple[QueryStatus, ...] = ("pending", "leased")
 

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
+from surrogym_shared.nouns import EventKind
 from surrogym_shared.wire.base import PROTOCOL, Reply, Role
 
 
@@ -37,8 +38,6 @@ class Event(Reply):
     """Server-sent event of a surrogate. Its ``id`` increases, so that a reader can continue with Last-Event-ID."""
 
     id: int = Field(description="number of the event")
-    kind: Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy", "job"] = (
-        Field(description="kind of the event")
-    )
+    kind: EventKind = Field(description="kind of the event")
     created_at: float = Field(description="when it happened, in seconds since 1970, by the server's clock")
     body: dict[str, Any] = Field(description="fields of this kind of event")

@@ -12,11 +12,12 @@ import torch
 from support import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
-from surrogym_server.engine.session import Session, open_session
+from surrogym_server.engine.occupancy import Reservoir
+from surrogym_server.engine.session import Session
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.models.files import from_bytes
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
-from surrogym_server.virtual import VirtualSettings
+from surrogym_server.virtual import VirtualSettings, create
 from surrogym_shared.nouns import RealStep, RealSteps
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -73,15 +74,9 @@ def opened(definition: EnvironmentDefinition) -> Callable[..., Session]:
 
     def open_one(id: str = "s", occupancy: bool = False, **settings: object) -> Session:
         values: dict[str, object] = {"num_envs": 4, "time_limit": 3, "autoreset_mode": "same_step", **settings}
-        return open_session(
-            id,
-            "pendulum",
-            definition,
-            VirtualSettings(**values),  # type: ignore[arg-type]
-            seed=3,
-            model="latest",
-            version=1,
-            occupancy=occupancy,
-        )
+        lanes = VirtualSettings(**values)  # type: ignore[arg-type]
+        state, versions = create(definition, lanes, 3), np.ones(lanes.num_envs, dtype=np.int64)
+        visited = Reservoir(3) if occupancy else None
+        return Session(id, "pendulum", definition, lanes, 3, "latest", state, versions, visited=visited)
 
     return open_one

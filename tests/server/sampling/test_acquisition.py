@@ -109,7 +109,7 @@ def test_the_first_of_a_batch_is_taken_from_the_reserved(model, candidates):
     reserved = torch.zeros(60, dtype=torch.bool)
     reserved[[7, 31]] = True
     nothing = candidates.points[:0]
-    batch = choose(model, candidates, nothing, nothing, [0, 0, 0], TOLERANCES, reserved)
+    batch = choose(model, replace(candidates, reserved=reserved), nothing, nothing, [0, 0, 0], TOLERANCES)
     assert batch[0] in (7, 31)
     assert len(batch) == 3
 

@@ -18,7 +18,7 @@ def plan_rollouts(round: Round) -> tuple[Query, ...]:
         longest=round.definition.max_rollout or 1,
         snapshots=request.snapshots,
         states=request.states,
-        ending=judged.reserved is not None,
+        ending=judged.candidates.reserved is not None,
         ended=bool(round.samples.terminated.any()),
     )
     steps = min(round.room, steps_of_a_round(round)) if round.continues else request.extra

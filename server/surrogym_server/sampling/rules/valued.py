@@ -19,5 +19,5 @@ def ask_best_candidates(round: Round) -> tuple[Query, ...]:
         outputs = [below[i % len(below)] for i in range(round.request.extra)]
     taken = Points.joined([Points(round.samples.q, round.samples.u), assumed])
     candidates = judged.candidates
-    picks = choose(round.model, candidates, taken, assumed, outputs, judged.tolerances, judged.reserved)
+    picks = choose(round.model, candidates, taken, assumed, outputs, judged.tolerances)
     return candidates.points[picks].queries

@@ -10,10 +10,9 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import IdempotencyConflict, UnknownSurrogate
-from surrogym_server.storage.records import EventKind
 from surrogym_server.storage.sql.database import NOW
 from surrogym_server.storage.sql.tables import events, queries, requests, surrogates
-from surrogym_shared.nouns import Purpose, Query
+from surrogym_shared.nouns import EventKind, Purpose, Query
 
 Span = tuple[int, int]  # of ids of surrogates: the first and the last
 

@@ -15,9 +15,9 @@ import numpy as np
 import sqlalchemy as sa
 from sqlalchemy.engine import Dialect
 
-from surrogym_server.storage.records import Array, EventKind
+from surrogym_server.storage.records import Array
 from surrogym_server.storage.sql.damage import damaged
-from surrogym_shared.nouns import Phase, Purpose, QueryKind, QueryStatus, SamplePurpose, Vector
+from surrogym_shared.nouns import EventKind, Phase, Purpose, QueryKind, QueryStatus, SamplePurpose, Vector
 
 metadata = sa.MetaData(
     naming_convention={
