@@ -149,9 +149,7 @@ def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
 
 def _samples(job: DesignJob) -> Samples:
     """The samples to learn from: those with known lags."""
-    known, steps = _known(job), job.samples
-    columns = (steps.coordinates, steps.action, steps.next_coordinates, steps.reward, steps.terminated)
-    return Samples(*(torch.from_numpy(column)[known] for column in columns))
+    return Samples.of(job.samples).at(_known(job))
 
 
 def _known(job: DesignJob) -> torch.Tensor:

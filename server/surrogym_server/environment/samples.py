@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, fields
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from surrogym_server.environment.angle_unwrapping import angle_increments
 from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_shared.nouns import RealSteps
 
 
 @dataclass(frozen=True)
@@ -25,8 +27,14 @@ class Samples:
     def __len__(self) -> int:
         return len(self.q)
 
+    @classmethod
+    def of(cls, steps: RealSteps) -> Self:
+        """Return real steps as tensors, which share their memory."""
+        columns = (steps.coordinates, steps.action, steps.next_coordinates, steps.reward, steps.terminated)
+        return cls(*map(torch.from_numpy, columns))
+
     def at(self, rows: Tensor) -> Samples:
-        """The samples of these rows."""
+        """Return the samples of these rows: numbers, or a mask (n,)."""
         return Samples(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     @property

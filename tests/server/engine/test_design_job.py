@@ -74,14 +74,8 @@ def test_pending_queries_and_occupancy_are_passed_on(job):
 def answered(job: DesignJob, result: DesignResult) -> DesignJob:
     """The job of the next round, with the answers to the queries of the last one."""
     steps = answer(SPEC, *arrays(result.queries))
-    samples = columns(join(samples_in(job), steps))
+    samples = columns(join(Samples.of(job.samples), steps))
     return replace(job, samples=samples, state=json.loads(json.dumps(result.state)), previous=result.model)
-
-
-def samples_in(job: DesignJob) -> Samples:
-    steps = job.samples
-    arrays = (steps.coordinates, steps.action, steps.next_coordinates, steps.reward, steps.terminated)
-    return Samples(*map(torch.from_numpy, arrays))
 
 
 def scored(result: DesignResult) -> list[int]:
@@ -102,7 +96,7 @@ def test_new_samples_are_predicted_by_the_model_before(job):
     assert scored(third) == [new + len(second.queries)] * 3
     error, deviation = second.state["predictions"][0][0]
     model = from_bytes(job.definition, first.model)
-    answers = samples_in(following).at(torch.arange(len(job.samples), len(following.samples)))
+    answers = Samples.of(following.samples).at(torch.arange(len(job.samples), len(following.samples)))
     truth = float(answers.q_next[0, 0] - answers.q[0, 0])
     assert error == pytest.approx(truth - float(model.means(answers.q[:1], answers.u[:1])[0, 0]), abs=1e-9)
     assert deviation > 0

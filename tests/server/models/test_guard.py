@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-import torch
 
 from support import pendulum, unruly
 from surrogym_server.convert import definition_from_spec
@@ -59,10 +58,9 @@ def test_ctrl_c_in_a_fit_of_ones_own_process_stays_ctrl_c(monkeypatch: pytest.Mo
 def test_a_prediction_of_a_wrong_shape_raises_on_use(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(guard, "learner_of", lambda _: unruly.Unruly())
     made = job()
-    samples = [torch.from_numpy(a) for a in (made.coordinates, made.action, made.next_coordinates, made.reward)]
-    inner = guard.learn(made.definition, Samples(*samples, torch.from_numpy(made.terminated)), None).model.inner
+    inner = guard.learn(made.definition, Samples.of(made.samples), None).model.inner
     with pytest.raises(PluginFailed, match=r"reward: expected the shape \(5,\), got \(5, 1\)"):
-        predict_points(unruly.Bent(inner, "shape"), made.coordinates, made.action)
+        predict_points(unruly.Bent(inner, "shape"), made.samples.coordinates, made.samples.action)
 
 
 @pytest.mark.parametrize(
