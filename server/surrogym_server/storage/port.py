@@ -231,7 +231,7 @@ class Queries(ABC):
     def enqueue(
         self,
         name: str,
-        wanted: Sequence[Query],
+        new_queries: Sequence[Query],
         *,
         purpose: Purpose = "manual",
         key: str | None = None,

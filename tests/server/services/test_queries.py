@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from support.queries import steps
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.notices import Notices
@@ -54,7 +55,7 @@ def test_without_waiting_nothing_is_an_answer(emptied: Storage, definitions: Def
 def test_a_new_query_wakes_a_waiting_claim(emptied: Storage, definitions: Definitions):
     async def run() -> tuple[Claim, float]:
         service = QueryService(emptied, definitions, Notices())
-        return await waiting_claim(service, lambda: service.add(NAME, np.zeros((1, 2)), np.zeros((1, 1)), None))
+        return await waiting_claim(service, lambda: service.add(NAME, steps([[0.0, 0.0]], [[0.0]]), None))
 
     claim, seconds = asyncio.run(run())
     assert [query.purpose for query in claim.queries] == ["manual"]
@@ -89,7 +90,7 @@ def test_two_waiting_samplers_share_new_queries(emptied: Storage, definitions: D
         service = QueryService(emptied, definitions, Notices())
         claims = [asyncio.create_task(service.claim(NAME, f"tester {i}", 1, 60, PATIENCE)) for i in range(2)]
         await asyncio.sleep(0.2)
-        service.add(NAME, np.array([[0.0, 0.0], [1.0, 1.0]]), np.zeros((2, 1)), None)
+        service.add(NAME, steps([[0.0, 0.0], [1.0, 1.0]], np.zeros((2, 1))), None)
         return await asyncio.gather(*claims)
 
     ids = [query.id for claim in asyncio.run(run()) for query in claim.queries]

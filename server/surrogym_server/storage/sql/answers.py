@@ -20,7 +20,7 @@ from surrogym_server.storage.sql.rows import append_event
 from surrogym_server.storage.sql.tables import leases, queries, samples
 from surrogym_shared.nouns import Purpose, SamplePurpose
 
-ASKED: sa.Select[Any] = (
+NAMED_QUERIES: sa.Select[Any] = (
     sa.select(queries.c.id, queries.c.purpose, queries.c.steps)
     .where(queries.c.surrogate_id == sa.bindparam("owner"), queries.c.id.in_(sa.bindparam("named", expanding=True)))
     .order_by(queries.c.id)
@@ -62,16 +62,16 @@ class Answered:
     reported: dict[int, Reported]  # samples reported under it before, by step
 
 
-def read_answered(connection: Connection, held: Row[Any], batch: Sequence[NewSample]) -> list[Answered | None]:
+def read_answered(connection: Connection, surrogate: Row[Any], batch: Sequence[NewSample]) -> list[Answered | None]:
     """Find the lease under which each sample was reported, or None. Locks their queries.
 
     Raises:
         UnknownQuery, ForeignLease, InvalidInput, IdempotencyConflict: as ``Samples.add`` says.
     """
     named = {sample.query_id for sample in batch if sample.query_id is not None}
-    asked = _lock_queries(connection, held, named)
-    by_token = _leases(connection, held, asked)
-    answered = [_lease_of(sample, asked, by_token) for sample in batch]
+    by_id = _lock_queries(connection, surrogate, named)
+    by_token = _leases(connection, surrogate, by_id)
+    answered = [_lease_of(sample, by_id, by_token) for sample in batch]
     steps: dict[int, set[int]] = defaultdict(set)
     for sample, lease in zip(batch, answered, strict=True):
         if lease is not None:
@@ -87,9 +87,9 @@ def settle(connection: Connection, answered: Iterable[Answered]) -> None:
     if not leases_done:
         return
     set_outcome(connection, list(leases_done), "answered")
-    done = [one.query_id for one in leases_done.values() if one.live or not one.contested]
-    if done:
-        connection.execute(ANSWER, {"done": done})
+    query_ids = [one.query_id for one in leases_done.values() if one.live or not one.contested]
+    if query_ids:
+        connection.execute(ANSWER, {"done": query_ids})
 
 
 def _check_steps(lease: Answered, steps: set[int]) -> None:
@@ -106,25 +106,25 @@ def _check_steps(lease: Answered, steps: set[int]) -> None:
         )
 
 
-def _lock_queries(connection: Connection, held: Row[Any], named: set[int]) -> dict[int, Row[Any]]:
+def _lock_queries(connection: Connection, surrogate: Row[Any], named: set[int]) -> dict[int, Row[Any]]:
     if not named:
         return {}
-    return {row.id: row for row in connection.execute(ASKED, {"owner": held.id, "named": list(named)})}
+    return {row.id: row for row in connection.execute(NAMED_QUERIES, {"owner": surrogate.id, "named": list(named)})}
 
 
-def _leases(connection: Connection, held: Row[Any], asked: dict[int, Row[Any]]) -> dict[tuple[int, str], Answered]:
+def _leases(connection: Connection, surrogate: Row[Any], by_id: dict[int, Row[Any]]) -> dict[tuple[int, str], Answered]:
     """All leases of these queries, by query and token."""
-    if not asked:
+    if not by_id:
         return {}
-    rows = connection.execute(LEASES, {"asked": list(asked), "now": held.now}).all()
+    rows = connection.execute(LEASES, {"asked": list(by_id), "now": surrogate.now}).all()
     reported = _reported(connection, [row.id for row in rows])
     live_ids = {row.query_id: row.id for row in rows if row.live}
     return {
         (row.query_id, row.token): Answered(
             lease_id=row.id,
             query_id=row.query_id,
-            purpose=asked[row.query_id].purpose,
-            steps=asked[row.query_id].steps,
+            purpose=by_id[row.query_id].purpose,
+            steps=by_id[row.query_id].steps,
             attempt=row.attempt,
             live=bool(row.live),
             contested=live_ids.get(row.query_id, row.id) != row.id,
@@ -143,13 +143,13 @@ def _reported(connection: Connection, lease_ids: Sequence[int]) -> dict[int, dic
 
 
 def _lease_of(
-    sample: NewSample, asked: dict[int, Row[Any]], by_token: dict[tuple[int, str], Answered]
+    sample: NewSample, by_id: dict[int, Row[Any]], by_token: dict[tuple[int, str], Answered]
 ) -> Answered | None:
     if sample.query_id is None:
         if sample.lease_token is not None:
             raise InvalidInput("expected a query_id beside lease_token, got none")
         return None
-    if sample.query_id not in asked:
+    if sample.query_id not in by_id:
         raise unknown_query(sample.query_id)
     lease = by_token.get((sample.query_id, sample.lease_token or ""))
     if lease is None:
@@ -157,23 +157,23 @@ def _lease_of(
     return lease
 
 
-def insert_samples(connection: Connection, held: Row[Any], sampler: str, rows: list[dict[str, Any]]) -> list[int]:
+def insert_samples(connection: Connection, surrogate: Row[Any], sampler: str, rows: list[dict[str, Any]]) -> list[int]:
     """Insert rows of samples and append the event. Returns their ids in order."""
     if not rows:
         return []
     ids = [int(id) for id in connection.execute(NEW_SAMPLES, rows).scalars()]
     late = sum(row["late"] for row in rows)
-    append_event(connection, held, "sample", sampler=sampler, ids=ids, late=late)
+    append_event(connection, surrogate, "sample", sampler=sampler, ids=ids, late=late)
     return ids
 
 
 def row_of(
-    held: Row[Any], sampler: str, sample: NewSample, lease: Answered | None = None, *, logged: bool = False
+    surrogate: Row[Any], sampler: str, sample: NewSample, lease: Answered | None = None, *, logged: bool = False
 ) -> dict[str, Any]:
     """A sample as a row of its table: an answer under a lease, a logged sample, or one by hand."""
     purpose: SamplePurpose = "logged" if logged else "manual"
     return {
-        "surrogate_id": held.id,
+        "surrogate_id": surrogate.id,
         "query_id": lease.query_id if lease else None,
         "lease_id": lease.lease_id if lease else None,
         "purpose": lease.purpose if lease else purpose,
@@ -190,5 +190,5 @@ def row_of(
         "observation": sample.observation,
         "next_observation": sample.next_observation,
         "fingerprint": fingerprint(asdict(sample)),
-        "created_at": held.now,
+        "created_at": surrogate.now,
     }

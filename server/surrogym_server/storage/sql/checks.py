@@ -43,9 +43,9 @@ def check_pages(connection: Connection, seconds: float = CHECK_SECONDS) -> None:
 
     timer = Timer(seconds, cut_short)
     timer.start()
-    found = "ok"
+    result = "ok"
     try:
-        found = str(connection.exec_driver_sql(f"PRAGMA {_check(connection)}(1)").scalar())
+        result = str(connection.exec_driver_sql(f"PRAGMA {_check(connection)}(1)").scalar())
     except sa.exc.OperationalError:
         if not expired.is_set():
             raise
@@ -54,8 +54,8 @@ def check_pages(connection: Connection, seconds: float = CHECK_SECONDS) -> None:
         timer.join()  # otherwise it might interrupt a later statement
     if expired.is_set():  # an interrupted check gives no reliable result
         logger.warning("the database is large: its check stopped after %g s, and the rest was not checked", seconds)
-    elif found != "ok":
-        raise damaged(" ".join(found.split()))
+    elif result != "ok":
+        raise damaged(" ".join(result.split()))
 
 
 def _check(connection: Connection) -> str:

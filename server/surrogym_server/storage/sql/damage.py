@@ -24,8 +24,8 @@ def means_damage(error: sa.exc.DBAPIError) -> bool:
     """Whether an error of the driver means that stored data can't be read, or that the tables differ."""
     if getattr(error.orig, "sqlstate", None) in SQLSTATES:
         return True
-    said = str(error.orig)
-    return are_broken_pages(error) or UNDECODABLE in said or OTHER_SCHEMA.search(said) is not None
+    message = str(error.orig)
+    return are_broken_pages(error) or UNDECODABLE in message or OTHER_SCHEMA.search(message) is not None
 
 
 def are_broken_pages(error: sa.exc.DBAPIError) -> bool:

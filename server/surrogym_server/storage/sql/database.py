@@ -118,10 +118,10 @@ class Database:
         total = 0
         while True:
             with self.write() as connection:
-                done = batch(connection)
-            if not done:
+                count = batch(connection)
+            if not count:
                 return total
-            total += done
+            total += count
             time.sleep(PAUSE_SECONDS)
 
     def require_sound(self) -> None:
@@ -204,10 +204,10 @@ class Database:
             raise
 
     def _damaged(self, reason: str, *, pages: bool) -> Damaged:
-        found = damaged(reason)
+        error = damaged(reason)
         if pages:
-            self._broken = str(found)
-        return found
+            self._broken = str(error)
+        return error
 
 
 def conflict_insert(connection: Connection, table: sa.Table) -> sqlite.Insert | postgresql.Insert:
@@ -302,5 +302,5 @@ def never_connected(error: BaseException | None) -> bool:
 
 def _reason(error: Exception) -> str:
     """The driver's message, without the position in a statement that no person typed."""
-    said = str(getattr(error, "orig", None) or error)
-    return said.partition("\n")[0]
+    message = str(getattr(error, "orig", None) or error)
+    return message.partition("\n")[0]

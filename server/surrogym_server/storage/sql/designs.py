@@ -85,14 +85,14 @@ class SqlDesigns(port.Designs):
     ) -> Granted:
         body = fingerprint(queries, checkpoint)
         with self._database.write() as connection:
-            held = hold(connection, name)
-            raised = recall(connection, held, "ask", key, body)
+            surrogate = hold(connection, name)
+            raised = recall(connection, surrogate, "ask", key, body)
             if raised is None:
                 before = stored.read(connection, name)
                 raised = _to_raise(connection, before, queries, allowed=raise_budget)
                 extra, budget = before.extra_queries + queries, before.budget + raised
-                touch(connection, held, extra_queries=extra, budget=budget, checkpoint=checkpoint)
-                remember(connection, held, "ask", key, body, raised)
+                touch(connection, surrogate, extra_queries=extra, budget=budget, checkpoint=checkpoint)
+                remember(connection, surrogate, "ask", key, body, raised)
             return Granted(stored.read(connection, name), raised)
 
     def left(self, name: str) -> int:
@@ -113,51 +113,53 @@ class SqlDesigns(port.Designs):
 
     def ask_first(self, name: str, queries: Sequence[Query]) -> None:
         with self._database.write() as connection:
-            held = hold(connection, name)
-            if connection.execute(sa.select(surrogates.c.id).where(surrogates.c.id == held.id, IS_UNBEGUN)).first():
-                initial.begin(connection, held, queries)
+            surrogate = hold(connection, name)
+            if connection.execute(
+                sa.select(surrogates.c.id).where(surrogates.c.id == surrogate.id, IS_UNBEGUN)
+            ).first():
+                initial.begin(connection, surrogate, queries)
         initial.ask(self._database, name, queries)
 
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
         with self._database.write() as connection:
-            held = hold(connection, name)
+            surrogate = hold(connection, name)
             row = connection.execute(
                 sa.select(surrogates.c.revision, surrogates.c.extra_queries, surrogates.c.checkpoint)
-                .where(surrogates.c.id == held.id)
+                .where(surrogates.c.id == surrogate.id)
                 .where(IS_DUE)
             ).one_or_none()
             if row is None:
                 return None
-            lease = FitLease(name, secrets.token_urlsafe(16), *row, expires=held.now + seconds)
-            _update(connection, held, fit_token=lease.token, fit_owner=owner, **_lasting(lease.expires, seconds))
-            stored.update_phase(connection, held, "fitting", None)
+            lease = FitLease(name, secrets.token_urlsafe(16), *row, expires=surrogate.now + seconds)
+            _update(connection, surrogate, fit_token=lease.token, fit_owner=owner, **_lasting(lease.expires, seconds))
+            stored.update_phase(connection, surrogate, "fitting", None)
             return lease
 
     def renew(self, lease: FitLease, seconds: float) -> FitLease:
         with self._database.write() as connection:
-            held = _hold_right(connection, lease)
-            renewed = replace(lease, expires=held.now + seconds)
-            _update(connection, held, **_lasting(renewed.expires, seconds))
+            surrogate = _hold_right(connection, lease)
+            renewed = replace(lease, expires=surrogate.now + seconds)
+            _update(connection, surrogate, **_lasting(renewed.expires, seconds))
             return renewed
 
     def commit(self, lease: FitLease, design: NewDesign) -> int:
         with self._database.write() as connection:
-            held = _hold_right(connection, lease)
-            version = insert_model(connection, held, design.model)
-            _finish(connection, held, lease, design)
-            insert_queries(connection, held, design.queries, "adaptive", held.round + 1, extra=design.extra)
-            append_event(connection, held, "phase", phase=design.phase, error=None)
+            surrogate = _hold_right(connection, lease)
+            version = insert_model(connection, surrogate, design.model)
+            _finish(connection, surrogate, lease, design)
+            insert_queries(connection, surrogate, design.queries, "adaptive", surrogate.round + 1, extra=design.extra)
+            append_event(connection, surrogate, "phase", phase=design.phase, error=None)
             return version
 
     def abort(self, lease: FitLease, error: str | None) -> None:
         with self._database.write() as connection:
             try:
-                held = _hold_right(connection, lease)
+                surrogate = _hold_right(connection, lease)
             except (LeaseExpired, UnknownSurrogate):
                 return
             seen = {} if error is None else {"fitted_revision": lease.revision}
-            _update(connection, held, **NO_RIGHT, **seen)
-            stored.update_phase(connection, held, _phase_after(held, error), error)
+            _update(connection, surrogate, **NO_RIGHT, **seen)
+            stored.update_phase(connection, surrogate, _phase_after(surrogate, error), error)
 
 
 def _lasting(expires: float, seconds: float) -> dict[str, float]:
@@ -183,29 +185,29 @@ def _to_raise(connection: Connection, record: SurrogateRecord, queries: int, *, 
 
 
 def _hold_right(connection: Connection, lease: FitLease) -> Row[Any]:
-    held = hold(connection, lease.surrogate, surrogates.c.fit_token)
-    if held.fit_token != lease.token:
+    surrogate = hold(connection, lease.surrogate, surrogates.c.fit_token)
+    if surrogate.fit_token != lease.token:
         raise LeaseExpired(f"the right to fit {lease.surrogate!r} has ended: start the fit again")
-    return held
+    return surrogate
 
 
-def _update(connection: Connection, held: Row[Any], **changes: Any) -> None:
-    connection.execute(sa.update(surrogates).where(surrogates.c.id == held.id).values(**changes))
+def _update(connection: Connection, surrogate: Row[Any], **changes: Any) -> None:
+    connection.execute(sa.update(surrogates).where(surrogates.c.id == surrogate.id).values(**changes))
 
 
-def _finish(connection: Connection, held: Row[Any], lease: FitLease, design: NewDesign) -> None:
+def _finish(connection: Connection, surrogate: Row[Any], lease: FitLease, design: NewDesign) -> None:
     _update(
         connection,
-        held,
+        surrogate,
         **NO_RIGHT,
         state=design.state,
         phase=design.phase,
         error=None,
-        round=held.round + 1,
+        round=surrogate.round + 1,
         fitted_revision=lease.revision,
         extra_queries=surrogates.c.extra_queries - lease.extra_queries,
     )
 
 
-def _phase_after(held: Row[Any], error: str | None) -> Phase:
-    return "failed" if error is not None else stored.resting_phase(held.round)
+def _phase_after(surrogate: Row[Any], error: str | None) -> Phase:
+    return "failed" if error is not None else stored.resting_phase(surrogate.round)

@@ -10,18 +10,18 @@ from surrogym_server.storage.sql.database import NOW
 Held = sa.ColumnElement[bool]  # whether a row of the table is leased
 
 
-def has_ended(table: sa.Table, held: Held) -> sa.ColumnElement[bool]:
+def has_ended(table: sa.Table, surrogate: Held) -> sa.ColumnElement[bool]:
     """Whether a lease has expired."""
-    return held & (table.c.expires <= NOW)
+    return surrogate & (table.c.expires <= NOW)
 
 
-def is_too_long(table: sa.Table, held: Held) -> sa.ColumnElement[bool]:
+def is_too_long(table: sa.Table, surrogate: Held) -> sa.ColumnElement[bool]:
     """Whether a lease has more time left than it was given, because the clock was set back since."""
-    return held & (table.c.expires > NOW + table.c.seconds)
+    return surrogate & (table.c.expires > NOW + table.c.seconds)
 
 
-def shorten(connection: Connection, table: sa.Table, held: Held) -> None:
+def shorten(connection: Connection, table: sa.Table, surrogate: Held) -> None:
     """Limit the time left of leases that are too long to the time that they were given, so that a live caller keeps its
     own."""
-    too_long = sa.update(table).where(is_too_long(table, held))
+    too_long = sa.update(table).where(is_too_long(table, surrogate))
     connection.execute(too_long.values(expires=NOW + table.c.seconds))

@@ -24,15 +24,15 @@ IS_INCOMPLETE = sa.exists(  # a condition on a row of surrogates
 )
 
 
-def begin(connection: Connection, held: Row[Any], queries: Sequence[Query]) -> None:
+def begin(connection: Connection, surrogate: Row[Any], queries: Sequence[Query]) -> None:
     """Queue as many as one transaction may, and note whether others are missing."""
-    remember(connection, held, OPERATION, KEY, "", 0)
-    _ask_some(connection, held, queries)
+    remember(connection, surrogate, OPERATION, KEY, "", 0)
+    _ask_some(connection, surrogate, queries)
 
 
-def end(connection: Connection, held: Row[Any]) -> None:
+def end(connection: Connection, surrogate: Row[Any]) -> None:
     """Let the queries that are queued be all."""
-    connection.execute(sa.delete(requests).where(requests.c.surrogate_id == held.id, _OF_DESIGN))
+    connection.execute(sa.delete(requests).where(requests.c.surrogate_id == surrogate.id, _OF_DESIGN))
 
 
 def ask(database: Database, name: str, queries: Sequence[Query]) -> None:
@@ -47,16 +47,16 @@ def ask(database: Database, name: str, queries: Sequence[Query]) -> None:
         database.write_in_batches(batch)
 
 
-def _ask_some(connection: Connection, held: Row[Any], queries: Sequence[Query]) -> int:
+def _ask_some(connection: Connection, surrogate: Row[Any], queries: Sequence[Query]) -> int:
     """Queue a batch of those that are missing. Returns how many were queued; 0 if none was missing."""
-    own = (requests.c.surrogate_id == held.id) & _OF_DESIGN
+    own = (requests.c.surrogate_id == surrogate.id) & _OF_DESIGN
     queued = connection.execute(sa.select(requests.c.result).where(own)).scalar()
     if queued is None:
         return 0
     first, last = int(queued), int(queued) + BATCH
-    ids = insert_queries(connection, held, queries[first:last], "initial", 0)
+    ids = insert_queries(connection, surrogate, queries[first:last], "initial", 0)
     if last >= len(queries):
-        end(connection, held)
+        end(connection, surrogate)
     else:
         connection.execute(sa.update(requests).where(own).values(result=last))
     return len(ids)

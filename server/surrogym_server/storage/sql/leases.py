@@ -40,7 +40,7 @@ SHARE = (
 
 
 def begin(
-    connection: Connection, held: Row[Any], rows: Sequence[Row[Any]], sampler: str, seconds: float
+    connection: Connection, surrogate: Row[Any], rows: Sequence[Row[Any]], sampler: str, seconds: float
 ) -> list[LeasedQuery]:
     """Lease the queries of these rows, which the caller has locked."""
     if not rows:
@@ -53,23 +53,23 @@ def begin(
             number=row.number,
             attempt=row.attempts + 1,
             token=secrets.token_urlsafe(16),
-            expires=held.now + seconds,
+            expires=surrogate.now + seconds,
         )
         for row in rows
     ]
-    connection.execute(NEW_LEASE, [_new(held, query, sampler, seconds) for query in leased])
+    connection.execute(NEW_LEASE, [_new(surrogate, query, sampler, seconds) for query in leased])
     connection.execute(LEASE_QUERIES, {"claimed": [query.id for query in leased], "claimer": sampler})
     return leased
 
 
-def _new(held: Row[Any], query: LeasedQuery, sampler: str, seconds: float) -> dict[str, Any]:
+def _new(surrogate: Row[Any], query: LeasedQuery, sampler: str, seconds: float) -> dict[str, Any]:
     return {
-        "surrogate_id": held.id,
+        "surrogate_id": surrogate.id,
         "query_id": query.id,
         "token": query.token,
         "sampler": sampler,
         "attempt": query.attempt,
-        "begun": held.now,
+        "begun": surrogate.now,
         "expires": query.expires,
         "seconds": seconds,
         "outcome": "open",
@@ -113,41 +113,43 @@ def share(connection: Connection, name: str) -> Row[Any]:
 
     ``has_ended``: whether leases of it have expired. They are ended then, which does block writers.
     """
-    found = connection.execute(SHARE, {"named": name}).one_or_none()
-    if found is None:
+    row = connection.execute(SHARE, {"named": name}).one_or_none()
+    if row is None:
         raise unknown_surrogate(name)
-    if found.has_ended:
+    if row.has_ended:
         sweep(connection, hold(connection, name))
-    return found
+    return row
 
 
-def sweep(connection: Connection, held: Row[Any]) -> int:
+def sweep(connection: Connection, surrogate: Row[Any]) -> int:
     """End the surrogate's expired leases. Returns their number."""
-    ended = connection.execute(
+    result = connection.execute(
         sa.update(leases)
-        .where(leases.c.surrogate_id == held.id, leases.c.outcome == "open", leases.c.expires <= held.now)
+        .where(leases.c.surrogate_id == surrogate.id, leases.c.outcome == "open", leases.c.expires <= surrogate.now)
         .values(outcome="expired")
         .returning(leases.c.query_id)
     )
-    ids = [int(id) for id in ended.scalars()]
+    ids = [int(id) for id in result.scalars()]
     if ids:
-        give_back(connection, held, ids, EXPIRED, "expired")
+        give_back(connection, surrogate, ids, EXPIRED, "expired")
     return len(ids)
 
 
-def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], error: str, outcome: Returned) -> None:
+def give_back(
+    connection: Connection, surrogate: Row[Any], query_ids: Sequence[int], error: str, outcome: Returned
+) -> None:
     """Make leased queries pending again, or set them aside after their last attempt or a refusal.
 
     A query has the same number of attempts each time it is requeued. A lease that ended before a real step does not
     count as an attempt. The leases already have their ``outcome``.
     """
-    spent = (
+    failures = (
         sa.select(sa.func.count())
         .where(leases.c.query_id == queries.c.id, leases.c.outcome.in_(("failed", "expired")))
         .scalar_subquery()
     )
     last = sa.false() if outcome in BEFORE_A_STEP else sa.true()
-    if_failed = sa.case((last & (spent % MAX_ATTEMPTS == 0), "set_aside"), else_="pending")
+    if_failed = sa.case((last & (failures % MAX_ATTEMPTS == 0), "set_aside"), else_="pending")
     next_status = sa.literal("refused") if outcome == "refused" else if_failed
     rows = connection.execute(
         sa.update(queries)
@@ -158,11 +160,11 @@ def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], 
     statuses = {row.id: row.status for row in rows}
     set_aside = sorted(id for id, status in statuses.items() if status != "pending")
     for query_id in set_aside:
-        append_event(connection, held, "set_aside", query_id=query_id, error=error)
+        append_event(connection, surrogate, "set_aside", query_id=query_id, error=error)
     if set_aside:
-        touch(connection, held)
+        touch(connection, surrogate)
     if len(statuses) > len(set_aside):
-        append_event(connection, held, "queries", given_back=len(statuses) - len(set_aside))
+        append_event(connection, surrogate, "queries", given_back=len(statuses) - len(set_aside))
 
 
 def is_unbegun(surrogate_id: int) -> sa.ColumnElement[bool]:
@@ -171,8 +173,8 @@ def is_unbegun(surrogate_id: int) -> sa.ColumnElement[bool]:
     return (queries.c.surrogate_id == surrogate_id) & (queries.c.status == "pending") & ~sa.exists(begun)
 
 
-def requeue_set_aside(connection: Connection, held: Row[Any]) -> int:
+def requeue_set_aside(connection: Connection, surrogate: Row[Any]) -> int:
     """Make the queries that were set aside or refused pending, with as many attempts as a new query. Returns their
     number."""
-    set_aside = (queries.c.surrogate_id == held.id) & queries.c.status.in_(("set_aside", "refused"))
+    set_aside = (queries.c.surrogate_id == surrogate.id) & queries.c.status.in_(("set_aside", "refused"))
     return connection.execute(sa.update(queries).where(set_aside).values(status="pending")).rowcount

@@ -54,15 +54,15 @@ class SqlLedger(port.Ledger):
 
     def report(self, name: str, steps: int, *, key: str, episodes: int = 0, note: str = "") -> LedgerRecord:
         body = fingerprint(steps, episodes, note)
-        told = {"steps": steps, "episodes": episodes, "note": note}
+        fields = {"steps": steps, "episodes": episodes, "note": note}
         with self._database.write() as connection:
-            held = hold(connection, name)
-            if recall(connection, held, OPERATION, key, body) is None:
-                row = sa.insert(evaluations).values(surrogate_id=held.id, created_at=held.now, **told)
+            surrogate = hold(connection, name)
+            if recall(connection, surrogate, OPERATION, key, body) is None:
+                row = sa.insert(evaluations).values(surrogate_id=surrogate.id, created_at=surrogate.now, **fields)
                 connection.execute(row)
-                append_event(connection, held, "ledger", purpose="evaluation", **told)
-                remember(connection, held, OPERATION, key, body, True)
-            return self._read(connection, held.id)
+                append_event(connection, surrogate, "ledger", purpose="evaluation", **fields)
+                remember(connection, surrogate, OPERATION, key, body, True)
+            return self._read(connection, surrogate.id)
 
     def read(self, name: str) -> LedgerRecord:
         with self._database.read() as connection:

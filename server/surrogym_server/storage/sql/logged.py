@@ -25,7 +25,7 @@ from surrogym_server.storage.sql.tables import samples, surrogates
 
 
 def store_logged(
-    connection: Connection, held: Row[Any], sampler: str, batch: Sequence[NewSample], after: str | None
+    connection: Connection, surrogate: Row[Any], sampler: str, batch: Sequence[NewSample], after: str | None
 ) -> AddedSamples:
     """Insert the new samples of a part of a log, which comes ``after`` another part, or begins the log.
 
@@ -35,45 +35,45 @@ def store_logged(
     for index, sample in enumerate(batch):
         if sample.query_id is not None:
             raise InvalidInput(f"samples.{index}: expected a logged sample without a query_id, got {sample.query_id}")
-    rows = [row_of(held, sampler, sample, logged=True) for sample in batch]
+    rows = [row_of(surrogate, sampler, sample, logged=True) for sample in batch]
     before = after or ""
     while True:
         chain = list(accumulate((row["fingerprint"] for row in rows), fingerprint, initial=before))
         links = [f"{one}:{other}" for one, other in pairwise(chain)]
-        known = _known(connection, held, links)
-        old = next((place for place, link in enumerate(links) if link not in known), len(links))
-        if old == len(links) or not _continued(connection, held, chain[old]):
+        stored_ids = _stored_ids(connection, surrogate, links)
+        old = next((place for place, link in enumerate(links) if link not in stored_ids), len(links))
+        if old == len(links) or not _continued(connection, surrogate, chain[old]):
             break
         before = chain[old + 1]  # shared by all logs that differ here in the same way, as one that grows does
         if after is not None:
             return AddedSamples((), 0, restart=before)
     new = [row | {"fingerprint": link} for row, link in zip(rows[old:], links[old:], strict=True)]
-    ids = [known[link] for link in links[:old]] + insert_samples(connection, held, sampler, new)
+    ids = [stored_ids[link] for link in links[:old]] + insert_samples(connection, surrogate, sampler, new)
     if new:
-        _update(connection, held, logged_revision=surrogates.c.revision + 1)
+        _update(connection, surrogate, logged_revision=surrogates.c.revision + 1)
     return AddedSamples(tuple(ids), old, digest=chain[-1])
 
 
-def complete_log(connection: Connection, held: Row[Any]) -> None:
+def complete_log(connection: Connection, surrogate: Row[Any]) -> None:
     """Make a fit due for the samples of a complete log."""
-    ahead = sa.select(surrogates.c.logged_revision > surrogates.c.revision).where(surrogates.c.id == held.id)
+    ahead = sa.select(surrogates.c.logged_revision > surrogates.c.revision).where(surrogates.c.id == surrogate.id)
     if connection.execute(ahead).scalar():
-        touch(connection, held)
+        touch(connection, surrogate)
 
 
-def _known(connection: Connection, held: Row[Any], fingerprints: Sequence[str]) -> dict[str, int]:
+def _stored_ids(connection: Connection, surrogate: Row[Any], fingerprints: Sequence[str]) -> dict[str, int]:
     """The stored logged samples with these fingerprints, by fingerprint."""
     same = samples.c.fingerprint.in_(set(fingerprints))
-    wanted = sa.select(samples.c.fingerprint, samples.c.id).where(samples.c.surrogate_id == held.id, same)
-    return {row.fingerprint: row.id for row in connection.execute(wanted.where(samples.c.purpose == "logged"))}
+    statement = sa.select(samples.c.fingerprint, samples.c.id).where(samples.c.surrogate_id == surrogate.id, same)
+    return {row.fingerprint: row.id for row in connection.execute(statement.where(samples.c.purpose == "logged"))}
 
 
-def _continued(connection: Connection, held: Row[Any], digest: str) -> bool:
+def _continued(connection: Connection, surrogate: Row[Any], digest: str) -> bool:
     """Whether a sample is stored that follows the log with this digest."""
     follows = samples.c.fingerprint.startswith(f"{digest}:")
-    wanted = sa.select(samples.c.id).where(samples.c.surrogate_id == held.id, follows).limit(1)
-    return connection.execute(wanted).first() is not None
+    statement = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogate.id, follows).limit(1)
+    return connection.execute(statement).first() is not None
 
 
-def _update(connection: Connection, held: Row[Any], **changes: Any) -> None:
-    connection.execute(sa.update(surrogates).where(surrogates.c.id == held.id).values(**changes))
+def _update(connection: Connection, surrogate: Row[Any], **changes: Any) -> None:
+    connection.execute(sa.update(surrogates).where(surrogates.c.id == surrogate.id).values(**changes))

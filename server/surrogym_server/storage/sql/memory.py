@@ -28,19 +28,19 @@ class SqlOccupancy(port.Occupancy):
 
     def put(self, name: str, checkpoint: str, states: Array) -> None:
         with self._database.write() as connection:
-            held = hold(connection, name)
-            own = (occupancies.c.surrogate_id == held.id, occupancies.c.checkpoint == checkpoint)
+            surrogate = hold(connection, name)
+            own = (occupancies.c.surrogate_id == surrogate.id, occupancies.c.checkpoint == checkpoint)
             connection.execute(sa.delete(occupancies).where(*own))
-            others = sa.select(sa.func.count()).where(occupancies.c.surrogate_id == held.id)
+            others = sa.select(sa.func.count()).where(occupancies.c.surrogate_id == surrogate.id)
             if connection.execute(others).scalar_one() >= MAX_CHECKPOINTS:
                 beyond = f"expected at most {MAX_CHECKPOINTS} checkpoints of {name!r}, got one more"
                 raise TooLarge(f"{beyond}: reuse the name of one of them")
             connection.execute(
                 sa.insert(occupancies).values(
-                    surrogate_id=held.id,
+                    surrogate_id=surrogate.id,
                     checkpoint=checkpoint,
-                    round=held.round,
-                    created_at=held.now,
+                    round=surrogate.round,
+                    created_at=surrogate.now,
                     columns=states.shape[1],
                     states=states.ravel(),
                 )
@@ -73,13 +73,13 @@ class SqlSessions(port.Sessions):
             return
         with self._database.write() as connection:
             insert = conflict_insert(connection, saved)
-            given = {"surrogate": insert.excluded.surrogate, "data": insert.excluded.data}
-            connection.execute(insert.on_conflict_do_update(index_elements=["id"], set_=given), rows)
+            values = {"surrogate": insert.excluded.surrogate, "data": insert.excluded.data}
+            connection.execute(insert.on_conflict_do_update(index_elements=["id"], set_=values), rows)
 
     def take(self) -> list[SavedSession]:
         with self._database.write() as connection:
-            taken = connection.execute(sa.delete(saved).returning(*saved.c)).all()
-        return [SavedSession(row.id, row.surrogate, bytes(row.data)) for row in taken]
+            rows = connection.execute(sa.delete(saved).returning(*saved.c)).all()
+        return [SavedSession(row.id, row.surrogate, bytes(row.data)) for row in rows]
 
 
 class SqlEvents(port.Events):

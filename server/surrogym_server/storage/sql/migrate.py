@@ -23,12 +23,12 @@ def migrate(database: Database) -> None:
         Unavailable: the database was written by a newer program, or by an unreleased one.
         Damaged: no program has ever made its schema.
     """
-    known = [script.name[1:5] for script in sorted(SCRIPTS.glob("versions/r*.py"))]
+    revisions = [script.name[1:5] for script in sorted(SCRIPTS.glob("versions/r*.py"))]
     with database.write() as connection:
         _take_turn(connection)
         present = _present(connection)
-        _refuse_others(present, known)
-        if present != known[-1:]:
+        _refuse_others(present, revisions)
+        if present != revisions[-1:]:
             _upgrade(connection)
 
 
@@ -60,16 +60,16 @@ def _take_turn(connection: Connection) -> None:
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(MIGRATION_LOCK)))
 
 
-def _refuse_others(present: list[str], known: list[str]) -> None:
-    unknown = sorted(map(str, set(present) - set(known)))
-    if unknown and max(unknown) < known[0]:
+def _refuse_others(present: list[str], revisions: list[str]) -> None:
+    unknown = sorted(map(str, set(present) - set(revisions)))
+    if unknown and max(unknown) < revisions[0]:
         raise Unavailable(
             f"the database was written by an unreleased Surrogym: its schema is {', '.join(unknown)}, "
-            f"the first released one is {known[0]}; export its samples with that version, or begin anew with another "
-            "--database"
+            f"the first released one is {revisions[0]}; export its samples with that version, or begin anew with "
+            "another --database"
         )
     if unknown:
         raise Unavailable(
             f"the database was written by a newer Surrogym: its schema is {', '.join(unknown)}, this program knows "
-            f"schemas up to {known[-1]}; start the newer program"
+            f"schemas up to {revisions[-1]}; start the newer program"
         )

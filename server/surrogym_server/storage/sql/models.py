@@ -50,8 +50,8 @@ class SqlModels(port.Models):
     def newest(self) -> dict[int, int]:
         with self._database.read() as connection:
             newest = sa.select(models.c.surrogate_id, sa.func.max(models.c.version))
-            wanted = newest.where(INTACT, models.c.surrogate_id.not_in(NAMELESS)).group_by(models.c.surrogate_id)
-            return {int(surrogate): int(version) for surrogate, version in connection.execute(wanted)}
+            statement = newest.where(INTACT, models.c.surrogate_id.not_in(NAMELESS)).group_by(models.c.surrogate_id)
+            return {int(surrogate): int(version) for surrogate, version in connection.execute(statement)}
 
     def blob(self, name: str, version: int | None = None) -> bytes:
         with self._database.read() as connection:
@@ -62,12 +62,12 @@ class SqlModels(port.Models):
 
     def set_aside(self, name: str, version: int, damage: str) -> bool:
         with self._database.write() as connection:
-            held = hold(connection, name)
-            own = (models.c.surrogate_id == held.id) & (models.c.version == version) & INTACT
+            surrogate = hold(connection, name)
+            own = (models.c.surrogate_id == surrogate.id) & (models.c.version == version) & INTACT
             if not connection.execute(sa.update(models).where(own).values(damage=damage)).rowcount:
                 return False
-            append_event(connection, held, "damaged", version=version, error=damage)
-            touch(connection, held)
+            append_event(connection, surrogate, "damaged", version=version, error=damage)
+            touch(connection, surrogate)
             return True
 
     def add(self, name: str, model: NewModel) -> int:
@@ -89,15 +89,15 @@ def newest_of(connection: Connection, span: Span) -> dict[int, tuple[int, float]
     return {surrogate: (version, _confidence_index(fidelity)) for surrogate, version, fidelity in rows}
 
 
-def insert_model(connection: Connection, held: Row[Any], model: NewModel) -> int:
+def insert_model(connection: Connection, surrogate: Row[Any], model: NewModel) -> int:
     """Store a model as the newest version. The surrogate is held, so that versions have no gaps."""
-    newest = sa.select(sa.func.max(models.c.version)).where(models.c.surrogate_id == held.id)
+    newest = sa.select(sa.func.max(models.c.version)).where(models.c.surrogate_id == surrogate.id)
     version = (connection.execute(newest).scalar() or 0) + 1
     connection.execute(
         sa.insert(models).values(
-            surrogate_id=held.id,
+            surrogate_id=surrogate.id,
             version=version,
-            created_at=held.now,
+            created_at=surrogate.now,
             samples=model.samples,
             data_hash=model.data_hash,
             fidelity=model.fidelity,
@@ -107,8 +107,8 @@ def insert_model(connection: Connection, held: Row[Any], model: NewModel) -> int
             checksum=_checksum(model.blob),
         )
     )
-    told = {"samples": model.samples, "fit_seconds": model.fit_seconds, "fidelity": model.fidelity}
-    append_event(connection, held, "fit", version=version, **told)
+    fields = {"samples": model.samples, "fit_seconds": model.fit_seconds, "fidelity": model.fidelity}
+    append_event(connection, surrogate, "fit", version=version, **fields)
     return version
 
 
@@ -124,9 +124,9 @@ def _confidence_index(fidelity: str) -> float:
 
 
 def _one(connection: Connection, name: str, version: int | None, *columns: sa.ColumnElement[Any]) -> Row[Any]:
-    wanted = sa.select(*columns).where(models.c.surrogate_id == find(connection, name))
-    wanted = wanted.where(INTACT if version is None else models.c.version == version)
-    row = connection.execute(wanted.order_by(models.c.version.desc()).limit(1)).one_or_none()
+    statement = sa.select(*columns).where(models.c.surrogate_id == find(connection, name))
+    statement = statement.where(INTACT if version is None else models.c.version == version)
+    row = connection.execute(statement.order_by(models.c.version.desc()).limit(1)).one_or_none()
     if row is not None:
         return row
     if version is None:

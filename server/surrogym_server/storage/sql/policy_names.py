@@ -36,11 +36,11 @@ def resolve(connection: Connection, surrogate: int, name: str, which: str) -> in
         require_version(connection, surrogate, name, int(which))
         return int(which)
     if which == LATEST:
-        wanted = sa.select(sa.func.max(policies.c.version)).where(policies.c.surrogate_id == surrogate)
+        statement = sa.select(sa.func.max(policies.c.version)).where(policies.c.surrogate_id == surrogate)
     else:
         aliases = policy_aliases.c
-        wanted = sa.select(aliases.version).where(aliases.surrogate_id == surrogate, aliases.alias == which)
-    version = connection.execute(wanted).scalar()
+        statement = sa.select(aliases.version).where(aliases.surrogate_id == surrogate, aliases.alias == which)
+    version = connection.execute(statement).scalar()
     if version is None:
         raise unknown_policy(name, which)
     return int(version)

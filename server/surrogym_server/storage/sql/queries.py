@@ -62,30 +62,30 @@ class SqlQueries(port.Queries):
     def enqueue(
         self,
         name: str,
-        wanted: Sequence[Query],
+        new_queries: Sequence[Query],
         *,
         purpose: Purpose = "manual",
         key: str | None = None,
     ) -> list[int]:
-        body = fingerprint(purpose, *(asdict(query) for query in wanted))
+        body = fingerprint(purpose, *(asdict(query) for query in new_queries))
         with self._database.write() as connection:
-            held = hold(connection, name)
-            before: list[int] | None = recall(connection, held, "enqueue", key, body)
+            surrogate = hold(connection, name)
+            before: list[int] | None = recall(connection, surrogate, "enqueue", key, body)
             if before is not None:
                 return before
             if purpose == "audit":
-                _require_room(connection, held, sum(query.steps for query in wanted))
-            ids = insert_queries(connection, held, wanted, purpose, held.round)
-            remember(connection, held, "enqueue", key, body, ids)
+                _require_room(connection, surrogate, sum(query.steps for query in new_queries))
+            ids = insert_queries(connection, surrogate, new_queries, purpose, surrogate.round)
+            remember(connection, surrogate, "enqueue", key, body, ids)
             return ids
 
     def claim(self, name: str, sampler: str, limit: int, seconds: float) -> list[LeasedQuery]:
         with self._database.write() as connection:
-            held = leasing.share(connection, name)
-            if held.paused:
+            surrogate = leasing.share(connection, name)
+            if surrogate.paused:
                 return []
-            rows = connection.execute(OLDEST_FREE, {"owner": held.id, "most": limit}).all()
-            return leasing.begin(connection, held, rows, sampler, seconds)
+            rows = connection.execute(OLDEST_FREE, {"owner": surrogate.id, "most": limit}).all()
+            return leasing.begin(connection, surrogate, rows, sampler, seconds)
 
     def renew(self, name: str, query_id: int, token: str, seconds: float) -> float:
         with self._database.write() as connection:
@@ -106,25 +106,25 @@ class SqlQueries(port.Queries):
     ) -> QueryRecord:
         outcome: leasing.Returned = "refused" if refused else "failed" if begun else "unbegun"
         with self._database.write() as connection:
-            held = hold(connection, name)
-            lease = leasing.of_query(connection, held.id, query_id, token)
-            if lease.outcome == "open" and lease.expires > held.now:
+            surrogate = hold(connection, name)
+            lease = leasing.of_query(connection, surrogate.id, query_id, token)
+            if lease.outcome == "open" and lease.expires > surrogate.now:
                 leasing.set_outcome(connection, [lease.id], outcome)
-                leasing.give_back(connection, held, [query_id], error, outcome)
-                given_back = _read(connection, held.id, query_id)
-                give_up_lost(connection, held, given_back)
+                leasing.give_back(connection, surrogate, [query_id], error, outcome)
+                given_back = _read(connection, surrogate.id, query_id)
+                give_up_lost(connection, surrogate, given_back)
                 return given_back
             elif lease.outcome != outcome:
                 raise _ended(query_id)
-            return _read(connection, held.id, query_id)
+            return _read(connection, surrogate.id, query_id)
 
     def withdraw(self, name: str, query_ids: Sequence[int]) -> int:
         with self._database.write() as connection:
-            held = hold(connection, name)
-            chosen = queries.c.id.in_(query_ids) & leasing.is_unbegun(held.id)
+            surrogate = hold(connection, name)
+            chosen = queries.c.id.in_(query_ids) & leasing.is_unbegun(surrogate.id)
             gone = len(connection.execute(sa.delete(queries).where(chosen).returning(queries.c.id)).all())
             if gone:
-                append_event(connection, held, "queries", withdrawn=gone, round=held.round)
+                append_event(connection, surrogate, "queries", withdrawn=gone, round=surrogate.round)
             return gone
 
     def get(self, name: str, query_id: int) -> QueryRecord:
@@ -133,10 +133,10 @@ class SqlQueries(port.Queries):
 
     def list(self, name: str, statuses: Sequence[QueryStatus] = (), limit: int = 10_000) -> list[QueryRecord]:
         with self._database.read() as connection:
-            wanted = _records().where(queries.c.surrogate_id == find(connection, name))
+            statement = _records().where(queries.c.surrogate_id == find(connection, name))
             if statuses:
-                wanted = wanted.where(queries.c.status.in_(statuses))
-            rows = connection.execute(wanted.order_by(queries.c.id).limit(limit))
+                statement = statement.where(queries.c.status.in_(statuses))
+            rows = connection.execute(statement.order_by(queries.c.id).limit(limit))
             return [_record(row) for row in rows]
 
     def counts(self, name: str) -> QueryCounts:
@@ -148,8 +148,8 @@ class SqlQueries(port.Queries):
         with self._database.read() as connection:
             ended = expiry.has_ended(leases, leasing.IS_OPEN)
             owners = sa.select(leases.c.surrogate_id).where(ended).distinct()
-            wanted = sa.select(surrogates.c.name).where(surrogates.c.id.in_(owners))
-            names = list(connection.execute(wanted).scalars())
+            statement = sa.select(surrogates.c.name).where(surrogates.c.id.in_(owners))
+            names = list(connection.execute(statement).scalars())
             too_long = expiry.is_too_long(leases, leasing.IS_OPEN)
             set_back = connection.execute(sa.select(sa.exists().where(too_long))).scalar()
         if set_back:
@@ -165,12 +165,12 @@ class SqlQueries(port.Queries):
             return 0
 
 
-def _require_room(connection: Connection, held: Row[Any], steps: int) -> None:
+def _require_room(connection: Connection, surrogate: Row[Any], steps: int) -> None:
     """Raise ``BeyondBudget`` if all audits together would take more steps than the budget and than
     ``LEAST_AUDITED``."""
-    asked = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0), sa.func.max(surrogates.c.budget))
+    sums = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0), sa.func.max(surrogates.c.budget))
     own = (queries.c.surrogate_id == surrogates.c.id) & (queries.c.purpose == "audit")
-    joined = asked.select_from(surrogates.outerjoin(queries, own)).where(surrogates.c.id == held.id)
+    joined = sums.select_from(surrogates.outerjoin(queries, own)).where(surrogates.c.id == surrogate.id)
     before, budget = connection.execute(joined).one()
     limit = max(int(budget), LEAST_AUDITED)
     if before + steps > limit:
@@ -183,8 +183,8 @@ def _require_room(connection: Connection, held: Row[Any], steps: int) -> None:
 def query_counts(connection: Connection, span: Span) -> dict[int, QueryCounts]:
     """Number of queries by status, for each surrogate of the span that has any."""
     counted: defaultdict[int, dict[str, int]] = defaultdict(dict)
-    wanted = sa.select(queries.c.surrogate_id, queries.c.status, sa.func.count()).where(within(queries, span))
-    rows = connection.execute(wanted.group_by(queries.c.surrogate_id, queries.c.status)).all()
+    statement = sa.select(queries.c.surrogate_id, queries.c.status, sa.func.count()).where(within(queries, span))
+    rows = connection.execute(statement.group_by(queries.c.surrogate_id, queries.c.status)).all()
     for surrogate, status, count in rows:
         counted[surrogate][status] = count
     return {surrogate: QueryCounts(**counts) for surrogate, counts in counted.items()}
@@ -202,8 +202,8 @@ def _records() -> sa.Select[Any]:
 
 
 def _read(connection: Connection, surrogate_id: int, query_id: int) -> QueryRecord:
-    wanted = _records().where(queries.c.surrogate_id == surrogate_id, queries.c.id == query_id)
-    row = connection.execute(wanted).one_or_none()
+    statement = _records().where(queries.c.surrogate_id == surrogate_id, queries.c.id == query_id)
+    row = connection.execute(statement).one_or_none()
     if row is None:
         raise leasing.unknown_query(query_id)
     return _record(row)

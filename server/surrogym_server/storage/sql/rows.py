@@ -20,8 +20,8 @@ Span = tuple[int, int]  # of ids of surrogates: the first and the last
 # send it.
 NAMED = surrogates.c.name == sa.bindparam("named")
 FIND = sa.select(surrogates.c.id).where(NAMED)
-HELD = (surrogates.c.id, surrogates.c.phase, surrogates.c.paused, surrogates.c.round, NOW.label("now"))
-HOLD = sa.select(*HELD).where(NAMED).with_for_update(key_share=True)
+LOCKED_COLUMNS = (surrogates.c.id, surrogates.c.phase, surrogates.c.paused, surrogates.c.round, NOW.label("now"))
+HOLD = sa.select(*LOCKED_COLUMNS).where(NAMED).with_for_update(key_share=True)
 TOUCH = (
     sa.update(surrogates).where(surrogates.c.id == sa.bindparam("touched")).values(revision=surrogates.c.revision + 1)
 )
@@ -30,10 +30,10 @@ NEW_EVENT, NEW_REQUEST = sa.insert(events), sa.insert(requests)
 
 def find(connection: Connection, name: str) -> int:
     """Return the surrogate's id."""
-    found = connection.execute(FIND, {"named": name}).scalar()
-    if found is None:
+    row = connection.execute(FIND, {"named": name}).scalar()
+    if row is None:
         raise unknown_surrogate(name)
-    return int(found)
+    return int(row)
 
 
 def hold(connection: Connection, name: str, *extra: sa.ColumnElement[Any]) -> Row[Any]:
@@ -41,10 +41,10 @@ def hold(connection: Connection, name: str, *extra: sa.ColumnElement[Any]) -> Ro
 
     Every writer calls it first, so that writers take turns and events get their ids in order.
     """
-    found = connection.execute(HOLD.add_columns(*extra) if extra else HOLD, {"named": name}).one_or_none()
-    if found is None:
+    row = connection.execute(HOLD.add_columns(*extra) if extra else HOLD, {"named": name}).one_or_none()
+    if row is None:
         raise unknown_surrogate(name)
-    return found
+    return row
 
 
 def within(table: sa.Table, span: Span) -> sa.ColumnElement[bool]:
@@ -56,16 +56,18 @@ def unknown_surrogate(name: str) -> UnknownSurrogate:
     return UnknownSurrogate(f"expected the name of a surrogate, got {name!r}, which does not exist")
 
 
-def append_event(connection: Connection, held: Row[Any], kind: EventKind, **body: Any) -> None:
-    connection.execute(NEW_EVENT, {"surrogate_id": held.id, "kind": kind, "created_at": held.now, "body": body})
+def append_event(connection: Connection, surrogate: Row[Any], kind: EventKind, **body: Any) -> None:
+    connection.execute(
+        NEW_EVENT, {"surrogate_id": surrogate.id, "kind": kind, "created_at": surrogate.now, "body": body}
+    )
 
 
-def touch(connection: Connection, held: Row[Any], **changes: Any) -> None:
+def touch(connection: Connection, surrogate: Row[Any], **changes: Any) -> None:
     """Make the design look at the surrogate again, and change other fields with it."""
-    connection.execute(TOUCH.values(**changes) if changes else TOUCH, {"touched": held.id})
+    connection.execute(TOUCH.values(**changes) if changes else TOUCH, {"touched": surrogate.id})
 
 
-def recall(connection: Connection, held: Row[Any], operation: str, key: str | None, body: str) -> Any:
+def recall(connection: Connection, surrogate: Row[Any], operation: str, key: str | None, body: str) -> Any:
     """Return the earlier result of the operation for this key; None if the key is new.
 
     Raises:
@@ -73,43 +75,45 @@ def recall(connection: Connection, held: Row[Any], operation: str, key: str | No
     """
     if key is None:
         return None
-    found = connection.execute(
+    row = connection.execute(
         sa.select(requests.c.fingerprint, requests.c.result)
-        .where(requests.c.surrogate_id == held.id, requests.c.operation == operation)
+        .where(requests.c.surrogate_id == surrogate.id, requests.c.operation == operation)
         .where(requests.c.key == key)
     ).one_or_none()
-    if found is None:
+    if row is None:
         return None
-    if found.fingerprint != body:
+    if row.fingerprint != body:
         raise IdempotencyConflict(f"expected the same body as in the first request with key {key!r}, got another")
-    return found.result
+    return row.result
 
 
-def remember(connection: Connection, held: Row[Any], operation: str, key: str | None, body: str, result: Any) -> None:
+def remember(
+    connection: Connection, surrogate: Row[Any], operation: str, key: str | None, body: str, result: Any
+) -> None:
     """Keep the result of the operation for this key."""
     if key is not None:
-        row = {"surrogate_id": held.id, "operation": operation, "key": key, "fingerprint": body, "result": result}
+        row = {"surrogate_id": surrogate.id, "operation": operation, "key": key, "fingerprint": body, "result": result}
         connection.execute(NEW_REQUEST, row)
 
 
 def insert_queries(
     connection: Connection,
-    held: Row[Any],
-    wanted: Sequence[Query],
+    surrogate: Row[Any],
+    new_queries: Sequence[Query],
     purpose: Purpose,
     round: int,
     *,
     extra: bool = False,
 ) -> list[int]:
     """Queue queries, and return their ids in the same order. ``extra``: the design alone would not have made them."""
-    if not wanted:
+    if not new_queries:
         return []
-    common = {"surrogate_id": held.id, "purpose": purpose, "round": round, "status": "pending", "attempts": 0}
+    common = {"surrogate_id": surrogate.id, "purpose": purpose, "round": round, "status": "pending", "attempts": 0}
     common["extra"] = extra
-    rows = [common | _columns(query) for query in wanted]
+    rows = [common | _columns(query) for query in new_queries]
     insert = sa.insert(queries).returning(queries.c.id, sort_by_parameter_order=True)
     ids = [int(id) for id in connection.execute(insert, rows).scalars()]
-    append_event(connection, held, "queries", count=len(ids), purpose=purpose, round=round)
+    append_event(connection, surrogate, "queries", count=len(ids), purpose=purpose, round=round)
     return ids
 
 

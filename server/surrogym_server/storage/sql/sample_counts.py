@@ -46,29 +46,29 @@ class CountedSamples:
         self._known: dict[int, SampleCounts] = {}
 
     def of(self, connection: Connection, surrogate_id: int) -> SampleCounts:
-        known = self._known.get(surrogate_id, NONE)
-        since = connection.execute(SINCE, {"owner": surrogate_id, "newest": known.newest})
-        return self._add(surrogate_id, known, since)
+        earlier = self._known.get(surrogate_id, NONE)
+        since = connection.execute(SINCE, {"owner": surrogate_id, "newest": earlier.newest})
+        return self._add(surrogate_id, earlier, since)
 
     def of_many(self, connection: Connection, newest: Mapping[int, int | None]) -> dict[int, SampleCounts]:
         """Count the samples of surrogates by a few statements, given the id of the newest sample of each."""
-        known = {id: self._known.get(id, NONE) for id in newest}
-        stale = [id for id, last in newest.items() if known[id].newest < (last or 0)]
+        earlier = {id: self._known.get(id, NONE) for id in newest}
+        stale = [id for id, last in newest.items() if earlier[id].newest < (last or 0)]
         for first in range(0, len(stale), AT_ONCE):
-            some = {id: known[id] for id in stale[first : first + AT_ONCE]}
-            known |= self._count(connection, some)
-        return known
+            some = {id: earlier[id] for id in stale[first : first + AT_ONCE]}
+            earlier |= self._count(connection, some)
+        return earlier
 
-    def _count(self, connection: Connection, known: Mapping[int, SampleCounts]) -> dict[int, SampleCounts]:
-        since = [_is_since(id, counts) for id, counts in known.items() if counts.newest]
-        new = samples.c.surrogate_id.in_([id for id, counts in known.items() if not counts.newest])
+    def _count(self, connection: Connection, earlier: Mapping[int, SampleCounts]) -> dict[int, SampleCounts]:
+        since = [_is_since(id, counts) for id, counts in earlier.items() if counts.newest]
+        new = samples.c.surrogate_id.in_([id for id, counts in earlier.items() if not counts.newest])
         rows: defaultdict[int, list[Sequence[Any]]] = defaultdict(list)
         for row in connection.execute(BY_PURPOSE.where(sa.or_(new, *since))):
             rows[row[0]].append(row)
-        return {id: self._add(id, counts, rows[id]) for id, counts in known.items()}
+        return {id: self._add(id, counts, rows[id]) for id, counts in earlier.items()}
 
-    def _add(self, surrogate_id: int, known: SampleCounts, since: Iterable[Sequence[Any]]) -> SampleCounts:
-        newest, by_purpose = known.newest, dict(known.by_purpose)
+    def _add(self, surrogate_id: int, earlier: SampleCounts, since: Iterable[Sequence[Any]]) -> SampleCounts:
+        newest, by_purpose = earlier.newest, dict(earlier.by_purpose)
         for _, purpose, count, last in since:
             if purpose not in COUNTED:
                 raise damaged(f"expected one of {list(COUNTED)} in samples.purpose, got {purpose!r}")

@@ -51,21 +51,20 @@ class SqlSamples(port.Samples):
         key: str | None = None,
         log: LogPart | None = None,
     ) -> AddedSamples:
-        told = [asdict(sample) for sample in samples] if key else []
-        body = fingerprint(sampler, told)  # compared only if there is a key
+        body = fingerprint(sampler, [asdict(sample) for sample in samples] if key else [])  # compared if there is a key
         with self._database.write() as connection:
-            held = hold(connection, name)
+            surrogate = hold(connection, name)
             if log is not None:  # the log identifies its samples
-                added = store_logged(connection, held, sampler, samples, log.after)
+                added = store_logged(connection, surrogate, sampler, samples, log.after)
                 if log.complete and added.restart is None:
-                    complete_log(connection, held)
+                    complete_log(connection, surrogate)
                 return added
-            before: list[int] | None = recall(connection, held, "add_samples", key, body)
+            before: list[int] | None = recall(connection, surrogate, "add_samples", key, body)
             if before is not None:
                 return AddedSamples(tuple(before), len(before))
-            answered = read_answered(connection, held, samples)
-            added = _store(connection, held, sampler, samples, answered)
-            remember(connection, held, "add_samples", key, body, added.ids)
+            answered = read_answered(connection, surrogate, samples)
+            added = _store(connection, surrogate, sampler, samples, answered)
+            remember(connection, surrogate, "add_samples", key, body, added.ids)
             return added
 
     def arrays(self, name: str) -> RealSteps:
@@ -110,32 +109,33 @@ class SqlSamples(port.Samples):
 
 def _store(
     connection: Connection,
-    held: Row[Any],
+    surrogate: Row[Any],
     sampler: str,
     batch: Sequence[NewSample],
     answered: Sequence[Answered | None],
 ) -> AddedSamples:
     """Insert the new samples of the batch. A step reported under one lease is one sample."""
-    identities = [_identity(place, *told) for place, told in enumerate(zip(batch, answered, strict=True))]
-    known = {(lease.lease_id, step): sample for lease in answered if lease for step, sample in lease.reported.items()}
-    ids: dict[Identity, int] = {identity: sample.sample_id for identity, sample in known.items()}
-    prints: dict[Identity, str] = {identity: sample.fingerprint for identity, sample in known.items()}
+    identities = [_identity(place, *pair) for place, pair in enumerate(zip(batch, answered, strict=True))]
+    leases = [lease for lease in answered if lease]
+    reported = {(lease.lease_id, step): sample for lease in leases for step, sample in lease.reported.items()}
+    ids: dict[Identity, int] = {identity: sample.sample_id for identity, sample in reported.items()}
+    prints: dict[Identity, str] = {identity: sample.fingerprint for identity, sample in reported.items()}
     new: dict[Identity, dict[str, Any]] = {}
-    made: dict[str, Vector] = {}
+    new_snapshots: dict[str, Vector] = {}
     for identity, sample, lease in zip(identities, batch, answered, strict=True):
-        row = row_of(held, sampler, sample, lease)
+        row = row_of(surrogate, sampler, sample, lease)
         if prints.setdefault(identity, row["fingerprint"]) != row["fingerprint"]:
             raise IdempotencyConflict(
                 f"expected the same sample as first reported for query {sample.query_id}, got another"
             )
         if identity not in ids:
             new.setdefault(identity, row)
-            made |= {} if sample.snapshot is None else {sample.snapshot: sample.next_coordinates}
-    ids |= dict(zip(new, insert_samples(connection, held, sampler, list(new.values())), strict=True))
-    insert_snapshots(connection, held, made)
+            new_snapshots |= {} if sample.snapshot is None else {sample.snapshot: sample.next_coordinates}
+    ids |= dict(zip(new, insert_samples(connection, surrogate, sampler, list(new.values())), strict=True))
+    insert_snapshots(connection, surrogate, new_snapshots)
     if new:
-        touch(connection, held)
-    settle(connection, [lease for lease in answered if lease and not lease.reported])
+        touch(connection, surrogate)
+    settle(connection, [lease for lease in leases if not lease.reported])
     return AddedSamples(tuple(ids[identity] for identity in identities), len(batch) - len(new))
 
 
@@ -148,8 +148,8 @@ def _raw_arrays(surrogate_id: int) -> sa.Select[Any]:
     """Rows of bytes, reward and flag: a bulk read without a Python float for each coordinate."""
     vectors = (samples.c.coordinates, samples.c.action, samples.c.next_coordinates)
     raw: list[Any] = [sa.type_coerce(column, sa.LargeBinary()) for column in vectors]
-    wanted = sa.select(*raw, samples.c.reward, samples.c.terminated, samples.c.purpose)
-    return wanted.where(samples.c.surrogate_id == surrogate_id).order_by(samples.c.id)
+    statement = sa.select(*raw, samples.c.reward, samples.c.terminated, samples.c.purpose)
+    return statement.where(samples.c.surrogate_id == surrogate_id).order_by(samples.c.id)
 
 
 def _matrix(rows: Sequence[bytes]) -> Array:

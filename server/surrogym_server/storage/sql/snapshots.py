@@ -26,53 +26,53 @@ class SqlSnapshots(port.Snapshots):
     def all(self, name: str) -> dict[str, Vector]:
         with self._database.read() as connection:
             own = snapshots.c.surrogate_id == find(connection, name)
-            wanted = sa.select(snapshots.c.name, snapshots.c.coordinates).where(own).order_by(snapshots.c.id)
-            return {row.name: row.coordinates for row in connection.execute(wanted)}
+            statement = sa.select(snapshots.c.name, snapshots.c.coordinates).where(own).order_by(snapshots.c.id)
+            return {row.name: row.coordinates for row in connection.execute(statement)}
 
     def drop(self, name: str, snapshots: Sequence[str]) -> int:
         with self._database.write() as connection:
-            held = hold(connection, name)
-            gone = _forget(connection, held, snapshots)
-            _give_up_queries(connection, held, snapshots)
+            surrogate = hold(connection, name)
+            gone = _forget(connection, surrogate, snapshots)
+            _give_up_queries(connection, surrogate, snapshots)
             return gone
 
 
-def insert_snapshots(connection: Connection, held: Row[Any], made: dict[str, Vector]) -> None:
+def insert_snapshots(connection: Connection, surrogate: Row[Any], new: dict[str, Vector]) -> None:
     """Make snapshots known, by name with their coordinates (C,). A name that is there stays as it is."""
-    if made:
-        rows = [{"surrogate_id": held.id, "name": name, "coordinates": at} for name, at in made.items()]
+    if new:
+        rows = [{"surrogate_id": surrogate.id, "name": name, "coordinates": at} for name, at in new.items()]
         insert = conflict_insert(connection, snapshots).on_conflict_do_nothing()
         connection.execute(insert, rows)
 
 
-def give_up_lost(connection: Connection, held: Row[Any], given_back: QueryRecord) -> None:
+def give_up_lost(connection: Connection, surrogate: Row[Any], given_back: QueryRecord) -> None:
     """Give up a query that was leased while its snapshot was reported as gone. Otherwise samplers would claim it again
     and again."""
     if given_back.snapshot is None or given_back.status != "pending":
         return
-    own = (snapshots.c.surrogate_id == held.id) & (snapshots.c.name == given_back.snapshot)
+    own = (snapshots.c.surrogate_id == surrogate.id) & (snapshots.c.name == given_back.snapshot)
     if not connection.execute(sa.select(sa.exists().where(own))).scalar():
-        _give_up_queries(connection, held, [given_back.snapshot])
+        _give_up_queries(connection, surrogate, [given_back.snapshot])
 
 
-def _forget(connection: Connection, held: Row[Any], names: Sequence[str]) -> int:
-    own = (snapshots.c.surrogate_id == held.id) & snapshots.c.name.in_(names)
+def _forget(connection: Connection, surrogate: Row[Any], names: Sequence[str]) -> int:
+    own = (snapshots.c.surrogate_id == surrogate.id) & snapshots.c.name.in_(names)
     return len(connection.execute(sa.delete(snapshots).where(own).returning(snapshots.c.id)).all())
 
 
-def _give_up_queries(connection: Connection, held: Row[Any], names: Sequence[str]) -> None:
+def _give_up_queries(connection: Connection, surrogate: Row[Any], names: Sequence[str]) -> None:
     """Remove the pending queries that begin at a snapshot that is gone, or set them aside if steps may have been taken.
     What ``improve`` asked for is asked for again."""
     from_there = queries.c.snapshot.in_(names)
-    unbegun = leasing.is_unbegun(held.id) & from_there
+    unbegun = leasing.is_unbegun(surrogate.id) & from_there
     removed = connection.execute(sa.delete(queries).where(unbegun).returning(queries.c.steps, queries.c.extra)).all()
-    waiting = (queries.c.surrogate_id == held.id) & (queries.c.status == "pending") & from_there
+    waiting = (queries.c.surrogate_id == surrogate.id) & (queries.c.status == "pending") & from_there
     aside = sa.update(queries).where(waiting).values(status="set_aside", error=GONE).returning(queries.c.id)
     begun = sorted(connection.execute(aside).scalars())
     if removed:
-        append_event(connection, held, "queries", withdrawn=len(removed), round=held.round)
+        append_event(connection, surrogate, "queries", withdrawn=len(removed), round=surrogate.round)
     for query_id in begun:
-        append_event(connection, held, "set_aside", query_id=query_id, error=GONE)
+        append_event(connection, surrogate, "set_aside", query_id=query_id, error=GONE)
     if removed or begun:
         again = sum(row.steps for row in removed if row.extra)
-        touch(connection, held, extra_queries=surrogates.c.extra_queries + again)
+        touch(connection, surrogate, extra_queries=surrogates.c.extra_queries + again)

@@ -82,10 +82,10 @@ def open_storage(url: str, synchronous: Synchronous = "full") -> Storage:
     return SqlStorage(database)
 
 
-def _way_out(url: str, said: str) -> str:
+def _way_out(url: str, message: str) -> str:
     """Return what to do about a PostgreSQL database that can't be opened."""
     name = sa.make_url(url).database
-    if f'database "{name}" does not exist' in said:
+    if f'database "{name}" does not exist' in message:
         return f"createdb {name} makes it, or check --database"
     return "check that PostgreSQL runs, and the address in --database"
 

@@ -80,13 +80,13 @@ def read_summaries(
     connection: Connection, condition: sa.ColumnElement[bool], limit: int | None, counted: Counted
 ) -> list[SurrogateSummary]:
     """Up to ``limit`` surrogates that meet a condition, oldest first. The condition must choose a range of ids."""
-    wanted = (
+    statement = (
         sa.select(*COLUMNS, sa.type_coerce(surrogates.c.spec, sa.Text), NEWEST, *OPEN_COUNTS)
         .where(condition)
         .order_by(surrogates.c.id)
         .limit(limit)
     )
-    rows = connection.execute(wanted).all()
+    rows = connection.execute(statement).all()
     if not rows:
         return []
     span = (rows[0].id, rows[-1].id)
@@ -95,10 +95,10 @@ def read_summaries(
     newest, none_spent = newest_of(connection, span), LedgerRecord()
     summaries = []
     for row in rows:
-        id, *known, spec, _ = row[: len(COLUMNS) + 2]
+        id, *values, spec, _ = row[: len(COLUMNS) + 2]
         queue = QueryCounts(answered=answers[id][1], **{status: row._mapping[status] for status in UNANSWERED})
         numbers = (spent.get(id, none_spent), queue, *newest.get(id, (None, None)))
-        fields: tuple[Any, ...] = (id, *known, _environment(spec), *numbers)
+        fields: tuple[Any, ...] = (id, *values, _environment(spec), *numbers)
         summaries.append(SurrogateSummary(*fields))
     return summaries
 

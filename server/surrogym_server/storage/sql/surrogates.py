@@ -39,9 +39,9 @@ class SqlSurrogates(port.Surrogates):
         with self._database.write() as connection:
             if not _insert(connection, new):
                 return read(connection, new.name), False
-            held = hold(connection, new.name)
-            append_event(connection, held, "created", name=new.name)
-            initial.begin(connection, held, new.queries)
+            surrogate = hold(connection, new.name)
+            append_event(connection, surrogate, "created", name=new.name)
+            initial.begin(connection, surrogate, new.queries)
         initial.ask(self._database, new.name, new.queries)
         return self.get(new.name), True
 
@@ -51,10 +51,10 @@ class SqlSurrogates(port.Surrogates):
 
     def standing(self, name: str) -> Standing:
         with self._database.read() as connection:
-            found = connection.execute(STANDING, {"named": name}).one_or_none()
-        if found is None:
+            row = connection.execute(STANDING, {"named": name}).one_or_none()
+        if row is None:
             raise unknown_surrogate(name)
-        return Standing(*found)
+        return Standing(*row)
 
     def name_of(self, id: int) -> str:
         with self._database.read() as connection:
@@ -66,10 +66,10 @@ class SqlSurrogates(port.Surrogates):
 
     def summary(self, name: str) -> SurrogateSummary:
         with self._database.read() as connection:
-            found = read_summaries(connection, surrogates.c.name == name, 1, self._counted)
-        if not found:
+            summaries = read_summaries(connection, surrogates.c.name == name, 1, self._counted)
+        if not summaries:
             raise unknown_surrogate(name)
-        return found[0]
+        return summaries[0]
 
     def summaries(self, after: int = 0, limit: int | None = None) -> list[SurrogateSummary]:
         with self._database.read() as connection:
@@ -85,33 +85,33 @@ class SqlSurrogates(port.Surrogates):
         tolerances: dict[str, float | None] | None = None,
     ) -> SurrogateRecord:
         with self._database.write() as connection:
-            held = hold(connection, name)
+            surrogate = hold(connection, name)
             before = read(connection, name)
             merged = None if tolerances is None else _set_or_taken_back(before.tolerances, tolerances)
-            asked = {"paused": paused, "budget": budget, "target": target, "tolerances": merged}
+            fields = {"paused": paused, "budget": budget, "target": target, "tolerances": merged}
             changes: dict[str, Any] = {
-                field: value for field, value in asked.items() if value is not None and value != getattr(before, field)
+                field: value for field, value in fields.items() if value is not None and value != getattr(before, field)
             }
             if paused is False and before.phase == "failed":
                 changes |= {"phase": resting_phase(before.round), "error": None}
-            again = requeue_set_aside(connection, held) if paused is False else 0
+            again = requeue_set_aside(connection, surrogate) if paused is False else 0
             if not changes and not again:
                 return before
             smaller = budget if budget is not None and budget < before.budget else None
             if smaller is not None:
-                initial.end(connection, held)
+                initial.end(connection, surrogate)
             if smaller is not None or changes.keys() & {"target", "tolerances"}:
-                changes |= _withdraw_unbegun(connection, held, before, smaller)
+                changes |= _withdraw_unbegun(connection, surrogate, before, smaller)
             if changes:
-                _apply(connection, held, changes)
-            told = {"asked_again": again} if again else {}
-            append_event(connection, held, "phase", **{"phase": before.phase, **changes, **told})
+                _apply(connection, surrogate, changes)
+            requeued = {"asked_again": again} if again else {}
+            append_event(connection, surrogate, "phase", **{"phase": before.phase, **changes, **requeued})
             return read(connection, name)
 
     def set_phase(self, name: str, phase: Phase, error: str | None = None) -> None:
         with self._database.write() as connection:
-            held = hold(connection, name)
-            update_phase(connection, held, phase, error)
+            surrogate = hold(connection, name)
+            update_phase(connection, surrogate, phase, error)
 
     def delete(self, name: str) -> None:
         with self._database.write() as connection:
@@ -133,10 +133,10 @@ def read(connection: Connection, name: str) -> SurrogateRecord:
     return _record(row)
 
 
-def update_phase(connection: Connection, held: Row[Any], phase: Phase, error: str | None) -> None:
-    update = sa.update(surrogates).where(surrogates.c.id == held.id)
+def update_phase(connection: Connection, surrogate: Row[Any], phase: Phase, error: str | None) -> None:
+    update = sa.update(surrogates).where(surrogates.c.id == surrogate.id)
     connection.execute(update.values(phase=phase, error=error))
-    append_event(connection, held, "phase", phase=phase, error=error)
+    append_event(connection, surrogate, "phase", phase=phase, error=error)
 
 
 def resting_phase(round: int) -> Phase:
@@ -169,12 +169,12 @@ def _insert(connection: Connection, new: NewSurrogate) -> bool:
 
 
 def _set_or_taken_back(before: dict[str, float], changes: dict[str, float | None]) -> dict[str, float]:
-    kept = {name: value for name, value in before.items() if name not in changes}
-    return kept | {name: value for name, value in changes.items() if value is not None}
+    others = {name: value for name, value in before.items() if name not in changes}
+    return others | {name: value for name, value in changes.items() if value is not None}
 
 
 def _withdraw_unbegun(
-    connection: Connection, held: Row[Any], before: SurrogateRecord, budget: int | None
+    connection: Connection, surrogate: Row[Any], before: SurrogateRecord, budget: int | None
 ) -> dict[str, Any]:
     """Withdraw the queries that the design chose for another target, tolerance or budget and that no sampler has begun,
     and the right of a running fit.
@@ -182,16 +182,16 @@ def _withdraw_unbegun(
     Queries added by ``improve`` are requested again, unless there is a smaller ``budget``; initial queries beyond that
     are withdrawn too. Returns the resulting changes of the surrogate.
     """
-    unbegun = is_unbegun(held.id)
-    chosen = sa.delete(queries).where(unbegun, queries.c.purpose == "adaptive")
-    withdrawn = connection.execute(chosen.returning(queries.c.steps, queries.c.extra)).all()
-    connection.execute(sa.update(surrogates).where(surrogates.c.id == held.id).values(**removal.NO_RIGHT))
-    changes = {"phase": resting_phase(held.round)} if held.phase == "fitting" else {}
+    unbegun = is_unbegun(surrogate.id)
+    statement = sa.delete(queries).where(unbegun, queries.c.purpose == "adaptive")
+    withdrawn = connection.execute(statement.returning(queries.c.steps, queries.c.extra)).all()
+    connection.execute(sa.update(surrogates).where(surrogates.c.id == surrogate.id).values(**removal.NO_RIGHT))
+    changes = {"phase": resting_phase(surrogate.round)} if surrogate.phase == "fitting" else {}
     if budget is None:
         again = sum(row.steps for row in withdrawn if row.extra)
         return {**changes, "extra_queries": before.extra_queries + again} if again else changes
     initial = sa.select(queries.c.id, queries.c.steps).where(unbegun, queries.c.purpose == "initial")
-    beyond, gone = spoken_for(connection, held.id) - budget, []
+    beyond, gone = spoken_for(connection, surrogate.id) - budget, []
     for row in connection.execute(initial.order_by(queries.c.id.desc())):
         if beyond < row.steps:
             break
@@ -213,8 +213,8 @@ def spoken_for(connection: Connection, surrogate_id: int) -> int:
     return int(connection.execute(sa.select(taken.scalar_subquery() + awaited.scalar_subquery())).scalar_one())
 
 
-def _apply(connection: Connection, held: Row[Any], changes: dict[str, Any]) -> None:
+def _apply(connection: Connection, surrogate: Row[Any], changes: dict[str, Any]) -> None:
     if changes.keys() - {"paused"}:
-        touch(connection, held, **changes)
+        touch(connection, surrogate, **changes)
     else:
-        connection.execute(sa.update(surrogates).where(surrogates.c.id == held.id).values(**changes))
+        connection.execute(sa.update(surrogates).where(surrogates.c.id == surrogate.id).values(**changes))
