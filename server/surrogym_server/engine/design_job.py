@@ -111,16 +111,16 @@ def judge_stored(job: DesignJob, stored: bytes) -> DesignResult:
     model, samples = from_bytes(job.definition, stored), _samples(job)
     usual = job.state.get("usual") or usual_tolerances(job.definition, model.scales.tolist())
     state = DesignState.from_json(job.state)
-    judged = judge_model(model, samples, usual, _request(job), state)
+    judgement = judge_model(model, samples, usual, _request(job), state)
     return DesignResult(
         model=stored,
         description=model.description,
         fidelity=fidelity_fields(
-            model, judged.confidences, judged.tolerances, job.target, reached_limits(job.definition, samples)
+            model, judgement.confidences, judgement.tolerances, job.target, reached_limits(job.definition, samples)
         ),
         data_hash=model.digest,
         state=job.state,
-        verdict=judged.verdict if model.digest == samples.digest else "continue",
+        verdict=judgement.verdict if model.digest == samples.digest else "continue",
         seconds=time.perf_counter() - started,
     )
 

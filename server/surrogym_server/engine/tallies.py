@@ -58,7 +58,7 @@ class Durations:
 
 @dataclass(frozen=True)
 class Episode:
-    """A finished episode. ``reward`` is the imagined return, ``penalty`` the part subtracted for deviations."""
+    """A finished episode. ``reward`` is the imagined return, ``penalty`` the part subtracted for uncertainty."""
 
     reward: float
     penalty: float

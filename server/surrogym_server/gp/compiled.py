@@ -1,4 +1,4 @@
-"""One process in compiled code: mean and latent deviation of a block of inputs, (d, B), one input in each column.
+"""One process in compiled code: mean and latent standard deviation of a block of inputs (d, B), one in each column.
 
 Exponents are computed by differences, which cost no more than products here (see ``gp.serving``, the reference).
 """
@@ -220,10 +220,10 @@ def _add_residuals(
 def predict(
     numbers: Floats, places: Ints, at: int, x: Floats, wanted: bool, paths: Floats, mean: Floats, deviation: Floats
 ) -> None:
-    """Write the mean and, if wanted, the latent deviation at inputs x (d, B), in the output's unit, to arrays (B,)
-    each.
+    """Write the mean and, if wanted, the latent standard deviation at inputs x (d, B) to arrays (B,) each.
 
-    With ``paths`` (B, W) the value of a drawn function, one for each column of x, replaces the mean.
+    Both are in the output's unit. With ``paths`` (B, W) the value of a posterior sample, one for each column of x,
+    replaces the mean.
     """
     head, inputs = matrix(numbers, places, at + HEAD), matrix(numbers, places, at + INPUTS)
     points, weights = matrix(numbers, places, at + POINTS), matrix(numbers, places, at + WEIGHTS)

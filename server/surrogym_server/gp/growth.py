@@ -32,7 +32,7 @@ from surrogym_server.gp.posterior import condition
 from surrogym_server.gp.search import Evidence, blas, minimum
 from surrogym_server.tensors import EDGE, STEEPEST, amplitude, bend
 
-PRIOR = 1.0  # deviation of a rate; inputs have deviation near 1
+PRIOR = 1.0  # standard deviation of a rate; inputs have standard deviation near 1
 FLAT = 1e-3  # smaller rates are 0: they bend nothing
 
 Array = NDArray[np.float64]

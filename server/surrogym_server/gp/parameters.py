@@ -21,9 +21,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Parts of the kernel, and the normal priors on logarithms: (mean, deviation). Inputs and outputs are standardised.
+    """Parts of the kernel, and the normal priors on logarithms: (mean, standard deviation).
 
-    The length scale's prior grows with sqrt(d), as distances do (Hvarfner et al., ICML 2024).
+    Inputs and outputs are standardised. The length scale's prior grows with sqrt(d), as distances do (Hvarfner et al., ICML 2024).
     """
 
     linear: bool = True  # parts beside the squared exponential
@@ -46,7 +46,7 @@ class Parameters:
         lengthscale = (options.lengthscale_prior[0] + 0.5 * math.log(d), options.lengthscale_prior[1])
         priors = [lengthscale] * d + [options.signal_prior]
         priors += [options.linear_prior] * options.linear + [options.quadratic_prior] * options.quadratic
-        self.prior = np.array([*priors, options.noise_prior])  # mean and deviation of each
+        self.prior = np.array([*priors, options.noise_prior])  # mean and standard deviation of each
         self.prior_constant = float(np.log(self.prior[:, 1]).sum())
         size = len(self.prior)
         self.lower, self.upper = np.full(size, math.log(1e-8)), np.full(size, math.log(1e4))
@@ -76,7 +76,9 @@ class Parameters:
         return values[: self.d], float(values[self.d]), linear, quadratic, float(values[-1])
 
     def in_deviations(self, theta: Array) -> Array:
-        """Distance of theta from the priors' means, in their deviations. The priors' negative log density is half of
-        its square, ``prior_constant``, and log(2 pi) / 2 for each."""
+        """Distance of theta from the priors' means, in their standard deviations.
+
+        The priors' negative log density is half of its square, ``prior_constant``, and log(2 pi) / 2 for each.
+        """
         distance: Array = (theta - self.prior[:, 0]) / self.prior[:, 1]
         return distance

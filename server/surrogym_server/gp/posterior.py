@@ -25,7 +25,7 @@ class LeftOut:
     """Accuracy of a process in predicting each of its points from all others."""
 
     error: float  # root mean square, in units of y
-    within_one: float  # share of the points within one predictive deviation
+    within_one: float  # share of the points within one predictive standard deviation
     within_two: float
     log_density: float  # mean log predictive density
 
@@ -43,7 +43,7 @@ class Sparse:
     """The points that a process with inducing points represents, and the loss that this causes."""
 
     points: int  # number of points that it was fitted to
-    unexplained: float  # root mean square deviation that is left at them, in prior deviations; 0 if nothing is lost
+    unexplained: float  # root mean variance at them that inducing points leave, in prior standard deviations
     left_out: LeftOut  # accuracy at these points
 
 

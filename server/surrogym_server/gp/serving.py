@@ -29,7 +29,7 @@ from surrogym_server.tensors import CPU, in_blocks
 
 BLOCK = 262_144  # covariances held at once: they stay in the cache, and memory is bounded at any batch size
 MIN_ROWS = 64
-MEAN_TOLERANCE = 1e-8  # of the prior's deviation
+MEAN_TOLERANCE = 1e-8  # of the prior's standard deviation
 VARIANCE_TOLERANCE = 5e-10  # of the prior's variance
 
 
@@ -73,7 +73,7 @@ class _Process:
         return exponent
 
     def deviation(self, x: Tensor, z: Tensor, squared: Tensor, smooth: Tensor) -> Tensor:
-        """Latent deviation (m,), in the output's unit. Overwrites its columns of ``smooth`` (m, S)."""
+        """Latent standard deviation (m,), in the output's unit. Overwrites its columns of ``smooth`` (m, S)."""
         k = smooth[:, self.span]
         if self.variance_by_differences and not self.mean_by_differences:
             k = self.exponent(x).exp_()
@@ -130,7 +130,7 @@ class Serving:
         return in_blocks(self.rows, lambda rows: (self._means(*self._covariances(rows)),), x)[0]
 
     def mean_and_deviation(self, x: Tensor, wanted: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Means at x (m, d), and the latent deviations of the columns ``wanted``, 0 in the others: (m, O) each."""
+        """Means at x (m, d), and latent standard deviations of the columns ``wanted``, 0 in the others: (m, O) each."""
 
         def block(rows: Tensor) -> tuple[Tensor, Tensor]:
             z, smooth = self._covariances(rows)
@@ -238,7 +238,7 @@ def _error_bounds(posterior: Posterior) -> tuple[float, float]:
     farthest point.
 
     With delta the largest error of an exponent, the error of the mean is at most sigma_f^2 delta |beta|_1, in prior
-    deviations, and that of the variance 2 |L^-1 k| |L^-1 dk| <= 2 s sigma_f^2 delta sqrt(n) / sigma_n, in prior
+    standard deviations. That of the variance is 2 |L^-1 k| |L^-1 dk| <= 2 s sigma_f^2 delta sqrt(n) / sigma_n, in prior
     variances; s^2 = sigma_f^2 + sigma_l^2 is the smallest prior variance. Mirror images double both. For an odd process
     s^2 = sigma_f^2, because its variance is 0 on the mirror, where it is known.
     """

@@ -42,7 +42,7 @@ class CandidateView:
     output: int  # number of the output, in the order of the definition
     tolerance: float  # of the output, in its unit
     deviation: Tensor  # (m,) latent, in the output's unit, as if all pending queries had been answered
-    distance: Tensor  # (m,) to the nearest query so far, in deviations of the sampling range
+    distance: Tensor  # (m,) to the nearest query so far, in standard deviations of the sampling range
     log_probability: Tensor  # (m,) log P_i (eq. 11); 0 unless the acquisition reads it
     _reduction: Callable[[], Tensor]
 
@@ -64,7 +64,7 @@ class PathView:
 
     @cached_property
     def deviation(self) -> Tensor:
-        """Latent deviation at each step, in the output's unit, (b, T)."""
+        """Latent standard deviation at each step, in the output's unit, (b, T)."""
         return self._deviation()
 
     @cached_property

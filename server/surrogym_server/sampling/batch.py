@@ -16,39 +16,39 @@ from surrogym_server.sampling.acquisition import CandidateView, acquisition_of, 
 from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.outlook import outlook_of
 
-NEAR = 0.02  # queries closer than this, in deviations of the sampling range, are near-duplicates
+NEAR = 0.02  # queries closer than this, in standard deviations of the sampling range, are near-duplicates
 
 
 def choose(
     model: DynamicsModel,
     candidates: Candidates,
-    taken: Points,
-    assumed: Points,
-    wanted: Sequence[int],
+    earlier: Points,
+    unanswered: Points,
+    outputs: Sequence[int],
     tolerances: Sequence[float],
 ) -> list[int]:
-    """Choose a greedy batch: for each output in ``wanted`` the best candidate, given answers to those chosen before it.
+    """Choose a greedy batch: for each of the ``outputs`` the best candidate, given answers to those chosen before it.
 
     Args:
-        model: the model whose deviations the batch should lower.
+        model: the model whose standard deviations the batch should lower.
         candidates: points to choose from; the first query is a reserved one, if there is one.
-        taken: all queries so far, answered or not; no query close to one of them is chosen.
-        assumed: unanswered queries, which are treated as answered.
-        wanted: for each query, the number of the output that it is chosen for.
+        earlier: all queries so far, answered or not; no query close to one of them is chosen.
+        unanswered: those without an answer, which are treated as answered.
+        outputs: for each query, the number of the output that it is chosen for.
         tolerances: (O,) in each output's unit.
 
     Returns:
-        Indices of candidates; fewer than wanted if no distinct candidate is left.
+        Indices of candidates; fewer than ``outputs`` if no distinct candidate is left.
     """
     definition, points = model.definition, candidates.points
     acquisition = definition.design.acquisition
     # The covariances of the reference cost the most.
     reads = acquisition_of(acquisition).reads_reference
     reference = candidates.reference if reads else candidates.reference[:0]
-    outlook = outlook_of(model, points, reference, assumed)
-    distance = nearest(definition, points, taken)
+    outlook = outlook_of(model, points, reference, unanswered)
+    distance = nearest(definition, points, earlier)
     picks: list[int] = []
-    for column in wanted:
+    for column in outputs:
         output, allowed = outlook[column], distance >= NEAR
         if not bool(allowed.any()):
             break
@@ -98,8 +98,8 @@ def candidate_view(
     )
 
 
-def nearest(definition: EnvironmentDefinition, points: Points, taken: Points) -> Tensor:
-    """Distance of m points to the nearest taken query, in deviations of the sampling range, (m,)."""
-    if not len(taken):
+def nearest(definition: EnvironmentDefinition, points: Points, earlier: Points) -> Tensor:
+    """Distance of m points to the nearest taken query, in standard deviations of the sampling range, (m,)."""
+    if not len(earlier):
         return points.q.new_full((len(points),), torch.inf)
-    return distances(definition, points, taken).amin(1)
+    return distances(definition, points, earlier).amin(1)

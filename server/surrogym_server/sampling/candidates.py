@@ -81,5 +81,5 @@ def under_random_actions(definition: EnvironmentDefinition, states: Tensor, rng:
 
 
 def _visited(definition: EnvironmentDefinition, states: Tensor, count: int, rng: np.random.Generator) -> Points:
-    chosen = torch.from_numpy(rng.integers(len(states), size=count))
-    return under_random_actions(definition, states[chosen], rng)
+    rows = torch.from_numpy(rng.integers(len(states), size=count))
+    return under_random_actions(definition, states[rows], rng)

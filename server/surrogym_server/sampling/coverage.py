@@ -26,10 +26,10 @@ def covered(definition: EnvironmentDefinition, q: Array, u: Array, logged_q: Arr
     """
     if not len(q) or not len(logged_q):
         return np.zeros(len(q), dtype=np.bool_)
-    asked, logged = _places(definition, q, u), _places(definition, logged_q, logged_u)
-    tree = scipy.spatial.cKDTree(asked)
-    other = tree.query(asked, k=2)[0][:, 1]  # infinite where there is none
-    nearest: Array = scipy.spatial.cKDTree(logged).query(asked)[0]
+    queries, steps = _places(definition, q, u), _places(definition, logged_q, logged_u)
+    tree = scipy.spatial.cKDTree(queries)
+    other = tree.query(queries, k=2)[0][:, 1]  # infinite where there is none
+    nearest: Array = scipy.spatial.cKDTree(steps).query(queries)[0]
     result: Bools = nearest < 0.5 * other
     return result
 

@@ -62,19 +62,19 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         ChoiceFailed: the acquisition broke its laws.
     """
     # Fit.
-    learned = learn(definition, samples, state.warm)
+    fit = learn(definition, samples, state.warm)
     default = frozen_tolerances(definition, samples, Usual(state.usual, state.ranges))
 
     # Judge.
-    judged = judge_model(learned.model, samples, default.tolerances, request, state)
+    judgement = judge_model(fit.model, samples, default.tolerances, request, state)
     tolerances = definition.tolerances_over(default.tolerances)
     now = (float(len(samples) - request.free), float(request.budget), request.target, *tolerances)
-    outcome = outcome_of(judged, state, request, now)
+    outcome = outcome_of(judgement, state, request, now)
     testing = outcome == "ready" and _is_untested(definition, samples, state)
 
     # Choose.
     continues = outcome == "continue" or testing
-    round = Round(state.round, learned.model, samples, request, judged, default.tolerances, continues, testing)
+    round = Round(state.round, fit.model, samples, request, judgement, default.tolerances, continues, testing)
     queries = _choose(round)
     verdict = _verdict(round, outcome, queries)
 
@@ -84,13 +84,13 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         round=state.round + 1,
         usual=default.tolerances,
         ranges=default.ranges,
-        warm=learned.warm,
+        warm=fit.warm,
         ended_with=now if ended else (),
         ended_as=verdict if ended else "",
         predictions=state.predictions,
         tested_at=tested_at if outcome == "ready" else 0,
     )
-    return Decision(learned.model, judged.confidences, judged.tolerances, following, verdict, queries)
+    return Decision(fit.model, judgement.confidences, judgement.tolerances, following, verdict, queries)
 
 
 def _choose(round: Round) -> tuple[Query, ...]:
@@ -109,7 +109,7 @@ def _verdict(round: Round, outcome: Verdict, queries: tuple[Query, ...]) -> Verd
         return outcome
     if queries or round.request.open:
         return "continue"
-    return "unsure" if round.spent < round.request.budget else "over_budget"
+    return "unsure" if round.cost < round.request.budget else "over_budget"
 
 
 def _is_untested(definition: EnvironmentDefinition, samples: Samples, state: DesignState) -> bool:

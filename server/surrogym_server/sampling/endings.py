@@ -73,13 +73,13 @@ def _predicted(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor |
     return ends if bool(ends.any()) else None
 
 
-def unexplored(definition: EnvironmentDefinition, seen: Tensor, q: Tensor) -> Tensor:
+def unexplored(definition: EnvironmentDefinition, states: Tensor, q: Tensor) -> Tensor:
     """Distance of q (m, C) beyond the seen states (n, C), (m,): the sum over both ends of every moving coordinate, in
     units of the seen range. An unseen ending may lie there."""
     columns = list(definition.moving)
-    if not len(seen):
+    if not len(states):
         return q.new_ones(len(q))
-    low, high = seen[:, columns].amin(0), seen[:, columns].amax(0)
+    low, high = states[:, columns].amin(0), states[:, columns].amax(0)
     width = (high - low).clamp_min(1e-12)
     at = q[:, columns]
     return (((at - high) / width).clamp_min(0) + ((low - at) / width).clamp_min(0)).clamp_max(1).sum(-1)

@@ -21,7 +21,7 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.rollouts import Sequences, best_rollout, predict_paths
 from surrogym_shared.nouns import Query, Vector
 
-FAR = 0.5  # deviations of the sampling range between the end of an excursion and the nearest sample
+FAR = 0.5  # standard deviations of the sampling range between the end of an excursion and the nearest sample
 LONGEST = 16  # actions in an excursion
 
 
@@ -51,6 +51,6 @@ def _reach(model: DynamicsModel, samples: Tensor, starts: Tensor, sequences: Seq
 
 
 def _state_distances(definition: EnvironmentDefinition, a: Tensor, b: Tensor) -> Tensor:
-    """Distances of states a (m, C) and b (n, C), in deviations of the sampling range, (m, n)."""
+    """Distances of states a (m, C) and b (n, C), in standard deviations of the sampling range, (m, n)."""
     still = (Points(q, q.new_zeros(len(q), definition.action.size)) for q in (a, b))
     return distances(definition, *still)

@@ -29,7 +29,7 @@ from surrogym_shared.nouns import Verdict
 
 
 @dataclass(frozen=True)
-class Judged:
+class Judgement:
     """Verdict on a model."""
 
     confidences: tuple[OutputConfidence, ...]  # per output
@@ -44,7 +44,7 @@ def judge_model(
     usual: Sequence[float],
     request: Request,
     state: DesignState,
-) -> Judged:
+) -> Judgement:
     """Judge a model by its definition's tolerances, or else by the ``usual`` ones (O,). Raises ``PluginFailed``."""
     definition = model.definition
     with plugin_calls(definition):
@@ -58,7 +58,7 @@ def judge_model(
     with plugin_calls(definition):
         deviation = deviations(model, points.q, points.u)
         require_deviations(model, deviation)
-        judged = confidences_of(model, points, deviation, tolerances)
+        without_noise = confidences_of(model, points, deviation, tolerances)
     confidences = tuple(
         replace(
             c,
@@ -67,7 +67,7 @@ def judge_model(
             past=past[i],
             prequential=scores_of(state.predictions[i], tolerances[i]) if state.predictions else None,
         )
-        for i, (c, w, one) in enumerate(zip(judged, noise, sensors, strict=True))
+        for i, (c, w, one) in enumerate(zip(without_noise, noise, sensors, strict=True))
     )
     candidates = candidates_of(model, points, request.states, generator_for(definition, f"visited {state.round}"))
     candidates = replace(candidates, reserved=ending(model, samples, candidates.points))
@@ -82,7 +82,7 @@ def judge_model(
         if candidates.reserved is None or state.round % 2:  # the two alternate
             candidates = with_reserved(candidates, peak)
     verdict = judge(definition, confidences, tolerances, len(samples), request, settled)
-    return Judged(confidences, tolerances, verdict, candidates)
+    return Judgement(confidences, tolerances, verdict, candidates)
 
 
 def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
@@ -106,17 +106,17 @@ def judge(
     the model. Logged samples can replace initial queries but not adaptive ones, because nobody chose them to disprove
     the model.
     """
-    initial, spent = definition.design.initial, samples - request.free
+    initial, cost = definition.design.initial, samples - request.free
     sure = all(c.confidence_index >= request.target for c in confidences)
     if definition.design.stopping == "tested_confidence":
         sure = sure and all(agrees(c, t) for c, t in zip(confidences, tolerances, strict=True))
-        sure = sure and settled and spent + min(request.logged, initial) >= math.ceil(1.5 * initial)
+        sure = sure and settled and cost + min(request.logged, initial) >= math.ceil(1.5 * initial)
         sure = sure and request.budget > 0
     if sure:
         return "ready"
     if request.budget == 0:
         return "from_log"
-    return "continue" if spent < request.budget else "over_budget"
+    return "continue" if cost < request.budget else "over_budget"
 
 
 def agrees(confidence: OutputConfidence, tolerance: float) -> bool:
@@ -125,20 +125,20 @@ def agrees(confidence: OutputConfidence, tolerance: float) -> bool:
     return confidence.leave_one_out_error is not None and confidence.leave_one_out_error <= limit
 
 
-def outcome_of(judged: Judged, state: DesignState, request: Request, now: tuple[float, ...]) -> Verdict:
+def outcome_of(judgement: Judgement, state: DesignState, request: Request, now: tuple[float, ...]) -> Verdict:
     """The verdict on a model, given how the design ended before.
 
     A design that was ready stays ready, unless a person has asked for more or the steps since then contradict it. A fit
     to more steps may lower a confidence index a little, although the model had predicted them all. Audits and logs
     don't make a design that has ended take further real steps.
     """
-    if judged.verdict in ("ready", "from_log"):
-        return judged.verdict
-    if state.ended_as == "ready" and not _asks_more(now, state.ended_with) and not _contradicted(judged, request):
+    if judgement.verdict in ("ready", "from_log"):
+        return judgement.verdict
+    if state.ended_as == "ready" and not _asks_more(now, state.ended_with) and not _contradicted(judgement, request):
         return "ready"
-    if judged.verdict == "continue" and (now == state.ended_with or request.is_mostly_refused(now[0])):
+    if judgement.verdict == "continue" and (now == state.ended_with or request.is_mostly_refused(now[0])):
         return "unsure"
-    return judged.verdict
+    return judgement.verdict
 
 
 def _asks_more(now: tuple[float, ...], before: tuple[float, ...]) -> bool:
@@ -147,11 +147,11 @@ def _asks_more(now: tuple[float, ...], before: tuple[float, ...]) -> bool:
     return now[1:3] != before[1:3] or smaller
 
 
-def _contradicted(judged: Judged, request: Request) -> bool:
+def _contradicted(judgement: Judgement, request: Request) -> bool:
     """Whether the errors of an output are larger than its tolerance: those of the predictions of the latest steps or,
     without any, the leave-one-out errors."""
     surprises = request.surprises
-    for i, (confidence, tolerance) in enumerate(zip(judged.confidences, judged.tolerances, strict=True)):
+    for i, (confidence, tolerance) in enumerate(zip(judgement.confidences, judgement.tolerances, strict=True)):
         latest = surprises[i] if surprises else ()
         error = confidence.leave_one_out_error or 0.0
         if latest:

@@ -26,12 +26,12 @@ def reached_limits(definition: EnvironmentDefinition, samples: Samples) -> tuple
     """Limits at which at least ``MANY`` of the samples end, the most frequent first."""
     if not len(samples):
         return ()
-    found: list[Limit] = []
+    limits: list[Limit] = []
     sides = limit_sides(definition, samples.q_next)
     for index in definition.moving:
         coordinate, side = definition.coordinates[index], sides[:, index]
-        found += [
+        limits += [
             Limit(coordinate.name, "lower", coordinate.low, float((side < 0).double().mean())),
             Limit(coordinate.name, "upper", coordinate.high, float((side > 0).double().mean())),
         ]
-    return tuple(sorted((one for one in found if one.share >= MANY), key=lambda one: -one.share))
+    return tuple(sorted((one for one in limits if one.share >= MANY), key=lambda one: -one.share))

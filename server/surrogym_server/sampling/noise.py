@@ -1,8 +1,9 @@
 """Tell noise of the original environment from misfit of the model, by steps that are taken twice.
 
 A process that does not fit its samples explains the rest as noise. Only a repeat of the same step shows which it is: a
-deterministic environment gives the same result. Repeats are few, so each conclusion is a chi-squared test of the sum of
-their squared deviations, at the level ``LEVEL``. Steps are repeated until every doubtful output has a conclusion.
+deterministic environment gives the same result. Repeats are few, so each conclusion is a chi-squared test, at the level
+``LEVEL``, of the sum of their squared differences from their mean. Steps are repeated until every doubtful output has a
+conclusion.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ ENOUGH = 3  # degrees of freedom from repeated steps, before noise counts as est
 STAGES = (1, ENOUGH, 6, 9)  # degrees of freedom after which the repeats are tested
 LEVEL = 0.01  # of each test
 NEGLIGIBLE = 0.5  # of the tolerance: noise of this size is established in at most ``LEVEL`` of the cases
-AT_MOST = 3.0  # largest ratio of learned noise to measured deviation; the rest is misfit, even if there are few repeats
+AT_MOST = 3.0  # largest ratio of learned noise to that of the repeats; the rest is misfit, even if repeats are few
 SLACK = 1.25  # a leave-one-out error beyond the noise that few samples leave
 
 
@@ -34,12 +35,15 @@ class Repeats:
     """Differences between results of the same step."""
 
     degrees: int  # of freedom
-    deviation: Tensor  # (O,) of one result, in each output's unit
+    deviation: Tensor  # (O,) standard deviation of one result, in each output's unit
 
 
 def repeats(model: DynamicsModel, samples: Samples) -> Repeats:
-    """Pool the deviations of repeated steps in the samples: of equal state, action and, in an episode, step before.
-    Otherwise, what an environment remembers of the step before would count as noise."""
+    """Pool the differences between results of the same step.
+
+    Two samples are the same step if their states and actions are equal and, in an episode, those of the steps before.
+    Otherwise, what an environment remembers of the step before would count as noise.
+    """
     targets = torch.cat([increments(model.definition, samples), samples.reward[:, None]], -1)
     groups, member = torch.unique(_conditions(model.definition, samples), dim=0, return_inverse=True)
     counts = torch.bincount(member, minlength=len(groups)).to(targets.dtype)
@@ -62,12 +66,12 @@ def _conditions(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Tensor:
     """Deviation of each output's noise that repeated steps confirm, in its unit, (O,). It is 0 if there is none, or if
     it is below the tolerance."""
-    learned, limits = _learned(model, tolerances)
-    found = repeats(model, samples)
-    if found.degrees < ENOUGH:
-        return torch.zeros_like(learned)
-    confirmed = (learned > limits) & _confirmed(found, limits)
-    return torch.where(confirmed, learned.minimum(AT_MOST * found.deviation), 0.0)
+    model_noise, limits = _model_noise(model, tolerances)
+    differences = repeats(model, samples)
+    if differences.degrees < ENOUGH:
+        return torch.zeros_like(model_noise)
+    confirmed = (model_noise > limits) & _confirmed(differences, limits)
+    return torch.where(confirmed, model_noise.minimum(AT_MOST * differences.deviation), 0.0)
 
 
 def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Points | None:
@@ -78,29 +82,29 @@ def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float
     repeats may have found too little noise. None if none is needed. Steps that ended at a bound are not repeated,
     because the bound hides their noise.
     """
-    learned, limits = _learned(model, tolerances)
-    found = repeats(model, samples)
-    if not found.degrees and not bool((learned > limits).any()):
-        learned = _possible(model, limits)
-    doubtful = learned > limits
-    if found.degrees:
-        doubtful &= ~_refuted(found, learned)
-    if found.degrees >= ENOUGH:
+    model_noise, limits = _model_noise(model, tolerances)
+    differences = repeats(model, samples)
+    if not differences.degrees and not bool((model_noise > limits).any()):
+        model_noise = _possible(model, limits)
+    doubtful = model_noise > limits
+    if differences.degrees:
+        doubtful &= ~_refuted(differences, model_noise)
+    if differences.degrees >= ENOUGH:
         noise = established_noise(model, samples, tolerances)
-        doubtful &= ~_confirmed(found, limits) | _unexplained(model, limits, noise)
-    following = next((stage for stage in STAGES if stage > found.degrees), None)
+        doubtful &= ~_confirmed(differences, limits) | _unexplained(model, limits, noise)
+    following = next((stage for stage in STAGES if stage > differences.degrees), None)
     if following is None or not bool(doubtful.any()):
         return None
     definition = model.definition
     free = definition.can_be_set(samples.q) & ~saturated(definition, samples.q_next)
-    which = free.nonzero()[found.degrees : following, 0]
+    which = free.nonzero()[differences.degrees : following, 0]
     return Points(samples.q[which], samples.u[which]) if len(which) else None
 
 
-def _confirmed(found: Repeats, limits: Tensor) -> Tensor:
+def _confirmed(differences: Repeats, limits: Tensor) -> Tensor:
     """Whether repeats show that the noise exceeds ``NEGLIGIBLE`` times the limits (O,), (O,) bool."""
-    bound = (NEGLIGIBLE * limits).square() * float(scipy.special.chdtri(found.degrees, LEVEL))
-    return found.degrees * found.deviation.square() > bound
+    bound = (NEGLIGIBLE * limits).square() * float(scipy.special.chdtri(differences.degrees, LEVEL))
+    return differences.degrees * differences.deviation.square() > bound
 
 
 def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
@@ -112,10 +116,10 @@ def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
     return errors > SLACK * torch.hypot(limits, noise)
 
 
-def _refuted(found: Repeats, learned: Tensor) -> Tensor:
+def _refuted(differences: Repeats, model_noise: Tensor) -> Tensor:
     """Whether repeats show that most of the learned noise (O,) is misfit, (O,) bool."""
-    bound = (learned / AT_MOST).square() * float(scipy.special.chdtri(found.degrees, 1 - LEVEL))
-    return found.degrees * found.deviation.square() <= bound
+    bound = (model_noise / AT_MOST).square() * float(scipy.special.chdtri(differences.degrees, 1 - LEVEL))
+    return differences.degrees * differences.deviation.square() <= bound
 
 
 def widened(tolerances: Sequence[float], noise: Tensor) -> tuple[float, ...]:
@@ -130,7 +134,7 @@ def _possible(model: DynamicsModel, limits: Tensor) -> Tensor:
     return torch.zeros_like(limits) if able is None else torch.tensor(able.possible_noise, dtype=limits.dtype)
 
 
-def _learned(model: DynamicsModel, tolerances: Sequence[float]) -> tuple[Tensor, Tensor]:
+def _model_noise(model: DynamicsModel, tolerances: Sequence[float]) -> tuple[Tensor, Tensor]:
     """The noise that a model has learned, and the tolerances, (O,) each."""
     limits = torch.tensor(list(tolerances), dtype=torch.float64)
     able = offers(model, LearnedNoise)

@@ -17,12 +17,12 @@ from surrogym_server.sampling.confidence import deviations
 
 
 def outlook_of(
-    model: DynamicsModel, candidates: Points, reference: Points, assumed: Points
+    model: DynamicsModel, candidates: Points, reference: Points, unanswered: Points
 ) -> tuple[OutputOutlook | None, ...]:
-    """Outlook of every output at m candidates and r reference points, after the queries ``assumed`` are answered."""
+    """Outlook of every output at m candidates and r reference points, after the ``unanswered`` queries are answered."""
     if (able := offers(model, Lookahead)) is not None:
-        return able.outlook(candidates, reference, assumed)
-    return NearbyAnswers.of(model, candidates, reference, assumed)
+        return able.outlook(candidates, reference, unanswered)
+    return NearbyAnswers.of(model, candidates, reference, unanswered)
 
 
 def path_outlook(model: DynamicsModel, steps: PredictedSteps, column: int) -> PathOutlook | None:
@@ -41,8 +41,11 @@ def as_if_answered(model: DynamicsModel, steps: PredictedSteps) -> DynamicsModel
 
 @dataclass(frozen=True)
 class NearbyAnswers(OutputOutlook):
-    """Outlook from distances alone. Two points at distance d, in deviations of the sampling range, have the correlation
-    exp(-d^2 / 2), and an answer removes all variance at its point."""
+    """Outlook from distances alone.
+
+    Two points at distance d, in standard deviations of the sampling range, have the correlation exp(-d^2 / 2). An
+    answer removes all variance at its point.
+    """
 
     definition: EnvironmentDefinition
     candidates: Points  # m
@@ -53,16 +56,16 @@ class NearbyAnswers(OutputOutlook):
 
     @classmethod
     def of(
-        cls, model: DynamicsModel, candidates: Points, reference: Points, assumed: Points
+        cls, model: DynamicsModel, candidates: Points, reference: Points, unanswered: Points
     ) -> tuple[NearbyAnswers, ...]:
-        """Build the outlook of every output (O,), after the queries ``assumed`` are answered."""
+        """Build the outlook of every output (O,), after the ``unanswered`` queries are answered."""
         own, there = (deviations(model, points.q, points.u).square() for points in (candidates, reference))
         definition, learns = model.definition, torch.ones(len(candidates), dtype=torch.bool)
         outputs = (
             cls(definition, candidates, reference, own[:, column], there[:, column], learns)
             for column in range(own.shape[1])
         )
-        queries = [assumed[index : index + 1] for index in range(len(assumed))]
+        queries = [unanswered[index : index + 1] for index in range(len(unanswered))]
         return tuple(reduce(cls.answered, queries, output) for output in outputs)
 
     @property
@@ -70,14 +73,16 @@ class NearbyAnswers(OutputOutlook):
         return self.own.sqrt()
 
     def reduction(self, weights: Tensor) -> Tensor:
-        return (weights * self.there) @ _told(self.definition, self.reference, self.candidates)
+        return (weights * self.there) @ _removed_share(self.definition, self.reference, self.candidates)
 
     def observe(self, index: int) -> NearbyAnswers:
         return self.answered(self.candidates[index : index + 1])
 
     def answered(self, query: Points) -> NearbyAnswers:
         """Outlook after one more query is answered."""
-        own, there = (_told(self.definition, points, query)[:, 0] for points in (self.candidates, self.reference))
+        own, there = (
+            _removed_share(self.definition, points, query)[:, 0] for points in (self.candidates, self.reference)
+        )
         return replace(self, own=self.own * (1 - own), there=self.there * (1 - there))
 
 
@@ -85,7 +90,7 @@ class NearbyAnswers(OutputOutlook):
 class IndependentSteps(PathOutlook):
     """Outlook along paths that treats steps as independent: I(t) = 1/2 sum log(1 + (w sigma / tau)^2)."""
 
-    spread: Tensor  # (b, T) deviation, in the output's unit
+    spread: Tensor  # (b, T) standard deviation, in the output's unit
     learns: Tensor  # (b, T) bool
 
     @property
@@ -96,6 +101,6 @@ class IndependentSteps(PathOutlook):
         return 0.5 * (weight * self.spread / tolerance).square().log1p().cumsum(-1)
 
 
-def _told(definition: EnvironmentDefinition, points: Points, queries: Points) -> Tensor:
+def _removed_share(definition: EnvironmentDefinition, points: Points, queries: Points) -> Tensor:
     """Share of the variance at m points that the answer to each of k queries removes, (m, k)."""
     return (-distances(definition, points, queries).square()).exp()

@@ -19,7 +19,7 @@ from surrogym_server.models.abilities import RewardPeaks, offers
 from surrogym_server.models.port import DynamicsModel
 
 CLIMBERS, TRIES, CLIMBS = 16, 16, 24  # points that climb, random steps of each in one iteration, and iterations
-WIDEST, SHRINK = 0.25, 0.75  # of the sampling range: deviation of the first random steps; ratio to the next
+WIDEST, SHRINK = 0.25, 0.75  # of the sampling range: standard deviation of the first random steps; ratio to the next
 NOTHING = torch.finfo(torch.float32).tiny  # trainers compute in float32, in which a smaller reward is 0
 UNMET = 0.1  # of how far a predicted reward lies above the lowest: clearly more than any sample was paid
 NEW = 0.01  # of the range: a place nearer to a sample than this was already queried
@@ -77,10 +77,10 @@ def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Point
         tried = _in_space(definition, tried.clamp(low, high).flatten(0, 1))
         values = able.promise(tried[:, :size], tried[:, size:])
         values = torch.where(_over(definition, tried[:, :size]), -torch.inf, values).reshape(len(at), TRIES)
-        found, place = values.max(1)
-        better = found > value
-        moved = tried.reshape(len(at), TRIES, -1)[torch.arange(len(at)), place]
-        at, value = torch.where(better[:, None], moved, at), torch.where(better, found, value)
+        new_value, place = values.max(1)
+        better = new_value > value
+        neighbours = tried.reshape(len(at), TRIES, -1)[torch.arange(len(at)), place]
+        at, value = torch.where(better[:, None], neighbours, at), torch.where(better, new_value, value)
     at = at[value.argsort(descending=True)]
     return Points(at[:, :size], at[:, size:])
 

@@ -83,12 +83,12 @@ def predicted(model: DynamicsModel, samples: Samples) -> Predictions:
     error = torch.cat([increments(model.definition, samples), samples.reward[:, None]], -1) - mean
     rewarded = torch.hypot(transition.reward_deviation, _reward_deviation_by_state(model, samples))
     deviation = torch.hypot(torch.cat([transition.deviation, rewarded[:, None]], -1), _noise(model, error))
-    known = error.isfinite() & deviation.isfinite()
+    usable = error.isfinite() & deviation.isfinite()
     if not model.definition.moves_observation:
-        known[:, :-1] &= ~saturated(model.definition, samples.q_next)[:, None]
-    known[:, -1] &= ~samples.terminated
+        usable[:, :-1] &= ~saturated(model.definition, samples.q_next)[:, None]
+    usable[:, -1] &= ~samples.terminated
     return tuple(
-        tuple(map(Prediction, error[rows, i].tolist(), deviation[rows, i].tolist())) for i, rows in enumerate(known.T)
+        tuple(map(Prediction, error[rows, i].tolist(), deviation[rows, i].tolist())) for i, rows in enumerate(usable.T)
     )
 
 
@@ -98,7 +98,7 @@ def continued(before: Predictions, new: Predictions) -> Predictions:
 
 
 def pairs_of(predictions: Predictions) -> list[list[list[float]]]:
-    """The predictions as JSON: [error, deviation] of each, by output."""
+    """The predictions as JSON: [error, standard deviation] of each, by output."""
     return [[[p.error, p.deviation] for p in output] for output in predictions]
 
 
@@ -116,7 +116,7 @@ def _noise(model: DynamicsModel, like: Tensor) -> Tensor:
 def _reward_deviation_by_state(model: DynamicsModel, samples: Samples) -> Tensor:
     """Deviation (m,) of the reward that the uncertain next state causes: 0 unless the reward depends on it.
 
-    To first order: the reward's change when one output after the other moves by one deviation.
+    To first order: the reward's change when one output after the other moves by one standard deviation.
     """
     count, outputs = len(samples), len(model.definition.outputs) - 1
     one = torch.eye(outputs, dtype=samples.q.dtype).repeat_interleave(count, 0)

@@ -57,8 +57,8 @@ def _region(inputs: Tensor, doubt: Tensor, names: Sequence[str]) -> Region | Non
     if float(doubt.mean()) < LEAST_DOUBT:
         return None
     share = doubt / doubt.sum()
-    found = chain.from_iterable(_ranges(inputs[:, i], share, name) for i, name in enumerate(names))
-    gain, best = max(found, key=lambda one: one[0])
+    ranges = chain.from_iterable(_ranges(inputs[:, i], share, name) for i, name in enumerate(names))
+    gain, best = max(ranges, key=lambda one: one[0])
     return best if gain >= LEAST_GAIN else None
 
 

@@ -4,7 +4,7 @@ A sequence begins at a reset, or at a snapshot: a state to which the environment
 
 The value of a sequence is the acquisition's value per real step: for most acquisitions, the information that a path
 gives about each output (``PathOutlook.information``). A step has weight 0 outside the sampling range and after the end
-of an episode. The weight falls with the deviation accumulated along the path, so a plan ends where it can't be
+of an episode. The weight falls with the standard deviation accumulated along the path, so a plan ends where it can't be
 predicted.
 """
 
@@ -61,7 +61,7 @@ class Paths:
     q_next: Tensor  # (b, T, C)
     running: Tensor  # (b, T) 1 while the episode runs, 0 after its end
     ended: Tensor  # (b, T) 1 from the step on that ended it
-    drift: Tensor  # (b, T) squared deviation of the mean path before the step, in those of the sampling range
+    drift: Tensor  # (b, T) variance of the mean path before the step, in units of that of the sampling range
 
 
 def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random.Generator) -> tuple[Query, ...]:
@@ -81,13 +81,13 @@ def plan_round(
     """Plan action sequences with ``steps`` real steps in all. Each one is planned as if the earlier and the unanswered
     ones had already been answered."""
     rollouts: list[Query] = []
-    done = list(unanswered)
+    latest = list(unanswered)
     while steps > model.definition.unknown_steps:
-        for rollout in done:
+        for rollout in latest:
             model = as_if_done(model, rollout, aim.snapshots, rng)
-        done = [plan_rollout(model, replace(aim, longest=min(steps, aim.longest)), rng)]
-        rollouts += done
-        steps -= done[0].steps
+        latest = [plan_rollout(model, replace(aim, longest=min(steps, aim.longest)), rng)]
+        rollouts += latest
+        steps -= latest[0].steps
         aim = replace(aim, ending=False)
     return rollouts
 
@@ -131,8 +131,8 @@ def _search(
     elite = population * ELITE // POPULATION
     value, length = worth(origins[places], sequences)
     for _ in range(GENERATIONS - 1):
-        kept = value.argsort(descending=True)[:elite].numpy()
-        parents = np.concatenate([kept, kept[rng.integers(elite, size=population - elite)]])
+        best_rows = value.argsort(descending=True)[:elite].numpy()
+        parents = np.concatenate([best_rows, best_rows[rng.integers(elite, size=population - elite)]])
         sequences, places = sequences[parents], places[parents]
         vary(definition, sequences[elite:], rng)
         value, length = worth(origins[places], sequences)
@@ -149,8 +149,8 @@ def as_if_done(
     if (at := snapshots.get(query.snapshot or "")) is not None:
         start = torch.tensor([at], dtype=torch.float64)
     path = predict_paths(model, start, torch.tensor([query.actions], dtype=torch.float64))
-    taken = (path.running[0] > 0) & model.definition.known(path.q[0])
-    return as_if_answered(model, PredictedSteps(path.q[0, taken], path.u[0, taken], path.q_next[0, taken]))
+    learnable = (path.running[0] > 0) & model.definition.known(path.q[0])
+    return as_if_answered(model, PredictedSteps(path.q[0, learnable], path.u[0, learnable], path.q_next[0, learnable]))
 
 
 def start_points(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> Tensor:

@@ -33,7 +33,7 @@ CRITICAL = 5.41  # 2 % quantile of chi-squared with one degree of freedom: half 
 MAINLY = 0.5  # share of the noise from which on it counts as noise of the sensors
 SHARES = torch.linspace(0, 1, 21, dtype=torch.float64)
 FACTORS = torch.logspace(-0.6, 0.6, 9, dtype=torch.float64)  # c
-CARRIED = 1.25  # factor on an estimated deviation, because slopes are of a model
+CARRIED = 1.25  # factor on an estimated standard deviation, because slopes are of a model
 DIFFERENCE = 1e-4  # of a coordinate's sampling range, for slopes
 
 
@@ -43,7 +43,7 @@ class SensorNoise:
 
     share: float  # of the variance of a single step's noise
     deviation: float  # of one measurement, in the output's unit
-    step: float  # deviation of a single step's noise, of which it is a share
+    step: float  # standard deviation of a single step's noise, of which it is a share
 
 
 def sensor_noise(model: DynamicsModel, samples: Samples, limits: Sequence[float]) -> tuple[SensorNoise | None, ...]:
@@ -55,14 +55,14 @@ def sensor_noise(model: DynamicsModel, samples: Samples, limits: Sequence[float]
         return (None,) * len(definition.outputs)
     chained = (follows >= 0) | torch.isin(torch.arange(len(follows)), follows)
     some = samples.at(chained.nonzero()[:MOST, 0])
-    found: list[SensorNoise | None] = []
+    result: list[SensorNoise | None] = []
     for column, index in enumerate(definition.moving):
         at = able.at_samples(some, column)
-        told = at is not None and math.sqrt(at.noise_variance) > limits[column]
-        found.append(
-            _told(at, preceding(definition, some), _slopes(model, some, column, index)) if at and told else None
+        exceeds = at is not None and math.sqrt(at.noise_variance) > limits[column]
+        result.append(
+            _told(at, preceding(definition, some), _slopes(model, some, column, index)) if at and exceeds else None
         )
-    return (*found, None)
+    return (*result, None)
 
 
 def noise_of_sensors(
@@ -72,9 +72,9 @@ def noise_of_sensors(
     sensor, or else what errors of all measured starts cause. It is 0 if it is below the limit (O,)."""
     if not any(sensors):
         return torch.zeros(len(sensors), dtype=torch.float64)
-    learned = _learned(model)
-    own = learned.minimum(learned.new_tensor([0.0 if one is None else one.step for one in sensors]))
-    noise = torch.where(own > 0, own, learned.minimum(_carried(model, samples, sensors)))
+    model_noise = _model_noise(model)
+    own = model_noise.minimum(model_noise.new_tensor([0.0 if one is None else one.step for one in sensors]))
+    noise = torch.where(own > 0, own, model_noise.minimum(_carried(model, samples, sensors)))
     return torch.where(noise > noise.new_tensor(limits), noise, 0.0)
 
 
@@ -87,11 +87,11 @@ def _carried(model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoi
     return CARRIED * variance.sqrt()
 
 
-def _learned(model: DynamicsModel) -> Tensor:
+def _model_noise(model: DynamicsModel) -> Tensor:
     """Deviation of each output's learned noise, (O,)."""
     able = offers(model, LearnedNoise)
-    found = [0.0] * len(model.definition.outputs) if able is None else able.noise_deviations
-    return torch.tensor(found, dtype=torch.float64)
+    result = [0.0] * len(model.definition.outputs) if able is None else able.noise_deviations
+    return torch.tensor(result, dtype=torch.float64)
 
 
 def _told(at: AtSamples, follows: Tensor, slope: Tensor) -> SensorNoise | None:

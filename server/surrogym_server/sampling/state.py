@@ -80,9 +80,9 @@ class Request:
         """Number of real steps of the pending queries."""
         return sum(query.steps for query in self.pending)
 
-    def is_mostly_refused(self, spent: float) -> bool:
-        """Whether the environment refused as many steps as it has taken, ``spent``, and the budget has in addition.
+    def is_mostly_refused(self, cost: float) -> bool:
+        """Whether the environment refused as many steps as it has taken, ``cost``, and the budget has in addition.
 
         Without this limit, a design whose queries are all refused would never end.
         """
-        return sum(query.steps for query in self.refused) >= self.budget + spent
+        return sum(query.steps for query in self.refused) >= self.budget + cost

@@ -1,9 +1,9 @@
-"""Default tolerances: 5 % of each output's deviation over the initial design, within bounds.
+"""Default tolerances: 5 % of each output's standard deviation over the initial design, within bounds.
 
 They are frozen after the first round, so that a design does not change its own goal. A size estimated from few samples
 can be wrong in two ways: it may be mere rounding, or the samples may have missed everything of interest. So sizes have
 a floor, and a tolerance is computed again when later samples cover a far larger range. The initial design of an
-environment with snapshots stays near the resets, so there a tolerance grows with the samples' deviation.
+environment with snapshots stays near the resets, so there a tolerance grows with the samples' standard deviation.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.samples import Samples, increments
 
-TOLERANCE = 0.05  # of the output's deviation over the initial design
-FLOOR = 1e-9  # of a coordinate's deviation over its range: a smaller increment is rounding
+TOLERANCE = 0.05  # of the output's standard deviation over the initial design
+FLOOR = 1e-9  # of a coordinate's standard deviation over its range: a smaller increment is rounding
 NOTHING = 1e-3  # of the range seen later: the first samples are useless if they lie closer together
 
 
 def sizes_of(definition: EnvironmentDefinition, samples: Samples) -> list[float]:
-    """Size of each output (O,): its deviation over the samples, or that of its mean if it never varied."""
+    """Size of each output (O,): its standard deviation over the samples, or that of its mean if it never varied."""
     targets = _targets(definition, samples)
     spread, mean = targets.std(0, correction=0), targets.mean(0).abs()
     return torch.where(spread > 0, spread, torch.where(mean > 0, mean, 1.0)).tolist()
@@ -55,14 +55,14 @@ def frozen_tolerances(definition: EnvironmentDefinition, samples: Samples, befor
     model them.
     """
     sizes, ranges = sizes_of(definition, samples), _ranges(definition, samples)
-    taken = usual_tolerances(definition, sizes)
+    current = usual_tolerances(definition, sizes)
     if not before.tolerances:
-        return Usual(taken, ranges)
+        return Usual(current, ranges)
     if not before.ranges or definition.design.tolerance == "raw":
         return before
-    old, now = zip(before.tolerances, before.ranges, strict=True), zip(taken, ranges, strict=True)
-    kept = [_later(last, new, grows=definition.snapshots) for last, new in zip(old, now, strict=True)]
-    return Usual(tuple(tolerance for tolerance, _ in kept), tuple(width for _, width in kept))
+    old, now = zip(before.tolerances, before.ranges, strict=True), zip(current, ranges, strict=True)
+    pairs = [_later(last, new, grows=definition.snapshots) for last, new in zip(old, now, strict=True)]
+    return Usual(tuple(tolerance for tolerance, _ in pairs), tuple(width for _, width in pairs))
 
 
 def _later(last: tuple[float, float], new: tuple[float, float], *, grows: bool) -> tuple[float, float]:

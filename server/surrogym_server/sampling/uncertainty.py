@@ -31,7 +31,7 @@ class UncertaintyResult:
 def query_uncertainty(
     model: DynamicsModel, q: Array, u: Array, tolerances: Array, occupancy: Array | None = None
 ) -> UncertaintyResult:
-    """Mean, deviation, U_m, P_i and log U at q (n, C), u (n, F) under tolerances (O,)."""
+    """Mean, standard deviation, U_m, P_i and log U at q (n, C), u (n, F) under tolerances (O,)."""
     at, action = torch.from_numpy(q), torch.from_numpy(u)
     states = None if occupancy is None else torch.from_numpy(occupancy)
     mean, deviation = model.means(at, action), deviations(model, at, action)

@@ -13,7 +13,7 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.guard import learn
 from surrogym_server.sampling.design import advance
-from surrogym_server.sampling.judging import Judged, judge_model
+from surrogym_server.sampling.judging import Judgement, judge_model
 from surrogym_server.sampling.noise import repeats
 from surrogym_server.sampling.past import EXPLAINED, pairs_lacking
 from surrogym_server.sampling.rules.past import LENGTH as LONGER
@@ -61,7 +61,7 @@ def of_sensor(s: np.ndarray, u: float, before: float, rng: np.random.Generator) 
     return after, seen + 0.1 * rng.normal()
 
 
-def judged(follow: Next, seed: int = 0) -> Judged:
+def judged(follow: Next, seed: int = 0) -> Judgement:
     """Verdict on a model of episodes with random actions."""
     rng = np.random.default_rng(seed)
     rows: list[tuple[float, float, float]] = []

@@ -17,7 +17,7 @@ def complete_initial_rollouts(round: Round) -> tuple[Query, ...] | None:
         return None
     initial = round.definition.design.initial
     request = round.request
-    missing = min(initial - round.spent - min(request.logged, initial) - request.pending_steps, round.room)
+    missing = min(initial - round.cost - min(request.logged, initial) - request.pending_steps, round.room)
     if missing <= steps_of_a_round(round):
         return None
     return first_rollouts(round.definition, missing, round.generator())

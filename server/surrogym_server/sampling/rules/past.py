@@ -14,10 +14,10 @@ LENGTH = 8  # steps of a rollout
 def see_the_past(round: Round) -> tuple[Query, ...] | None:
     """Take random rollouts that give enough consecutive steps for the test, if an error exceeds its tolerance. With
     snapshots none are needed, because they keep the past."""
-    definition, judged = round.definition, round.judged
+    definition, judgement = round.definition, round.judgement
     if not round.may_examine or definition.snapshots or round.request.pending:
         return None
-    if all(agrees(c, t) for c, t in zip(judged.confidences[:-1], judged.tolerances, strict=False)):
+    if all(agrees(c, t) for c, t in zip(judgement.confidences[:-1], judgement.tolerances, strict=False)):
         return None
     length = min(LENGTH, definition.max_rollout or 1)
     if length < 2:

@@ -11,14 +11,14 @@ SHORTEST = 4  # real steps of a round
 
 def plan_rollouts(round: Round) -> tuple[Query, ...]:
     """Plan rollouts for the outputs below their target."""
-    request, judged = round.request, round.judged
+    request, judgement = round.request, round.judgement
     aim = Aim(
         columns=round.below_target,
-        tolerances=judged.tolerances,
+        tolerances=judgement.tolerances,
         longest=round.definition.max_rollout or 1,
         snapshots=request.snapshots,
         states=request.states,
-        ending=judged.candidates.reserved is not None,
+        ending=judgement.candidates.reserved is not None,
         ended=bool(round.samples.terminated.any()),
     )
     steps = min(round.room, steps_of_a_round(round)) if round.continues else request.extra

@@ -11,13 +11,13 @@ from surrogym_shared.nouns import Query
 def ask_best_candidates(round: Round) -> tuple[Query, ...]:
     """Choose one query for each output below its target, the least confident first. The first query is a reserved
     candidate, if there is one."""
-    below, judged = round.below_target, round.judged
-    assumed = Points.of(round.definition, round.request.unanswered)
+    below, judgement = round.below_target, round.judgement
+    unanswered = Points.of(round.definition, round.request.unanswered)
     if round.continues:
         outputs = below[: round.room]
     else:
         outputs = [below[i % len(below)] for i in range(round.request.extra)]
-    taken = Points.joined([Points(round.samples.q, round.samples.u), assumed])
-    candidates = judged.candidates
-    picks = choose(round.model, candidates, taken, assumed, outputs, judged.tolerances)
+    earlier = Points.joined([Points(round.samples.q, round.samples.u), unanswered])
+    candidates = judgement.candidates
+    picks = choose(round.model, candidates, earlier, unanswered, outputs, judgement.tolerances)
     return candidates.points[picks].queries
