@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 class FitOptions:
     """Parts of the kernel, and the normal priors on logarithms: (mean, standard deviation).
 
-    Inputs and outputs are standardised. The length scale's prior grows with sqrt(d), as distances do (Hvarfner et al., ICML 2024).
+    Inputs and outputs are standardised. The length scale's prior grows with sqrt(d), as distances do (Hvarfner et al.,
+    ICML 2024).
     """
 
     linear: bool = True  # parts beside the squared exponential

@@ -43,7 +43,7 @@ class Sparse:
     """The points that a process with inducing points represents, and the loss that this causes."""
 
     points: int  # number of points that it was fitted to
-    unexplained: float  # root mean variance at them that inducing points leave, in prior standard deviations
+    unexplained: float  # root of the mean variance that stays unexplained at them, in prior standard deviations
     left_out: LeftOut  # accuracy at these points
 
 
