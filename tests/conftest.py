@@ -26,7 +26,7 @@ import typer.testing
 
 import surrogym.cli
 from support.long import TESTS, Long
-from support.nursery import CONTEXTS, contexts_of_forks
+from support.nursery import CONTEXTS, contexts_of_forks, one_thread
 from support.server import ServerProcess, running_server
 from support.teaching import teach
 from surrogym_client.transport import Api
@@ -116,8 +116,8 @@ def pytest_xdist_node_collection_finished(node: Any) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_thread() -> None:
-    """Small matrices gain nothing from more, and the server's processes want the other cores."""
-    torch.set_num_threads(1)
+    """Once all libraries are loaded."""
+    one_thread()
 
 
 @pytest.fixture(scope="session", autouse=True)

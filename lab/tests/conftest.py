@@ -7,9 +7,16 @@ from collections.abc import Iterator
 
 import pytest
 
+from support.nursery import one_thread
 from support.saying import speaker
 from surrogym.cli import run
 from surrogym_lab.commands import build
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread() -> None:
+    """Once all libraries are loaded."""
+    one_thread()
 
 
 @pytest.fixture(scope="module")

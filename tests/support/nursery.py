@@ -26,6 +26,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import IO, Any
 
+import torch
+from threadpoolctl import threadpool_limits
+
 MODULES = (
     "surrogym_server.cli.optimise",
     "surrogym_server.cli.runner",
@@ -141,6 +144,13 @@ def reads_early(environment: Mapping[str, str]) -> bool:
     return any(name.startswith(READ_EARLY) for name in environment if name != "PYTHONPATH")
 
 
+def one_thread() -> None:
+    """Let libraries compute in one thread each. Small matrices gain nothing from more, and threads that wait for each
+    other wait by spinning: on cores that others use as well, for much longer than they compute."""
+    torch.set_num_threads(1)
+    threadpool_limits(1)
+
+
 @cache
 def nursery() -> Nursery | None:
     """The nursery of this process, None on a system where forks are not safe."""
@@ -161,6 +171,7 @@ def main(asked: socket.socket, path: list[str]) -> None:
     context._concrete_contexts = CONTEXTS | {"spawn": CONTEXTS["forkserver"]}  # type: ignore[attr-defined]
     with TemporaryDirectory() as folder:
         open_storage(f"sqlite:///{folder}/surrogym.db").close()  # it imports, and compiles statements, at its first use
+    one_thread()
     gc.freeze()
     children: dict[int, tuple[int, int]] = {}  # by a descriptor that is readable at its end: its process, its status
     with selectors.DefaultSelector() as waiting:
@@ -198,6 +209,7 @@ class _Fork(context.ForkServerProcess):
     def run(self) -> None:
         os.environ.clear()
         os.environ.update(self._environment)
+        one_thread()
         super().run()
 
 
