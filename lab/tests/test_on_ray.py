@@ -28,7 +28,11 @@ ray = pytest.importorskip("ray")
 
 PATIENCE = 60.0
 
-pytestmark = [pytest.mark.timeout(600), pytest.mark.filterwarnings("ignore::FutureWarning:ray")]
+pytestmark = [
+    pytest.mark.long,  # a cluster takes long to start; test_cells.py and peers/test_processes.py run cells without one
+    pytest.mark.timeout(600),
+    pytest.mark.filterwarnings("ignore::FutureWarning:ray"),
+]
 
 
 def work_of(value: int) -> Callable[[Path], int]:
@@ -87,7 +91,6 @@ def test_a_cell_of_the_paper_continues_in_the_cluster_from_its_files(
     assert result.read_bytes() == first
 
 
-@pytest.mark.long
 def test_a_seed_of_the_paper_has_the_same_table_in_the_cluster_as_here(address: str, tmp_path: Path):
     connect(address)
     todo = list(paper_cases.cells(["cartpole"], 1, paper_cases.QUICK))
