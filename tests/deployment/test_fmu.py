@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fmpy.fmi1 import FMICallException
 from fmpy.validation import validate_fmu
 
 from support.controllers import network, plant
@@ -70,9 +72,21 @@ def test_a_controller_without_a_period_is_refused(tmp_path: Path):
         controller_of(network(tmp_path, plant(), (8,)), choices=Choices(period=0.1))
 
 
-def test_a_measurement_called_time_or_with_trigraphs_gets_a_name_that_is_valid():
-    block = Block("b", "", (Variable("??/", "Float64", "input", 0.0),), 1.0, None, {})
-    assert '"?""?/"' in block.header()
+def test_measurements_have_names_that_c_reads_in_another_way(tmp_path: Path):
+    odd = 'a"b\\c??/ 😀'
+    spec = plant()
+    named = type(spec).model_validate_json(spec.model_dump_json().replace('"slide"', json.dumps(odd)))
+    (path,) = deploy(controller_of(network(tmp_path, named, (8,))), "fmu", tmp_path / "out")
+    with opened(path, said := []) as one:
+        with pytest.raises(FMICallException):
+            one.step(0.0, PERIOD, **{odd: 0.5})
+        assert "initialised" in said[0]
+        one.begin()
+        one.step(0.0, PERIOD, **{odd: 0.5})
+        assert one.get("status") == [0.0]
+
+
+def test_a_measurement_called_time_or_with_control_characters_is_refused():
     for name in ("time", "a\nb"):
         with pytest.raises(ValueError, match=r"time|control characters"):
             Block("b", "", (Variable(name, "Float64", "input", 0.0),), 1.0, None, {})

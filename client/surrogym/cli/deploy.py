@@ -142,12 +142,16 @@ class Checking:
 
     def run(self, comparison: Comparison, output: Output) -> Checked:
         """Run the episodes."""
-        from surrogym_shared.terminal import progress
+        from surrogym_shared.terminal import progress, say
         from surrogym_trainer.evaluation.evaluator import FIRST_SEED
 
         seeds = range(FIRST_SEED, FIRST_SEED + self.episodes)
-        with progress("check", quiet=output.quiet) as update:
-            return comparison.over(seeds, lambda share: update(share, f"{self.episodes} episodes of each"))
+        try:
+            with progress("check", quiet=output.quiet) as update:
+                return comparison.over(seeds, lambda share: update(share, f"{self.episodes} episodes of each"))
+        except KeyboardInterrupt:
+            say("interrupted: the controller is written, its check is not; the same command checks it again")
+            raise
 
     def stored(self, checked: Checked, target: str, controller: Controller, card: PolicyCard) -> StoredCheck:
         """Return the check as a file has it."""
@@ -283,7 +287,7 @@ def _local(
     """Yield a policy file. A stored policy is downloaded for as long as the command runs.
 
     Raises:
-        CommandError: the surrogate's specification has changed since the policy was stored.
+        CommandError: the policy was trained for another specification than the surrogate's, and none is given.
     """
     from tempfile import TemporaryDirectory
 
@@ -303,7 +307,7 @@ def _local(
             if card.spec is None and spec is None:
                 raise CommandError(
                     f"expected --spec with the specification that {policy} was trained for, because that of {name!r} "
-                    f"has changed: {found.differs}"
+                    f"differs in {found.differs}"
                 )
             path.write_bytes(api.policies.file(name, found.version, "zip"))
         write_card(path, card)

@@ -133,8 +133,12 @@ class Names:
 
 
 def _string(text: str) -> str:
-    """A string of C, without the trigraphs of C99."""
-    return json.dumps(text).replace("??", '?""?')
+    """A string of C. What C99 reads in another way is written as octal bytes: quotes, trigraphs, all beyond ASCII."""
+    octal = (
+        chr(byte) if (chr(byte).isalnum() and byte < 128) or byte in b" ._-" else f"\\{byte:03o}"
+        for byte in text.encode()
+    )
+    return f'"{"".join(octal)}"'
 
 
 def _array(of: str, name: str, values: list[str]) -> str:
