@@ -151,6 +151,8 @@ def test_the_source_has_no_heap_no_recursion_and_a_bounded_stack(tmp_path: Path,
     assert {kind for _, _, kind in usage} == {"static"}
     stated = re.search(r"_STACK \((\d+) \* sizeof\(arm_real\) \+ 256\)", (folder / "arm_controller.h").read_text())
     assert sum(int(size) for _, size, _ in usage) <= int(stated.group(1)) * 8 + 256
+    constants = re.findall(r"static const real \w+\[(\d+)\]", (folder / "arm_controller.c").read_text())
+    assert f" and {sum(map(int, constants)):,} constants." in (folder / "arm_controller.h").read_text()
 
 
 def test_names_that_would_end_a_comment_do_no_harm(tmp_path: Path):

@@ -106,6 +106,7 @@ def _header(controller: Controller) -> dict[str, Any]:
         "late": controller.late,
         "fallback": ", ".join(f"{a:g}" for a in controller.fallback),
         "numbers": source.stack_of(controller),
+        "constants": f"{source.constants_of(controller):,}",
         "R": len(controller.measurements),
         "F": len(controller.low),
         "D": len(controller.observation),

@@ -91,14 +91,23 @@ def parts_of(controller: Controller) -> dict[str, str]:
     }
 
 
-def _arrays(controller: Controller) -> str:
+def constants_of(controller: Controller) -> int:
+    """Return how many constant numbers the source has."""
+    return sum(array.size for array in _constants(controller).values())
+
+
+def _constants(controller: Controller) -> dict[str, Array]:
     decision = controller.decision
     arrays = {"MEAN": decision.mean, "DEVIATION": decision.deviation}
     for i, layer in enumerate(decision.layers):
         arrays |= {f"WEIGHTS{i}": layer.weights, f"BIAS{i}": layer.bias}
     if not decision.counts:
         arrays |= {"CENTRE": decision.centre, "REACH": decision.reach}
-    arrays |= {"LOW": controller.low, "HIGH": controller.high}
+    return arrays | {"LOW": controller.low, "HIGH": controller.high}
+
+
+def _arrays(controller: Controller) -> str:
+    decision, arrays = controller.decision, _constants(controller)
     code = "#define R(number) ((real)(number))\n\n" + "".join(_array(name, array) for name, array in arrays.items())
     if decision.counts:
         code += f"static const int CHOICES[{len(decision.counts)}] = {{{', '.join(map(str, decision.counts))}}};\n"
