@@ -194,7 +194,7 @@ class LocalEngine(SessionEngine):
         return None if request.within is None else self._live.clock() + request.within
 
     def _counted(self, request: Advance, answer: Answer, began: float) -> Reply:
-        """The reply, once what was done is counted; a repeat counts as a request and not as steps of its session."""
+        """Count the request and its steps, and return the reply. A repeat counts as a request, but has no steps."""
         reply = Reply(answer.seq, answer.outcome)
         tally = self._tallies.of(request.session)
         if isinstance(request, Reset):

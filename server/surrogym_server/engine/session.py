@@ -41,7 +41,7 @@ class Fingerprint:
     __slots__ = ("_digest", "_parts")
 
     def __init__(self, *parts: object, digest: str | None = None) -> None:
-        """Take parts as in ``digest_of``; arrays among them must not change. With a digest no parts are needed."""
+        """Take the parts of a request, as ``digest_of`` does, or its digest. Arrays among the parts must not change."""
         self._parts = parts
         self._digest = digest
 

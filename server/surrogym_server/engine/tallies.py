@@ -66,7 +66,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class SessionActivity:
-    """A session and its activity since this process has it."""
+    """A session, and its activity since this process opened or restored it."""
 
     session: SessionInfo
     steps: int  # of all lanes
@@ -85,7 +85,7 @@ class Tally:
         self._decayed = 0.0
         self._seq = 0
         self._pending: list[StepResult | PolicyRollout] = []
-        self._unfolded = 0  # steps in them
+        self._unfolded = 0  # steps in ``_pending``
         self._sums: NDArray[np.float64] | None = None  # (2, N) reward and penalty of the running episodes
         self._steps = 0
         self._episodes = 0
@@ -175,7 +175,7 @@ class Counts:
     """Present counts of an engine, and totals since its start."""
 
     sessions: Mapping[str, int]  # open ones by the name of their surrogate
-    lanes: int  # of all of them
+    lanes: int  # of all open sessions
     requests: int  # running or waiting
     steps: Durations  # requests with steps, waiting and computing included
     lane_steps: int  # virtual environment steps

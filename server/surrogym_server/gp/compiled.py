@@ -22,8 +22,8 @@ Ints = NDArray[np.int64]
 # Places of a process' matrices: its numbers (below); columns of x and inverse length scales (2, d); points in length
 # scales (n, d), then their mirror images; weights of them (1, S); coefficients of x, x^2 and of the prior variance's
 # x^2, x^4, of the mirror's exponent, and of the polynomial covariances with points (5 + 2 n, d); L (n, n).
-# The frequencies of drawn functions (d, S), of inputs in their own unit, of those that a reflection leaves and of those
-# that it turns.
+# The frequencies of posterior samples (d, S), of inputs in their own unit: first those of the inputs that a reflection
+# leaves, then those of the inputs that it turns.
 HEAD, INPUTS, POINTS, WEIGHTS, POLYNOMIALS, FACTOR, KEPT, TURNED = range(8)
 # Scale, constants of mean and prior variance, parity of a reflection or 0, signal variance, constant of the polynomial
 # covariance, whether there is any, the number of points, whether there is a linear and a quadratic part, and whether a
@@ -176,7 +176,7 @@ def _deviation(head: Floats, rows: Floats, own: Floats, explained: Floats, devia
 def _add_residuals(
     head: Floats, rows: Floats, kept: Floats, turned: Floats, own: Floats, k: Floats, paths: Floats, mean: Floats
 ) -> None:
-    """Add to the mean (B,) the residuals of drawn functions, the first columns of paths (B, W)."""
+    """Add to the mean (B,) the residuals of posterior samples, whose weights are the first columns of paths (B, W)."""
     (size, count), parity, scale = kept.shape, head[0, PARITY], head[0, SCALE]
     straight, mirrored = np.empty(count), np.empty(count)
     sine, cosine = np.empty(count), np.empty(count)

@@ -1,7 +1,7 @@
 """Samples from the posterior of hyperparameters, for processes with few points, which leave hyperparameters uncertain.
 
 The prior of theta, the logarithms, is normal, so elliptical slice sampling needs no step size. It rotates theta around
-the prior's mean, in the plane through theta and a new draw of the prior, until the evidence exceeds a random level.
+the prior's mean, in the plane through theta and a new sample of the prior, until the evidence exceeds a random level.
 
 Reference: Murray, Adams, MacKay, "Elliptical slice sampling", AISTATS 2010, figure 2.
 """

@@ -1,13 +1,13 @@
-"""Functions drawn from a posterior by Matheron's rule. A draw has one consistent value at every input.
+"""Posterior samples of a process by Matheron's rule: functions, each with one consistent value at every input.
 
-A draw is the posterior's mean plus a residual, g(x) - k(x, X) (K + sigma_n^2 I)^-1 (g(X) + e), where g is a draw from
-the prior and e a draw of the noise. The residual is g conditioned to vanish at the data. g is exact in the polynomial
-parts, which have finitely many features, and uses random Fourier features for the squared exponential (cosine and sine
-of the same frequency, so that its prior variance is exact). The update is exact, through the Cholesky factor.
+A posterior sample is the posterior's mean plus a residual, g(x) - k(x, X) (K + sigma_n^2 I)^-1 (g(X) + e), where g is a
+sample of the prior and e one of the noise. The residual is g conditioned to vanish at the data. g is exact in the
+polynomial parts, which have finitely many features. For the squared exponential it uses random Fourier features, cosine
+and sine of the same frequency, so that its prior variance is exact. The update is exact, through the Cholesky factor.
 
-All draws share fixed frequencies and differ in their weights: N draws at one input each cost one matrix product and N
-scalar products. Under a reflection the features are those of (f(x) + p f(s x)) / sqrt(2). With S frequencies the
-prior's covariance has an error of about sigma_f^2 / sqrt(2 S).
+All posterior samples share fixed frequencies and differ in their weights: the values of N of them, at one input each,
+cost one matrix product and N scalar products. Under a reflection the features are those of (f(x) + p f(s x)) / sqrt(2).
+With S frequencies the prior's covariance has an error of about sigma_f^2 / sqrt(2 S).
 
 References: Wilson et al., "Efficiently sampling functions from Gaussian process posteriors", ICML 2020, eq. 13; Rahimi
 and Recht, "Random features for large-scale kernel machines", NeurIPS 2007.
@@ -32,25 +32,25 @@ FREQUENCIES = 256  # S
 
 @dataclass(frozen=True)
 class Pathwise:
-    """Draws from one posterior. A draw is a row of ``size`` weights: first of the prior's features, then of the n
+    """Posterior samples of one process. Each is a row of ``size`` weights: of the prior's features, then of the n
     points."""
 
     posterior: Posterior
 
     @property
     def size(self) -> int:
-        """Number of standard normal numbers that a draw takes, and of its weights."""
+        """Number of weights of a posterior sample, and of the standard normal numbers that make one."""
         return self._features + len(self.posterior.y)
 
     def draw(self, noise: Tensor) -> Tensor:
-        """Weights (N, size) of the residuals that standard normal ``noise`` (N, size) gives."""
+        """Return the weights (N, size) of N posterior samples, made from standard normal ``noise`` (N, size)."""
         posterior = self.posterior
         prior, measured = noise[:, : self._features], noise[:, self._features :]
         at_points = prior @ self._prior_at_points.T + self._noise(measured)
         return torch.cat([prior, -torch.cholesky_solve(at_points.T, posterior.factor).T], 1)
 
     def residual(self, x: Tensor, weights: Tensor) -> Tensor:
-        """Residual of draw i, ``weights`` (N, size), at input i of x (N, d): (N,)."""
+        """Residual of posterior sample i, ``weights`` (N, size), at input i of x (N, d): (N,)."""
         k = covariance(self.posterior.hyper, x, self.posterior.x)
         return (torch.cat([self._prior(x), k], 1) * weights).sum(1)
 
@@ -103,5 +103,5 @@ class Pathwise:
 @torch.inference_mode(False)
 def frequencies(d: int, device: torch.device) -> Tensor:
     """Frequencies (d, S) of the squared exponential in length scales: standard normal, from a fixed seed."""
-    drawn = np.random.Generator(np.random.Philox(key=d)).standard_normal((d, FREQUENCIES))
-    return torch.from_numpy(drawn).to(device)
+    values = np.random.Generator(np.random.Philox(key=d)).standard_normal((d, FREQUENCIES))
+    return torch.from_numpy(values).to(device)

@@ -7,8 +7,8 @@ X), L L^T = k(Z, Z), and C = V V^T, the projected process (R&W (2006), section 8
     var(x) = k(x, x) - k(x, Z) (F F^T)^-1 k(Z, x),  F = L chol(I + sigma_n^2 C^-1).
 
 So it is an exact process of the m points with the factor F, the values y_Z = F F^T weights, and the noise sigma_n^2 L
-C^-1 L^T, which is the remaining noise if n points are represented by m. It is served, stored, extended and drawn from
-like any other process. Away from Z its variance returns to the prior's.
+C^-1 L^T, which is the remaining noise if n points are represented by m. It is served, stored, extended and sampled like
+any other process. Away from Z its variance returns to the prior's.
 
 Its m values are not data, because each represents many points. So leave-one-out errors are those of the n points, with
 h_i = (V^T (C + sigma_n^2 I)^-1 V)_ii:

@@ -41,7 +41,9 @@ class CandidateView:
     points: Points  # m states and actions
     output: int  # number of the output, in the order of the definition
     tolerance: float  # of the output, in its unit
-    deviation: Tensor  # (m,) latent, in the output's unit, as if all pending queries had been answered
+    deviation: (
+        Tensor  # (m,) latent standard deviation, in the output's unit, as if all pending queries had been answered
+    )
     distance: Tensor  # (m,) to the nearest query so far, in standard deviations of the sampling range
     log_probability: Tensor  # (m,) log P_i (eq. 11); 0 unless the acquisition reads it
     _reduction: Callable[[], Tensor]
@@ -69,12 +71,12 @@ class PathView:
 
     @cached_property
     def information(self) -> Tensor:
-        """Information about the output in the beginning of each path, up to each step, in nats, (b, T)."""
+        """Information about the output, in nats, that each path gives up to each of its steps, (b, T)."""
         return self._information()
 
 
 class Acquisition(ABC):
-    """One criterion. It follows the laws of the module."""
+    """Criterion that values queries. It follows the laws in this module's docstring."""
 
     adaptive: ClassVar[bool] = True  # False: the whole budget is queried before the first fit
     reads_reference: ClassVar[bool] = False  # whether it uses ``variance_reduction``

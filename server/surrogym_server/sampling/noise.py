@@ -64,8 +64,10 @@ def _conditions(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Tensor:
-    """Deviation of each output's noise that repeated steps confirm, in its unit, (O,). It is 0 if there is none, or if
-    it is below the tolerance."""
+    """Standard deviation of each output's noise that repeated steps confirm, in its unit, (O,).
+
+    It is 0 if there is none, or if it is below the tolerance.
+    """
     model_noise, limits = _model_noise(model, tolerances)
     differences = repeats(model, samples)
     if differences.degrees < ENOUGH:
@@ -75,12 +77,13 @@ def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequen
 
 
 def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Points | None:
-    """Steps to take again, if noise beyond a tolerance explains the samples, and no repeat has confirmed or refuted it.
+    """Return the steps to take again; None if none are needed.
 
-    First one step, which refutes the noise in a deterministic environment, then as many as the next of ``STAGES``
+    They are needed if noise beyond a tolerance explains the samples, and no repeat has confirmed or refuted it. One
+    step comes first, which refutes the noise in a deterministic environment, then as many as the next of ``STAGES``
     lacks. An output whose confirmed noise does not explain its leave-one-out error is doubtful again, because few
-    repeats may have found too little noise. None if none is needed. Steps that ended at a bound are not repeated,
-    because the bound hides their noise.
+    repeats may have found too little noise. Steps that ended at a bound are not repeated, because the bound hides their
+    noise.
     """
     model_noise, limits = _model_noise(model, tolerances)
     differences = repeats(model, samples)

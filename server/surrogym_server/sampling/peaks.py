@@ -19,7 +19,8 @@ from surrogym_server.models.abilities import RewardPeaks, offers
 from surrogym_server.models.port import DynamicsModel
 
 CLIMBERS, TRIES, CLIMBS = 16, 16, 24  # points that climb, random steps of each in one iteration, and iterations
-WIDEST, SHRINK = 0.25, 0.75  # of the sampling range: standard deviation of the first random steps; ratio to the next
+WIDEST = 0.25  # of the sampling range: standard deviation of the random steps of the first iteration
+SHRINK = 0.75  # its factor from one iteration to the next
 NOTHING = torch.finfo(torch.float32).tiny  # trainers compute in float32, in which a smaller reward is 0
 UNMET = 0.1  # of how far a predicted reward lies above the lowest: clearly more than any sample was paid
 NEW = 0.01  # of the range: a place nearer to a sample than this was already queried

@@ -29,7 +29,7 @@ class Prediction:
     """One output of one sample, as a model predicted it before any model learned from the sample."""
 
     error: float  # sample less mean, in the output's unit
-    deviation: float  # with the noise of a single step
+    deviation: float  # standard deviation, with the noise of a single step
 
 
 Predictions = tuple[tuple[Prediction, ...], ...]  # of each output (O,), in order of arrival

@@ -81,6 +81,6 @@ def _range(gain: Tensor, doubt: Tensor, values: Tensor, name: str, *, outside: b
     high = None if end == len(values) else float((values[end - 1] + values[end]) / 2)
     inside = float(doubt[end] - doubt[begin])
     share = 1 - inside if outside else inside
-    if outside and (low is None or high is None):  # the rest of a range with one end is one, too
+    if outside and (low is None or high is None):  # beyond a region with one end lies one with one end
         return float(gain[end] - gain[begin]), Region(name, high, low, False, share)
     return float(gain[end] - gain[begin]), Region(name, low, high, outside, share)

@@ -54,7 +54,7 @@ class Aim:
 
 @dataclass(frozen=True)
 class Paths:
-    """Mean paths of b lanes over T steps."""
+    """Paths of the predicted mean state: b lanes over T steps."""
 
     q: Tensor  # (b, T, C)
     u: Tensor  # (b, T, F)

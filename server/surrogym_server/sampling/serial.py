@@ -29,11 +29,11 @@ from surrogym_server.models.port import DynamicsModel
 
 FEWEST = 12  # pairs of consecutive steps for a test
 MOST = 256  # samples in a test, because its time grows with their third power
-CRITICAL = 5.41  # 2 % quantile of chi-squared with one degree of freedom: half of it is 1 %
+CRITICAL = 5.41  # upper 2 % point of chi-squared with one degree of freedom: the one-sided test has level 1 %
 MAINLY = 0.5  # share of the noise from which on it counts as noise of the sensors
 SHARES = torch.linspace(0, 1, 21, dtype=torch.float64)
 FACTORS = torch.logspace(-0.6, 0.6, 9, dtype=torch.float64)  # c
-CARRIED = 1.25  # factor on an estimated standard deviation, because slopes are of a model
+CARRIED = 1.25  # safety factor on an estimated standard deviation, because the slopes are those of a model
 DIFFERENCE = 1e-4  # of a coordinate's sampling range, for slopes
 
 

@@ -21,7 +21,7 @@ class DesignState:
     round: int = 0
     usual: tuple[float, ...] = ()  # default tolerances, per output; see ``tolerances``
     warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # what a fit passes to the next one
-    ended_with: tuple[float, ...] = ()  # steps of the budget, budget, target and tolerances at the end of the design
+    ended_with: tuple[float, ...] = ()  # at the end: real steps that count, budget, target, tolerances
     ended_as: str = ""  # the verdict at that end; "" while the design continues
     ranges: tuple[float, ...] = ()  # of the targets, from which each tolerance was computed
     predictions: Predictions = ()  # the last ones of each output, of samples that were then learned from
@@ -67,7 +67,10 @@ class Request:
 
     @property
     def free(self) -> int:
-        """Number of samples that don't count towards the budget, less the real steps that are no samples."""
+        """Number of samples less that of the real steps that count towards the budget.
+
+        Samples of logs and audits don't count; steps from which nothing is learned do, and are no samples.
+        """
         return self.logged + self.audited - self.unlearned
 
     @property

@@ -287,7 +287,9 @@ class Designer:
             open_steps=sum(query.steps for query in pending if query.status != "set_aside"),
             refused=tuple(refused),
             snapshots=self._storage.snapshots.all(name) if definition.snapshots else {},
-            extra_queries=min(lease.extra_queries, max(0, record.budget - spoken)),  # it may be lower by now
+            extra_queries=min(
+                lease.extra_queries, max(0, record.budget - spoken)
+            ),  # the budget may have been lowered since
             occupancy=None if visited is None else visited.states,
             threads=self._threads,
             previous=self._previous(name) if set(samples.purpose).difference(UNCHOSEN) else None,

@@ -93,7 +93,7 @@ def settle(connection: Connection, answered: Iterable[Answered]) -> None:
 
 
 def _check_steps(lease: Answered, steps: set[int]) -> None:
-    """Refuse an answer with a gap, one that is too long, or one that grows after it was given."""
+    """Raise an error if the answer of a lease lacks a step, has too many, or has more than when it first came."""
     if lease.reported:
         if more := steps - lease.reported.keys():
             raise IdempotencyConflict(
@@ -135,7 +135,7 @@ def _leases(connection: Connection, surrogate: Row[Any], by_id: dict[int, Row[An
 
 
 def _reported(connection: Connection, lease_ids: Sequence[int]) -> dict[int, dict[int, Reported]]:
-    """The samples stored under each of these leases."""
+    """Return the samples stored under each of these leases, by step."""
     reported: dict[int, dict[int, Reported]] = defaultdict(dict)
     for lease_id, step, *stored in connection.execute(REPORTED, {"reported": lease_ids}):
         reported[lease_id][step] = Reported(*stored)

@@ -12,7 +12,7 @@ from surrogym_server.errors import Damaged
 SQLITE_CODES = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 SQLSTATES = ("XX001", "XX002", "42P01", "42703")  # data and index corrupted, undefined table and column
 OTHER_SCHEMA = re.compile(r"no such (table|column)|has no column|already exists")  # SQLite has no code for these
-UNDECODABLE = "Could not decode to UTF-8"  # and Python's driver has none for this
+UNDECODABLE = "Could not decode to UTF-8"  # Python's driver has no error class for this
 
 
 def damaged(reason: object) -> Damaged:

@@ -29,7 +29,7 @@ from surrogym_server.storage.sql.rows import append_event, hold, insert_queries,
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
 from surrogym_shared.nouns import Phase, Query
 
-INTERRUPTED_SECONDS = 60.0  # after which initial queries that are not all queued are those of a server that has died
+INTERRUPTED_SECONDS = 60.0  # initial queries that stay incomplete for so long are those of a server that has died
 # conditions on a row of surrogates
 OWN_QUERIES = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogates.c.id)
 OWN_SAMPLES = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogates.c.id)

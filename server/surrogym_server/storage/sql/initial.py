@@ -25,7 +25,7 @@ IS_INCOMPLETE = sa.exists(  # a condition on a row of surrogates
 
 
 def begin(connection: Connection, surrogate: Row[Any], queries: Sequence[Query]) -> None:
-    """Queue as many as one transaction may, and note whether others are missing."""
+    """Queue the first of the initial queries, as many as one transaction may, and note whether others are missing."""
     remember(connection, surrogate, OPERATION, KEY, "", 0)
     _ask_some(connection, surrogate, queries)
 

@@ -32,8 +32,10 @@ def _evaluations() -> sa.Select[Any]:
 
 
 def _unresolved() -> sa.Select[Any]:
-    """Steps of leases that failed or expired, whether swept or not. An index leads to them past those with an
-    answer."""
+    """Select the steps of leases that failed or expired, also of those that are still marked as open.
+
+    The conditions use an index, so that leases with an answer, which are nearly all, are not read.
+    """
     failed, expired, is_open = constant("failed"), constant("expired"), constant("open")
     unswept = (leases.c.outcome == is_open) & (leases.c.expires <= NOW)
     ended = leases.c.outcome.in_((failed, expired, is_open)) & ((leases.c.outcome != is_open) | unswept)

@@ -154,7 +154,9 @@ surrogates = sa.Table(
     sa.Column("checkpoint", sa.Text),
     sa.Column("revision", sa.BigInteger, nullable=False),  # grows with whatever the design has to look at
     sa.Column("fitted_revision", sa.BigInteger, nullable=False),  # what the last fit has seen
-    sa.Column("logged_revision", sa.BigInteger, nullable=False, server_default="0"),  # that has all of the last log
+    sa.Column(
+        "logged_revision", sa.BigInteger, nullable=False, server_default="0"
+    ),  # the one that has all of the last log
     sa.Column("fit_token", sa.Text),
     sa.Column("fit_owner", sa.Text),
     sa.Column("fit_expires", sa.Double),
