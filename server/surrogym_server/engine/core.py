@@ -161,14 +161,14 @@ def steps_asked(request: Advance) -> int:
 
 
 def carried_out(
-    request: Advance, models: Models, wanted: Callable[[], None], interrupts: bool, session: Session
+    request: Advance, models: Models, require_wanted: Callable[[], None], interrupts: bool, session: Session
 ) -> tuple[Session, Outcome]:
     """Apply a request to a session. Returns the new session and the outcome.
 
     Args:
         request: the request.
         models: of the session's surrogate.
-        wanted: called before each step of a rollout; raises if nobody wants the rollout any more.
+        require_wanted: called before each step of a rollout; raises if nobody wants the rollout any more.
         interrupts: whether ``KeyboardInterrupt`` in a model's code is a failure of that code. True in a server, where a
             person's Ctrl-C arrives differently.
         session: the present session.
@@ -188,9 +188,9 @@ def carried_out(
             latest = models.latest(session.surrogate_id) if session.model == "latest" else session.model
             return reset_session(session, request.seed, request.mask, latest)
         case Rollout():
-            return roll(session, request.actions, partial(_next_step, models, wanted, interrupts))
+            return roll(session, request.actions, partial(_next_step, models, require_wanted, interrupts))
         case PolicySteps():
-            return roll_policy(session, request.run, partial(_next_step, models, wanted, interrupts))
+            return roll_policy(session, request.run, partial(_next_step, models, require_wanted, interrupts))
         case _:
             assert_never(request)
 
@@ -210,9 +210,9 @@ def visited_states(session: Session) -> Array:
 
 
 def _next_step(
-    models: Models, wanted: Callable[[], None], interrupts: bool, session: Session, u: Array
+    models: Models, require_wanted: Callable[[], None], interrupts: bool, session: Session, u: Array
 ) -> tuple[Session, StepResult]:
-    wanted()
+    require_wanted()
     return _stepped(session, u, None, False, models, interrupts)
 
 

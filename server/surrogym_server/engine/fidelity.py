@@ -24,8 +24,8 @@ def fidelity_fields(
     """The fields of ``wire.Fidelity``, from the confidence and tolerance of each output, (O,) each, and the limits at
     which many samples end."""
     rows = [
-        {"name": name, "structure": structure, "tolerance": tolerance, **asdict(judged)}
-        for name, structure, judged, tolerance in zip(
+        {"name": name, "structure": structure, "tolerance": tolerance, **asdict(output)}
+        for name, structure, output, tolerance in zip(
             model.definition.outputs, model.structures, confidences, tolerances, strict=True
         )
     ]
@@ -51,5 +51,5 @@ def fidelity_of(model: DynamicsModel, usual: Sequence[float], target: float) -> 
     usual = usual or usual_tolerances(model.definition, model.scales.tolist())
     tolerances = model.definition.tolerances_over(usual)
     points = Points(*monte_carlo(model.definition))
-    judged = confidences_of(model, points, deviations(model, points.q, points.u), tolerances)
-    return fidelity_fields(model, judged, tolerances, target)
+    confidences = confidences_of(model, points, deviations(model, points.q, points.u), tolerances)
+    return fidelity_fields(model, confidences, tolerances, target)

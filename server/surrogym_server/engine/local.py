@@ -98,10 +98,10 @@ class LocalEngine(SessionEngine):
         async with self._opening.of(request.surrogate_id):
             if opening.key and (known := self._live.opened_by(request.surrogate, opening.key, digest)):
                 return info_of(known)
-            needed = await asyncio.to_thread(self._expected_bytes, request)
-            self._live.check_room(needed)
+            nbytes = await asyncio.to_thread(self._expected_bytes, request)
+            self._live.check_room(nbytes)
             self._tallies.forget_all_but(session.id for session in self._live)
-            return info_of(self._live.add(await asyncio.to_thread(self._opened, request, digest), needed))
+            return info_of(self._live.add(await asyncio.to_thread(self._opened, request, digest), nbytes))
 
     async def advance(self, request: Advance) -> Reply:
         if (reply := self.try_now(request)) is not None:
@@ -129,9 +129,9 @@ class LocalEngine(SessionEngine):
         return coordinates
 
     async def submit(self, session: str) -> Visited:
-        found = self._live.get(session)
-        states = visited_states(found)
-        return await asyncio.to_thread(self._visited, found, states)
+        live = self._live.get(session)
+        states = visited_states(live)
+        return await asyncio.to_thread(self._visited, live, states)
 
     async def close(self, session: str) -> None:
         self.end(session)
@@ -206,8 +206,8 @@ class LocalEngine(SessionEngine):
         return reply
 
     def _expected_bytes(self, request: Open) -> int:
-        surrogate, wanted = request.surrogate_id, request.opening.model
-        model = self._models.get(surrogate, self._models.refresh(surrogate) if wanted == "latest" else wanted)
+        surrogate, version = request.surrogate_id, request.opening.model
+        model = self._models.get(surrogate, self._models.refresh(surrogate) if version == "latest" else version)
         settings = request.opening.settings
         draws = function_draws(model, settings.functions)
         return expected_bytes(request.definition, settings, draws.path_size)

@@ -86,14 +86,14 @@ class ModelCache:
             The surrogates that are deleted. Their models stay until ``forget``, so that their sessions can end before.
         """
         with self._lock:
-            known = list(self._latest.items())
-        if not known:
+            versions = list(self._latest.items())
+        if not versions:
             return []
         newest = self._newest()
-        for surrogate, version in known:
+        for surrogate, version in versions:
             if newest.get(surrogate, version) > version:
                 self.publish(surrogate, newest[surrogate])
-        return [surrogate for surrogate, _ in known if surrogate not in newest]
+        return [surrogate for surrogate, _ in versions if surrogate not in newest]
 
     def publish(self, surrogate: int, version: int) -> int:
         """Let lanes use a version from their next reset on, unless a newer one is known. Returns the newest version."""

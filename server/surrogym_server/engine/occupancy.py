@@ -33,11 +33,11 @@ class Reservoir:
         seen = self.seen + len(states)
         if len(candidates) == 0:
             return Reservoir(self.seed, seen, self.states, self.priority)
-        held = self.states if len(self.states) else np.zeros((0, states.shape[1]))
-        joined_states = np.concatenate([held, states[candidates]])
+        before = self.states if len(self.states) else np.zeros((0, states.shape[1]))
+        joined_states = np.concatenate([before, states[candidates]])
         joined = np.concatenate([self.priority, priority[candidates]])
-        kept = np.sort(np.argsort(joined, kind="stable")[-CAPACITY:])
-        return Reservoir(self.seed, seen, joined_states[kept], joined[kept])
+        rows = np.sort(np.argsort(joined, kind="stable")[-CAPACITY:])
+        return Reservoir(self.seed, seen, joined_states[rows], joined[rows])
 
 
 def _priorities(seed: int, first: int, count: int) -> Array:

@@ -111,23 +111,23 @@ def _settings(saved: dict[str, Any], starts: NDArray[Any] | None, device: torch.
 
 
 def _answer(header: dict[str, Any], arrays: Arrays) -> Answer | None:
-    if (kept := header.get("answer")) is None:
+    if (stored := header.get("answer")) is None:
         return None
     outcome: Outcome
     if reset := _unprefixed("reset", arrays):
         outcome = ResetResult(**reset)
     elif policy := _unprefixed("policy", arrays):
-        known: dict[str, Any] = {"log_probability": None, **policy}
-        outcome = PolicyRollout(**known)
+        fields: dict[str, Any] = {"log_probability": None, **policy}
+        outcome = PolicyRollout(**fields)
     else:
         outcome = _steps(_unprefixed("steps", arrays))
-    return Answer(kept["seq"], Fingerprint(digest=kept["digest"]), outcome)
+    return Answer(stored["seq"], Fingerprint(digest=stored["digest"]), outcome)
 
 
 def _visited(header: dict[str, Any], arrays: Arrays) -> Reservoir | None:
-    if (kept := header.get("visited")) is None:
+    if (stored := header.get("visited")) is None:
         return None
-    return Reservoir(kept["seed"], kept["seen"], arrays["visited/states"], arrays["visited/priority"])
+    return Reservoir(stored["seed"], stored["seen"], arrays["visited/states"], arrays["visited/priority"])
 
 
 def _outcome_arrays(outcome: Outcome) -> Arrays:

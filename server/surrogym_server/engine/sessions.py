@@ -161,11 +161,11 @@ class LiveSessions:
         """Do ``advance`` in this call and this thread. Call it only if ``prompt`` returns True."""
         live = self._get(id)
         live.used = self.clock()
-        if kept := replay(live.session, seq, request):
-            return kept
+        if repeat := replay(live.session, seq, request):
+            return repeat
         if steps > 1:
             self._check_memory(live.session.answer_bytes(steps))
-        return self._kept(live, request, self._done_now(live, work, steps, deadline))
+        return self._keep(live, request, self._done_now(live, work, steps, deadline))
 
     async def advance(
         self, id: str, seq: int | None, request: Fingerprint, work: Work, steps: int = 1, deadline: float | None = None
@@ -197,11 +197,11 @@ class LiveSessions:
         try:
             async with live.lock:
                 self._get(id).used = self.clock()
-                if kept := replay(live.session, seq, request):
-                    return kept
+                if repeat := replay(live.session, seq, request):
+                    return repeat
                 if steps > 1:
                     self._check_memory(live.session.answer_bytes(steps))
-                return self._kept(live, request, await self._do(live, work, steps, deadline))
+                return self._keep(live, request, await self._do(live, work, steps, deadline))
         finally:
             self._requests -= 1
             live.requests -= 1
@@ -261,8 +261,8 @@ class LiveSessions:
                 f"and {_mebibytes(nbytes)} more: close some, or try later"
             )
 
-    def _kept(self, live: _Live, request: Fingerprint, done: tuple[Session, Outcome]) -> Answer:
-        live.session, answer = answered(done[0], request, done[1])
+    def _keep(self, live: _Live, request: Fingerprint, result: tuple[Session, Outcome]) -> Answer:
+        live.session, answer = answered(result[0], request, result[1])
         live.used = self.clock()
         return answer
 
@@ -271,13 +271,13 @@ class LiveSessions:
         if expected < INLINE_SECONDS:
             return self._done_now(live, work, steps, deadline)
         threads = self._threads if steps == 1 else self._rollouts
-        done, seconds = await self._in_thread(threads, live.session, work, expected, deadline)
-        return _learned(live, done, seconds, steps)
+        result, seconds = await self._in_thread(threads, live.session, work, expected, deadline)
+        return _learned(live, result, seconds, steps)
 
     def _done_now(self, live: _Live, work: Work, steps: int, deadline: float | None) -> tuple[Session, Outcome]:
         self._check_deadline(deadline, live.seconds_per_step * steps)
-        done, seconds = _timed(work, live.session)
-        return _learned(live, done, seconds, steps)
+        result, seconds = _timed(work, live.session)
+        return _learned(live, result, seconds, steps)
 
     async def _in_thread(
         self, threads: Threads, session: Session, work: Work, expected: float, deadline: float | None
@@ -302,13 +302,14 @@ class LiveSessions:
             )
 
 
-def _learned(live: _Live, done: tuple[Session, Outcome], seconds: float, steps: int) -> tuple[Session, Outcome]:
+def _learned(live: _Live, result: tuple[Session, Outcome], seconds: float, steps: int) -> tuple[Session, Outcome]:
     """Return the result, after an update of the session's predicted time for a step."""
-    taken = len(done[1]) if isinstance(done[1], PolicyRollout) else steps  # a policy's rollout may have stopped early
+    outcome = result[1]
+    taken = len(outcome) if isinstance(outcome, PolicyRollout) else steps  # a policy's rollout may have stopped early
     each = seconds / taken
     known = live.seconds_per_step if live.seconds_per_step < float("inf") else each
     live.seconds_per_step = (1 - FORGETTING) * known + FORGETTING * each
-    return done
+    return result
 
 
 def _mebibytes(nbytes: int) -> str:
@@ -317,8 +318,8 @@ def _mebibytes(nbytes: int) -> str:
 
 def _timed(work: Work, session: Session) -> tuple[tuple[Session, Outcome], float]:
     start = time.perf_counter()
-    done = work(session)
-    return done, time.perf_counter() - start
+    result = work(session)
+    return result, time.perf_counter() - start
 
 
 class OpeningLocks:
