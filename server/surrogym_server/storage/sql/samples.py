@@ -28,12 +28,12 @@ from surrogym_server.storage.sql.snapshots import insert_snapshots
 from surrogym_server.storage.sql.tables import queries, samples
 from surrogym_shared.nouns import RealSteps, Vector
 
-_COLUMNS: dict[str, sa.ColumnElement[Any]] = {
-    "requested_coordinates": sa.case((queries.c.kind == "step", queries.c.coordinates)),
-    "trajectory": sa.case((queries.c.kind == "rollout", samples.c.lease_id)),
+_COMPUTED: dict[str, sa.ColumnElement[Any]] = {
+    "requested_coordinates": sa.case((queries.c.kind == "step", queries.c.coordinates)).label("requested_coordinates"),
+    "trajectory": sa.case((queries.c.kind == "rollout", samples.c.lease_id)).label("trajectory"),
 }
 _NAMES = [field.name for field in fields(SampleRecord)]
-_FIELDS = [(_COLUMNS[name] if name in _COLUMNS else samples.c[name]).label(name) for name in _NAMES]
+_FIELDS = [_COMPUTED[name] if name in _COMPUTED else samples.c[name] for name in _NAMES]
 
 Identity = tuple[int | None, int]
 
