@@ -87,7 +87,7 @@ def test_rounds_end_when_the_visited_region_is_known_or_design_ready(
         return train(port, out, replace(settings, prolong=False), progress)
 
     monkeypatch.setattr("surrogym_trainer.training.closed_loop.train", trained)
-    settings = replace(SETTINGS, prolong=True)
+    settings = replace(SETTINGS, algorithm="FASTPPO", prolong=True)
     initial, unsure, ready = 4, tolerance < 1, budget > 4
     tolerances = dict.fromkeys(("theta", "speed", "reward"), tolerance)
     design = Design(initial=initial, budget=budget, target=0.9999999 if unsure else 0.501, monte_carlo=64)

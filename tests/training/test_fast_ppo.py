@@ -24,13 +24,13 @@ from surrogym_server.local import LocalSurrogate
 from surrogym_shared.spec import EnvironmentSpec, MultiDiscreteAction
 from surrogym_trainer.evaluation import imagined_returns
 from surrogym_trainer.policies import UnusablePolicy, load_policy
-from surrogym_trainer.training import TrainingInterrupted, TrainSettings, train
+from surrogym_trainer.training import TrainingInterrupted, TrainProgress, TrainSettings, train
+from surrogym_trainer.training.checks import Checks
 from surrogym_trainer.training.fast_ppo import search as searches
 from surrogym_trainer.training.fast_ppo.actions import Bounded, Choices
 from surrogym_trainer.training.fast_ppo.learner import Learner, Objective, compiled_update, noisy, restored
 from surrogym_trainer.training.fast_ppo.rollouts import Collector, RewardScale, Rollout
 from surrogym_trainer.training.search import search_for
-from surrogym_trainer.training.verdicts import Verdicts
 
 needs_numba = pytest.mark.skipif(compiled_update() is None, reason="numba is not installed, or switched off")
 
@@ -190,43 +190,34 @@ def test_inputs_standardised_anew_leave_the_policy_as_it_was(make: Callable[[], 
     assert np.abs(learner.values(inputs) - critic).max() > 0.1, "the critic is a new one"
 
 
-def test_a_training_ends_with_fine_tuning_from_the_declared_starts(surrogate, tmp_path: Path, monkeypatch):
-    """The policy is never worse in the surrogate than before. Asked-for steps are not followed by it."""
-    boxes: list[float] = []
+def watched(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
+    """The session fields of the lanes that are opened."""
+    opened: list[dict] = []
 
-    def watched(num_envs: int, mode: str, options: dict):
-        boxes.append(options["start_box"])
+    def seen(num_envs: int, mode: str, options: dict):
+        opened.append(options)
         return session_request(num_envs, mode, options)
 
-    monkeypatch.setattr(searches, "session_request", watched)
+    monkeypatch.setattr(searches, "session_request", seen)
+    return opened
+
+
+def test_a_training_refines_its_policy_from_the_declared_starts(surrogate, tmp_path: Path, monkeypatch):
+    """The policy is never worse in the surrogate than before. Chosen steps are not followed by it."""
+    opened = watched(monkeypatch)
     settings = TrainSettings(algorithm="fastppo", total_steps=4_096, num_envs=16, hyperparameters=SMALL, prolong=False)
     plain = train(surrogate, tmp_path / "plain.zip", settings)
-    assert (plain.virtual_steps, boxes) == (4_096, [0.5])
-    tuned = train(surrogate, tmp_path / "tuned.zip", replace(settings, prolong=True))
-    assert (boxes[1:], tuned.virtual_steps % 4_096) == ([0.5, 0.0], 0)
-    assert tuned.virtual_steps >= 8_192
-    assert tuned.imagined_return >= plain.imagined_return
-    noise = [restored(path, surrogate.spec(), (64, 64)).further for path in (plain.path, tuned.path)]
+    assert plain.virtual_steps == 4_096
+    assert [one["start_box"] for one in opened] == [0.5]
+    seen: list[TrainProgress] = []
+    refined = train(surrogate, tmp_path / "refined.zip", replace(settings, prolong=True), seen.append)
+    assert [one["start_box"] for one in opened[1:]] == [0.5, 0.0]
+    assert [one["stage"] for one in refined.settings["cycles"]][-1] == "refine"
+    assert all(now.steps <= now.total_steps for now in seen)
+    noise = [restored(path, surrogate.spec(), (64, 64)).further for path in (plain.path, refined.path)]
     assert noise[1] <= noise[0]
-    further = replace(settings, prolong=True, start_from=tuned.path)
-    assert train(surrogate, tmp_path / "further.zip", further).imagined_return >= tuned.imagined_return
-
-
-def test_short_training_episodes_have_no_fine_tuning(tmp_path: Path, monkeypatch):
-    """All lanes of long episodes from the declared starts would be in the same part of an episode, and the policy would
-    forget the other parts."""
-    asked: list[dict] = []
-
-    def watched(num_envs: int, mode: str, options: dict):
-        asked.append(options)
-        return session_request(num_envs, mode, options)
-
-    monkeypatch.setattr(searches, "session_request", watched)
-    spec = pendulum().model_copy(update={"time_limit": 100})
-    port = LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, 12, seed=0)).model)
-    settings = TrainSettings(algorithm="fastppo", total_steps=1_024, num_envs=16, hyperparameters=SMALL, prolong=True)
-    train(port, tmp_path / "policy.zip", settings)
-    assert [(one["start_box"], one["time_limit"]) for one in asked] == [(1.0, 20)]
+    further = replace(settings, prolong=True, start_from=refined.path)
+    assert train(surrogate, tmp_path / "further.zip", further).imagined_return >= refined.imagined_return
 
 
 def test_it_continues_from_a_saved_policy(surrogate, tmp_path: Path):
@@ -244,28 +235,19 @@ def test_it_continues_from_a_saved_policy(surrogate, tmp_path: Path):
         )
 
 
-class Patient(Verdicts):
-    """Abandons no network."""
-
-    def judge(self) -> None:
-        """Keep the present network."""
-
-
-class Strict(Verdicts):
-    """Abandons each network after 512 steps, while enough steps are left for another one."""
-
-    def judge(self) -> None:
-        self.given_up = self.own_steps >= 512 and self.left >= 1_024
+def learned(monkeypatch: pytest.MonkeyPatch, value: bool) -> None:
+    """Let every check find that a network has learned something, or nothing."""
+    monkeypatch.setattr(Checks, "learned", property(lambda _: value))
 
 
 @pytest.mark.parametrize(
-    ("spec", "networks", "noise"),
-    [(mountain_car_continuous(), 3, [1, searches.HELD]), (cartpole(), 7, [1])],
+    ("spec", "noise"),
+    [(mountain_car_continuous(), [1, searches.HELD]), (cartpole(), [1])],
     ids=["continuous", "discrete"],
 )
-def test_an_abandoned_network_is_followed_by_another(spec, networks: int, noise, tmp_path: Path, monkeypatch):
-    """Continuous actions are then explored by held noise, and at last by Stable-Baselines3's state-dependent noise.
-    Steps of all networks together stay within what was asked for."""
+def test_a_network_that_learned_nothing_is_followed_by_another(spec, noise, tmp_path: Path, monkeypatch):
+    """Every second one explores by held noise, where actions are continuous. All of them together stay within the
+    chosen steps."""
     holds: list[int] = []
 
     class Watched(Collector):
@@ -273,41 +255,58 @@ def test_an_abandoned_network_is_followed_by_another(spec, networks: int, noise,
             holds.append(hold)
             return super().collect(learner, steps, hold)
 
-    monkeypatch.setattr(searches, "Verdicts", Strict)
+    learned(monkeypatch, False)
+    monkeypatch.setattr(searches, "PATIENT_ROLLOUTS", 2)
     monkeypatch.setattr(searches, "Collector", Watched)
     seen: list[int] = []
     settings = TrainSettings(algorithm="fastppo", total_steps=4_096, num_envs=16, hyperparameters=SMALL, prolong=False)
     result = train(short(spec), tmp_path / "policy.zip", settings, lambda now: seen.append(now.steps))
     assert seen == sorted(seen)
-    assert result.networks == networks
+    assert result.networks == 3, "each has a third of the steps"
     assert list(dict.fromkeys(holds)) == noise
-    assert result.algorithm in (("FASTPPO", "PPO") if networks == 3 else ("FASTPPO",))
-    assert result.virtual_steps <= settings.total_steps
+    assert 3_500 < result.virtual_steps <= settings.total_steps
     load_policy(result.path, result.algorithm)
 
 
-def test_a_new_network_is_trained_beside_a_policy_of_stable_baselines3(surrogate, tmp_path: Path, monkeypatch):
-    """Without ``anew`` the policy itself is trained further, by its own library. With it that happens only if the new
-    network is abandoned."""
-    monkeypatch.setattr(searches, "Verdicts", Patient)
+@pytest.mark.parametrize(("gained", "cycles"), [(True, 6), (False, 1)], ids=["while it gains", "it gains no more"])
+def test_cycles_follow_while_the_second_half_of_the_last_one_gained(
+    surrogate, gained: bool, cycles: int, tmp_path: Path, monkeypatch
+):
+    learned(monkeypatch, True)
+    monkeypatch.setattr(Checks, "gained", lambda *_: gained)
+    settings = TrainSettings(algorithm="fastppo", total_steps=3_072, num_envs=16, hyperparameters=SMALL, prolong=True)
+    result = train(surrogate, tmp_path / "policy.zip", settings)
+    assert [one["stage"] for one in result.settings["cycles"]] == ["learn"] * cycles + ["refine"]
+    assert result.gaining is gained
+
+
+def test_a_saved_policy_stays_until_a_new_network_comes_near(surrogate, tmp_path: Path, monkeypatch):
+    """With ``anew`` a new network learns beside it. The saved one is trained further only if that one falls short."""
+    monkeypatch.setattr(searches, "PATIENT_ROLLOUTS", 2)
+    small = {"total_steps": 2_048, "num_envs": 16, "hyperparameters": SMALL, "prolong": False}
+    start = train(surrogate, tmp_path / "first.zip", TrainSettings("fastppo", **small))
+    further = TrainSettings("fastppo", start_from=start.path, anew=True, **small)
+    assert train(surrogate, tmp_path / "further.zip", further).imagined_return > start.untrained
+    hopeless = replace(further, hyperparameters=SMALL | {"learning_rate": 0.0})
+    result = train(surrogate, tmp_path / "hopeless.zip", hopeless)
+    assert result.networks == 2
+    assert result.imagined_return == pytest.approx(start.imagined_return)
+
+
+def test_only_stable_baselines3_trains_its_policies_further(surrogate, tmp_path: Path):
     small = {"total_steps": 512, "num_envs": 16, "hyperparameters": SMALL, "prolong": False}
     start = train(surrogate, tmp_path / "first.zip", TrainSettings("ppo", **small)).path
-    further = TrainSettings("fastppo", start_from=start, **small)
-    assert train(surrogate, tmp_path / "further.zip", further).algorithm == "PPO"
-    assert train(surrogate, tmp_path / "anew.zip", replace(further, anew=True)).algorithm == "FASTPPO"
-    monkeypatch.setattr(searches, "Verdicts", Strict)
-    abandoned = replace(further, anew=True, total_steps=4_096)
-    assert train(surrogate, tmp_path / "abandoned.zip", abandoned).networks == 2
+    for anew in (False, True):
+        further = TrainSettings("fastppo", start_from=start, anew=anew, **small)
+        assert train(surrogate, tmp_path / "further.zip", further).algorithm == "PPO"
 
 
 def test_training_ends_early_where_nothing_can_be_gained(surrogate, tmp_path: Path, monkeypatch):
-    class Saturated(Patient):
-        saturated = property(lambda self: len(self._bests) >= 3)
-
-    monkeypatch.setattr(searches, "Verdicts", Saturated)
-    settings = TrainSettings(algorithm="fastppo", total_steps=8_192, num_envs=16, hyperparameters=SMALL, prolong=False)
+    monkeypatch.setattr(Checks, "saturated", property(lambda self: self.best is not None))
+    settings = TrainSettings(algorithm="fastppo", total_steps=8_192, num_envs=16, hyperparameters=SMALL, prolong=True)
     result = train(surrogate, tmp_path / "policy.zip", settings)
     assert 0 < result.virtual_steps < 8_192
+    assert [one["stage"] for one in result.settings["cycles"]] == ["learn"]
     load_policy(result.path, result.algorithm)
 
 

@@ -22,13 +22,11 @@ from surrogym_trainer.policies import UnusablePolicy, load_policy
 from surrogym_trainer.policies.networks import WIDER, PaperPolicy
 from surrogym_trainer.training import TrainingInterrupted, TrainProgress, TrainSettings, train
 from surrogym_trainer.training.proportions import even_batch, suggested_gamma
-from surrogym_trainer.training.search import MAX_STEPS, SEARCHES
+from surrogym_trainer.training.search import MAX_STEPS, SEARCHES, search_for
 from surrogym_trainer.training.settings import prolongs
 from surrogym_trainer.training.stable_baselines import search as training
 from surrogym_trainer.training.stable_baselines.algorithms import OffPolicySearch, OnPolicySearch
-from surrogym_trainer.training.stable_baselines.early_stopping import Checks
-from surrogym_trainer.training.stable_baselines.search import imagined_return
-from surrogym_trainer.training.verdicts import Imagined
+from surrogym_trainer.training.stable_baselines.search import imagined_returns_of
 
 SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 2}
 
@@ -173,7 +171,7 @@ def test_the_policy_with_the_best_imagined_return_is_kept(surrogate, tmp_path: P
     result = train(surrogate, tmp_path / "policy.zip", settings, lambda p: seen.append(p.imagined_return))
     kept = PPO.load(result.path, device="cpu")
     assert result.imagined_return >= max(seen)
-    assert imagined_return(surrogate, kept, settings).mean == pytest.approx(result.imagined_return)
+    assert imagined_returns_of(surrogate, kept, settings).mean() == pytest.approx(result.imagined_return)
 
 
 def test_imagined_returns_are_whole_episodes_from_the_declared_starts(surrogate):
@@ -263,85 +261,6 @@ def test_statistics_are_of_the_sampling_range(surrogate):
 IDLE = SMALL | {"learning_rate": 0.0, "n_steps": 4}  # learns nothing
 
 
-@pytest.fixture
-def made(monkeypatch):
-    """The settings of every network that training makes."""
-    made, plain = [], training.make_learner
-
-    def seen(algorithm, env, settings, *rest):
-        made.append(settings)
-        return plain(algorithm, env, settings, *rest)
-
-    monkeypatch.setattr(training, "make_learner", seen)
-    return made
-
-
-def idle(**settings) -> TrainSettings:
-    return small(**{"total_steps": 2_000, "hyperparameters": IDLE, "session": {"time_limit": 4}} | settings)
-
-
-def test_a_network_that_learns_too_slowly_is_replaced(surrogate, tmp_path: Path, made):
-    result = train(surrogate, tmp_path / "policy.zip", idle())
-    seeds = {settings.seed for settings in made}
-    assert 2 <= result.networks == len(made) == len(seeds) <= 4, "at most one for each quarter of the steps"
-    assert 1_900 <= result.virtual_steps <= 2_000
-    kept = PPO.load(result.path, device="cpu")
-    assert imagined_return(surrogate, kept, idle()).mean == pytest.approx(result.imagined_return)
-
-
-def earning(each: float) -> Imagined:
-    """Every episode earns the same."""
-    return Imagined(float(each), float(each), float(each))
-
-
-def test_ctrl_c_while_the_next_network_is_made_keeps_what_was_learned(surrogate, tmp_path: Path, made, monkeypatch):
-    plain = training.make_learner
-
-    def interrupted(*args):
-        if made:
-            raise KeyboardInterrupt
-        return plain(*args)
-
-    monkeypatch.setattr(training, "make_learner", interrupted)
-    monkeypatch.setattr(training, "imagined_return", lambda *_: earning(0))
-    with pytest.raises(TrainingInterrupted) as interruption:
-        train(surrogate, tmp_path / "policy.zip", idle())
-    assert 0 < interruption.value.result.virtual_steps < 2_000
-    assert PPO.load(tmp_path / "policy.zip", device="cpu").seed == 0
-
-
-def test_a_hundredth_of_what_an_episode_earned_is_to_be_learned(surrogate, tmp_path: Path, made, monkeypatch):
-    """An untrained network earns -40, the best episodes of four steps about 0."""
-    for earned, networks in ((-39.9, {3, 4}), (-39.0, {1})):
-        returns = itertools.chain([-40.0], itertools.repeat(earned))
-        monkeypatch.setattr(training, "imagined_return", lambda *_, returns=returns: earning(next(returns)))
-        assert train(surrogate, tmp_path / "policy.zip", idle()).networks in networks
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "own", "later"),
-    [("PPO", {}, {True}), ("PPO", {"use_sde": False}, {False}), ("A2C", {"n_steps": 4}, {None}), ("TD3", {}, {None})],
-    ids=["by state", "as asked", "short rollouts", "none of its own"],
-)
-def test_after_a_network_that_was_given_up_the_next_explores_by_state(
-    surrogate, tmp_path: Path, made, monkeypatch, algorithm, own, later
-):
-    monkeypatch.setattr(training, "imagined_return", lambda *_: earning(0))
-    hyperparameters = (IDLE if algorithm == "PPO" else {"learning_rate": 0.0}) | own
-    train(surrogate, tmp_path / "policy.zip", idle(algorithm=algorithm, hyperparameters=hyperparameters))
-    explores = [settings.hyperparameters.get("use_sde") for settings in made]
-    assert len(explores) > 1
-    assert explores[0] == own.get("use_sde")
-    assert set(explores[1:]) == later
-
-
-def test_discrete_actions_and_the_papers_networks_do_not_explore_by_state(tmp_path: Path, made, monkeypatch):
-    monkeypatch.setattr(training, "imagined_return", lambda *_: earning(0))
-    for spec in (cartpole(), make("Pendulum-v1", preset="paper").spec()):
-        assert train(local(spec), tmp_path / "policy.zip", idle()).networks > 1
-    assert not [settings for settings in made if "use_sde" in settings.hyperparameters]
-
-
 def test_ctrl_c_before_the_first_rollout_leaves_an_untrained_policy(surrogate, tmp_path: Path, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
@@ -353,26 +272,7 @@ def test_ctrl_c_before_the_first_rollout_leaves_an_untrained_policy(surrogate, t
     assert load_policy(tmp_path / "policy.zip")(np.zeros((1, 3), np.float32)).shape == (1, 1)
 
 
-RISING, AT_ITS_BEST = itertools.count(), itertools.chain([0, 50], itertools.repeat(100))
-
-
-@pytest.mark.parametrize(
-    ("returns", "prolong", "taken"),
-    [(RISING, True, 2), (AT_ITS_BEST, True, 1), (RISING, False, 1), (RISING, None, 1)],
-    ids=["it gains", "it gained before", "it may not", "steps were asked for"],
-)
-def test_a_training_that_gained_in_its_last_quarter_takes_as_many_steps_again(
-    surrogate, tmp_path: Path, monkeypatch, returns, prolong, taken
-):
-    seen = []
-    monkeypatch.setattr(training, "imagined_return", lambda *_: earning(next(returns)))
-    result = train(surrogate, tmp_path / "policy.zip", small(total_steps=1_536, prolong=prolong), seen.append)
-    assert result.virtual_steps == taken * 1_536 == seen[-1].total_steps
-    assert result.gaining == (returns is RISING)
-    assert len({now.imagined_return for now in seen} - {None}) <= 12 * taken, "checks come as often as before"
-
-
-def test_nobody_asked_for_a_number_of_steps_so_a_training_may_be_prolonged_but_not_the_papers():
+def test_nobody_asked_for_a_number_of_steps_so_a_training_may_take_more_cycles_but_not_the_papers():
     default, paper = pendulum(), make("Pendulum-v1", preset="paper").spec()
     assert prolongs(TrainSettings(), default)
     assert not prolongs(TrainSettings(total_steps=1_000), default)
@@ -380,40 +280,22 @@ def test_nobody_asked_for_a_number_of_steps_so_a_training_may_be_prolonged_but_n
     assert prolongs(TrainSettings(total_steps=1_000, prolong=True), paper)
 
 
-@pytest.mark.parametrize(
-    ("steps", "earned", "given_up"),
-    [(128, 0.0, False), (2_000, 0.0, True), (2_000, 40.0, True), (2_000, 60.0, False)],
-    ids=["too early to say", "nothing learned", "not half as far", "half as far"],
-)
-def test_anew_a_saved_policy_waits_until_a_new_network_falls_short(
-    surrogate, tmp_path: Path, monkeypatch, steps, earned, given_up
-):
+@pytest.mark.parametrize("earned", [40.0, 160.0], ids=["less", "more"])
+def test_anew_the_saved_policy_stays_if_a_new_network_earns_less(surrogate, tmp_path: Path, monkeypatch, earned: float):
     """An untrained network earns nothing, the saved policy 100."""
-    saved, session, turns, plain = tmp_path / "saved.zip", {"time_limit": 4}, [], Checks.worth_keeping
-    train(surrogate, saved, small(session=session))
+    saved = tmp_path / "saved.zip"
+    train(surrogate, saved, small(total_steps=128))
     returns = itertools.chain([0.0, 100.0], itertools.repeat(earned))
-    monkeypatch.setattr(training, "imagined_return", lambda *_: earning(next(returns)))
-    monkeypatch.setattr(
-        Checks, "worth_keeping", lambda self, known: turns.append(self.verdicts.steps) or plain(self, known)
-    )
-    settings = small(start_from=saved, anew=True, session=session, total_steps=steps, hyperparameters=IDLE)
-    train(surrogate, tmp_path / "policy.zip", settings)
-    assert len(turns) == given_up
-    assert not turns or (0.45 if earned else 0.2) * steps < turns[0] < (0.65 if earned else 0.4) * steps
+    monkeypatch.setattr(training, "imagined_returns_of", lambda *_: np.full(4, next(returns)))
+    result = train(surrogate, tmp_path / "policy.zip", small(total_steps=128, start_from=saved, anew=True, seed=1))
+    assert result.imagined_return == max(earned, 100.0)
+    one, two = (PPO.load(path, device="cpu").policy for path in (saved, result.path))
+    assert (distance(one, two) == 0) is (earned < 100)
 
 
-@pytest.mark.parametrize(("ours", "theirs"), [(0, 1), (1, 0)])
-def test_a_saved_policy_that_earns_no_more_than_an_untrained_one_is_not_gone_on_from(
-    surrogate, tmp_path: Path, ours, theirs
-):
-    saved, untrained = tmp_path / "saved.zip", tmp_path / "untrained.zip"
-    for path, seed in ((saved, theirs), (untrained, ours)):
-        train(surrogate, path, small(seed=seed, hyperparameters=IDLE, total_steps=32))
-    settings = small(seed=ours, hyperparameters=IDLE, total_steps=32, start_from=saved)
-    earned = [imagined_return(surrogate, PPO.load(p, device="cpu"), settings).mean for p in (saved, untrained)]
-    result = train(surrogate, tmp_path / "policy.zip", settings)
-    assert earned[0] != earned[1]
-    assert result.imagined_return == pytest.approx(max(earned))
+def test_it_takes_the_steps_that_it_was_given_and_no_more(surrogate):
+    with pytest.raises(ValueError, match="PPO trains for a fixed number of steps"):
+        search_for(small(prolong=True))
 
 
 def test_policies_are_compared_by_what_was_asked_for_and_not_by_what_they_learn_in(surrogate, tmp_path: Path):
@@ -421,8 +303,10 @@ def test_policies_are_compared_by_what_was_asked_for_and_not_by_what_they_learn_
     asked = small(session=session, judge={"variant": "pathwise", "time_limit": 3})
     result = train(surrogate, tmp_path / "policy.zip", asked)
     kept = PPO.load(result.path, device="cpu")
-    assert imagined_return(surrogate, kept, asked).mean == pytest.approx(result.imagined_return)
-    assert imagined_return(surrogate, kept, small(session=session)).mean < result.imagined_return, "a fourth cost more"
+    assert imagined_returns_of(surrogate, kept, asked).mean() == pytest.approx(result.imagined_return)
+    assert imagined_returns_of(surrogate, kept, small(session=session)).mean() < result.imagined_return, (
+        "a fourth cost more"
+    )
 
 
 @pytest.mark.parametrize("threads", [0, 10**9, 1.5, True])

@@ -152,7 +152,7 @@ class SessionOptions:
 
 @dataclass(frozen=True)
 class StartOptions:
-    """Options of where episodes and the policy start, and of prolonging the training."""
+    """Options of where episodes and the policy start, and of how long the training goes on."""
 
     start_box: Annotated[
         float | None,
@@ -194,9 +194,8 @@ class StartOptions:
         bool | None,
         typer.Option(
             "--prolong/--no-prolong",
-            help="Train for as many virtual steps again, once, if the imagined return still rises at the end. Fastppo "
-            "then also fine-tunes its policy from the declared starts. Not with cmaes or gradient. [default: on if "
-            "--steps is not given]",
+            help="Train in cycles while the imagined return rises, then refine the policy from the declared starts. "
+            "Only with fastppo. [default: on if --steps is not given]",
             show_default=False,
         ),
     ] = None

@@ -50,7 +50,7 @@ class DemoSettings:
     @property
     def virtual_steps(self) -> int | None:
         """Virtual steps of all rounds together; None derives them from the specification."""
-        return self.steps or self.demo_task.steps
+        return self.steps
 
     @property
     def search(self) -> str:
@@ -59,8 +59,7 @@ class DemoSettings:
 
     @property
     def prolong(self) -> bool:
-        """Whether a training that still gains takes as many virtual steps again: as ``prolongs`` where the task chose
-        their number, and not if the search can't be prolonged."""
+        """Whether a training takes more cycles while it gains: as ``prolongs``, and not if the search can't."""
         return SEARCHES.get(self.search).prolongable and prolongs(TrainSettings(total_steps=self.steps), self.spec())
 
     @property

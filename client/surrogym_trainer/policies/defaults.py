@@ -7,7 +7,6 @@ EXPLORATION = 0.5  # initial standard deviation of a continuous action, as a sha
 LANES = 128  # lanes of a session for an on-policy algorithm
 LEARNING_RATE = 3e-3
 LAST_RATE = 0.02  # final learning rate, as a share of the initial one
-ATTEMPT_SEED = 1_000_003  # difference between the seeds of successive networks of one training
 
 
 def decaying(remaining: float) -> float:

@@ -22,9 +22,9 @@ from surrogym_trainer.evaluation.imagined import (
     imagine,
     observation_statistics,
 )
+from surrogym_trainer.training.checks import checked
 from surrogym_trainer.training.search import Found, PolicySearch, SearchTask
 from surrogym_trainer.training.settings import CHECKS, TrainProgress, TrainSettings
-from surrogym_trainer.training.verdicts import checked
 
 FULL_COVARIANCE = 200  # most parameters with a full covariance; beyond, it is diagonal (separable CMA-ES)
 
@@ -129,7 +129,7 @@ class _Distribution:
 
     def imagined(self) -> float:
         """Imagined return of the mean."""
-        return checked(self._port, self.policy, self._settings).mean
+        return float(checked(self._port, self.policy, self._settings).mean())
 
     def _network(self, vector: NDArray[np.float64]) -> Network:
         return Network.of(self._spec, self._mean, self._deviation, self.choices.units, vector)

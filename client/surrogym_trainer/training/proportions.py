@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from surrogym_shared.network import counts_of
 from surrogym_shared.spec import EnvironmentSpec
 
 BATCH = 1_024  # large, because updates take most of the time and their cost depends on the number of batches
@@ -13,11 +12,6 @@ def suggested_gamma(spec: EnvironmentSpec) -> float:
     """Return the discount whose horizon, 1 / (1 - gamma), is a third of the time limit: 0.985 for 200 steps, 0.994
     for 500."""
     return min(max(1 - 3 / (spec.time_limit or 1_000), SHORTEST_SIGHT), LONGEST_SIGHT)
-
-
-def explores_further(spec: EnvironmentSpec) -> bool:
-    """Whether a network that follows an abandoned one explores by noise that lasts: for continuous actions."""
-    return not counts_of(spec) and spec.preset.adapts_training
 
 
 def even_batch(rollout: int) -> int:

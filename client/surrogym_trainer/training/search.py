@@ -46,11 +46,8 @@ class SearchTask:
     settings: TrainSettings
     steps: int  # virtual steps at most
     out: Path  # where the policy will be saved; names the run to trackers
-    prolong: bool = False  # whether to take as many steps again while the return rises, and to fine-tune
+    prolong: bool = False  # whether to take more cycles while the return rises, and to refine the policy
     progress: Progress = lambda _: None
-    patient: bool = False  # whether to keep a network that has learned nothing in the first quarter of the steps
-    gamma: float | None = None  # discount; None: as the time limit suggests
-    noise: float = 0.0  # least standard deviation of a continuous action in a training, as a share of its first one
 
 
 class Saved(Protocol):
@@ -96,6 +93,7 @@ class PolicySearch(ABC):
     suggested_steps: ClassVar[int] = 600_000  # virtual steps by default
     most_steps: ClassVar[int | None] = MAX_STEPS  # None: no limit, for a search whose steps are cheap
     prolongable: ClassVar[bool] = False  # supports ``task.prolong``
+    whole_episodes: ClassVar[bool] = True  # knows no other starts than the declared ones, and no shorter episodes
     tracked: ClassVar[bool] = False  # logs its curves to ``settings.tracker``
     by_mean: ClassVar[bool] = False  # moves by the mean without noise, whatever the session's variant
     resumable: ClassVar[bool] = True  # can start from a policy, and so learn in rounds
@@ -159,7 +157,7 @@ def search_for(settings: TrainSettings) -> PolicySearch:
     name, kind = name_of(settings), SEARCHES.get(name_of(settings))
     if settings.prolong and not kind.prolongable:
         raise ValueError(f"{name} trains for a fixed number of steps: expected no prolonging, or another algorithm")
-    if not kind.prolongable and (settings.start_visited is not None or settings.horizon is not None):
+    if kind.whole_episodes and (settings.start_visited is not None or settings.horizon is not None):
         raise ValueError(f"{name} runs whole episodes: expected no start_visited or horizon, or another algorithm")
     if settings.tracker is not None and not kind.tracked:
         raise ValueError(f"{name} supports no tracker: expected none, or another algorithm, got {settings.tracker}")
@@ -186,6 +184,6 @@ def planned_steps(settings: TrainSettings) -> int:
 
 
 def is_prolonged(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
-    """Whether a training takes as many steps again if its imagined return still rises at the end. Raises as
+    """Whether a training takes more cycles while its return rises, and refines its policy. Raises as
     ``search_for``."""
     return search_for(settings).prolongable and prolongs(settings, spec)

@@ -45,7 +45,7 @@ class TrainSettings:
     start_from: Path | None = None  # saved policy to continue from
     trust_policy: bool = False  # unpickle that policy's objects, which may run code
     anew: bool = False  # begin with a new network, and use the saved policy only if the new one stays worse
-    prolong: bool | None = None  # whether to prolong and to fine-tune a training; None: as ``prolongs``
+    prolong: bool | None = None  # whether to take cycles while they gain, and to refine; None: as ``prolongs``
     threads: int = 1
     tracker: Tracker | None = None  # for searches that log curves
     tensorboard: Path | None = (
@@ -114,7 +114,7 @@ def noise_of(view: SurrogateView) -> dict[str, Any]:
 
 
 def prolongs(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
-    """Whether a training takes as many steps again if its imagined return still rises at the end, and is fine-tuned.
+    """Whether a training takes more cycles while its return rises, and refines its policy.
 
     By default it does if the number of steps was not chosen. With preset ``paper``, the paper's maximum holds.
     """
@@ -157,7 +157,7 @@ class TrainResult:
     lost_episodes: int  # episodes that ended because the server lost the session
     settings: dict[str, Any]
     episode_penalty: float | None = None  # what it takes off a training episode's return; mean of the last 100
-    networks: int = 1  # networks of the last training; more than one if networks were abandoned
+    networks: int = 1  # networks of the last training; more than one if some learned nothing
     gaining: bool = False  # whether the best policy was still improving when the training ended
     untrained: float | None = None  # imagined return of a network that has learned nothing; None: not measured
     visited_confidence: tuple[float | None, ...] = ()  # confidence index over the visited states, of each round

@@ -156,11 +156,6 @@ class Learner:
         self.critic.backward((error * np.float32(2 * objective.vf_coef / size))[:, None])
         self._adam(objective.max_grad_norm, rate)
 
-    def keep_noise(self, share: float) -> None:
-        """Raise the standard deviations of continuous actions to at least this share of their first values."""
-        if share > 0:
-            np.maximum(self.further, self.distribution.further() + np.float32(np.log(share)), out=self.further)
-
     def limit_noise(self, logarithms: Array, share: float) -> None:
         """Lower the standard deviations of continuous actions to at most this share of others, given by their
         logarithms."""

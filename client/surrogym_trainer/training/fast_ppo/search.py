@@ -1,32 +1,25 @@
-"""Proximal policy optimisation without torch, as a policy search."""
+"""Proximal policy optimisation without torch, as a policy search in two stages: learn and refine."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
-from surrogym_shared.network import Network
+from surrogym_shared.network import Network, counts_of
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_trainer.evaluation.imagined import DECLARED, observation_statistics
-from surrogym_trainer.policies.defaults import (
-    ATTEMPT_SEED,
-    HIDDEN,
-    LANES,
-    LAST_RATE,
-    LEARNING_RATE,
-    WIDER,
-    decaying,
-)
-from surrogym_trainer.policies.files import load_policy
+from surrogym_trainer.evaluation.imagined import observation_statistics
+from surrogym_trainer.policies.defaults import HIDDEN, LANES, LEARNING_RATE, WIDER, decaying
 from surrogym_trainer.policies.predict import Predict
+from surrogym_trainer.training.checks import Checks, Returns, checked
 from surrogym_trainer.training.fast_ppo.learner import (
     Batch,
     LearnedNetwork,
@@ -36,15 +29,11 @@ from surrogym_trainer.training.fast_ppo.learner import (
     noisy,
     restored,
 )
-from surrogym_trainer.training.fast_ppo.long_episodes import with_short_episodes
-from surrogym_trainer.training.fast_ppo.rollouts import Collector, Rollout
-from surrogym_trainer.training.proportions import even_batch, explores_further, suggested_gamma
+from surrogym_trainer.training.fast_ppo.rollouts import Collector
+from surrogym_trainer.training.fast_ppo.stages import Stage, learn, refine
+from surrogym_trainer.training.proportions import even_batch
 from surrogym_trainer.training.search import REFERENCE, SEARCHES, Found, PolicySearch, SearchTask
-from surrogym_trainer.training.settings import TrainProgress, TrainSettings
-from surrogym_trainer.training.verdicts import Imagined, Verdicts, checked
-
-if TYPE_CHECKING:
-    from surrogym_trainer.training.stable_baselines.search import StableBaselinesSearch
+from surrogym_trainer.training.settings import CHECKS, TrainProgress
 
 RANGES = {  # whole numbers have whole bounds
     "n_steps": (1, 100_000),
@@ -58,36 +47,35 @@ RANGES = {  # whole numbers have whole bounds
     "max_grad_norm": (0.0, 1e6),
 }
 
-
-HELD = 16  # steps that share the noise of the second network
-
-SECOND_SEED = 3_000_017  # difference between the noise seeds of the two trainings with short episodes
-FINE_SEED = 2_000_003  # difference between the noise seeds of the fine-tuning and of the training before
-FINE = 0.1  # learning rate of the fine-tuning, as a share of the one before
-LOOKS = 1 / 8  # largest share of the fine-tuning that only collects observations
+CYCLES = 3  # of the stage ``learn`` in the suggested steps
+LEARNING = 2  # times the suggested steps: the most that a training takes before the stage ``refine``
+REFINING = 1 / 2  # cycle of the stage ``refine``, as a share of one of the stage ``learn``
+PATIENT_ROLLOUTS = 32  # fewest rollouts before a network is replaced
+HELD = 16  # steps that share the noise of every second network
+FINE = 0.1  # learning rate of the stage ``refine``, as a share of the usual one
+QUIET = 0.1  # noise at the end of its first cycle, as a share of that at its beginning
+LOOKS = 1 / 8  # largest share of the suggested steps that only collects observations
 CRITIC_ROLLOUTS = 8  # next rollouts, from which the critic alone learns
-QUIET = 0.1  # noise at the end of the fine-tuning, as a share of that at its beginning
-FRUITLESS = 1 / 2  # share of the fine-tuning after which it ends if the imagined return did not rise
+STAGE_SEED = 2_000_003  # difference between the noise seeds of two stages
 
 
 @dataclass(frozen=True)
 class FastPpo(PolicySearch):
     """Policy search by PPO in NumPy, with updates that take a sixth of the time of Stable-Baselines3's.
 
-    Networks, loss, Adam, scaled rewards and advantages are those of the search ``PPO``. A network that has learned
-    nothing after a quarter of the steps is abandoned, and another one takes the remaining steps. For continuous actions
-    its noise is held for ``HELD`` steps. If it is abandoned as well, one of Stable-Baselines3's ``PPO`` follows, with
-    state-dependent noise. If episodes are long and nothing ends them, training episodes are short and begin anywhere
-    (``with_short_episodes``). If nobody chose steps or discount, a second network then has the discount of whole
-    episodes.
+    Networks, loss, Adam, scaled rewards and advantages are those of the search ``PPO``. A training has two stages, of
+    cycles in which the learning rate falls. Module ``stages`` says what their episodes are, and why.
 
-    If nobody chose the number of steps, and training episodes are not short, as many steps follow for fine-tuning. All
-    of their episodes begin at declared starts. Inputs are standardised by the observations that the policy meets, and
-    the critic is a new one. The reason: returns from anywhere can be a thousand times those from the declared starts,
-    and critic and advantages then do not resolve the latter.
+    1. *learn*: short episodes that look a little ahead. A cycle follows while the second half of the one before gained.
+       A network that has learned nothing in its first cycle is replaced. The noise of every second network is held for
+       ``HELD`` steps where actions are continuous, because a first success may need a steady push.
+    2. *refine*: whole episodes from the declared starts. Inputs are standardised by the observations that the policy
+       meets, and the critic is a new one. It is one cycle.
+
+    If the number of steps was chosen, they are one cycle of the first stage.
     """
 
-    n_steps: int = 64  # steps of each lane in a rollout
+    n_steps: int = 16  # steps of each lane in a rollout
     n_epochs: int = 10
     batch_size: int | None = None  # None: about 1,024
     learning_rate: float | None = None  # None: decreases from 3e-3 to a fiftieth of it
@@ -99,6 +87,7 @@ class FastPpo(PolicySearch):
 
     suggested_steps = 450_000
     prolongable = True
+    whole_episodes = False
 
     def __post_init__(self) -> None:
         for name, (low, high) in RANGES.items():
@@ -107,15 +96,12 @@ class FastPpo(PolicySearch):
                 raise ValueError(f"{name}: expected {low} to {high}, got {value!r}")
 
     def search(self, task: SearchTask) -> Found:
-        if _starts_from_reference(task.settings) and not task.settings.anew:
+        start = task.settings.start_from
+        if start is not None and not Network.is_at(start):
             return _reference().search(task)  # only Stable-Baselines3 can train its own policies further
         compiled_update()  # loads a linear algebra library now, so that its threads are limited as well
         with threadpool_limits(limits=task.settings.threads):
-            cut = with_short_episodes(task, self.n_steps)
-            fine = _from_declared_starts(task) if task.prolong and cut is task else None
-            twice = task.prolong and cut is not task and self.gamma is None
-            with _lanes(cut) as lanes:
-                return _Training(self, cut, lanes, fine, twice=twice).run()
+            return _Training(self, task).run()
 
     def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:
         if not Network.is_at(policy):
@@ -126,171 +112,163 @@ class FastPpo(PolicySearch):
 class _Training:
     """Networks of one training, and the checks that compare them."""
 
-    def __init__(
-        self, search: FastPpo, task: SearchTask, lanes: Lanes, fine: SearchTask | None, *, twice: bool
-    ) -> None:
-        self._search, self._task, self._fine, self._spec = search, task, fine, task.port.spec()
-        self._twice = twice  # whether a second network follows, with another discount
+    def __init__(self, search: FastPpo, task: SearchTask) -> None:
+        self._search, self._task, self._spec = search, task, task.port.spec()
         settings = task.settings
-        suggested = suggested_gamma(self._spec) if task.gamma is None else task.gamma
-        self._gamma = suggested if search.gamma is None else search.gamma
         self._rng = np.random.default_rng(settings.seed)
         mean, deviation = observation_statistics(task.port, settings.seed)
         self._standardisation = np.array(mean), np.array(deviation)
         self._new = self._made()
-        self._theirs = _starts_from_reference(settings)
-        own = None if self._theirs else settings.start_from
-        self._saved = None if own is None else restored(own, self._spec, units_of(self._spec))
-        self._rollout = lanes.num_envs * search.n_steps
+        start = settings.start_from
+        self._saved = None if start is None else restored(start, self._spec, units_of(self._spec))
+        self._num_envs = settings.num_envs or LANES
+        self._rollout = self._num_envs * search.n_steps  # virtual steps
         self._batch = search.batch_size or even_batch(self._rollout)
         self._objective = Objective(search.clip_range, search.vf_coef, search.max_grad_norm)
-        self._lanes, self._lost = lanes, 0
-        planned = max(task.steps // self._rollout, 1) * self._rollout
-        self._most = planned * (1 + task.prolong + (fine is not None) + twice)  # virtual steps, if all follow
-        saved = self._earlier() if settings.anew else None
-        self._verdicts = Verdicts(planned, self._imagined(self._new), saved, patient=task.patient)
+        self._planned = max(task.steps // self._rollout, 1)  # rollouts
+        self._cycle = max(self._planned // CYCLES, 1) if task.prolong else self._planned
+        self._left = self._planned * (LEARNING if task.prolong else 1)  # rollouts before the stage ``refine``
+        saved = self._imagined(self._saved) if settings.anew and self._saved is not None else None
+        self._checks = Checks(self._imagined(self._new), saved)
         self._kept: LearnedNetwork | None = None
-        self._collector = Collector(lanes, self._gamma, search.gae_lambda, settings.seed)
+        self._taken = self._expected = self._lost = self._stages = 0
+        self._networks, self._gaining = 1, False
+        self._penalty: float | None = None
+        self._cycles: list[dict[str, Any]] = []
 
     def run(self) -> Found:
-        """Train networks one after another until one completes its steps, or Ctrl-C is pressed."""
-        verdicts, learner, whole = self._verdicts, self._new, True
+        """Run the stages until they end, or Ctrl-C is pressed."""
+        whole = True
         try:
-            for learner, hold in self._networks():
-                self._learn(learner, verdicts.left, hold)
-                if verdicts.given_up:
-                    continue
-                if self._task.prolong and verdicts.prolong():
-                    self._learn(learner, verdicts.left, hold)
-                if self._fine is not None and not verdicts.saturated:
-                    self._fine_tune(learner, self._fine)
-                if self._twice and not verdicts.saturated:
-                    learner = self._made()
-                    self._learn_again(learner)
-                break
-            else:
-                return self._by_reference()  # a network is only abandoned if steps are left
+            for learner, hold in self._candidates():
+                self._learn(learner, hold)
+                if self._checks.learned or self._checks.saturated or self._left < self._patience:
+                    break
+                self._networks += 1
+            if self._task.prolong and not self._checks.saturated:
+                self._refine()
         except KeyboardInterrupt:
             whole = False
-        return self._found(self._kept or _saved(learner), whole=whole)
+        return self._found(whole=whole)
 
-    def _networks(self) -> Iterator[tuple[Learner, int]]:
+    @property
+    def _patience(self) -> int:
+        """Rollouts after which a network that has learned nothing is replaced."""
+        return max(self._planned // CYCLES, PATIENT_ROLLOUTS)
+
+    def _learn(self, learner: Learner, hold: int) -> None:
+        """Train a network in cycles, while it gains."""
+        own, stage = 0, learn(self._task)
+        self._gaining = True
+        with self._open(stage):
+            while self._gaining and self._left > 0 and not self._checks.saturated:
+                rollouts = min(self._cycle, self._left)
+                taken, self._gaining = self._run_cycle(stage, learner, own, rollouts, hold)
+                own, self._left = own + taken, self._left - taken
+
+    def _refine(self) -> None:
+        """Train the best policy further."""
+        assert self._kept is not None
+        learner, stage = self._made(), refine(self._task)
+        learner.take_up(self._kept)
+        episode = -(-(self._spec.time_limit or LONGEST_EPISODE) // self._search.n_steps)
+        looks, cycle = max(min(episode, int(LOOKS * self._planned)), 1), max(int(REFINING * self._cycle), 1)
+        rate = self._search.learning_rate or LEARNING_RATE
+        with self._open(stage):
+            self._expect(looks + CRITIC_ROLLOUTS + cycle)
+            seen = [self._collect(learner).observations for _ in range(looks)]
+            learner.standardise_anew(np.concatenate(seen), self._rng)
+            for _ in range(CRITIC_ROLLOUTS):
+                rows = self._collect(learner)
+                self._update(learner, replace(rows, advantages=np.zeros_like(rows.advantages)), rate)
+            self._run_cycle(stage, learner, 0, cycle)
+
+    def _run_cycle(self, stage: Stage, learner: Learner, own: int, rollouts: int, hold: int = 1) -> tuple[int, bool]:
+        """Train a network while its learning rate falls. Returns the number of rollouts, and whether another cycle may
+        gain.
+
+        Args:
+            stage: stage of the training.
+            learner: the network.
+            own: rollouts that it has learned from in this stage. The rate of its next cycle begins lower.
+            rollouts: rollouts of this cycle.
+            hold: steps that share the noise of its actions.
+        """
+        fine, noise, before = stage.name == "refine", learner.further.copy(), self._checks.returns_of_best
+        self._expect(rollouts + (self._task.prolong and not fine) * int(REFINING * self._cycle))
+        for number in range(1, rollouts + 1):
+            rows = self._collect(learner, hold)
+            if self._checks.saturated or self._hopeless(own + number, rollouts - number):
+                break
+            remaining, rate = 1 - (own + number) / (own + rollouts), self._search.learning_rate
+            rate = decaying(remaining) if rate is None else rate
+            self._update(learner, rows, FINE * rate if fine else rate)
+            if fine:
+                learner.limit_noise(noise, 1 - (1 - QUIET) * number / rollouts)
+            if number == rollouts // 2 and not fine:
+                self._check(learner)
+                before = self._checks.returns_of_best
+        else:
+            self._check(learner)
+        entry = {"stage": stage.name, "network": self._networks, "virtual_steps": self._taken * self._rollout}
+        self._cycles.append({**entry, "imagined_return": self._checks.best})
+        return number, not self._checks.saturated and self._checks.gained(before)
+
+    def _hopeless(self, own: int, left: int) -> bool:
+        """Whether the network has learned nothing in its first rollouts, and another one has time to."""
+        return own == self._patience <= left and not self._checks.learned
+
+    def _candidates(self) -> Iterator[tuple[Learner, int]]:
         """Iterate over networks to train, each with the number of steps that share its noise: new ones, and in its turn
         the saved one if it had learned anything."""
         anew = self._task.settings.anew
         if anew or self._saved is None:
             yield self._new, 1
         if self._saved is not None:
-            best, learned = self._verdicts.knows(self._imagined(self._saved))
-            if best:
-                self._kept = _saved(self._saved)
-            if learned:
+            self._check(self._saved)
+            if self._checks.learned:
                 yield self._saved, 1
             elif not anew:
                 yield self._new, 1
-        if self._theirs:
-            return
-        if explores_further(self._spec):
-            yield self._made(), HELD
-            return
-        while True:
-            yield self._made(), 1
+        continuous = not counts_of(self._spec) and self._spec.preset.adapts_training
+        for number in itertools.count():
+            yield self._made(), HELD if continuous and number % 2 == 0 else 1
 
     def _made(self) -> Learner:
         """Return a new network, with other initial parameters each time."""
         return Learner(self._spec, *self._standardisation, units_of(self._spec), self._rng)
 
-    def _earlier(self) -> Imagined | None:
-        """Measure the returns of the policy to start from; None if there is none."""
-        if self._saved is not None:
-            return self._imagined(self._saved)
-        settings = self._task.settings
-        if settings.start_from is None:
-            return None
-        predict = load_policy(settings.start_from, REFERENCE, trust=settings.trust_policy)
-        return checked(self._task.port, predict, settings)
-
-    def _learn(self, learner: Learner, steps: int, hold: int) -> None:
-        """Train one network for ``steps`` virtual steps, or until it is abandoned."""
-        verdicts, search = self._verdicts, self._search
-        verdicts.begin()
-        before = verdicts.own_steps
-        for number in range(1, max(steps // self._rollout, 1) + 1):
-            rollout = self._collect(learner, before + number * self._rollout, hold)
-            if verdicts.given_up or verdicts.saturated:
-                return
-            remaining = 1 - verdicts.own_steps / (before + steps)
-            rate = decaying(remaining) if search.learning_rate is None else search.learning_rate
-            self._update(learner, rollout.rows, rate)
-        self._check(learner)
-
-    def _fine_tune(self, learner: Learner, task: SearchTask) -> None:
-        """Train the best policy further from the declared starts of ``task``. ``FastPpo`` says why."""
-        verdicts, search = self._verdicts, self._search
-        assert self._kept is not None
-        learner.take_up(self._kept)
-        before, rate = verdicts.own_steps, LEARNING_RATE if search.learning_rate is None else search.learning_rate
-        noise = learner.further.copy()
-        verdicts.extend()
-        rollouts = max(verdicts.left // self._rollout, 1)
-        episode = -(-(self._spec.time_limit or LONGEST_EPISODE) // search.n_steps)
-        looks, seen = max(min(episode, int(LOOKS * rollouts)), 1), []
-        best, rose = verdicts.best, looks + CRITIC_ROLLOUTS  # the last rollout after which the best return rose
-        with _lanes(task) as lanes:
-            self._collector = Collector(lanes, self._gamma, search.gae_lambda, task.settings.seed + FINE_SEED)
-            for number in range(1, rollouts + 1):
-                rows = self._collect(learner, before + number * self._rollout).rows
-                if verdicts.best != best:
-                    best, rose = verdicts.best, max(number, rose)
-                if verdicts.saturated or number - rose > FRUITLESS * rollouts:
-                    return
-                if number <= looks:
-                    seen.append(rows.observations)
-                    if number == looks:
-                        learner.standardise_anew(np.concatenate(seen), self._rng)
-                elif number <= looks + CRITIC_ROLLOUTS:
-                    self._update(learner, replace(rows, advantages=np.zeros_like(rows.advantages)), rate)
-                else:
-                    self._update(learner, rows, FINE * rate * max(1 - number / rollouts, LAST_RATE))
-                    learner.limit_noise(noise, 1 - (1 - QUIET) * number / rollouts)
-        self._check(learner)
-
-    def _learn_again(self, learner: Learner) -> None:
-        """Train a new network with the discount of whole episodes, after one with that of short episodes.
-
-        Only the imagined returns tell which of the two serves a task. ``with_short_episodes`` says why.
-        """
-        verdicts, search = self._verdicts, self._search
-        kept, gamma = self._kept, self._gamma
-        self._gamma = suggested_gamma(self._spec)
-        self._collector = Collector(self._lanes, self._gamma, search.gae_lambda, self._task.settings.seed + SECOND_SEED)
-        verdicts.extend()
-        verdicts.restart()
+    @contextmanager
+    def _open(self, stage: Stage) -> Iterator[None]:
+        """Open the lanes of a stage."""
+        fields = session_request(self._num_envs, "same_step", stage.settings.learning)
+        gamma = stage.gamma if self._search.gamma is None else self._search.gamma
+        seed = self._task.settings.seed + STAGE_SEED * self._stages
+        lanes = Lanes(self._task.port, fields)
         try:
-            self._learn(learner, verdicts.left, 1)
+            self._collector = Collector(lanes, gamma, self._search.gae_lambda, seed)
+            self._stages += 1
+            yield
         finally:
-            if self._kept is kept:
-                self._gamma = gamma
+            lanes.close()
 
-    def _collect(self, learner: Learner, steps: int, hold: int = 1) -> Rollout:
-        """Collect the rollout with which the present network will have taken ``steps``, and check it if that is due."""
-        verdicts = self._verdicts
+    def _expect(self, rollouts: int) -> None:
+        """Expect so many rollouts more, for the progress."""
+        self._expected = self._taken + rollouts
+
+    def _collect(self, learner: Learner, hold: int = 1) -> Batch:
+        """Collect a rollout, check the policy if that is due, and report the progress."""
         rollout = self._collector.collect(learner, self._search.n_steps, hold)
-        verdicts.saw(rollout.earned)
-        verdicts.at(steps)
+        self._checks.saw(rollout.earned)
         self._lost += rollout.lost
-        self._after(learner, rollout)
-        return rollout
-
-    def _after(self, learner: Learner, rollout: Rollout) -> None:
-        verdicts = self._verdicts
-        if verdicts.after_rollout():
+        before, self._taken = self._taken, self._taken + 1
+        if self._taken * CHECKS // self._planned > before * CHECKS // self._planned:
             self._check(learner)
-            verdicts.judge()
-        steps = min(verdicts.steps, verdicts.total)
-        penalty = self._collector.episode_penalty
-        most = max(verdicts.total, self._most)
-        self._task.progress(TrainProgress(steps, most, verdicts.latest, rollout.penalty_share, penalty))
+        steps, total = self._taken * self._rollout, max(self._taken, self._expected) * self._rollout
+        self._penalty = self._collector.episode_penalty
+        now = TrainProgress(steps, total, self._checks.latest, rollout.penalty_share, self._penalty)
+        self._task.progress(now)
+        return rollout.rows
 
     def _update(self, learner: Learner, rows: Batch, rate: float) -> None:
         size = len(rows.returns)
@@ -298,61 +276,29 @@ class _Training:
             shuffled = rows.at(self._rng.permutation(size))
             for begin in range(0, size, self._batch):
                 learner.update(shuffled.at(slice(begin, begin + self._batch)), self._objective, rate)
-        learner.keep_noise(self._task.noise)
 
     def _check(self, learner: Learner) -> None:
-        if self._verdicts.check(self._imagined(learner)):
+        if self._checks.add(self._imagined(learner)):
             self._kept = _saved(learner)
 
-    def _imagined(self, learner: Learner) -> Imagined:
+    def _imagined(self, learner: Learner) -> Returns:
         return checked(self._task.port, learner.policy(), self._task.settings)
 
-    def _found(self, policy: LearnedNetwork, *, whole: bool) -> Found:
-        verdicts = self._verdicts
-        chosen = {"gamma": self._gamma, "batch_size": self._batch, "net_arch": units_of(self._spec)}
-        lanes = {"num_envs": self._lanes.num_envs, "start_box": self._task.settings.learning["start_box"]}
-        ran_with = {**asdict(self._search), **chosen, **lanes, "total_steps": verdicts.total}
-        if "time_limit" in self._task.settings.session:
-            ran_with["time_limit"] = self._task.settings.session["time_limit"]
+    def _found(self, *, whole: bool) -> Found:
+        chosen = {"gamma": self._search.gamma, "batch_size": self._batch, "net_arch": units_of(self._spec)}
+        ran_with = {**asdict(self._search), **chosen, "num_envs": self._num_envs, "cycles": self._cycles}
         return Found(
-            policy,
-            verdicts.steps,
-            verdicts.best,
-            ran_with,
+            self._kept or _saved(self._new),
+            self._taken * self._rollout,
+            self._checks.best,
+            {**ran_with, "total_steps": self._planned * self._rollout},
             whole=whole,
-            episode_penalty=self._collector.episode_penalty,
+            episode_penalty=self._penalty,
             lost_episodes=self._lost,
-            networks=verdicts.networks,
-            gaining=verdicts.gaining,
-            untrained=verdicts.floor,
+            networks=self._networks,
+            gaining=self._gaining,
+            untrained=self._checks.untrained,
         )
-
-    def _by_reference(self) -> Found:
-        """Train ``PPO`` of Stable-Baselines3 for the remaining steps, and return its policy or the best earlier one.
-
-        It begins with its own saved policy if there is one, and else with a new network.
-        """
-        verdicts, task = self._verdicts, self._task
-        spent, left = verdicts.steps, max(verdicts.left, 1)
-        start = task.settings.start_from if self._theirs else None
-        chosen = {} if self._theirs else _reference().exploring_by_state(self._spec)
-        seed = task.settings.seed + ATTEMPT_SEED
-        settings = replace(task.settings, seed=seed, start_from=start, hyperparameters=chosen, anew=False)
-
-        def shifted(now: TrainProgress) -> None:
-            task.progress(replace(now, steps=spent + now.steps, total_steps=spent + now.total_steps))
-
-        other = _reference(**chosen).search(replace(task, settings=settings, steps=left, progress=shifted))
-        theirs, best = other.imagined_return, other
-        if self._kept is not None and verdicts.best is not None and (theirs is None or verdicts.best > theirs):
-            best = self._found(self._kept, whole=other.whole)
-        networks = verdicts.networks + other.networks
-        return replace(best, virtual_steps=spent + other.virtual_steps, networks=networks)
-
-
-def _starts_from_reference(settings: TrainSettings) -> bool:
-    """Whether the policy to start from is one of Stable-Baselines3."""
-    return settings.start_from is not None and not Network.is_at(settings.start_from)
 
 
 def units_of(spec: EnvironmentSpec) -> tuple[int, ...]:
@@ -364,26 +310,10 @@ def _saved(learner: Learner) -> LearnedNetwork:
     return LearnedNetwork(learner.policy(), learner.state())
 
 
-def _reference(**hyperparameters: Any) -> StableBaselinesSearch:
+def _reference() -> PolicySearch:
     """Return the ``PPO`` search of Stable-Baselines3.
 
     Raises:
         ModuleNotFoundError: it is not installed.
     """
-    return cast("StableBaselinesSearch", SEARCHES.get(REFERENCE)(**hyperparameters))
-
-
-def _from_declared_starts(task: SearchTask) -> SearchTask:
-    """Return the task with every episode from a declared start."""
-    session = {**task.settings.session, **DECLARED}
-    return replace(task, settings=replace(task.settings, horizon=None, session=session))
-
-
-@contextmanager
-def _lanes(task: SearchTask) -> Iterator[Lanes]:
-    settings = task.settings
-    lanes = Lanes(task.port, session_request(settings.num_envs or LANES, "same_step", settings.learning))
-    try:
-        yield lanes
-    finally:
-        lanes.close()
+    return SEARCHES.get(REFERENCE)()

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.policies.defaults import LANES, decaying
 from surrogym_trainer.policies.networks import WIDER, PaperPolicy
-from surrogym_trainer.training.proportions import even_batch, explores_further
+from surrogym_trainer.training.proportions import even_batch
 from surrogym_trainer.training.stable_baselines.search import StableBaselinesSearch
 
 
@@ -52,15 +52,6 @@ class PPO(OnPolicySearch):
             "gae_lambda": 0.97,
             "batch_size": even_batch(rollout),
         }
-
-    def exploring_by_state(self, spec: EnvironmentSpec) -> dict[str, Any]:
-        """Return the hyperparameters of gSDE, which explores by a function of the state (Raffin et al. 2022).
-
-        Noise drawn anew at every step may never reach a goal that takes many steps in one direction. A noise function
-        that stays for a whole rollout pushes each lane its own way. It is for continuous actions, and for PPO alone,
-        because the rollouts of other algorithms are too short.
-        """
-        return {"use_sde": True} if explores_further(spec) else {}
 
 
 class A2C(OnPolicySearch):

@@ -1,9 +1,8 @@
-"""Training by an algorithm of Stable-Baselines3: networks are tried one after another, and the best policy is kept."""
+"""Training by an algorithm of Stable-Baselines3, for a fixed number of steps. The best policy of its checks is kept."""
 
 from __future__ import annotations
 
 import inspect
-import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -12,7 +11,6 @@ from typing import Any, ClassVar
 
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -22,16 +20,15 @@ from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.evaluation.imagined import observation_statistics
-from surrogym_trainer.policies.defaults import ATTEMPT_SEED
 from surrogym_trainer.policies.files import load_learner, save_policy
 from surrogym_trainer.policies.networks import Standardise
 from surrogym_trainer.policies.predict import Predict
+from surrogym_trainer.training.checks import Returns, checked
 from surrogym_trainer.training.proportions import suggested_gamma
 from surrogym_trainer.training.search import Found, PolicySearch, SearchTask
 from surrogym_trainer.training.settings import TrainSettings
-from surrogym_trainer.training.stable_baselines.early_stopping import Checks
+from surrogym_trainer.training.stable_baselines.callback import Checking
 from surrogym_trainer.training.stable_baselines.tracking import tracking
-from surrogym_trainer.training.verdicts import Imagined, checked
 
 Statistics = tuple[Sequence[float], Sequence[float]]  # mean and deviation of observations, (D,) each
 
@@ -54,8 +51,8 @@ class StableBaselinesSearch(PolicySearch):
     algorithm: ClassVar[type[BaseAlgorithm]]
     policy: ClassVar[type[BasePolicy] | str]
     lanes: ClassVar[int]  # default number of lanes
-    prolongable = True
     tracked = True
+    whole_episodes = False
 
     def __init__(self, **hyperparameters: Any) -> None:
         self.hyperparameters = hyperparameters
@@ -81,10 +78,6 @@ class StableBaselinesSearch(PolicySearch):
         """Return keywords of the policy network, except those of standardisation."""
         return {}
 
-    def exploring_by_state(self, spec: EnvironmentSpec) -> dict[str, Any]:  # noqa: ARG002
-        """Return hyperparameters that replace the usual ones in the network that follows an abandoned one."""
-        return {}
-
     @contextmanager
     def _environment(self, task: SearchTask, gamma: float) -> Iterator[VecNormalize]:
         settings = task.settings
@@ -98,87 +91,49 @@ class StableBaselinesSearch(PolicySearch):
 
 
 class _Training:
-    """Networks of one training, and the checks that compare them."""
+    """One network, and the checks of its policy."""
 
     def __init__(self, search: StableBaselinesSearch, task: SearchTask, env: VecNormalize, gamma: float) -> None:
         self._search, self._task, self._env, self._gamma = search, task, env, gamma
         settings, self._spec = task.settings, task.port.spec()
         self._statistics = observation_statistics(task.port, settings.seed)
-        self._saved = None if settings.start_from is None else self._made(0, settings.start_from)
-        self._untrained = self._made(0)
-        self._total = _whole_rollouts(self._untrained, task.steps)
-        self._checks = Checks(
-            self._total,
-            task.progress,
-            lambda learner: imagined_return(task.port, learner, settings),
-            self._untrained,
-            self._saved if settings.anew else None,
+        saved = None if settings.start_from is None else self._made(settings.start_from)
+        new = self._made()
+        self._learner = new if saved is None or settings.anew else saved
+        self._total = _whole_rollouts(self._learner, task.steps)
+        self._checking = Checking(
+            self._total, task.progress, lambda learner: imagined_returns_of(task.port, learner, settings), new
         )
+        if saved is not None:
+            self._checking.check(saved)  # stays the best if training does not earn as much
 
     def run(self) -> Found:
-        """Train networks one after another until one completes its steps, or Ctrl-C is pressed."""
-        settings, checks, verdicts = self._task.settings, self._checks, self._checks.verdicts
-        with tracking(settings, self._task.out) as callbacks:
-            last, whole = self._learned(callbacks)
-        learner = checks.best_of(last)
-        ran_with = {"num_envs": self._env.num_envs, "total_steps": self._total, **effective(learner)}
+        """Train until the steps are taken, or Ctrl-C is pressed."""
+        checking, whole = self._checking, True
+        if self._learner.tensorboard_log is None:  # otherwise a temporary folder is made
+            self._learner.set_logger(Logger(folder=None, output_formats=[]))
+        with tracking(self._task.settings, self._task.out) as callbacks:
+            try:
+                self._learner.learn(self._total, callback=[checking, *callbacks])
+            except KeyboardInterrupt:
+                whole = False
+        best = checking.best_of(self._learner)
+        ran_with = {"num_envs": self._env.num_envs, "total_steps": self._total, **effective(best)}
         return Found(
-            LearnedPolicy(learner),
-            verdicts.steps,
-            verdicts.best,
+            LearnedPolicy(best),
+            checking.steps,
+            checking.checks.best,
             ran_with,
-            type(learner).__name__,
+            type(best).__name__,
             whole,
-            checks.episode_penalty,
-            checks.lost,
-            verdicts.networks,
-            verdicts.gaining,
-            verdicts.floor,
+            checking.episode_penalty,
+            checking.lost,
+            untrained=checking.checks.untrained,
         )
 
-    def _learned(self, callbacks: Sequence[BaseCallback]) -> tuple[BaseAlgorithm, bool]:
-        """Return the last network, and whether the training was completed rather than interrupted."""
-        verdicts = self._checks.verdicts
-        learner: BaseAlgorithm | None = None
-        for attempt in itertools.count():
-            try:
-                learner = self._network(attempt)
-                if learner.tensorboard_log is None:  # otherwise a temporary folder is made
-                    learner.set_logger(Logger(folder=None, output_formats=[]))
-                self._learn(learner, callbacks)
-                if self._task.prolong and not verdicts.given_up and verdicts.prolong():
-                    self._learn(learner, callbacks)
-            except KeyboardInterrupt:
-                if learner is None:
-                    raise
-                return learner, False
-            if not verdicts.given_up:
-                return learner, True
-        raise AssertionError("unreachable")
-
-    def _learn(self, learner: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> None:
-        """Let the algorithm learn for the training's remaining virtual steps.
-
-        If the training was prolonged, the learning rate continues from the middle of its schedule.
-        """
-        verdicts = self._checks.verdicts
-        steps = _whole_rollouts(learner, verdicts.left)
-        learner.learn(steps, callback=[self._checks, *callbacks], reset_num_timesteps=not verdicts.prolonged)
-
-    def _network(self, attempt: int) -> BaseAlgorithm:
-        """Return a new network, or in its turn the saved policy if it earns more than an untrained one."""
-        saved, anew = self._saved, self._task.settings.anew
-        if saved is not None and attempt == int(anew) and self._checks.worth_keeping(saved):
-            return saved
-        return self._made(attempt) if attempt else self._untrained
-
-    def _made(self, attempt: int, start_from: Path | None = None) -> BaseAlgorithm:
-        settings = self._task.settings
-        asked = replace(settings, seed=settings.seed + ATTEMPT_SEED * attempt, start_from=start_from)
-        if attempt and start_from is None:
-            by_state = self._search.exploring_by_state(self._spec)
-            asked = replace(asked, hyperparameters=by_state | asked.hyperparameters)
-        return make_learner(self._search, self._env, asked, self._spec, self._statistics, self._gamma)
+    def _made(self, start_from: Path | None = None) -> BaseAlgorithm:
+        settings = replace(self._task.settings, start_from=start_from)
+        return make_learner(self._search, self._env, settings, self._spec, self._statistics, self._gamma)
 
 
 def make_learner(
@@ -220,8 +175,8 @@ def make_learner(
         raise ValueError(f"{settings.algorithm} can't be trained here: {error}") from error
 
 
-def imagined_return(port: SurrogatePort, learner: BaseAlgorithm, settings: TrainSettings) -> Imagined:
-    """Measure the present policy without exploration, on the same starts at every check."""
+def imagined_returns_of(port: SurrogatePort, learner: BaseAlgorithm, settings: TrainSettings) -> Returns:
+    """Return the returns of the present policy without exploration, from the same starts at every check."""
 
     def predict(observation: Any) -> Any:
         return learner.predict(observation, deterministic=True)[0]

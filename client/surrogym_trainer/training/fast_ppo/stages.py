@@ -1,0 +1,62 @@
+"""The stages of a training: where their episodes begin, how long they are, and how far the policy looks ahead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from surrogym_sampler.original.protocol import LONGEST_EPISODE
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.evaluation.imagined import DECLARED
+from surrogym_trainer.training.proportions import suggested_gamma
+from surrogym_trainer.training.search import SearchTask
+from surrogym_trainer.training.settings import TrainSettings
+
+SHORTER = 5  # times: a training episode
+SHORTEST = 40  # steps
+SIGHT = 1 / 2  # horizon of the discount of short episodes, 1 / (1 - gamma), as a share of their length
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a training."""
+
+    name: str
+    settings: TrainSettings  # of its lanes
+    gamma: float
+
+
+def learn(task: SearchTask) -> Stage:
+    """Return the stage of short episodes, half of which begin anywhere, with a discount that looks half an episode
+    ahead.
+
+    A model can start anywhere, which a machine can't. In short episodes each lane sees many states, those near success
+    included, and a short sight finds a first policy in a tenth of the steps. The last reward of a truncated episode
+    includes the critic's value of its last state, so short episodes don't change what is optimal. Starts and lengths
+    that the user chose are kept, with the discount of whole episodes; so are those of preset ``paper``.
+    """
+    spec, settings = task.port.spec(), task.settings
+    ways = settings.start_box, settings.start_visited, settings.horizon
+    chosen = any(way is not None for way in ways) or not {"time_limit", "start_box"}.isdisjoint(settings.session)
+    if chosen or not spec.preset.adapts_training:
+        return Stage("learn", settings, suggested_gamma(spec))
+    length = short_episode(spec)
+    session = {**settings.session, "time_limit": length}
+    short = replace(settings, session=session, judge=settings.judging)
+    return Stage("learn", short, 1 - 1 / (SIGHT * length))
+
+
+def refine(task: SearchTask) -> Stage:
+    """Return the stage of whole episodes from the declared starts.
+
+    Returns from anywhere can be a thousand times those from the declared starts. Critic and advantages then do not
+    resolve the latter.
+    """
+    settings = task.settings
+    session = {**settings.session, **DECLARED}
+    return Stage("refine", replace(settings, horizon=None, session=session), suggested_gamma(task.port.spec()))
+
+
+def short_episode(spec: EnvironmentSpec) -> int:
+    """Return the steps of a short episode."""
+    limit = spec.time_limit or LONGEST_EPISODE
+    return min(max(limit // SHORTER, SHORTEST), limit)
