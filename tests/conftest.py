@@ -93,14 +93,10 @@ def pytest_collection() -> Iterator[None]:
 def pytest_configure(config: pytest.Config) -> None:
     """Compile steps once, before the first test: a dozen servers that do so at once outlast what tests wait for.
 
-    Workers collect their tests meanwhile, each from another file on: whichever comes to a file first compiles it for
-    all. What another checkout has compiled is of no use to this one.
+    Workers collect their tests meanwhile, all in the same order: xdist refuses to run them otherwise. What another
+    checkout has compiled is of no use to this one.
     """
     config.stash[WHOLE] = [Path(argument).resolve() for argument in config.args] == [TESTS]
-    if config.stash[WHOLE] and (worker := getattr(config, "workerinput", None)):
-        files = sorted(str(path) for path in TESTS.rglob("test_*.py"))
-        first = len(files) * int(worker["workerid"].removeprefix("gw")) // worker["workercount"]
-        config.args = files[first:] + files[:first]
     if getattr(config.option, "numprocesses", None):
         config.stash[COMPILING] = subprocess.Popen([sys.executable, "-c", PROGRAM])
     elif not hasattr(config, "workerinput"):
