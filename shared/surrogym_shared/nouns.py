@@ -1,7 +1,7 @@
 """The nouns of the loop, which the wire, the storage, the design and the sampler share.
 
-They are plain values without checks: the wire's models check what arrives. This file imports the standard library
-and NumPy alone, so that the pure core may import it.
+They are plain values without checks: the wire's models check what arrives. This file imports NumPy and the standard
+library alone, so that the pure core may import it. The thin client loads ``states`` alone.
 
 Shapes: C coordinates, F action entries, D observation entries, T actions of a query, n real steps.
 """
@@ -10,31 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from surrogym_shared.states import COMPLETED as COMPLETED
+from surrogym_shared.states import ENDED as ENDED
+from surrogym_shared.states import EventKind as EventKind
+from surrogym_shared.states import Phase as Phase
+from surrogym_shared.states import Purpose as Purpose
+from surrogym_shared.states import QueryKind as QueryKind
+from surrogym_shared.states import QueryStatus as QueryStatus
+from surrogym_shared.states import SamplePurpose as SamplePurpose
+from surrogym_shared.states import Verdict as Verdict
+
 Vector = tuple[float, ...]
-
-Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "unsure", "from_log", "failed"]
-"""Phase of a design."""
-
-COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "unsure", "from_log")  # the model will not improve by itself
-ENDED: tuple[Phase, ...] = (*COMPLETED, "failed")  # a sampler has nothing left to do
-
-Verdict = Literal["continue", "ready", "over_budget", "unsure", "from_log"]
-"""Verdict of one round. Unless it is ``continue``, it is also the phase of the design that ends with the round."""
-
-Purpose = Literal["initial", "adaptive", "manual", "audit"]
-"""Why a query was made."""
-
-SamplePurpose = Literal["initial", "adaptive", "manual", "audit", "logged"]
-"""Why the real step of a sample was taken: the purpose of its query, or ``logged``."""
-
-QueryKind = Literal["step", "rollout"]
-QueryStatus = Literal["pending", "leased", "answered", "set_aside", "refused"]
-EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy", "job"]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
-import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -23,6 +22,7 @@ from surrogym_server.services.queries import QueryService
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSurrogate
 from surrogym_server.storage.sql import open_storage
+from surrogym_shared.nouns import Query
 from surrogym_shared.spec import EnvironmentSpec
 
 SECONDS = 60.0
@@ -113,7 +113,7 @@ def test_a_claim_that_waits_at_one_server_wakes_for_a_query_of_another(
         while not (waiting.done() or listening(storages[0])):
             await asyncio.sleep(0.01)
         await asyncio.sleep(0.1)  # it looks once, and then waits
-        await asyncio.to_thread(there.add, "waited", np.zeros((1, 2)), np.zeros((1, 1)), None)
+        await asyncio.to_thread(there.add, "waited", [Query.step((0.0, 0.0), (0.0,))], None)
         return len((await asyncio.wait_for(waiting, SECONDS / 2)).queries)
 
     try:

@@ -68,8 +68,8 @@ def test_a_training_is_stored_with_its_curve_and_promise(api: Api, run_one, tmp_
     assert job.version is not None
     policy = api.policies.get(NAME, job.version)
     assert policy.promise is not None
-    assert [point.steps for point in policy.curve] == [8_192]  # one rollout
-    assert [point.steps for point in job.curve] == [8_192]
+    assert [point.steps for point in policy.curve] == [2_048]  # one rollout
+    assert [point.steps for point in job.curve] == [2_048]
     (file,) = tmp_path.glob("pendulum-job*.zip")
     assert api.policies.file(NAME, job.version, "zip") == file.read_bytes()
     load_policy(file)

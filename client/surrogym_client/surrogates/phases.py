@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from surrogym_shared.nouns import COMPLETED as COMPLETED
-from surrogym_shared.nouns import ENDED as ENDED
-from surrogym_shared.nouns import Phase
+from surrogym_shared.states import COMPLETED as COMPLETED
+from surrogym_shared.states import ENDED as ENDED
+from surrogym_shared.states import Phase
 from surrogym_shared.wire import SurrogateView
 
 IN_WORDS: dict[Phase, str] = {

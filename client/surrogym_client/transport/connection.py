@@ -27,7 +27,6 @@ from surrogym_client.errors import (
 )
 from surrogym_client.transport.stream import Stream, StreamUnavailable
 from surrogym_shared.codes import Problem
-from surrogym_shared.secret_files import tokens_in
 
 T = TypeVar("T")
 
@@ -250,6 +249,8 @@ def token_in(path: Path) -> str:
     Raises:
         UnusableToken: the file can't be read, or does not contain exactly one token.
     """
+    from surrogym_shared.secret_files import tokens_in  # only who has a token in a file needs it
+
     try:
         tokens = tokens_in(path)
     except OSError as error:

@@ -8,12 +8,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from surrogym_shared.acting import MAX_ROLLOUT as MAX_ROLLOUT  # for modules that only import the wire
 from surrogym_shared.bounded import FailFast
-from surrogym_shared.nouns import Phase as Phase
-from surrogym_shared.nouns import Purpose as Purpose
-from surrogym_shared.nouns import QueryKind as QueryKind
-from surrogym_shared.nouns import QueryStatus as QueryStatus
-from surrogym_shared.nouns import SamplePurpose as SamplePurpose
 from surrogym_shared.spec import MAX_DIMENSIONS, NAME_PATTERN
+from surrogym_shared.states import Phase as Phase
+from surrogym_shared.states import Purpose as Purpose
+from surrogym_shared.states import QueryKind as QueryKind
+from surrogym_shared.states import QueryStatus as QueryStatus
+from surrogym_shared.states import SamplePurpose as SamplePurpose
 
 PROTOCOL = 1
 LEASE_SECONDS = 60.0  # default of a claim: of a query by a sampler, and of a job by a worker

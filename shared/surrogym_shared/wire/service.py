@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from surrogym_shared.nouns import EventKind
+from surrogym_shared.states import EventKind
 from surrogym_shared.wire.base import PROTOCOL, Reply, Role
 
 

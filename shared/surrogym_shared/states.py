@@ -1,0 +1,22 @@
+"""Phases, verdicts, purposes and kinds, each listed once."""
+
+from typing import Literal
+
+Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "unsure", "from_log", "failed"]
+"""Phase of a design."""
+
+COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "unsure", "from_log")  # the model will not improve by itself
+ENDED: tuple[Phase, ...] = (*COMPLETED, "failed")  # a sampler has nothing left to do
+
+Verdict = Literal["continue", "ready", "over_budget", "unsure", "from_log"]
+"""Verdict of one round. Unless it is ``continue``, it is also the phase of the design that ends with the round."""
+
+Purpose = Literal["initial", "adaptive", "manual", "audit"]
+"""Why a query was made."""
+
+SamplePurpose = Literal["initial", "adaptive", "manual", "audit", "logged"]
+"""Why the real step of a sample was taken: the purpose of its query, or ``logged``."""
+
+QueryKind = Literal["step", "rollout"]
+QueryStatus = Literal["pending", "leased", "answered", "set_aside", "refused"]
+EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy", "job"]
