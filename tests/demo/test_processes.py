@@ -71,7 +71,7 @@ def test_stubborn_processes_end_with_all_they_started(
 
 
 def failed(children: Children, child: Child) -> str:
-    """What is said after a process has failed."""
+    """Return the message of the error that a failed process causes."""
     until(lambda: child.process.poll() is not None)
     with pytest.raises(RunFailed) as said:
         children.check()

@@ -213,6 +213,7 @@ def test_a_training_refines_its_policy_from_the_declared_starts(surrogate, tmp_p
     refined = train(surrogate, tmp_path / "refined.zip", replace(settings, prolong=True), seen.append)
     assert [one["start_box"] for one in opened[1:]] == [0.5, 0.0]
     assert [one["stage"] for one in refined.settings["cycles"]][-1] == "refine"
+    assert (refined.settings["gamma"], refined.settings["time_limit"]) == (0.9, 20), "of the stage learn"
     assert all(now.steps <= now.total_steps for now in seen)
     noise = [restored(path, surrogate.spec(), (64, 64)).further for path in (plain.path, refined.path)]
     assert noise[1] <= noise[0]

@@ -152,7 +152,7 @@ class SessionOptions:
 
 @dataclass(frozen=True)
 class StartOptions:
-    """Options of where episodes and the policy start, and of how long the training goes on."""
+    """Options for the starts of episodes, for the policy to continue from, and for further cycles."""
 
     start_box: Annotated[
         float | None,

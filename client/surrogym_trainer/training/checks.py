@@ -33,7 +33,7 @@ class Checks:
     def __init__(self, untrained: Returns, saved: Returns | None = None) -> None:
         self.untrained = float(untrained.mean())
         self.latest: float | None = None  # imagined return of the last check
-        self._best: Returns | None = None
+        self.returns_of_best: Returns | None = None  # (episodes,) of the best policy so far
         self._half_way = self.untrained if saved is None else (self.untrained + float(saved.mean())) / 2
         self._few = self._many = _of_many(untrained)  # of an untrained network, and the highest so far
         self._seen = self.untrained  # highest return of a training episode
@@ -43,12 +43,7 @@ class Checks:
     @property
     def best(self) -> float | None:
         """Imagined return of the best policy so far."""
-        return None if self._best is None else float(self._best.mean())
-
-    @property
-    def returns_of_best(self) -> Returns | None:
-        """Returns (episodes,) of the best policy so far."""
-        return self._best
+        return None if self.returns_of_best is None else float(self.returns_of_best.mean())
 
     def saw(self, earned: Iterable[float]) -> None:
         """Record the returns of training episodes."""
@@ -64,7 +59,7 @@ class Checks:
         self.latest = imagined
         better = self.best is None or imagined >= self.best
         if better:
-            self._best = returns
+            self.returns_of_best = returns
         return better
 
     @property
@@ -92,13 +87,14 @@ class Checks:
         Args:
             before: returns (episodes,) of the best policy before; None: of an untrained network.
         """
-        if self._best is None or not self.learned:
+        best = self.returns_of_best
+        if best is None or not self.learned:
             return False
         if before is None:
             return True
-        gains = self._best - before
+        gains = best - before
         error = float(gains.std(ddof=1)) / len(gains) ** 0.5
-        return bool(gains.mean() > max(CLEARLY * error, GAIN * (self._best.mean() - self.untrained)))
+        return bool(gains.mean() > max(CLEARLY * error, GAIN * (best.mean() - self.untrained)))
 
     @property
     def _nothing(self) -> float:

@@ -49,11 +49,11 @@ RANGES = {  # whole numbers have whole bounds
 
 CYCLES = 3  # of the stage ``learn`` in the suggested steps
 LEARNING = 2  # times the suggested steps: the most that a training takes before the stage ``refine``
-REFINING = 1 / 2  # cycle of the stage ``refine``, as a share of one of the stage ``learn``
+REFINING = 1 / 2  # length of the stage ``refine``, as a share of a cycle of the stage ``learn``
 PATIENT_ROLLOUTS = 32  # fewest rollouts before a network is replaced
 HELD = 16  # steps that share the noise of every second network
 FINE = 0.1  # learning rate of the stage ``refine``, as a share of the usual one
-QUIET = 0.1  # noise at the end of its first cycle, as a share of that at its beginning
+QUIET = 0.1  # noise at its end, as a share of that at its beginning
 LOOKS = 1 / 8  # largest share of the suggested steps that only collects observations
 CRITIC_ROLLOUTS = 8  # next rollouts, from which the critic alone learns
 STAGE_SEED = 2_000_003  # difference between the noise seeds of two stages
@@ -173,7 +173,7 @@ class _Training:
         learner.take_up(self._kept)
         episode = -(-(self._spec.time_limit or LONGEST_EPISODE) // self._search.n_steps)
         looks, cycle = max(min(episode, int(LOOKS * self._planned)), 1), max(int(REFINING * self._cycle), 1)
-        rate = self._search.learning_rate or LEARNING_RATE
+        rate = LEARNING_RATE if self._search.learning_rate is None else self._search.learning_rate
         with self._open(stage):
             self._expect(looks + CRITIC_ROLLOUTS + cycle)
             seen = [self._collect(learner).observations for _ in range(looks)]
@@ -242,18 +242,20 @@ class _Training:
     def _open(self, stage: Stage) -> Iterator[None]:
         """Open the lanes of a stage."""
         fields = session_request(self._num_envs, "same_step", stage.settings.learning)
-        gamma = stage.gamma if self._search.gamma is None else self._search.gamma
         seed = self._task.settings.seed + STAGE_SEED * self._stages
         lanes = Lanes(self._task.port, fields)
         try:
-            self._collector = Collector(lanes, gamma, self._search.gae_lambda, seed)
+            self._collector = Collector(lanes, self._gamma_of(stage), self._search.gae_lambda, seed)
             self._stages += 1
             yield
         finally:
             lanes.close()
 
+    def _gamma_of(self, stage: Stage) -> float:
+        return stage.gamma if self._search.gamma is None else self._search.gamma
+
     def _expect(self, rollouts: int) -> None:
-        """Expect so many rollouts more, for the progress."""
+        """Let the progress show that this many rollouts are left."""
         self._expected = self._taken + rollouts
 
     def _collect(self, learner: Learner, hold: int = 1) -> Batch:
@@ -285,8 +287,11 @@ class _Training:
         return checked(self._task.port, learner.policy(), self._task.settings)
 
     def _found(self, *, whole: bool) -> Found:
-        chosen = {"gamma": self._search.gamma, "batch_size": self._batch, "net_arch": units_of(self._spec)}
+        stage = learn(self._task)
+        chosen = {"gamma": self._gamma_of(stage), "batch_size": self._batch, "net_arch": units_of(self._spec)}
         ran_with = {**asdict(self._search), **chosen, "num_envs": self._num_envs, "cycles": self._cycles}
+        if "time_limit" in stage.settings.session:
+            ran_with["time_limit"] = stage.settings.session["time_limit"]
         return Found(
             self._kept or _saved(self._new),
             self._taken * self._rollout,

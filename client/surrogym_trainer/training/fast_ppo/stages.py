@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
-from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.evaluation.imagined import DECLARED
 from surrogym_trainer.training.proportions import suggested_gamma
 from surrogym_trainer.training.search import SearchTask
@@ -39,7 +38,8 @@ def learn(task: SearchTask) -> Stage:
     chosen = any(way is not None for way in ways) or not {"time_limit", "start_box"}.isdisjoint(settings.session)
     if chosen or not spec.preset.adapts_training:
         return Stage("learn", settings, suggested_gamma(spec))
-    length = short_episode(spec)
+    limit = spec.time_limit or LONGEST_EPISODE
+    length = min(max(limit // SHORTER, SHORTEST), limit)
     session = {**settings.session, "time_limit": length}
     short = replace(settings, session=session, judge=settings.judging)
     return Stage("learn", short, 1 - 1 / (SIGHT * length))
@@ -54,9 +54,3 @@ def refine(task: SearchTask) -> Stage:
     settings = task.settings
     session = {**settings.session, **DECLARED}
     return Stage("refine", replace(settings, horizon=None, session=session), suggested_gamma(task.port.spec()))
-
-
-def short_episode(spec: EnvironmentSpec) -> int:
-    """Return the steps of a short episode."""
-    limit = spec.time_limit or LONGEST_EPISODE
-    return min(max(limit // SHORTER, SHORTEST), limit)
