@@ -48,7 +48,6 @@ from surrogym_trainer.training.settings import chosen_for
 HARMFUL = 0.2  # share of the policy's gain
 EPISODES = 100  # of a real return
 SEARCH = "FASTPPO"
-LEARNED = 600  # virtual episodes that a policy is learned in
 APART = 1_000_000  # between the numbers of two copies in a database
 UNCHANGED = ("unchanged", "unchanged 2", "unchanged 3", "unchanged 4")
 
@@ -105,7 +104,7 @@ def learn(machine: Machine, seed: int, kept: Path) -> None:
     plant = Plant(machine, machine.real, np.random.default_rng([seed, 1]))
     with running_server(kept) as server, placed(server.url, spec, plant, keep=True) as (api, port):
         view = wait_for_design(api, port.surrogate, PATIENCE_SECONDS)
-        settings = chosen_for(view, TrainSettings(SEARCH, LEARNED * machine.time_limit, seed=seed))
+        settings = chosen_for(view, TrainSettings(SEARCH, seed=seed))
         train(port, kept / "policy.zip", settings)
         learned = {"name": port.surrogate, "session": dict(settings.judging)}
     (kept / "learned.json").write_text(json.dumps(learned))

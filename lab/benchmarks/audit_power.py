@@ -36,6 +36,7 @@ from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_lab.reproduce.rows import read_records, write_records
 from surrogym_lab.reproduce.statistics import exact_interval
+from surrogym_sampler.original.protocol import Environment
 from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_shared.spec import Design, EnvironmentSpec
 from surrogym_trainer.policies import load_policy
@@ -128,7 +129,7 @@ def _row(handover: Handover, *known: str | int | float) -> Row:
 
 @contextmanager
 def placed(
-    url: str, spec: EnvironmentSpec, environment: Changing, *, keep: bool = False
+    url: str, spec: EnvironmentSpec, environment: Environment, *, keep: bool = False
 ) -> Iterator[tuple[Api, HttpSurrogate]]:
     """A surrogate, with a sampler beside the environment in a thread. It is deleted at the end, or kept."""
     name = f"audited-{uuid4().hex[:8]}"
@@ -143,7 +144,7 @@ def placed(
 
 
 @contextmanager
-def sampling(url: str, name: str, environment: Changing) -> Iterator[None]:
+def sampling(url: str, name: str, environment: Environment) -> Iterator[None]:
     """A sampler beside the environment in a thread, until the context ends or the surrogate is deleted."""
     settings = SamplerSettings(name="beside", wait_seconds=0.5, time_limit=2 * PATIENCE_SECONDS)
     with Api(url) as own:
