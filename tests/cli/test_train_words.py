@@ -66,6 +66,11 @@ def test_the_closed_loop_says_how_well_the_policys_region_is_known():
     assert words_of(vars(now)) == "100 of about 512 virtual steps, confidence index 0.9000 where the policy went"
 
 
+def test_the_progress_names_the_stage_of_a_search_that_has_some():
+    now = TrainProgress(100, 512, -1.5, 0.0, stage="refine")
+    assert words_of(vars(now)) == "refine: 100 of about 512 virtual steps, imagined return -1.5 (in the surrogate)"
+
+
 def test_a_training_that_still_improves_shows_how_to_continue():
     words = words_of_result(replace(RESULT, gaining=True))
     assert "; it still improved at the end, and --start-from p.zip continues it; next: surrogym evaluate" in words

@@ -215,6 +215,7 @@ def test_a_training_refines_its_policy_from_the_declared_starts(surrogate, tmp_p
     assert [one["stage"] for one in refined.settings["cycles"]][-1] == "refine"
     assert (refined.settings["gamma"], refined.settings["time_limit"]) == (0.9, 20), "of the stage learn"
     assert all(now.steps <= now.total_steps for now in seen)
+    assert list(dict.fromkeys(now.stage for now in seen)) == ["learn", "refine"], "each stage has lines of its own"
     noise = [restored(path, surrogate.spec(), (64, 64)).further for path in (plain.path, refined.path)]
     assert noise[1] <= noise[0]
     further = replace(settings, prolong=True, start_from=refined.path)

@@ -143,6 +143,7 @@ class TrainProgress:
     visited_confidence: float | None = (
         None  # confidence index over the states that the policy visited in the last round
     )
+    stage: str | None = None  # name of the present stage, of a search that has some
 
 
 @dataclass(frozen=True)

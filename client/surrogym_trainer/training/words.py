@@ -87,10 +87,9 @@ def words_of_interruption(result: TrainResult, asked: str) -> str:
 def words_of(now: dict[str, Any]) -> str:
     """Describe the state of a training, from the fields of ``TrainProgress``."""
     penalty = f", penalty {now['episode_penalty']:.1f} an episode" if now["episode_penalty"] else ""
-    known = _known(now.get("visited_confidence"))
-    return (
-        f"{now['steps']} of about {now['total_steps']} virtual steps{_imagined(now['imagined_return'])}{penalty}{known}"
-    )
+    known, stage = _known(now.get("visited_confidence")), f"{now['stage']}: " if now.get("stage") else ""
+    steps = f"{now['steps']} of about {now['total_steps']} virtual steps"
+    return f"{stage}{steps}{_imagined(now['imagined_return'])}{penalty}{known}"
 
 
 def _given_up(networks: int) -> str:

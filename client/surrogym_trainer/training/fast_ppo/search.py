@@ -132,6 +132,7 @@ class _Training:
         self._checks = Checks(self._imagined(self._new), saved)
         self._kept: LearnedNetwork | None = None
         self._taken = self._expected = self._lost = self._stages = 0
+        self._stage = ""
         self._networks, self._gaining = 1, False
         self._penalty: float | None = None
         self._cycles: list[dict[str, Any]] = []
@@ -247,6 +248,7 @@ class _Training:
         try:
             self._collector = Collector(lanes, self._gamma_of(stage), self._search.gae_lambda, seed)
             self._stages += 1
+            self._stage = stage.name
             yield
         finally:
             lanes.close()
@@ -268,8 +270,9 @@ class _Training:
             self._check(learner)
         steps, total = self._taken * self._rollout, max(self._taken, self._expected) * self._rollout
         self._penalty = self._collector.episode_penalty
-        now = TrainProgress(steps, total, self._checks.latest, rollout.penalty_share, self._penalty)
-        self._task.progress(now)
+        self._task.progress(
+            TrainProgress(steps, total, self._checks.latest, rollout.penalty_share, self._penalty, stage=self._stage)
+        )
         return rollout.rows
 
     def _update(self, learner: Learner, rows: Batch, rate: float) -> None:
