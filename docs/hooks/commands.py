@@ -1,11 +1,13 @@
-"""Makes the page of all commands while the site is built, from the source of ``surrogym COMMAND --help``, and names
-the paths of records, which are in the repository and not in the site."""
+"""Makes two pages while the site is built: the commands from the source of ``surrogym COMMAND --help``, and the routes
+from the server's OpenAPI. Names the paths of records, which are in the repository and not in the site."""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import click
@@ -15,8 +17,10 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 from surrogym.cli import build
+from surrogym_server.app import create_app
+from surrogym_server.settings import Settings
 
-PAGE = "reference/commands.md"
+PAGE, ROUTES = "reference/commands.md", "reference/http.md"
 LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)\s]+)\)")
 
 
@@ -36,9 +40,47 @@ def outside(link: re.Match[str], folder: Path, docs: Path) -> str:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Adds the page to those of the folder."""
+    """Adds the two pages to those of the folder."""
+    with TemporaryDirectory() as folder:
+        api = create_app(Settings(database=f"{folder}/empty.db")).openapi()
     files.append(File.generated(config, PAGE, content=page(typer.main.get_command(build()))))
+    files.append(File.generated(config, ROUTES, content=routes(api)))
     return files
+
+
+def routes(api: dict[str, Any]) -> str:
+    """One section for each route: what it does, its parameters and the fields of its body."""
+    sections = [
+        "# HTTP routes\n\nMade from the OpenAPI of the server, which `/docs` of a running server shows with examples.\n"
+    ]
+    for path, methods in api["paths"].items():
+        for method, route in methods.items():
+            rows = [*parameters(route), *fields(route, api)]
+            head = "| field | default | meaning |\n|---|---|---|\n" if rows else ""
+            told = cell(route.get("description", "")).replace("``", "`")
+            sections.append(f"## `{method.upper()} {path}`\n\n{route['summary']}. {told}\n\n{head}" + "".join(rows))
+    return "\n".join(sections)
+
+
+def parameters(route: dict[str, Any]) -> Iterator[str]:
+    """A row for each parameter of the query."""
+    for parameter in route.get("parameters", []):
+        if parameter["in"] == "query":
+            yield field(parameter["name"], parameter["schema"] | parameter, parameter.get("required", False))
+
+
+def fields(route: dict[str, Any], api: dict[str, Any]) -> Iterator[str]:
+    """A row for each field of the JSON body."""
+    content = route.get("requestBody", {}).get("content", {}).get("application/json", {})
+    name = content.get("schema", {}).get("$ref", "").rpartition("/")[2]
+    body = api["components"]["schemas"].get(name, {})
+    for key, schema in body.get("properties", {}).items():
+        yield field(key, schema, key in body.get("required", []))
+
+
+def field(name: str, schema: dict[str, Any], required: bool) -> str:
+    default = "required" if required else f"`{json.dumps(schema.get('default'))}`"
+    return f"| `{name}` | {default} | {cell(schema.get('description', '')).replace('``', '`')} |\n"
 
 
 def page(program: Any) -> str:

@@ -71,6 +71,7 @@ OTHERWISE = {
     "docs/how-to/backup.md": "tests/server starts on databases and copies of them",
     "docs/evidence.md": "lab/tests runs its studies, in short",
     "docs/http-api.md": "test_http_api.py sends its requests without curl",
+    "docs/reference/stream.md": "test_http_api.py sends its requests without curl",
     "docs/how-to/containers.md": "tests/docker reads it; no container engine is needed",
     "docs/how-to/operate.md": "tests/server and tests/security start servers with these settings",
     "docs/how-to/plugins.md": "tests/plugins installs the package and compares its class with the page",

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from support.commands import command_line
+from surrogym_shared.wire import OpenSession
 
 ROOT = Path(__file__).parents[2]
 LOADED = re.compile(
@@ -58,6 +59,13 @@ def test_every_command_is_in_the_reference(site: Path) -> None:
     page = (site / "reference" / "commands.html").read_text(encoding="utf-8")
     names = [name for name, command in command_line().commands.items() if not command.hidden]
     assert [name for name in names if f"surrogym {name}" not in page] == []
+
+
+def test_every_route_is_in_the_reference_with_its_options(site: Path) -> None:
+    page = (site / "reference" / "http.html").read_text(encoding="utf-8")
+    assert "POST /v1/surrogates/{name}/policies" in page
+    fields = OpenSession.model_fields
+    assert [name for name in fields if f"<code>{name}</code>" not in page] == []
 
 
 def test_the_client_is_in_the_reference_with_its_docstrings(site: Path) -> None:

@@ -126,11 +126,7 @@ def test_the_example_keeps_the_laws(cases: dict[str, ModelCase], law, name: str)
     law(cases[name])
 
 
-def test_the_page_shows_the_example():
+def test_the_page_names_the_entry_point_of_the_example():
     page = (ROOT / "docs" / "how-to" / "plugins.md").read_text()
     assert 'bayesian_linear = "bayesian_linear:BayesianLinear"' in page
     assert 'bayesian_linear = "bayesian_linear:BayesianLinear"' in (EXAMPLE / "pyproject.toml").read_text()
-    shown = page.partition("## Write your own family of models")[2].partition("```python\n")[2].partition("```")[0]
-    module = (EXAMPLE / "bayesian_linear.py").read_text()
-    assert [line for line in shown.splitlines() if line not in module.splitlines()] == []
-    assert "class BayesianLinear(Learner)" in shown
