@@ -15,8 +15,8 @@ beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 ========  ======================  =========================================================
 """
 
-from surrogym_server.gp.bound import Fewer, fewer_inputs, fit_bound
-from surrogym_server.gp.fit import Fitted, fit, noisy_explanation, refine, refine_where_hard
+from surrogym_server.gp.bound import Fewer, fewer_inputs, fit_bound, fit_through_few, is_noisy, loses_nothing
+from surrogym_server.gp.fit import Fitted, fit, fit_some, noisy_explanation, refine, refine_where_hard
 from surrogym_server.gp.growth import fit_growing
 from surrogym_server.gp.hyperparameter_samples import hyperparameter_samples
 from surrogym_server.gp.joint import Joint
@@ -57,7 +57,11 @@ __all__ = [
     "fit",
     "fit_bound",
     "fit_growing",
+    "fit_some",
+    "fit_through_few",
     "hyperparameter_samples",
+    "is_noisy",
+    "loses_nothing",
     "noisy_explanation",
     "pools",
     "refine",

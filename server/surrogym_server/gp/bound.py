@@ -41,6 +41,8 @@ from surrogym_server.gp.sparse import condition_sparse, pivots
 from surrogym_server.gp.subsets import SOME, spread
 
 SEARCHES = ((2_000, 40), (None, 15))  # most points of each search, None for all, and its iterations
+NOISY = 1e-4  # noise variance, as a share of the output's: with less, errors of inducing points count beside it
+PRECISE = 1e-4  # error of points that are predicted from the others, in standard deviations of the output
 HARDLY, TRIES = 0.3, 6  # of the noise: largest effect of an input that may be left out; and searches
 JITTER = 1e-9  # of the points' mean prior variance: added to the diagonal of K_uu
 
@@ -70,6 +72,42 @@ def fit_bound(
                 break
         hyper = Parameters(x.shape[1], options, reflection).hyper(starts[0])
         return condition(hyper, x, y) if len(y) <= inducing else condition_sparse(hyper, x, y, inducing)
+
+
+def fit_through_few(
+    x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection: Reflection | None = None
+) -> Posterior | None:
+    """Fit a process to points x (n, d), y (n,), both standardised, through fewer than ``SOME`` of them. None if that
+    would lose something, see ``loses_nothing``, or if there are no more points.
+
+    ``theta`` was fitted to some of the points. With noise, the bound of all is searched from there. Runs on the CPU.
+    """
+    parameters = Parameters(x.shape[1], options, reflection)
+    hyper = parameters.hyper(theta)
+    if len(y) <= SOME or len(pivots(hyper, x, SOME)) == SOME:
+        return None
+    found = [condition_sparse(hyper, x, y, SOME)]
+    if is_noisy(hyper):
+        with blas().limit(limits=1):
+            few = replace(options, max_iterations=SEARCHES[-1][1])
+            _, searched = _searched(x, y, few, theta, SOME, reflection)
+        found.append(condition_sparse(parameters.hyper(searched), x, y, SOME))
+    whole = [posterior for posterior in found if loses_nothing(posterior)]
+    return max(whole, key=lambda posterior: posterior.left_out.log_density, default=None)
+
+
+def loses_nothing(posterior: Posterior) -> bool:
+    """Whether a process stands for all of its points. Inducing points do where they leave less of the function open
+    than noise hides, or where each point is predicted precisely from the others."""
+    if posterior.sparse is None:
+        return True
+    hidden = is_noisy(posterior.hyper) or posterior.left_out.error <= PRECISE
+    return len(posterior.y) < SOME and hidden
+
+
+def is_noisy(hyper: Hyperparameters) -> bool:
+    """Whether errors of inducing points are small beside the noise."""
+    return hyper.noise_variance > NOISY
 
 
 @dataclass(frozen=True)

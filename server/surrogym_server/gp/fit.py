@@ -13,7 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from surrogym_server.gp.kernel import Hyperparameters, Reflection
-from surrogym_server.gp.parameters import Array, FitOptions
+from surrogym_server.gp.parameters import Array, FitOptions, Parameters
 from surrogym_server.gp.posterior import Posterior, condition
 from surrogym_server.gp.search import Evidence, blas, minimum
 from surrogym_server.gp.sparse import hardest
@@ -51,14 +51,11 @@ def fit(
     return Fitted(condition(objective.hyper(theta), x, y), -value, theta)
 
 
-def refine(
-    x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection: Reflection | None = None
-) -> tuple[Hyperparameters, ...]:
-    """Refine hyperparameters of x (n, d) and y (n,) from ``theta``, which was fitted to fewer points. Return the result
-    of each stage; the last one has seen all points.
+def fit_some(x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection: Reflection | None = None) -> Array:
+    """Fit hyperparameters to some of x (n, d) and y (n,) from ``theta``, which was fitted to fewer. Return theta.
 
-    More points have other optima, because they resolve what fewer points explain as noise. So a subset is searched from
-    two starts, and the full set in a few iterations from the better result. Both are bounded, see ``gp.subsets``.
+    More points have other optima, because they resolve what fewer points explain as noise. So they are searched from
+    two starts.
     """
     rows = spread(len(y), SOME)
     objective = Evidence(x[rows], y[rows], options, reflection)
@@ -67,13 +64,27 @@ def refine(
     shorter[-1] = objective.default_start[-1]
     with blas().limit(limits=1):
         _, theta = min((minimum(objective, start) for start in (theta, shorter)), key=lambda pair: pair[0])
-        found = [theta]
+    return theta
+
+
+def refine(
+    x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection: Reflection | None = None
+) -> tuple[Hyperparameters, ...]:
+    """Refine hyperparameters of x (n, d) and y (n,) from ``theta``, the result of ``fit_some``. Return the result of
+    each stage, that one included; the last one has seen all points.
+
+    The full set is searched in a few iterations. Both stages are bounded, see ``gp.subsets``.
+    """
+    found, seen = [theta], min(len(y), SOME)
+    with blas().limit(limits=1):
         for most, iterations in REFINEMENTS:
-            if len(y) > len(rows):
+            if len(y) > seen:
                 rows = spread(len(y), most)
                 objective = Evidence(x[rows], y[rows], replace(options, max_iterations=iterations), reflection)
                 found.append(minimum(objective, found[-1])[1])
-    return tuple(objective.hyper(theta) for theta in found)
+                seen = len(rows)
+    parameters = Parameters(x.shape[1], options, reflection)
+    return tuple(parameters.hyper(theta) for theta in found)
 
 
 def refine_where_hard(posterior: Posterior, x: Tensor, y: Tensor, options: FitOptions) -> Hyperparameters:

@@ -89,6 +89,11 @@ class Posterior:
         return -float(0.5 * (self.y @ self.weights) + roots) - 0.5 * len(self.y) * math.log(2 * math.pi)
 
     @property
+    def points(self) -> int:
+        """Number of points that it was fitted to: n, or those that its inducing points represent."""
+        return len(self.y) if self.sparse is None else self.sparse.points
+
+    @property
     def left_out(self) -> LeftOut:
         """Accuracy in predicting each of the points from all others."""
         if self.sparse is not None:

@@ -23,6 +23,10 @@ from surrogym_server.gp import (
     fewer_inputs,
     fit,
     fit_bound,
+    fit_some,
+    fit_through_few,
+    loses_nothing,
+    spread,
 )
 from surrogym_server.gp.bound import Bound
 from surrogym_server.gp.search import Evidence
@@ -198,3 +202,50 @@ def test_an_odd_process_keeps_an_input_that_turns():
     whole, may = condition_sparse(hyper, x, y, 30), torch.ones(2, dtype=torch.bool)
     found = fewer_inputs(x, y, whole, FitOptions(), 30, may, 100.0)
     assert found is None or bool(found.kept[0])
+
+
+@pytest.mark.parametrize("parity", [0, -1])
+def test_noisy_points_go_through_few_of_them_and_predict_as_through_all(parity: int):
+    (x, y), (at, truth) = points(900, 3, 0), points(300, 3, 1)
+    mirror = Reflection(-torch.ones(3, dtype=torch.float64), parity) if parity else None
+    some = fit_some(x, y, FitOptions(), fit(x[:100], y[:100], FitOptions(), reflection=mirror).theta, mirror)
+    few = fit_through_few(x, y, FitOptions(), some, mirror)
+    assert few is not None
+    assert few.points == 900
+    assert len(few.y) < 150
+    assert loses_nothing(few)
+    whole = condition(few.hyper, x, y)
+    for ours, theirs in zip(few.mean_and_variance(at), whole.mean_and_variance(at), strict=True):
+        torch.testing.assert_close(ours.abs().sqrt(), theirs.abs().sqrt(), rtol=0, atol=0.1 * NOISE)
+    assert few.left_out.error == pytest.approx(whole.left_out.error, rel=0.01)
+    assert few.hyper.noise_variance == pytest.approx(NOISE**2, rel=0.15)
+    assert float((few.mean(at) - truth).std()) < 1.1 * NOISE
+
+
+@pytest.mark.parametrize("what", ["a kink", "few points", "rough"])
+def test_points_of_which_some_do_not_say_as_much_as_all_keep_all_of_them(what: str):
+    count = 300 if what == "few points" else 600
+    x, y = points(count, 3, 0)
+    if what == "a kink":
+        y = x[:, 0].abs() + x[:, 1]
+    if what == "rough":
+        y = y + torch.sin(9 * x).prod(1)
+    rows = spread(count, 150)
+    some = fit_some(x, y, FitOptions(), fit(x[rows], y[rows], FitOptions()).theta)
+    if what == "rough":
+        some[:3] = math.log(0.1)
+    assert fit_through_few(x, y, FitOptions(), some) is None
+
+
+def test_a_smooth_function_without_noise_goes_through_few_points_precisely():
+    (x, _), (at, _) = points(900, 3, 0), points(300, 3, 1)
+
+    def function(x: Tensor) -> Tensor:
+        return x[:, 0] - 0.3 * x[:, 1] + torch.sin(x[:, 2])
+
+    some = fit_some(x, function(x), FitOptions(), fit(x[:100], function(x[:100]), FitOptions()).theta)
+    few = fit_through_few(x, function(x), FitOptions(), some)
+    assert few is not None
+    assert loses_nothing(few)
+    assert len(few.y) < 50
+    assert float((few.mean(at) - function(at)).abs().max()) < 1e-4

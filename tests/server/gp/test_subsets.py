@@ -14,6 +14,7 @@ from surrogym_server.gp import (
     condition,
     condition_sparse,
     fit,
+    fit_some,
     refine,
     refine_where_hard,
     spread,
@@ -46,7 +47,8 @@ def smooth(points: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
 def test_hyperparameters_refined_from_a_few_points_predict_as_those_of_all():
     (x, y), (at, truth) = smooth(500, 0), smooth(300, 1)
     few = spread(len(y), subsets.FEW)
-    refined = condition(refine(x, y, FitOptions(), fit(x[few], y[few], FitOptions()).theta)[-1], x, y)
+    some = fit_some(x, y, FitOptions(), fit(x[few], y[few], FitOptions()).theta)
+    refined = condition(refine(x, y, FitOptions(), some)[-1], x, y)
     full = fit(x, y, FitOptions()).posterior
     for ours, theirs in zip(refined.mean_and_variance(at), full.mean_and_variance(at), strict=True):
         torch.testing.assert_close(ours.abs().sqrt(), theirs.abs().sqrt(), rtol=0, atol=3e-3)
@@ -61,7 +63,7 @@ def test_more_points_resolve_what_few_explain_as_noise():
     y, found = torch.sin(6 * x[:, 0]), np.array([0.7, 0.0, -10.0, 0.0])  # as theta: the last is log sigma_n^2
     _, alone = minimum(Evidence(x, y, FitOptions(), None), found)
     assert math.exp(alone[-1]) > 0.1
-    assert refine(x, y, FitOptions(), found)[-1].noise_variance < 1e-4
+    assert refine(x, y, FitOptions(), fit_some(x, y, FitOptions(), found))[-1].noise_variance < 1e-4
 
 
 def test_hard_points_teach_what_a_steep_region_needs(monkeypatch: pytest.MonkeyPatch):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from support.models import learn
+from support.models import gaussian_processes, learn
 from support.real_steps import join, random_steps
 from surrogym_sampler.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_server.convert import definition_from_spec
@@ -15,7 +15,7 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.gp import fit, sparse, subsets
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.gaussian_process.learning import output_learner
-from surrogym_shared.spec import Design
+from surrogym_shared.spec import BoxAction, Coordinate, Design, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 PAPER = pendulum().model_copy(update={"design": Design(preset="paper")})
 
@@ -163,6 +163,40 @@ def test_beyond_a_number_of_samples_a_model_is_sparse_and_says_so(
     inside = later.q_next[:, 1].abs() < 8
     error = (model.transition(later.q, later.u).q_next - later.q_next)[inside, 1]
     assert float(error.abs().max()) < 0.05
+
+
+def test_a_model_of_many_noisy_samples_is_small_and_reads_what_matters():
+    """A mass on a spring, and a base on which nothing depends."""
+    size, noise, seeded = 600, 0.02, torch.Generator().manual_seed(0)
+    definition = definition_from_spec(spring())
+
+    def steps(noise: float) -> Samples:
+        q = 2 * torch.rand(size, 3, dtype=torch.float64, generator=seeded) - 1
+        u = 2 * torch.rand(size, 1, dtype=torch.float64, generator=seeded) - 1
+        push = u[:, 0] - 2 * torch.sin(2 * q[:, 0])
+        after = torch.stack([q[:, 0] + 0.1 * q[:, 1], q[:, 1] + 0.1 * push, q[:, 2] + 0.1 * u[:, 0]], 1)
+        after = after + noise * torch.randn(size, 3, dtype=torch.float64, generator=seeded)
+        return Samples(q, u, after, torch.zeros(size, dtype=torch.float64), torch.zeros(size, dtype=torch.bool))
+
+    model, test = gaussian_processes(definition, steps(noise)), steps(0.0)
+    assert [output.posterior.points for output in model.transitions] == [size] * 3
+    assert all(len(output.posterior.y) < 100 for output in model.transitions)
+    assert [2 in output.feature_map.dropped for output in model.transitions] == [True] * 3
+    off = model.transition(test.q, test.u).q_next - test.q_next
+    assert float(off.square().mean().sqrt()) < 0.3 * noise
+    assert model.leave_one_out()[1].error == pytest.approx(noise, rel=0.15)
+    assert from_bytes(definition, to_bytes(model)).description == model.description
+
+
+def spring() -> EnvironmentSpec:
+    names = {"place": Uniform(low=-1, high=1), "speed": Uniform(low=-1, high=1), "base": Uniform(low=-1, high=1)}
+    return EnvironmentSpec(
+        coordinates=tuple(Coordinate(name=name, sampling=sampling) for name, sampling in names.items()),
+        observation=tuple(ObservationEntry(name=name, term=Term.linear(**{name: 1})) for name in names),
+        action=BoxAction(low=(-1,), high=(1,)),
+        start=names,
+        time_limit=50,
+    )
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap, features
 from surrogym_server.errors import NumericalFailure
-from surrogym_server.gp import Posterior, Selection, condition, select_inputs, spread, subsets
+from surrogym_server.gp import Posterior, Selection, condition, is_noisy, loses_nothing, select_inputs, spread, subsets
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner, is_unexplained
 from surrogym_server.models.gaussian_process.learning.rates import inputs_of
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
@@ -28,27 +28,29 @@ def without_inputs(
     may, posterior = _may_be_dropped(learner, output), output.posterior
     if posterior is None or not bool(may.any()):
         return output
+    x, y = posterior.x, posterior.y
+    if posterior.sparse is not None:
+        x = inputs_of(output, inputs)[used]
+        y = output.standardised(target[used], x)
+        if posterior.points != len(x):  # it has learned from further samples, which ended at limits
+            return output
     try:
-        if posterior.sparse is not None:
-            return _of_many(learner, output, posterior, may, target[used], inputs_of(output, inputs)[used])
-        rows = spread(len(posterior.y), subsets.FEW)
-        some = condition(posterior.hyper, posterior.x[rows], posterior.y[rows])
+        if posterior.sparse is not None and (is_noisy(posterior.hyper) or not loses_nothing(posterior)):
+            return _of_many(learner, output, posterior, may, x, y)
+        rows = spread(len(y), subsets.FEW)
+        some = condition(posterior.hyper, x[rows], y[rows])
         found = select_inputs(some, learner.options(output.name), may, ODDS)
         learner.selections[output.name] = found
         wins = found.gain > WIN * len(rows)
-        return _with_fewer(learner, output, posterior, found) if wins else output
+        return _with_fewer(learner, output, x, y, found) if wins else output
     except NumericalFailure:
         return output
 
 
 def _of_many(
-    learner: OutputLearner, output: OutputModel, posterior: Posterior, may: Tensor, target: Tensor, x: Tensor
+    learner: OutputLearner, output: OutputModel, posterior: Posterior, may: Tensor, x: Tensor, y: Tensor
 ) -> OutputModel:
-    """The output of a process through inducing points, learned from targets (n,) at x (n, d)."""
-    assert posterior.sparse is not None
-    if posterior.sparse.points != len(x):  # it has learned from further samples, which ended at limits
-        return output
-    y = output.standardised(target, x)
+    """The output of a process through inducing points, which are of the points x (n, d), y (n,)."""
     found = learner.many.fewer_inputs(x, y, learner.options(output.name), posterior, may, ODDS)
     if found is None:
         return output
@@ -68,18 +70,20 @@ def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
     if posterior is None or not learner.settings.drop_inputs:
         return none
     enough = posterior.sparse is not None or is_unexplained(posterior)
-    return may if len(posterior.y) >= FEWEST and enough else none
+    return may if posterior.points >= FEWEST and enough else none
 
 
-def _with_fewer(learner: OutputLearner, output: OutputModel, posterior: Posterior, found: Selection) -> OutputModel:
-    """The output with the inputs that were found, if with these all samples are foretold better by the others."""
-    kept, x, y = found.kept, posterior.x[:, found.kept], posterior.y
+def _with_fewer(learner: OutputLearner, output: OutputModel, x: Tensor, y: Tensor, found: Selection) -> OutputModel:
+    """The output with the inputs that were found, if with these each of its points x (n, d), y (n,) is predicted better
+    from the others."""
+    assert output.posterior is not None
+    kept, x = found.kept, x[:, found.kept]
     feature_map = map_without(output.feature_map, kept)
     if len(y) <= subsets.FEW:
         fewer = condition(found.hyper, x, y)
     else:
         fewer = learner.refined(output.name, feature_map, x, y, found.theta)
-    if fewer.left_out.error > LESS * posterior.left_out.error:
+    if fewer.left_out.error > LESS * output.posterior.left_out.error:
         return output
     scores = (*output.scores, (str(feature_map), found.score))
     return replace(output, feature_map=feature_map, posterior=fewer, scores=scores)

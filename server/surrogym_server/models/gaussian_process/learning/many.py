@@ -20,9 +20,13 @@ from surrogym_server.gp import (
     condition_sparse,
     fewer_inputs,
     fit_bound,
+    fit_some,
+    fit_through_few,
+    loses_nothing,
     refine,
     refine_where_hard,
 )
+from surrogym_server.gp.subsets import SOME
 
 EXPLAINED = 0.01  # of the targets' deviation: a process that foretells its samples as well needs no other structure
 
@@ -74,7 +78,8 @@ class ManySamples(ABC):
 class BySubsets(ManySamples):
     """Hyperparameters of subsets; the process is exact up to ``gp.sparse.MAX_EXACT`` points.
 
-    Hyperparameters of the hard points are tried too, if the points are many and not foretold well from the others.
+    Hyperparameters of the hard points are tried too, if the points are many and not foretold well from the others. A
+    process goes through inducing points as soon as these lose nothing, see ``gp.bound.loses_nothing``.
     """
 
     def fitted(
@@ -86,6 +91,9 @@ class BySubsets(ManySamples):
         mirror: Reflection | None,
         at_limit: Censored | None,
     ) -> Posterior:
+        theta = fit_some(x, y, options, theta, mirror)
+        if (through_few := fit_through_few(x, y, options, theta, mirror)) is not None:
+            return through_few
         found = condition_many(refine(x, y, options, theta, mirror), x, y, at_limit)
         if found.sparse is None or found.left_out.error <= EXPLAINED:
             return found
@@ -93,6 +101,11 @@ class BySubsets(ManySamples):
 
     def conditioned(self, hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
         return condition_sparse(hyper, x, y)
+
+    def fewer_inputs(
+        self, x: Tensor, y: Tensor, options: FitOptions, posterior: Posterior, may: Tensor, odds: float
+    ) -> Fewer | None:
+        return fewer_inputs(x, y, posterior, options, SOME, may, odds) if loses_nothing(posterior) else None
 
 
 @dataclass(frozen=True)

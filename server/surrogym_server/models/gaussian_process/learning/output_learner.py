@@ -11,7 +11,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import Censored, FitOptions, Fitted, Posterior, Selection, fit, spread, subsets
+from surrogym_server.gp import Censored, FitOptions, Fitted, Posterior, Selection, fit, loses_nothing, spread, subsets
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.learning.many import EXPLAINED, BySubsets, ManySamples
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
@@ -121,10 +121,10 @@ class OutputLearner:
 def is_unexplained(posterior: Posterior) -> bool:
     """Whether other structures of a process are worth a search.
 
-    They are not if it foretells each sample well from the others. They are not with thousands of samples either, where
-    inducing points stand for the samples.
+    They are not if it predicts each sample well from the others. They are not either where inducing points stand for
+    the samples, and lose something.
     """
-    return posterior.sparse is None and posterior.left_out.error > EXPLAINED
+    return loses_nothing(posterior) and posterior.left_out.error > EXPLAINED
 
 
 def _with_whole_history(inputs: Mapping[FeatureMap, Tensor]) -> list[FeatureMap]:

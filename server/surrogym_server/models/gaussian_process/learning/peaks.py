@@ -142,7 +142,7 @@ def _structure(output: OutputModel) -> float:
     """Log odds of a fitted process against targets that don't depend on their inputs."""
     if output.posterior is None:
         return 0.0
-    count = len(output.posterior.y)
+    count = output.posterior.points
     return dict(output.scores)[str(output.feature_map)] + 0.5 * count * (1 + math.log(2 * math.pi))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -34,10 +34,15 @@ def output_with_rates(
     if not bool(may.any()):
         return output
     try:
-        evidence, grown = _grown(learner, output, target, inputs, keep, may)
+        grown = _grown(learner, output, target, inputs, keep, may)
     except NumericalFailure:
         return output
-    return grown if evidence > _evidence(output) else output
+    if not any(grown.feature_map.rates):
+        return output
+    plain, other = _evidence([output, grown], inputs, keep)
+    other += ODDS * int(may.sum())
+    scores = (*output.scores, (str(grown.feature_map), other))
+    return replace(grown, scores=scores) if other > plain else output
 
 
 def inputs_of(output: OutputModel, inputs: Mapping[FeatureMap, Tensor]) -> Tensor:
@@ -70,8 +75,8 @@ def _grown(
     inputs: Mapping[FeatureMap, Tensor],
     keep: Tensor,
     may: Tensor,
-) -> tuple[float, OutputModel]:
-    """Log evidence of the output with rates, and the output."""
+) -> OutputModel:
+    """The output with rates."""
     plain = output.feature_map
     z, t = inputs[plain][keep], (target[keep] - output.centre) / output.scale
     rows, among = spread(len(t), subsets.FEW), ",".join(map(str, may.nonzero().ravel().tolist()))
@@ -86,12 +91,16 @@ def _grown(
         posterior = learner.refined(
             output.name, grown, x, t / amplitude(x, rates), found.fitted.theta[: -int(may.sum())]
         )
-    made = replace(output, feature_map=grown, posterior=posterior)
-    evidence = _evidence(made) + ODDS * int(may.sum()) if any(found.rates) else -torch.inf
-    return evidence, replace(made, scores=(*output.scores, (str(grown), evidence)))
+    return replace(output, feature_map=grown, posterior=posterior)
 
 
-def _evidence(output: OutputModel) -> float:
-    """Log density of the targets, in the output's scale."""
-    assert output.posterior is not None
-    return output.posterior.log_evidence - float(output.amplitude(output.posterior.x).log().sum())
+def _evidence(outputs: Sequence[OutputModel], inputs: Mapping[FeatureMap, Tensor], keep: Tensor) -> list[float]:
+    """Log density of the targets by each of the outputs, in the output's scale: with inducing points, which have no
+    evidence of all samples, the density of each target given all others."""
+    fitted = [(output, posterior) for output in outputs if (posterior := output.posterior) is not None]
+    exact = all(posterior.sparse is None for _, posterior in fitted)
+    return [
+        (posterior.log_evidence if exact else posterior.points * posterior.left_out.log_density)
+        - float(output.amplitude(inputs_of(output, inputs)[keep]).log().sum())
+        for output, posterior in fitted
+    ]
