@@ -1,4 +1,4 @@
-"""Laws that every policy search must keep, as functions for the tests of a search's author.
+"""Invariants that every policy search must keep, as functions for the tests of a search's author.
 
 Examples:
     >>> @pytest.mark.parametrize("law", POLICY_SEARCH_LAWS)
@@ -28,7 +28,7 @@ OBSERVATIONS = 200
 
 
 class LawBroken(AssertionError):
-    """A policy search breaks a law. The message says what was expected and what the search did."""
+    """A policy search breaks an invariant. The message says what was expected and what the search did."""
 
 
 def same_seed_gives_same_policy(port: SurrogatePort, settings: TrainSettings, folder: Path) -> None:
@@ -123,7 +123,7 @@ POLICY_SEARCH_LAWS = (
 
 
 class _Failure(Exception):
-    """Error that the law's own progress callback raises."""
+    """Error that the check's own progress callback raises."""
 
 
 class _Watched:

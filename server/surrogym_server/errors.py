@@ -161,12 +161,12 @@ class NotInstalled(SurrogymError):
 
 
 class PluginFailed(SurrogymError):
-    """An acquisition or a family of models raised an error or broke its laws. The message names it."""
+    """An acquisition or a family of models raised an error or broke its invariants. The message names it."""
 
 
 class ChoiceFailed(PluginFailed):
-    """An acquisition raised an error or broke its laws. The model was fitted, but its next queries could not
-    be chosen."""
+    """An acquisition raised an error or broke its invariants. The model was fitted, but its next queries could not be
+    chosen."""
 
 
 class NumericalFailure(SurrogymError):

@@ -181,7 +181,7 @@ class _Search:
 
     @property
     def _noise(self) -> float:
-        """Deviation of the noise before the last tanh. It decays like the learning rate."""
+        """Standard deviation of the noise before the last tanh. It decays like the learning rate."""
         return NOISE * float(self._rate.get_last_lr()[0]) / self._settings.learning_rate
 
     @property

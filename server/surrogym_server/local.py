@@ -28,7 +28,7 @@ VERSION = 1
 
 
 class LocalSurrogate:
-    """One model behind the SurrogatePort; see its laws. Errors are those of ``surrogym_server.errors``.
+    """One model behind the SurrogatePort; see its invariants. Errors are those of ``surrogym_server.errors``.
 
     Args:
         spec: the original environment.

@@ -95,7 +95,7 @@ class ActingPolicy:
             most = np.abs(self.log_deviations).max()
             raise ValueError(f"policy: expected log_deviations within +-{MAX_LOG_DEVIATION}, got {most:g}")
         if not (self.deviation > 0).all():
-            raise ValueError(f"policy: expected a positive deviation, got {self.deviation.min():g}")
+            raise ValueError(f"policy: expected a positive standard deviation, got {self.deviation.min():g}")
 
     @classmethod
     def of(cls, network: Network) -> Self:

@@ -192,10 +192,10 @@ def _array(entry: Any, body: bytes) -> NDArray[Any]:
 
 
 def _pair(given: Any) -> list[float]:
-    """Return the error and the deviation of a prediction. Raises one of ``UNREADABLE`` if they are invalid."""
+    """Return the error and the standard deviation of a prediction. Raises one of ``UNREADABLE`` if they are invalid."""
     error, deviation = (float(one) for one in given)
     if not math.isfinite(error) or not 0 <= deviation < math.inf:
-        raise ValueError(f"a prediction with the error {error} and the deviation {deviation}")
+        raise ValueError(f"a prediction with the error {error} and the standard deviation {deviation}")
     return [error, deviation]
 
 

@@ -282,7 +282,7 @@ def test_every_cut_of_a_frame_is_an_error(read: Callable[[bytes], None], content
         (of_policy(units=[1_024] * 2), "policy: expected at most 262144 weights and biases, got 1053696"),
         (of_policy(units=[5, 1]), "parameters: expected 104 bytes"),
         (of_policy(mean=np.ones(4).data), "mean: expected 12 bytes"),
-        (of_policy(deviation=np.zeros(3, dtype=np.float32).data), "expected a positive deviation, got 0"),
+        (of_policy(deviation=np.zeros(3, dtype=np.float32).data), "expected a positive standard deviation, got 0"),
         (of_policy(parameters=np.full(21, np.nan, dtype=np.float32).data), "finite numbers in layers"),
         (of_policy(until=np.ones(3, dtype=bool).data), "until: expected 2 bytes"),
         (of_policy(noise=frames.Noise(-1, 0)), "expected a frame"),

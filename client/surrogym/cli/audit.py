@@ -49,7 +49,7 @@ def command(
     ] = None,
     episodes: Annotated[int, typer.Option(min=1, max=100, help="Number of whole episodes, with --env.")] = 3,
     seed: Annotated[
-        int, typer.Option(min=0, help="Seed of starts, of drawn functions, and of the places to audit.")
+        int, typer.Option(min=0, help="Seed of starts, of sampled functions, and of the places to audit.")
     ] = 0,
     *,
     reading: PolicyReading,

@@ -344,5 +344,5 @@ class Differing:
         state = ", ".join(f"{name} {value:.4g}" for name, value in zip(known, one.step.coordinates, strict=True))
         return (
             f"seed {self.first_seed + one.step.episode}, step {one.step.number}, at {state}: {one.output} is "
-            f"{one.error:+.3g} off the prediction, whose deviation is {one.claimed:.3g}"
+            f"{one.error:+.3g} off the prediction, whose standard deviation is {one.claimed:.3g}"
         )

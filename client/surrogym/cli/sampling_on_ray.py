@@ -101,7 +101,7 @@ def run_samplers(
 
 
 def _reason(lacking: dict[str, float]) -> str:
-    """Return why samplers wait for room, and what to do about it."""
+    """Return why samplers wait for free resources, and what to do about it."""
     from surrogym_sampler.queries.on_ray import amounts
 
     if not lacking:

@@ -21,7 +21,7 @@ Form = Literal["json", "short", "words"]
 
 FIDELITY = (
     *("output", "confidence", "as in the paper", "tolerance", "coverage"),
-    *("leave-one-out error", "within 1 deviation", "within 2", "noise"),
+    *("leave-one-out error", "within 1 std", "within 2", "noise"),
 )
 PREQUENTIAL = ("output", "new samples", "in 50 %", "in 80 %", "in 90 %", "interval score")
 

@@ -74,9 +74,9 @@ class SessionOptions:
     variant: Annotated[
         Variant | None,
         typer.Option(
-            help="How the state moves: by the mean (deterministic), as particles (probabilistic), or along a drawn "
-            "function (pathwise). [default: the mean. If the design is not ready, the final training draws from "
-            "the posterior]"
+            help="How the state moves: by the mean (deterministic), as particles (probabilistic), or along a sampled "
+            "function (pathwise). [default: the mean. If the design is not ready, the final training "
+            "samples the posterior]"
         ),
     ] = None
     particles: Annotated[

@@ -233,7 +233,7 @@ def _forecast(samples: Sequence[float], values: Sequence[float], limit: float) -
 
 
 def _within_reach(view: SurrogateView, output: OutputFidelity) -> float:
-    """Return the tolerance with which the output would be certain, assuming the same deviation everywhere.
+    """Return the tolerance with which the output would be certain, assuming the same standard deviation everywhere.
 
     The server adds the noise to a tolerance, but does not count noise that is much smaller than the tolerance.
     """

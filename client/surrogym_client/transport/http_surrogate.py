@@ -46,7 +46,7 @@ class _Live:
 
 
 class HttpSurrogate:
-    """One surrogate on a server. It keeps the laws of ``SurrogatePort``.
+    """One surrogate on a server. It keeps the invariants of ``SurrogatePort``.
 
     After a lost reply, a time-out or a dropped connection, the same request is sent again with the same sequence
     number, so a step happens once. A session is an id, not a connection: another HttpSurrogate may continue it, and a

@@ -180,8 +180,8 @@ def _history_of(original: IsolatedEnvironment | Executable | Simulated, spec: En
         return Finding("history", f"what is declared tells what happens next; {took}")
     needed = (
         f"the next change of a coordinate depends on {found.changes} earlier changes and {found.actions} earlier "
-        f"actions: errors of {100 * found.error:.2g} % of its deviation, and of {100 * found.error_without:.2g} % "
-        f"without them; {took}"
+        f"actions: errors of {100 * found.error:.2g} % of its standard deviation, "
+        f"and of {100 * found.error_without:.2g} % without them; {took}"
     )
     return Finding("history", needed, _declaring(found))
 

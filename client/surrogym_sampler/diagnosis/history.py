@@ -35,7 +35,7 @@ WIDER = 1.5  # times the largest observed change
 
 @dataclass(frozen=True)
 class History:
-    """Earlier changes and actions that tell what happens next. Errors are shares of the deviation of a change.
+    """Earlier changes and actions that tell what happens next. Errors are shares of the standard deviation of a change.
 
     Attributes:
         steps: number of real steps.
@@ -152,7 +152,7 @@ def _changes(episode: _Episode, turning: Bools) -> Array:
 
 def _left_out_error(x: Array, y: Array) -> float:
     """Error of changes y (n, M) by a linear regression on inputs x (n, d), each step left out in turn: the root mean
-    square, as a share of the changes' deviation; the largest of the coordinates."""
+    square, as a share of the changes' standard deviation; the largest of the coordinates."""
     spread, size = x.std(0), y.std(0)
     z = np.hstack([np.ones((len(x), 1)), (x - x.mean(0)) / np.where(spread > 0, spread, 1.0)])
     gram = z.T @ z + RIDGE * len(z) * np.eye(z.shape[1])

@@ -64,7 +64,7 @@ class Episode(ABC):
 
     @abstractmethod
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
-        """Multiply the physical attributes by normal factors with mean 1 and deviation sigma."""
+        """Multiply the physical attributes by normal factors with mean 1 and standard deviation sigma."""
 
     @abstractmethod
     def close(self) -> None:

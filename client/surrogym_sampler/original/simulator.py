@@ -126,7 +126,7 @@ class Simulator(ABC):
         return False
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
-        """Multiply the original masses by normal factors of mean 1 and deviation ``sigma``.
+        """Multiply the original masses by normal factors of mean 1 and standard deviation ``sigma``.
 
         Raises:
             NotPerturbable: the simulator's masses are unknown.

@@ -179,7 +179,7 @@ class RaySamplers:
 
     @property
     def running(self) -> int:
-        """Number of samplers that have not ended, with those that wait for room."""
+        """Number of samplers that have not ended, with those that wait for free resources."""
         return len(self._running)
 
     @property

@@ -254,7 +254,7 @@ def _require_small(decision: Decision) -> None:
             "surrogym export-policy writes it for a larger machine"
         )
     if not (decision.deviation > 0).all():
-        raise NotDeployable("expected a policy with positive deviations, got others")
+        raise NotDeployable("expected a policy with positive standard deviations, got others")
     arrays = (decision.mean, decision.deviation, decision.centre, decision.reach, *layers)
     _require_in_float("a policy", *arrays)
 

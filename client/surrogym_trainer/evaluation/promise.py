@@ -33,7 +33,7 @@ def promise_of(
     session: Mapping[str, Any] | None = None,
     floor: float | None = None,
 ) -> Promise:
-    """Compute a policy's promise along functions drawn from the posterior, each from several starts, without any
+    """Compute a policy's promise along functions sampled from the posterior, each from several starts, without any
     penalty.
 
     Args:

@@ -63,7 +63,7 @@ class Inputs(NamedTuple):
 
     @classmethod
     def over(cls, spec: EnvironmentSpec, q: Array, u: Array) -> Self:
-        """Take mean and deviation of states q (m, C) and actions u (m, F)."""
+        """Take mean and standard deviation of states q (m, C) and actions u (m, F)."""
         at = columns(spec, q, u)
         spread = at.std(0)
         return cls(at.mean(0), np.where(spread > 1e-9 * (1 + np.abs(at).max(0)), spread, 1.0))

@@ -32,7 +32,8 @@ __all__ = [
 
 
 class Standardise(BaseFeaturesExtractor):
-    """Layer that computes (observation - mean) / deviation with fixed mean and deviation, (D,) each."""
+    """Layer that computes (observation - mean) / standard deviation with fixed mean and standard deviation, (D,)
+    each."""
 
     mean: Tensor
     deviation: Tensor

@@ -124,7 +124,7 @@ def _video(api: Api, name: str, policy: PolicyDetail) -> tuple[tuple[str, bytes]
         if file is None:
             continue
         if not file.stored:
-            missing.append(f"the video ({form}) is missing: it never came, or it made room for newer files")
+            missing.append(f"the video ({form}) is missing: it never came, or it was removed for newer files")
         elif file.bytes > MOST_VIDEO_BYTES:
             missing.append(
                 f"the video has {file.bytes / 1e6:.0f} MB, too much for one page: surrogym policy get "

@@ -28,7 +28,7 @@ FIDELITY = {
     "tolerance": "tolerance",
     "coverage": "coverage",
     "leave-one-out error": "leave_one_out_error",
-    "within 1 deviation": "leave_one_out_within_one",
+    "within 1 std": "leave_one_out_within_one",
     "within 2": "leave_one_out_within_two",
     "noise": "noise",
 }

@@ -100,7 +100,7 @@ class PolicySearch(ABC):
 
     @abstractmethod
     def search(self, task: SearchTask) -> Found:
-        """Find a policy. The laws are at the top of this module."""
+        """Find a policy. The invariants are at the top of this module."""
 
     def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:  # noqa: ARG002  for those that have noise
         """Load a saved policy that explores as in training; a policy without noise takes its most probable actions."""

@@ -89,8 +89,8 @@ async def add(name: str, request: Request, use: Use) -> ModelView:
 async def query_uncertainty(
     name: str, body: Annotated[Points, example(examples.POINTS)], request: Request, use: Use
 ) -> Uncertainty:
-    """Return for each point and output: mean, deviation, model uncertainty (eq. 10), input probability (eq. 11) and
-    uncertainty index (eq. 12) of Active Uncertainty Reduction."""
+    """Return for each point and output: mean, standard deviation, model uncertainty (eq. 10), input probability (eq.
+    11) and uncertainty index (eq. 12) of Active Uncertainty Reduction."""
     q, u = numbers("coordinates", body.coordinates), numbers("action", body.action)
     said = await _in_turn(request, lambda: use.models.query_uncertainty(name, q, u, body.model))
     return resources.uncertainty(said)
@@ -109,8 +109,8 @@ async def predict(
 async def imagine(
     name: str, body: Annotated[Imagine, example(examples.IMAGINE)], request: Request, use: Use
 ) -> Imagined:
-    """Imagine episodes without a session: one along the mean, and some along functions drawn from the posterior, which
-    diverge where the model is uncertain. An episode that terminates is shorter than ``actions``."""
+    """Imagine episodes without a session: one along the mean, and some along functions sampled from the posterior,
+    which diverge where the model is uncertain. An episode that terminates is shorter than ``actions``."""
     q, u = numbers("coordinates", body.coordinates), numbers("actions", body.actions)
     draws, seed, version = body.draws, body.seed, body.model
     episodes = await _in_turn(request, lambda: use.models.imagine(name, q, u, draws=draws, seed=seed, version=version))

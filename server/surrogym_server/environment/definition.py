@@ -244,8 +244,8 @@ class EnvironmentDefinition:
 
     @cached
     def observation_scaling(self) -> tuple[Tensor, Tensor]:
-        """Mean and deviation of the observation over the sampling range, (D,) each. An entry that never varies has
-        deviation 1."""
+        """Mean and standard deviation of the observation over the sampling range, (D,) each. An entry that never varies
+        has standard deviation 1."""
         drawn = np.random.default_rng(0).uniform(size=(SCALING_POINTS, len(self.coordinates)))
         p = torch.from_numpy(drawn).to(self.device)
         q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(self.coordinates)], -1)

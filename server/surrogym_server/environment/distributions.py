@@ -72,7 +72,7 @@ Distribution = Uniform | Normal | Fixed
 
 
 def scaling(distribution: Distribution) -> tuple[float, float]:
-    """Centre and scale that give a sampled coordinate mean 0 and deviation about 1."""
+    """Centre and scale that give a sampled coordinate mean 0 and standard deviation about 1."""
     match distribution:
         case Uniform(low, high):
             return (low + high) / 2, (high - low) / math.sqrt(12)

@@ -1,4 +1,4 @@
-"""Inputs of models: encodings of coordinates and action, scaled so that each feature has deviation near 1."""
+"""Inputs of models: encodings of coordinates and action, scaled so that each feature has standard deviation near 1."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tupl
 
 
 def distances(definition: EnvironmentDefinition, a: Points, b: Points) -> Tensor:
-    """Distances of points a (m) and b (n), in deviations of the sampling range, (m, n)."""
+    """Distances of points a (m) and b (n), in standard deviations of the sampling range, (m, n)."""
     plain = FeatureMap()
     return torch.cdist(encode(definition, plain, a.q, a.u), encode(definition, plain, b.q, b.u))
 

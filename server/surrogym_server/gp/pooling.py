@@ -177,8 +177,8 @@ def _may_play(part: Part, other: Part) -> Tensor:
 
 
 def _played(known: Posterior, x: Tensor, y: Tensor, may: Tensor) -> Inputs | None:
-    """Inputs of x (n, D) with which a process foretells targets (n,) best, found by exchanging one of them, or two
-    with each other, as long as this helps.
+    """Inputs of x (n, D) with which a process predicts targets (n,) best, found by exchanging one of them, or two with
+    each other, as long as this helps.
 
     The search begins at inputs that vary most with the targets. ``may`` (d, D) says which input may play which part.
     """

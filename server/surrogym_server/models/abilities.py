@@ -30,7 +30,7 @@ def offers(model: DynamicsModel, ability: type[A]) -> A | None:
 
 
 class FunctionDraws(ABC):
-    """Ability to draw whole functions from the posterior, each consistent for a whole episode.
+    """Ability to sample whole functions from the posterior, each consistent for a whole episode.
 
     Fallback of ``draws``: one standard normal number for each transition output is kept for the episode, and shifts
     this output everywhere by as many standard deviations. These are the draws of outputs whose errors are the same at
@@ -44,7 +44,7 @@ class FunctionDraws(ABC):
 
     @abstractmethod
     def draw(self, noise: Tensor) -> Tensor:
-        """Draw functions (N, W), one from each row of standard normal ``noise`` (N, W).
+        """Sample functions (N, W), one from each row of standard normal ``noise`` (N, W).
 
         Each draw is a pure function of its row, except for the last bits.
         """
@@ -60,14 +60,14 @@ class FunctionDraws(ABC):
         deviations: bool = False,
         reward_deviation: bool = False,
     ) -> Transition:
-        """Predict as ``transition`` does, with each row along a drawn function of its own.
+        """Predict as ``transition`` does, with each row along a sampled function of its own.
 
         ``paths`` (m, W) are the functions; the first ``path_size`` columns are used.
         """
 
 
 class UncertainHyperparameters(ABC):
-    """Ability to draw functions with uncertain hyperparameters, because few samples don't determine them.
+    """Ability to sample functions with uncertain hyperparameters, because few samples don't determine them.
 
     Fallback of ``virtual``: the functions of ``FunctionDraws``, which are drawn with the optimal hyperparameters.
     """
@@ -75,7 +75,7 @@ class UncertainHyperparameters(ABC):
     @property
     @abstractmethod
     def uncertain_functions(self) -> FunctionDraws:
-        """Return the object that draws functions with uncertain hyperparameters.
+        """Return the object that samples functions with uncertain hyperparameters.
 
         The model's first call may take as long as a fit. If the object has compiled steps, they are those of its own
         ``CompiledSteps``.
@@ -116,8 +116,8 @@ class LearnedNoise(ABC):
 
     @property
     def possible_noise(self) -> tuple[float, ...]:
-        """Standard deviation of each output's noise in another explanation of the samples, if it is at least as likely,
-        (O,). Those that it has learned if the family looks for no other."""
+        """Standard deviation of each output's noise in another explanation of the samples, if it is at least
+        as likely, (O,). Those that it has learned if the family looks for no other."""
         return self.noise_deviations
 
 
@@ -144,7 +144,7 @@ class SampledFunctions(ABC):
 
 
 class OutputOutlook(ABC):
-    """Forecast of one output's deviations at m candidates after some further queries, in the output's unit."""
+    """Forecast of one output's standard deviations at m candidates after some further queries, in the output's unit."""
 
     learns: Tensor  # (m,) bool: whether a sample at the candidate would improve this output
 
@@ -199,7 +199,7 @@ class PredictedSteps:
 
 
 class Lookahead(ABC):
-    """Ability to forecast how further real steps would change the deviations, before they are taken.
+    """Ability to forecast how further real steps would change the standard deviations, before they are taken.
 
     Fallback of ``sampling``: a sample is assumed to be correlated with nearby points, by their distance in deviations
     of the sampling range. Along paths the steps count as independent, and a planned path does not change the model for
@@ -219,7 +219,8 @@ class Lookahead(ABC):
 
     @abstractmethod
     def as_if_answered(self, steps: PredictedSteps) -> DynamicsModel:
-        """Return the model as if real steps (T, ...) had been taken as predicted: deviations shrink, means stay."""
+        """Return the model as if real steps (T, ...) had been taken as predicted: standard deviations shrink, means
+        stay."""
 
 
 class RewardEdges(ABC):
@@ -308,12 +309,13 @@ class CompiledSteps(ABC):
 
     @abstractmethod
     def compiled_pays(self, *, deviations: bool) -> bool:
-        """Whether compiled steps are faster, with deviations in every step or without."""
+        """Whether compiled steps are faster, with standard deviations in every step or without."""
 
 
 @dataclass(frozen=True)
 class StepSource:
-    """C99 source of ``transition``, its deviations and ``terminated``: the functions that its ``step.h`` declares."""
+    """C99 source of ``transition``, its standard deviations and ``terminated``: the functions that its ``step.h``
+    declares."""
 
     files: Mapping[str, str]  # content by name; step.c is what a compiler takes
     numbers: int  # float64 constants in it

@@ -1,4 +1,4 @@
-"""Functions drawn from any model: by its family's ``FunctionDraws``, or by the fallback for families without it."""
+"""Functions sampled from any model: by its family's ``FunctionDraws``, or by the fallback for families without it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from surrogym_server.models.port import DynamicsModel, Transition
 
 
 def function_draws(model: DynamicsModel, functions: int | None = None) -> FunctionDraws:
-    """Return the object that draws functions of a model: the model itself, or a fallback if its family draws none.
+    """Return the object that samples functions of a model: the model itself, or a fallback if its family samples none.
 
     If lanes share a number of ``functions``, hyperparameters are drawn too, so that the few functions cover their
     uncertainty.
@@ -23,7 +23,8 @@ def function_draws(model: DynamicsModel, functions: int | None = None) -> Functi
 
 @dataclass(frozen=True)
 class ConstantErrors(FunctionDraws):
-    """Functions that have the same distance from the mean everywhere, in deviations. The reward's function is its mean.
+    """Functions that have the same distance from the mean everywhere, in standard deviations. The reward's function is
+    its mean.
 
     A draw is one standard normal number for each transition output.
     """

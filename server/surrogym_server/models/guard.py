@@ -57,7 +57,7 @@ def learn(definition: EnvironmentDefinition, samples: Samples, warm: Warm | None
 
 def require_sound(model: DynamicsModel, q: Tensor, u: Tensor) -> None:
     """Raise ``PluginFailed`` unless a model's attributes, and its predictions at q (m, C) under u (m, F), have the
-    shapes of the port and are finite, deviations are not negative, and probabilities lie in 0 to 1."""
+    shapes of the port and are finite, standard deviations are not negative, and probabilities lie in 0 to 1."""
     definition, outputs = model.definition, len(model.definition.outputs)
     predicted = model.transition(q, u, deviations=True, reward_deviation=True)
     require_shapes(model, predicted, q, deviations=True)
@@ -90,15 +90,17 @@ def require_shapes(model: DynamicsModel, predicted: Transition, q: Tensor, *, de
     if deviations or predicted.deviation is not None:
         _require_shape(definition, "deviation", predicted.deviation, (rows, len(definition.outputs) - 1))
     if deviations or predicted.reward_deviation is not None:
-        _require_shape(definition, "deviation of the reward", predicted.reward_deviation, (rows,))
+        _require_shape(definition, "standard deviation of the reward", predicted.reward_deviation, (rows,))
 
 
 def require_deviations(model: DynamicsModel, deviation: Tensor) -> None:
-    """Raise ``PluginFailed`` unless deviations (m, O) of all outputs are finite and not negative."""
+    """Raise ``PluginFailed`` unless standard deviations (m, O) of all outputs are finite and not negative."""
     for name, column in zip(model.definition.outputs, deviation.T, strict=True):
-        require_numbers(model.definition, f"deviation of {name!r}", column, column.shape)
+        require_numbers(model.definition, f"standard deviation of {name!r}", column, column.shape)
         if bool((column < 0).any()):
-            raise _wrong(model.definition, f"deviation of {name!r}: expected at least 0", f"{float(column.min()):g}")
+            raise _wrong(
+                model.definition, f"standard deviation of {name!r}: expected at least 0", f"{float(column.min()):g}"
+            )
 
 
 def require_numbers(definition: EnvironmentDefinition, what: str, values: Tensor, shape: tuple[int, ...]) -> None:

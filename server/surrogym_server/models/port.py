@@ -70,7 +70,7 @@ class DynamicsModel(ABC):
         deviations: bool = False,
         reward_deviation: bool = False,
     ) -> Transition:
-        """Predict the step from q (m, C) under u (m, F): by the mean, or as a draw if ``noise`` is given.
+        """Predict the step from q (m, C) under u (m, F): by the mean, or as a sample if ``noise`` is given.
 
         Args:
             q: coordinates before the step.
@@ -108,8 +108,8 @@ class DynamicsModel(ABC):
     @property
     @abstractmethod
     def scales(self) -> Tensor:
-        """Standard deviation of each output over the samples, (O,), in its own unit; 1 for an output that never
-        varied."""
+        """Standard deviation of each output over the samples, (O,), in its own unit; 1 for an output that
+        never varied."""
 
     @property
     @abstractmethod

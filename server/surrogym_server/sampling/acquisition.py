@@ -76,7 +76,7 @@ class PathView:
 
 
 class Acquisition(ABC):
-    """Criterion that values queries. It follows the laws in this module's docstring."""
+    """Criterion that values queries. It follows the invariants in this module's docstring."""
 
     adaptive: ClassVar[bool] = True  # False: the whole budget is queried before the first fit
     reads_reference: ClassVar[bool] = False  # whether it uses ``variance_reduction``
@@ -118,7 +118,7 @@ class IntegratedVariance(Acquisition):
 
 @dataclass(frozen=True)
 class Variance(Acquisition):
-    """Deviation at the candidate."""
+    """Standard deviation at the candidate."""
 
     def value(self, candidates: CandidateView) -> Tensor:
         return candidates.deviation
@@ -178,13 +178,14 @@ def check_acquisition(definition: EnvironmentDefinition) -> None:
 
 
 def value_of(choice: Choice, candidates: CandidateView) -> Tensor:
-    """Return the acquisition's value of each of m candidates, (m,). Raises ``ChoiceFailed`` if it breaks the laws."""
+    """Return the acquisition's value of each of m candidates, (m,). Raises ``ChoiceFailed`` if it breaks the
+    invariants."""
     return _criterion_values(choice, acquisition_of(choice).value, candidates, candidates.distance.shape)
 
 
 def path_value_of(choice: Choice, paths: PathView) -> Tensor:
     """Return the acquisition's value of each beginning of b paths, (b, T). Raises ``ChoiceFailed`` if it breaks the
-    laws."""
+    invariants."""
     return _criterion_values(choice, acquisition_of(choice).path_value, paths, paths.weight.shape)
 
 

@@ -108,13 +108,13 @@ def from_pairs(pairs: Sequence[Sequence[Sequence[float]]]) -> Predictions:
 
 
 def _noise(model: DynamicsModel, like: Tensor) -> Tensor:
-    """Deviation of the noise of a single step that the model has learned, (O,)."""
+    """Standard deviation of the noise of a single step that the model has learned, (O,)."""
     able = offers(model, LearnedNoise)
     return like.new_zeros(like.shape[1]) if able is None else like.new_tensor(able.noise_deviations)
 
 
 def _reward_deviation_by_state(model: DynamicsModel, samples: Samples) -> Tensor:
-    """Deviation (m,) of the reward that the uncertain next state causes: 0 unless the reward depends on it.
+    """Standard deviation (m,) of the reward that the uncertain next state causes: 0 unless the reward depends on it.
 
     To first order: the reward's change when one output after the other moves by one standard deviation.
     """

@@ -68,8 +68,8 @@ def sensor_noise(model: DynamicsModel, samples: Samples, limits: Sequence[float]
 def noise_of_sensors(
     model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoise | None], limits: Sequence[float]
 ) -> Tensor:
-    """Deviation of a single step's noise of each output (O,) that comes from the sensors, in its unit: that of its own
-    sensor, or else what errors of all measured starts cause. It is 0 if it is below the limit (O,)."""
+    """Standard deviation of a single step's noise of each output (O,) that comes from the sensors, in its unit: that of
+    its own sensor, or else what errors of all measured starts cause. It is 0 if it is below the limit (O,)."""
     if not any(sensors):
         return torch.zeros(len(sensors), dtype=torch.float64)
     model_noise = _model_noise(model)
@@ -79,7 +79,8 @@ def noise_of_sensors(
 
 
 def _carried(model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoise | None]) -> Tensor:
-    """Deviation of each output (O,) that errors of measured starts cause: root mean square over the samples."""
+    """Standard deviation of each output (O,) that errors of measured starts cause: root mean square over the
+    samples."""
     variance = torch.zeros(len(sensors), dtype=torch.float64)
     for index, sensor in zip(model.definition.moving, sensors, strict=False):
         if sensor is not None:
@@ -88,7 +89,7 @@ def _carried(model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoi
 
 
 def _model_noise(model: DynamicsModel) -> Tensor:
-    """Deviation of each output's learned noise, (O,)."""
+    """Standard deviation of each output's learned noise, (O,)."""
     able = offers(model, LearnedNoise)
     result = [0.0] * len(model.definition.outputs) if able is None else able.noise_deviations
     return torch.tensor(result, dtype=torch.float64)

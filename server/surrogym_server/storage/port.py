@@ -1,4 +1,4 @@
-"""The storage port: all data that the server keeps. Its docstrings are laws, by which every adapter is tested.
+"""The storage port: all data that the server keeps. Its docstrings are invariants, by which every adapter is tested.
 
 For all of it:
 - an operation is atomic, and what it changed is durable when it returns;

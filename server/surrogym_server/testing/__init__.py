@@ -1,4 +1,5 @@
-"""Laws of the ports as plain functions, for authors of implementations. A broken law raises ``AssertionError``.
+"""Invariants of the ports as plain functions, for authors of implementations. A broken invariant raises
+``AssertionError``.
 
 Examples:
     >>> import pytest

@@ -1,4 +1,4 @@
-"""Laws of the abilities. A family without an ability passes its laws trivially."""
+"""Invariants of the abilities. A family without an ability passes its invariants trivially."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DRAWS = 400
 
 
 def _draws(case: ModelCase) -> list[FunctionDraws]:
-    """Objects that draw functions of the model: with the optimal hyperparameters, and with uncertain ones."""
+    """Objects that samples functions of the model: with the optimal hyperparameters, and with uncertain ones."""
     plain, uncertain = offers(case.model, FunctionDraws), offers(case.model, UncertainHyperparameters)
     found = [] if plain is None else [plain]
     return found if uncertain is None else [*found, uncertain.uncertain_functions]

@@ -1,4 +1,4 @@
-"""Small environments with known equations, for checks of the laws of a family of models."""
+"""Small environments with known equations, for checks of the invariants of a family of models."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Laws of every engine of sessions; see the docstrings of ``engine.port``."""
+"""Invariants of every engine of sessions; see the docstrings of ``engine.port``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Laws of every family of models; see the docstrings of ``models.port``."""
+"""Invariants of every family of models; see the docstrings of ``models.port``."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def points_do_not_see_those_beside_them(case: ModelCase) -> None:
 
 
 def without_points_there_are_no_steps(case: ModelCase) -> None:
-    """And no warning, because the deviation of no values is not a number."""
+    """And no warning, because the standard deviation of no values is not a number."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         made = case.model.transition(case.points.q[:0], case.points.u[:0], deviations=True, reward_deviation=True)

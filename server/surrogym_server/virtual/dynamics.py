@@ -44,7 +44,7 @@ def move_mean(
     paths: Tensor | None = None,
     functions: int | None = None,
 ) -> Moved:
-    """AUR-D: move q (N, C) under u (N, F) to the mean of the next state, or along each lane's drawn function.
+    """AUR-D: move q (N, C) under u (N, F) to the mean of the next state, or along each lane's sampled function.
 
     Args:
         paths: (N, W), the drawn functions.
@@ -136,7 +136,7 @@ def _compiled_transition(
 
 
 def penalised(reward: Tensor, penalty: float, deviation: Tensor) -> Tensor:
-    """Subtract ``penalty`` deviations (m,) from rewards (m,)."""
+    """Subtract ``penalty`` standard deviations (m,) from rewards (m,)."""
     return reward - penalty * deviation  # eq. 14
 
 
@@ -150,7 +150,7 @@ def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:
 
 
 def _weights(spread: Tensor, scale: Tensor, weighting: Weighting) -> Tensor:
-    """Normalised weights (N, P) of particles with reward deviations ``spread`` (N, P)."""
+    """Normalised weights (N, P) of particles with reward standard deviations ``spread`` (N, P)."""
     if weighting == "uniform":
         return torch.full_like(spread, 1 / spread.shape[1])
     precision = 1 / (spread.square() + WEIGHT_FLOOR * scale**2).clamp_min(LEAST_VARIANCE)

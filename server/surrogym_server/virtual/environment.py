@@ -55,7 +55,7 @@ class VirtualSettings:
 
     @property
     def doubts(self) -> bool:
-        """Whether a step needs the deviation of each output."""
+        """Whether a step needs the standard deviation of each output."""
         return self.trust is not None or self.caution > 0
 
 
@@ -241,8 +241,8 @@ def _move(
 
 
 def _doubted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> Moved:
-    """The move with rewards lowered by ``caution`` times the doubt: the largest deviation of an output, in its
-    deviations over the samples, times the deviation of the reward over the samples."""
+    """The move with rewards lowered by ``caution`` times the doubt: the largest standard deviation of an output, in its
+    standard deviations over the samples, times the standard deviation of the reward over the samples."""
     if settings.caution == 0:
         return moved
     assert moved.deviation is not None
@@ -251,7 +251,8 @@ def _doubted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> M
 
 
 def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> Tensor | None:
-    """Which lanes (N,) left the trusted range: the deviation of an output exceeds ``trust`` of its own deviations."""
+    """Which lanes (N,) left the trusted range: the standard deviation of an output exceeds ``trust`` of its own
+    standard deviations."""
     if settings.trust is None:
         return None
     assert moved.deviation is not None

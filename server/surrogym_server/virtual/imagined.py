@@ -1,4 +1,4 @@
-"""Episodes from a given state under given actions: one along the mean, and some along functions drawn from the
+"""Episodes from a given state under given actions: one along the mean, and some along functions sampled from the
 posterior.
 
 Shapes: C coordinates, F action entries, T actions, K draws.

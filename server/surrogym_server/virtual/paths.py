@@ -1,4 +1,5 @@
-"""Variant ``pathwise``: each episode of a lane follows one function drawn from the posterior (TS-infinity of PETS)."""
+"""Variant ``pathwise``: each episode of a lane follows one function sampled from the posterior (TS-infinity of
+PETS)."""
 
 from __future__ import annotations
 

@@ -45,8 +45,8 @@ def _one_of(states: Tensor, p: Tensor) -> Tensor:
 def start_particles(
     definition: EnvironmentDefinition, lanes: LaneState, q: Tensor, count: int, spread: float
 ) -> Tensor:
-    """Initial particles (N, P, C) around starts q (N, C): normal, with a fixed small deviation in each dimension
-    (section 4)."""
+    """Initial particles (N, P, C) around starts q (N, C): normal, with a fixed small standard deviation in each
+    dimension (section 4)."""
     each = [_deviation(definition, i, spread) for i in range(len(definition.coordinates))]
     deviation = torch.tensor(each, dtype=q.dtype, device=q.device)
     noise = normal_noise(lanes, Purpose.SPREAD, count, len(definition.coordinates))

@@ -47,13 +47,13 @@ class Prediction(Reply):
 
 
 class Imagine(Request):
-    """Request for virtual episodes under given actions: one along the mean, and some along functions drawn from the
+    """Request for virtual episodes under given actions: one along the mean, and some along functions sampled from the
     posterior."""
 
     coordinates: Vector = Field(description="(C,) state at the start")
     actions: Annotated[list[Vector], Field(min_length=1, max_length=MAX_IMAGINED)] = Field(description="(T, F) actions")
-    draws: Annotated[int, Field(ge=0, le=MAX_DRAWS)] = Field(default=0, description="number of functions to draw")
-    seed: Seed = Field(default=0, description="seed of the draws")
+    draws: Annotated[int, Field(ge=0, le=MAX_DRAWS)] = Field(default=0, description="number of functions to sample")
+    seed: Seed = Field(default=0, description="seed of the sampled functions")
     model: Annotated[int, Field(ge=1)] | None = Field(
         default=None, description="version of the model; null: the latest"
     )

@@ -33,7 +33,7 @@ class PolicyPromise(BaseModel):
     median: float = Field(description="median")
     low: float = Field(description="5 % quantile")
     high: float = Field(description="95 % quantile")
-    functions: Count = Field(default=0, description="number of functions that were drawn from the posterior")
+    functions: Count = Field(default=0, description="number of functions that were sampled from the posterior")
     episodes: Count = Field(default=0, description="number of virtual episodes")
 
 
@@ -234,7 +234,7 @@ class PolicyFileView(Reply):
     digest: str = Field(description="SHA-256 of the file, as hex")
     stored: bool = Field(
         description="whether the server has the file; false: it was announced and has not arrived yet, or it was "
-        "removed to make room"
+        "removed to free space"
     )
 
 

@@ -58,7 +58,7 @@ class OpenSession(Request):
     num_envs: Annotated[int, Field(ge=1, le=MAX_LANES)] = Field(default=1, description="number of lanes, N")
     variant: Variant = Field(
         default="deterministic",
-        description="how the state moves: by the model's mean, as particles, or along a drawn function",
+        description="how the state moves: by the model's mean, as particles, or along a sampled function",
     )
     seed: Seed | None = Field(
         default=None,
@@ -105,7 +105,8 @@ class OpenSession(Request):
         default=1_000, description="variant probabilistic: number of particles of a lane"
     )
     propagation: Literal["mean", "sample"] = Field(
-        default="sample", description="variant probabilistic: each particle moves by the mean, or by a draw of its own"
+        default="sample",
+        description="variant probabilistic: each particle moves by the mean, or by a sample of its own",
     )
     weighting: Literal["inverse_variance", "uniform"] = Field(
         default="inverse_variance", description="variant probabilistic: how the rewards of the particles are averaged"
@@ -117,7 +118,7 @@ class OpenSession(Request):
     )
     functions: Annotated[int, Field(ge=1, le=MAX_LANES)] | None = Field(
         default=None,
-        description="variant pathwise: number of drawn functions; lane i follows function i modulo this number, so "
+        description="variant pathwise: number of sampled functions; lane i follows function i modulo this number, so "
         "that lanes share functions from different starts; null: one function for each lane",
     )
     residual: Residual | None = Field(
@@ -203,7 +204,7 @@ class SessionView(Reply):
     observation_space: BoxSpace
     action_space: ActionSpace
     outputs: list[str] = Field(
-        description="names of the quantities that the model predicts, in the order of a step's deviations"
+        description="names of the quantities that the model predicts, in the order of a step's standard deviations"
     )
     idle_seconds: float = Field(description="seconds without a request after which the session expires")
     replay: int = Field(
@@ -335,7 +336,7 @@ class PolicyArrays(Request):
     """
 
     mean: Numbers = Field(description="(D,) mean that is subtracted from an observation")
-    deviation: Numbers = Field(description="(D,) deviation by which the difference is divided")
+    deviation: Numbers = Field(description="(D,) standard deviation by which the difference is divided")
     layers: Annotated[list[PolicyLayer], Field(min_length=1, max_length=MAX_LAYERS)] = Field(
         description="layers of the network, from the observation to the outputs"
     )

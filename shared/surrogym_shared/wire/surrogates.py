@@ -76,12 +76,12 @@ class OutputFidelity(Reply):
     name: str = Field(description="name of the output")
     structure: str = Field(description="inputs and kernel that were chosen, in words")
     confidence_index: float = Field(
-        description="mean Phi(tolerance / deviation) over the Monte Carlo set (eq. 8, 9); a noisy output has a wider "
-        "tolerance there: 1.5 deviations of its noise"
+        description="mean Phi(tolerance / standard deviation) over the Monte Carlo set (eq. 8, 9); a noisy output "
+        "has a wider tolerance there: 1.5 standard deviations of its noise"
     )
-    confidence_index_paper: float = Field(description="mean Phi(1 / deviation): the paper's, in raw units")
+    confidence_index_paper: float = Field(description="mean Phi(1 / standard deviation): the paper's, in raw units")
     tolerance: float = Field(description="error that is too small to matter, in the output's unit")
-    coverage: float = Field(description="share of the Monte Carlo set whose deviation is below the tolerance")
+    coverage: float = Field(description="share of the Monte Carlo set whose standard deviation is below the tolerance")
     leave_one_out_error: float | None = Field(
         description="root mean square error of each sample's prediction from all others, in the output's unit; "
         "null if the family of models can't compute it"
@@ -89,11 +89,11 @@ class OutputFidelity(Reply):
     leave_one_out_within_one: float | None = Field(
         default=None,
         description="share of the samples that are predicted from all others with an error below one predicted "
-        "deviation: near 0.68 if the deviations are right; null if the family can't compute it, or if "
+        "standard deviation: near 0.68 if these are right; null if the family can't compute it, or if "
         "the model is older than this field",
     )
     leave_one_out_within_two: float | None = Field(
-        default=None, description="the same below two predicted deviations: near 0.95"
+        default=None, description="the same below two predicted standard deviations: near 0.95"
     )
     noise: float = Field(
         default=0.0,

@@ -337,7 +337,7 @@ def with_layers(count: int, units: int) -> dict[str, Any]:
         ({**ROLL, "noise": {"seed": 0}}, "expected log_deviations for the noise"),
         ({**ROLL, "noise": {"seed": 0}, "policy": {**POLICY, "log_deviations": [81]}}, "within +-80, got 81"),
         ({**ROLL, "policy": {**POLICY, "mean": [0, 0]}}, "expected deviation of shape (2,), got (3,)"),
-        ({**ROLL, "policy": {**POLICY, "deviation": [1, 0, 1]}}, "expected a positive deviation, got 0"),
+        ({**ROLL, "policy": {**POLICY, "deviation": [1, 0, 1]}}, "expected a positive standard deviation, got 0"),
         ({**ROLL, "policy": {**POLICY, "mean": [0, 0, 1e300]}}, "finite numbers in mean"),
         ({**ROLL, "policy": {**POLICY, "mean": [0, 0, float("nan")]}}, "finite"),
         ({**ROLL, "policy": {**POLICY, "layers": []}}, "layers"),

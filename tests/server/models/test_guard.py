@@ -29,7 +29,7 @@ def job(**changes: object) -> DesignJob:
     [
         ("nan", ": next coordinates: expected finite numbers, got nan"),
         ("reward", ": reward: expected finite numbers, got nan"),
-        ("negative", r": deviation of 'theta': expected at least 0, got -"),
+        ("negative", r": standard deviation of 'theta': expected at least 0, got -"),
         ("shape", r": reward: expected the shape \(5,\), got \(5, 1\)"),
         ("narrow", r": next coordinates: expected the shape \(5, 2\), got \(5, 1\)"),
         ("nothing", ": expected transition to return a Transition, got NoneType"),

@@ -19,7 +19,7 @@ PUSHED_BY = "pushed_by"  # entry of a card: who stored it
 
 @dataclass(frozen=True)
 class PolicyFile:
-    """A file of a policy. ``blob`` is None if the file was announced but not sent, or was removed to make room."""
+    """A file of a policy. ``blob`` is None if the file was announced but not sent, or was removed to free space."""
 
     form: str
     bytes: int

@@ -177,7 +177,7 @@ class PolicyService:
         if found is None:
             raise UnknownPolicy(f"expected an evaluation of version {record.version} of {name!r}'s policies, got {id}")
         if found.blob is None:
-            return record, found, None, "they were removed to make room for newer files"
+            return record, found, None, "they were removed to free space for newer files"
         try:
             content = self._content(found.blob, found.digest, f"the episodes of evaluation {id}")
             return record, found, json.loads(content), None

@@ -1,5 +1,5 @@
-"""Inputs of the networks of one environment: features with mean near 0 and deviation near 1, without a choice by
-evidence."""
+"""Inputs of the networks of one environment: features with mean near 0 and standard deviation near 1, without a choice
+by evidence."""
 
 from __future__ import annotations
 

@@ -71,7 +71,8 @@ def _noiseless(training: Training, x: Tensor, y: Tensor) -> Regression:
 
 
 def standardised(y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Targets (n, p) in deviations, their mean (p,) and their deviation (p,), 0 for one that never varied."""
+    """Targets (n, p) in standard deviations, their mean (p,) and their standard deviation (p,), 0 for one that never
+    varied."""
     centre, scale = y.mean(0), y.std(0, correction=0)
     scale = torch.where(scale > CONSTANT * centre.abs(), scale, 0.0)
     return (y - centre) / torch.where(scale > 0, scale, 1.0), centre, scale

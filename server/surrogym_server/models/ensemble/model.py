@@ -18,13 +18,13 @@ from surrogym_server.tensors import cached
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of single steps that depends on the inputs, in deviations of the outputs."""
+    """Noise of single steps that depends on the inputs, in standard deviations of the outputs."""
 
     networks: Networks  # of its log variance
     size: Tensor  # (p,) deviation over the samples: root mean square
 
     def deviation(self, x: Tensor) -> Tensor:
-        """Deviation at x (m, d), that of the members' mean variance, (m, p)."""
+        """Standard deviation at x (m, d), that of the members' mean variance, (m, p)."""
         return bounded(self.networks(x)).exp().mean(0).sqrt()
 
 
@@ -49,8 +49,8 @@ class Regression:
 
 @dataclass(frozen=True)
 class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise, Differentiable):
-    """K members. The mean is the members' mean, and the deviation that between members. The noise of a transition
-    depends on the state; the reward has none."""
+    """K members. The mean is the members' mean, and the standard deviation that between members. The noise of a
+    transition depends on the state; the reward has none."""
 
     rows = 8_192
 
@@ -73,7 +73,7 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise, Differentiable):
         return 1
 
     def draw(self, noise: Tensor) -> Tensor:
-        """Draw functions. A function is a member, chosen with equal probability, and is given by its number."""
+        """Sample functions. A function is a member, chosen with equal probability, and is given by its number."""
         return drawn_member(noise, self.transitions.networks.members)
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:

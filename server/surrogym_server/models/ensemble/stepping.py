@@ -1,4 +1,4 @@
-"""Steps of models whose drawn functions are members of networks: in blocks, from changes to next states."""
+"""Steps of models whose sampled functions are members of networks: in blocks, from changes to next states."""
 
 from __future__ import annotations
 
@@ -57,7 +57,8 @@ class SteppedInBlocks(DynamicsModel, FunctionDraws):
         process: Tensor | None,
         paths: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Next states (m, C), rewards (m,), and the requested deviations, (m, M) and (m,), else (m, 0) and (m,).
+        """Next states (m, C), rewards (m,), and the requested standard deviations, (m, M) and (m,), else (m, 0) and
+        (m,).
 
         Rows follow the mean, moved by ``noise`` (m, M) deviations, or each its own function of ``paths`` (m, W).
         ``process`` (m, M) adds the learned noise.

@@ -212,7 +212,7 @@ class GaussianProcessModel(
         return self.reward.warp is not None and self.reward.warp.sign > 0
 
     def promise(self, q: Tensor, u: Tensor) -> Tensor:
-        """Mean plus one deviation of the reward's targets."""
+        """Mean plus one standard deviation of the reward's targets."""
         steps = PredictedSteps(q, u, self._predictor.transition(q, u, None, None, None, False, False).q_next)
         mean, deviation = self.reward.target(process_inputs(self.definition, self.reward, steps))
         return mean + deviation

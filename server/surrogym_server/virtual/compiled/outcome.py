@@ -45,7 +45,7 @@ def _exceeds(deviation: Floats, trust: float, scales: Floats) -> bool:
 
 @inlined
 def _doubt(deviation: Floats, scales: Floats) -> float:
-    """The largest deviation, in deviations over the samples, times that of the reward."""
+    """The largest standard deviation, in standard deviations over the samples, times that of the reward."""
     most = 0.0
     for o in range(len(deviation)):
         most = max(most, deviation[o] / scales[o])
@@ -54,7 +54,8 @@ def _doubt(deviation: Floats, scales: Floats) -> float:
 
 @inlined
 def _penalised(mean: float, deviation: Floats, penalty: float, caution: float, scales: Floats) -> float:
-    """A mean reward less penalties of the deviations (O,), that of the reward last. Those of weight 0 are not read."""
+    """A mean reward less penalties of the standard deviations (O,), that of the reward last. Those of weight 0 are not
+    read."""
     paid = mean if penalty == 0 else mean - penalty * deviation[-1]
     return float(paid - caution * _doubt(deviation, scales) if caution > 0 else paid)
 

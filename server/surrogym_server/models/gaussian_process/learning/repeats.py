@@ -80,7 +80,7 @@ def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Cand
 
 
 def _sharing(members: Sequence[_Candidate], pool: Pool, member: int) -> OutputModel:
-    """A member with the samples of its pool, if its own are foretold no worse by them."""
+    """A member with the samples of its pool, if its own are predicted no worse by them."""
     made, output = members[member], members[member].output
     assert output.posterior is not None
     x, y, hyper = pool.samples_of(member, MOST)

@@ -1,4 +1,4 @@
-"""Effect of further real steps on the deviations of processes, before they are taken.
+"""Effect of further real steps on the standard deviations of processes, before they are taken.
 
 The deviations of a process depend on where it is observed, not on the observed values. So the outlook after a query
 needs no guess of its answer. Only processes that read a predicted value (the lead, the next state of a reward) use the

@@ -1,4 +1,4 @@
-"""Outputs predicted together from one set of features: their means, and deviations from these."""
+"""Outputs predicted together from one set of features: their means, and differences from these."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class OutputGroup:
     def predict(
         self, x: Tensor, wanted: tuple[int, ...], kick: Tensor | None, process: Tensor | None, paths: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Values at features x (m, d), and the latent deviations of the wanted columns, (m, O) each.
+        """Values at features x (m, d), and the latent standard deviations of the wanted columns, (m, O) each.
 
         A value is the posterior's mean. ``kick`` (m, O) moves it by latent deviations, ``process`` (m, O) by deviations
         of the noise, and with ``paths`` (m, W) it is that of a drawn function, one for each row.

@@ -44,11 +44,11 @@ class OutputModel:
         return mean if self.warp is None else self.warp.value(mean)
 
     def mean_and_deviation(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Posterior mean and latent deviation at x (m, d), in the output's unit, (m,) each."""
+        """Posterior mean and latent standard deviation at x (m, d), in the output's unit, (m,) each."""
         return paid(self.warp, *self.target(x))
 
     def target(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Posterior mean and latent deviation at x (m, d), in the targets' unit, (m,) each."""
+        """Posterior mean and latent standard deviation at x (m, d), in the targets' unit, (m,) each."""
         if self.posterior is None:
             return x.new_full(x.shape[:-1], self.centre), x.new_zeros(x.shape[:-1])
         mean, variance = self.posterior.mean_and_variance(x)
@@ -66,7 +66,7 @@ class OutputModel:
 
     @property
     def size(self) -> float:
-        """Deviation of the output over the samples, in its unit; 1 for one that never varied."""
+        """Standard deviation of the output over the samples, in its unit; 1 for one that never varied."""
         return self.scale if self.warp is None else self.warp.size
 
     @property
@@ -76,13 +76,13 @@ class OutputModel:
 
     @property
     def noise_deviation(self) -> float:
-        """Deviation of the learned noise, in the output's unit; that of a warped output at a value as large as its
-        size, and with rates that at the points, as a root mean square."""
+        """Standard deviation of the learned noise, in the output's unit; that of a warped output at a value as large as
+        its size, and with rates that at the points, as a root mean square."""
         return 0.0 if self.posterior is None else self._of_noise(self.posterior.hyper.noise_variance)
 
     @property
     def possible_noise(self) -> float:
-        """The same deviation in an explanation by noise that is at least as likely, if a search finds one."""
+        """The same standard deviation in an explanation by noise that is at least as likely, if a search finds one."""
         if self.posterior is None:
             return 0.0
         hyper = self.posterior.hyper
@@ -148,5 +148,5 @@ class OutputModel:
 
 
 def paid(warp: Warp | None, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and deviation (m,) of the output, given those of its targets."""
+    """Mean and standard deviation (m,) of the output, given those of its targets."""
     return (mean, deviation) if warp is None else (warp.value(mean), warp.deviation(mean, deviation))

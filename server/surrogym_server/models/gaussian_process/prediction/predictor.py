@@ -65,12 +65,12 @@ class Predictor:
 
     @cached_property
     def path_size(self) -> int:
-        """Number of weights of a drawn function, W."""
+        """Number of weights of a sampled function, W."""
         return sum(one.pathwise.size for group in self._groups if group for one in group.drawn)
 
     def draw(self, noise: Tensor) -> Tensor:
-        """Draw functions from the posteriors of all outputs, one for each row of standard normal ``noise`` (N, W): (N,
-        W)."""
+        """Sample functions from the posteriors of all outputs, one for each row of standard normal ``noise`` (N, W):
+        (N, W)."""
         drawn = [one for group in self._groups if group for one in group.drawn]
         return torch.cat([noise[:, :0], *(one.pathwise.draw(noise[:, one.span]) for one in drawn)], 1)
 
@@ -83,7 +83,7 @@ class Predictor:
         process: Tensor | None,
         paths: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Next coordinates, changes and reward (m, columns), and the deviations of the wanted columns.
+        """Next coordinates, changes and reward (m, columns), and the standard deviations of the wanted columns.
 
         Each stage fills its own columns and leaves the others 0, so that the stages can be added.
         """
@@ -115,7 +115,8 @@ class Predictor:
         return mean + added, variance
 
     def _reward_spread(self, mean: Tensor, spread: Tensor, edges: Tensor | float) -> Tensor:
-        """Deviation (m,) of the reward, given mean and deviation (m,) of its process and the variance of its edges."""
+        """Standard deviation (m,) of the reward, given mean and standard deviation (m,) of its process and the variance
+        of its edges."""
         if self.reward.warp is not None:
             spread = self.reward.warp.deviation(mean, spread)
         return (spread.square() + edges).sqrt()

@@ -190,6 +190,6 @@ def jumped(jumps: Sequence[Jump], q: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def likely(mean: Tensor, deviation: Tensor) -> Tensor:
-    """Probability (m,) that a latent value with this mean and deviation is above 0."""
+    """Probability (m,) that a latent value with this mean and standard deviation is above 0."""
     probability: Tensor = torch.special.ndtr(mean / deviation.clamp_min(1e-9))
     return probability

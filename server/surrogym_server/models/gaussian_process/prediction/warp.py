@@ -38,11 +38,11 @@ class Warp:
         return self.base + self.sign * y.clamp_max(LARGEST).exp()
 
     def deviation(self, y: Tensor, spread: Tensor) -> Tensor:
-        """Deviation of the reward if y (m,) has deviation spread (m,)."""
+        """Standard deviation of the reward if y (m,) has standard deviation spread (m,)."""
         return 0.5 * ((y + spread).clamp_max(LARGEST).exp() - (y - spread).clamp_max(LARGEST).exp())
 
     def slope(self, y: Tensor, spread: Tensor) -> Tensor:
-        """Slope of the reward over y, (m,), where y may lie up to one deviation ``spread`` (m,) higher."""
+        """Slope of the reward over y, (m,), where y may lie up to one standard deviation ``spread`` (m,) higher."""
         return torch.exp((y + spread).clamp_max(LARGEST))
 
     def __str__(self) -> str:

@@ -169,8 +169,8 @@ def judge(
     deviation: Floats,
     terminated: Bools,
 ) -> None:
-    """Apply learned regions to steps from q to q_next (N, C): jumps to ``reward`` (N,) and to its deviation, the last
-    column of ``deviation`` (N, O), and learned ends to ``terminated`` (N,). ``actions`` is F."""
+    """Apply learned regions to steps from q to q_next (N, C): jumps to ``reward`` (N,) and to its standard deviation,
+    the last column of ``deviation`` (N, O), and learned ends to ``terminated`` (N,). ``actions`` is F."""
     head = matrix(numbers, places, HEAD)
     observe = int(head[0, OBSERVE])
     for begin in range(0, len(q), BLOCK):

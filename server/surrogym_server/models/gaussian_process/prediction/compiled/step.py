@@ -149,7 +149,8 @@ def _encode_stage(
 
 @inlined
 def _grow(numbers: Floats, places: Ints, at: int, x: Floats, mean: Floats, spread: Floats) -> None:
-    """Multiply what an output has beyond its centre, and its deviation, (B,) each, by its amplitude at x (d, B)."""
+    """Multiply what an output has beyond its centre, and its standard deviation, (B,) each, by its amplitude at x (d,
+    B)."""
     rates, centre = matrix(numbers, places, at), matrix(numbers, places, at + 1)[0, 0]
     for b in range(len(mean)):
         amplitude = 1.0
@@ -222,7 +223,8 @@ def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floa
 
 @inlined
 def _unwarp(warp: Floats, mean: Floats, spread: Floats) -> None:
-    """Convert means and deviations (B,) of a warped reward's targets to those of the reward, as ``Warp`` does."""
+    """Convert means and standard deviations (B,) of a warped reward's targets to those of the reward, as ``Warp``
+    does."""
     for b in range(len(mean)):
         y, s = mean[b], spread[b]
         spread[b] = 0.5 * (math.exp(min(y + s, LARGEST)) - math.exp(min(y - s, LARGEST)))
