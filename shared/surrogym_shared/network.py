@@ -199,7 +199,7 @@ def _read_head(content: bytes) -> _Head:
     try:
         return _Head.model_validate_json(content)
     except ValidationError as error:
-        raise ValueError(f"{HEAD}: {first_fault(error)}") from error
+        raise ValueError(f"{HEAD}: {first_fault(error)}; save or download the policy again") from error
 
 
 def _require_chain(head: _Head, headers: Mapping[str, Header]) -> None:

@@ -120,7 +120,9 @@ class SurrogateFile:
         try:
             own = json.loads(header[METADATA].pop(OWN))
             if own["format"] != FORMAT:
-                raise NotASurrogateFile(f"expected a surrogate's file of format {FORMAT}, got {own['format']!r}")
+                raise NotASurrogateFile(
+                    f"expected a surrogate's file of format {FORMAT}, got {own['format']!r}: export it by this release"
+                )
             spec = EnvironmentSpec.model_validate(own["spec"])
             names = [one for one in RealSamples.__dataclass_fields__ if one != LOGGED or SAMPLES + one in header]
             entries = {one: header.pop(SAMPLES + one) for one in names}

@@ -236,7 +236,9 @@ def read_spec_file(path: Path) -> SpecContent:
             )
         spec = EnvironmentSpec.model_validate_json(json.dumps(read["specification"]) if described else content)
     except ValidationError as error:
-        raise CommandError(f"{path} is not a specification: {first_fault(error, of=EnvironmentSpec)}") from error
+        raise CommandError(
+            f"{path} is not a specification: {first_fault(error, of=EnvironmentSpec)}; correct it and try again"
+        ) from error
     except json.JSONDecodeError as error:
         raise CommandError(
             f"{path} is not a specification: no JSON from line {error.lineno}, column {error.colno} on ({error.msg})"

@@ -217,7 +217,9 @@ class HttpSurrogate:
             raise ProtocolMismatch(f"unexpected answer of {live.route}/{what}: {error}") from error
         if seq != live.seq + 1:
             live.stream.close()
-            raise ProtocolMismatch(f"expected the answer to seq {live.seq + 1} of {session}, got {seq}")
+            raise ProtocolMismatch(
+                f"expected the answer to seq {live.seq + 1} of {session}, got {seq}: open a new session"
+            )
         live.seq = seq
         if live.window is not None:
             live.window.keep(replace(sent, digest=digest_of(answer)))

@@ -138,5 +138,5 @@ def unpacked(snapshot: bytes, shape: tuple[int, ...]) -> NDArray[Any]:
     except (ValueError, EOFError, OSError) as error:
         raise StepFailed(f"expected a snapshot of {shape} numbers, got one that can't be read: {error}") from error
     if state.shape != shape:
-        raise StepFailed(f"expected a snapshot of {shape} numbers, got {state.shape}: another version made it")
+        raise StepFailed(f"expected a snapshot of {shape} numbers, got {state.shape}: delete these snapshots")
     return state

@@ -61,7 +61,9 @@ def check_query(own: EnvironmentSpec, query: Query) -> None:
 def _check_action(own: EnvironmentSpec, action: Sequence[float]) -> None:
     _check_values("action", [f"action {i}" for i in range(own.action.size)], action, action_ranges(own))
     if not isinstance(own.action, BoxAction) and not all(float(value).is_integer() for value in action):
-        raise QueryRefused(f"expected the numbers of discrete actions, got {list(action)}")
+        raise QueryRefused(
+            f"expected the numbers of discrete actions, got {list(action)}: register this environment anew"
+        )
 
 
 def _check_values(what: str, names: Sequence[str], values: Sequence[float], ranges: Sequence[Range]) -> None:

@@ -111,4 +111,6 @@ def read_card(policy: Path) -> PolicyCard:
     try:
         return PolicyCard.model_validate_json(content)
     except ValidationError as error:
-        raise UnusablePolicy(f"{card_path(policy)} is not the card of a policy: {first_fault(error)}") from error
+        raise UnusablePolicy(
+            f"{card_path(policy)} is not the card of a policy: {first_fault(error)}; download or train the policy again"
+        ) from error

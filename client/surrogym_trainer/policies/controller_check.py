@@ -62,7 +62,9 @@ def read_check(folder: Path, policy: str) -> StoredCheck:
     with path.open("rb") as file:
         content = file.read(MOST_BYTES + 1)
     if len(content) > MOST_BYTES:
-        raise UnusableCheck(f"{path} is not the check of a controller: expected at most {MOST_BYTES} bytes")
+        raise UnusableCheck(
+            f"{path} is not the check of a controller: expected at most {MOST_BYTES} bytes; run surrogym deploy --check"
+        )
     try:
         check = StoredCheck.model_validate_json(content)
     except ValidationError as error:

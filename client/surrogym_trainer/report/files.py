@@ -50,4 +50,4 @@ def as_pdf(page: str) -> bytes:
             subprocess.run(command, check=True, capture_output=True, timeout=SECONDS)
             return pdf.read_bytes()
         except (OSError, subprocess.SubprocessError) as error:
-            raise NoPdf(f"no PDF was made: {browser} failed: {error}") from error
+            raise NoPdf(f"no PDF was made: {browser} failed: {error}; print the HTML from a browser") from error

@@ -145,7 +145,7 @@ def _read(path: Path) -> Waiting:
         content = file.read(MAX_BYTES + 1)
     try:
         if len(content) > MAX_BYTES:
-            raise UnusablePolicy(f"{path} has more than {MAX_BYTES} bytes")
+            raise UnusablePolicy(f"{path} has more than {MAX_BYTES} bytes: train smaller networks")
         return Waiting.model_validate_json(content)
     except ValidationError as error:
         raise UnusablePolicy(f"{path} is no result of a job: {first_fault(error)}") from error

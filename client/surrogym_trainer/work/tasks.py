@@ -129,7 +129,8 @@ def run_episodes(
     """
     if task.real_episodes > environment.most_episodes:
         raise ValueError(
-            f"expected at most {counted(environment.most_episodes, 'real episode')}, got {task.real_episodes}"
+            f"expected at most {counted(environment.most_episodes, 'real episode')}, got {task.real_episodes}: "
+            "ask for fewer, or start the worker with a larger --most-episodes"
         )
     found = api.policies.get(surrogate, task.policy)
     gathered.version = found.version

@@ -36,7 +36,9 @@ class Gate:
         """Return the role of a token. Raises ``Unauthenticated`` if it is unknown."""
         found = [role for known, role in self._tokens if hmac.compare_digest(known, token.encode())]
         if not found:
-            raise Unauthenticated("expected a known bearer token, got an unknown one")
+            raise Unauthenticated(
+                "expected a known bearer token, got an unknown one: set SURROGYM_TOKEN, or ask the server's admin"
+            )
         return found[0]
 
     def check(self, token: str | None, allowed: tuple[Role, ...]) -> None:

@@ -203,7 +203,7 @@ def visited_states(session: Session) -> Array:
         NotReset: the session has visited no state yet.
     """
     if session.visited is None:
-        raise InvalidInput("expected a session opened with occupancy=true, got one without")
+        raise InvalidInput("expected a session opened with occupancy=true, got one without: open a new one")
     if not len(session.visited.states):
         raise NotReset("expected a session that has visited states, got a new one: reset and step it first")
     return session.visited.states

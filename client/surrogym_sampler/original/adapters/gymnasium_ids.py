@@ -194,7 +194,7 @@ def _limits_of(space: Any) -> Array | None:
 def _reward(given: Any) -> float:
     number = np.asarray(given)
     if number.size != 1 or number.dtype.kind not in "fiub":
-        raise StepFailed(f"expected its reward to be a number, got {given!r:.60}")
+        raise StepFailed(f"expected its reward to be a number, got {given!r:.60}: wrap it in a class of your own")
     return float(number.item())
 
 

@@ -222,7 +222,8 @@ class Program:
                 searched = len(self._unread)
                 if searched > LONGEST_LINE:
                     raise StepFailed(
-                        f"expected a line of at most {LONGEST_LINE} bytes from the program, got a longer one"
+                        f"expected a line of at most {LONGEST_LINE} bytes from the program, got a longer one: "
+                        "print logs to standard error"
                     )
                 left = deadline - time.monotonic()
                 if left <= 0 or not selector.select(left):

@@ -95,7 +95,7 @@ class Fmu(SavingSimulator):
 
     def write(self, state: Array) -> None:
         if not self.settable:
-            raise UnknownEnvironment(f"{self._name} can't be set to {state.tolist()}: it can only be reset")
+            raise UnknownEnvironment(f"{self._name} can't be set to {state.tolist()}: register it with --access reset")
         self._set(state)
 
     def observe(self) -> Array:

@@ -70,7 +70,9 @@ class FolderBlobs(Blobs):
         except OSError as error:
             with suppress(OSError):
                 part.unlink()
-            raise Unavailable(f"a file can't be stored in {self._folder} now: {error.strerror}") from error
+            raise Unavailable(
+                f"a file can't be stored in {self._folder} now: {error.strerror}; free space, then send it again"
+            ) from error
         return name
 
     def get(self, name: str) -> bytes:

@@ -22,7 +22,7 @@ def check_file(form: str, content: bytes, size: int, digest: str) -> None:
         InvalidInput: the size or digest differs, or the content does not have this form.
     """
     if len(content) != size:
-        raise InvalidInput(f"expected a file of {size} bytes, as announced, got {len(content)}")
+        raise InvalidInput(f"expected a file of {size} bytes, as announced, got {len(content)}: send the whole file")
     found = hashlib.sha256(content).hexdigest()
     if found != digest:
         raise InvalidInput(f"expected a file with SHA-256 {digest}, as announced, got {found}")

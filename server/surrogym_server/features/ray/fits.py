@@ -50,7 +50,9 @@ class RayFits(Compute):
         except TaskCancelledError as error:
             raise Unavailable("the fit was ended: this server stops") from error
         except RayError as error:
-            raise Unavailable(f"the process or machine of a fit died: {in_one_line(error)}") from error
+            raise Unavailable(
+                f"the process or machine of a fit died: {in_one_line(error)}; the fit is tried again"
+            ) from error
         except asyncio.CancelledError:
             await asyncio.to_thread(_end, asked)
             raise

@@ -88,7 +88,10 @@ class Readiness:
         probe = self._latest()
         wait([probe], PATIENCE_SECONDS)
         if not probe.done():
-            raise Unavailable(f"the database can't be used now: no write succeeded within {PATIENCE_SECONDS:g} s")
+            raise Unavailable(
+                f"the database can't be used now: no write succeeded within {PATIENCE_SECONDS:g} s; "
+                "see whether its disk is full or another program holds it"
+            )
         if (error := probe.exception()) is not None:
             raise Unavailable(str(error)) from error
 

@@ -130,5 +130,5 @@ def _one(connection: Connection, name: str, version: int | None, *columns: sa.Co
     if row is not None:
         return row
     if version is None:
-        raise NoModel(f"expected a model of {name!r}, but no model has been fitted yet")
+        raise NoModel(f"expected a model of {name!r}, but no model has been fitted yet: start surrogym sample")
     raise UnknownModel(f"expected a version of {name!r}'s models, got {version}, which does not exist")
