@@ -153,9 +153,7 @@ def _read_tokens(environment: Mapping[str, str], file: str | Path | None) -> dic
     try:
         return tokens | tokens_in(Path(file))
     except OSError as error:
-        raise InvalidInput(
-            f"the token file {str(file)!r} can't be read: {error}; correct --token-file or its rights"
-        ) from error
+        raise InvalidInput(f"the token file {str(file)!r} can't be read: {error}; correct --token-file") from error
     except ValueError as error:
         raise InvalidInput(f"the token file {str(file)!r}: {error}") from None
 

@@ -80,8 +80,7 @@ def test_a_missing_token_file_is_one_sentence(surrogym, server):
     said = surrogym("status", "--server", server.url, "--token-file", "missing")
     assert (said.code, server.received) == (1, [])
     assert (
-        said.err
-        == "error: the token file 'missing' can't be read: No such file or directory; correct --token-file or its rights\n"
+        said.err == "error: the token file 'missing' can't be read: No such file or directory; correct --token-file\n"
     )
 
 
