@@ -28,8 +28,9 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.sampling.design import initial_queries
 from surrogym_shared import nouns
-from surrogym_shared.nouns import Phase, RealStep
+from surrogym_shared.nouns import RealStep
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.states import Phase
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 
 Floats = NDArray[np.float64]

@@ -1,7 +1,7 @@
 """The nouns of the loop, which the wire, the storage, the design and the sampler share.
 
 They are plain values without checks: the wire's models check what arrives. This file imports NumPy and the standard
-library alone, so that the pure core may import it. The thin client loads ``states`` alone.
+library alone, so that the pure core may import it. Phases, verdicts and kinds are in ``states`` and ``kinds``.
 
 Shapes: C coordinates, F action entries, D observation entries, T actions of a query, n real steps.
 """
@@ -15,15 +15,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from surrogym_shared.states import COMPLETED as COMPLETED
-from surrogym_shared.states import ENDED as ENDED
-from surrogym_shared.states import EventKind as EventKind
-from surrogym_shared.states import Phase as Phase
-from surrogym_shared.states import Purpose as Purpose
-from surrogym_shared.states import QueryKind as QueryKind
-from surrogym_shared.states import QueryStatus as QueryStatus
-from surrogym_shared.states import SamplePurpose as SamplePurpose
-from surrogym_shared.states import Verdict as Verdict
+from surrogym_shared.states import QueryKind, SamplePurpose
 
 Vector = tuple[float, ...]
 

@@ -12,6 +12,9 @@ from typing import Literal
 
 PresetName = Literal["default", "paper"]
 Tolerance = Literal["relative", "raw"]
+Moves = Literal["coordinates", "observation"]
+InputProbability = Literal["uniform", "predicted"]
+Stopping = Literal["confidence", "tested_confidence"]
 
 
 @dataclass(frozen=True)
@@ -21,7 +24,7 @@ class Preset:
     name: PresetName
 
     # What is learned.
-    moves: Literal["coordinates", "observation"]  # what the model of the transition predicts
+    moves: Moves  # what the model of the transition predicts
     takes_declared_rewards: bool
     penalty: float  # k of eq. 14
     limits_rewards: bool  # by those of the samples
@@ -33,8 +36,8 @@ class Preset:
     acquisition: str
     tolerance: Tolerance
     visited_candidates: bool
-    input_probability: Literal["uniform", "predicted"]
-    stopping: Literal["confidence", "tested_confidence"]
+    input_probability: InputProbability
+    stopping: Stopping
 
     # How a policy is trained and judged.
     algorithm: str  # policy search

@@ -20,3 +20,7 @@ SamplePurpose = Literal["initial", "adaptive", "manual", "audit", "logged"]
 QueryKind = Literal["step", "rollout"]
 QueryStatus = Literal["pending", "leased", "answered", "set_aside", "refused"]
 EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy", "job"]
+
+JobKind = Literal["train", "evaluate"]
+JobStatus = Literal["queued", "running", "done", "failed", "cancelled"]
+JobEnd = Literal["done", "failed", "cancelled"]

@@ -13,8 +13,9 @@ from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples
 from surrogym_server.sampling.latin_hypercube import random_points
-from surrogym_shared.nouns import Query, RealSteps, SamplePurpose
+from surrogym_shared.nouns import Query, RealSteps
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.states import SamplePurpose
 
 
 def arrays(queries: Sequence[Query]) -> tuple[Tensor, Tensor]:

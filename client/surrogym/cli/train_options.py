@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from surrogym_shared.kinds import Propagation, Variant, Weighting
+
 if TYPE_CHECKING:
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_trainer.training.closed_loop import LoopSettings
     from surrogym_trainer.training.handover import AuditSettings
     from surrogym_trainer.training.settings import Tracker
 
-Variant = Literal["deterministic", "probabilistic", "pathwise"]
-Propagation = Literal["mean", "sample"]
-Weighting = Literal["inverse_variance", "uniform"]
 Log = Literal["tensorboard", "wandb", "mlflow", "none"]
 
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from surrogym_client.registration import SWING_UP, SWING_UP_NARROW
 from surrogym_sampler.original.protocol import Array, Native
 from surrogym_sampler.original.swingup import swing_up, swing_up_narrow
+from surrogym_shared.kinds import Relation
 from surrogym_shared.spec import (
     Bounds,
     BoxAction,
@@ -198,7 +198,7 @@ def _linear(name: str) -> Term:
     return Term.linear(**{name: 1.0})
 
 
-def _inequality(name: str, relation: Literal["<", "<=", ">", ">="], value: float) -> Inequality:
+def _inequality(name: str, relation: Relation, value: float) -> Inequality:
     return Inequality(term=_linear(name), relation=relation, value=value)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.errors import SurrogymClientError
+from surrogym_shared.kinds import Function, LagKind
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, Lag, Term, limits
 from surrogym_shared.spec.actions import Action
 
@@ -68,7 +69,7 @@ class Remembered:
 
     name: str
     place: int
-    kind: Literal["change", "value", "action", "steps"]
+    kind: LagKind
     source: int
     angle: bool
     of_action: bool
@@ -81,7 +82,7 @@ class Remembered:
 class Part:
     """coefficient * phi(sum of weight * q[place]), with phi = 1, the identity, sin or cos."""
 
-    function: Literal["one", "linear", "sin", "cos"]
+    function: Function
     coefficient: float
     weights: tuple[tuple[int, float], ...]
 

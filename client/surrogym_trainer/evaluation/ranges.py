@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_shared.kinds import Side
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.spec.coordinates import Coordinate, limits
 from surrogym_trainer.policies.evidence import RangeLeft
 
 LITTLE = 0.05  # share of a way that may lie beyond an end
 MOST_UNTESTABLE = 0.2  # share of a way that may lie beyond what the original environment can be set to
-SIDES: tuple[Literal["lower", "upper"], ...] = ("lower", "upper")
+SIDES: tuple[Side, ...] = ("lower", "upper")
 
 Array = NDArray[np.float64]
 
@@ -48,7 +47,7 @@ def _beyond(ends: tuple[float, float], values: Array) -> float:
     return float(((values < ends[0]) | (values > ends[1])).mean())
 
 
-def _left(coordinate: Coordinate, values: Array, side: Literal["lower", "upper"]) -> RangeLeft:
+def _left(coordinate: Coordinate, values: Array, side: Side) -> RangeLeft:
     low, high = limits(coordinate.sampling)
     end, beyond = (low, values < low) if side == "lower" else (high, values > high)
     farthest = values.min() if side == "lower" else values.max()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import BaseModel, ConfigDict
+
+from surrogym_shared.kinds import Side
 
 
 class Promise(BaseModel):
@@ -43,7 +43,7 @@ class RangeLeft(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
     coordinate: str
-    side: Literal["lower", "upper"]
+    side: Side
     end: float
     share: float
     farthest: float

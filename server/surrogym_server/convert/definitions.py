@@ -1,4 +1,4 @@
-"""Conversion of a specification to a definition."""
+"""Derives a definition, with indices and defaults, from a specification, with names."""
 
 from __future__ import annotations
 
@@ -133,28 +133,28 @@ def _coordinate(coordinate: wire.Coordinate, spec: wire.EnvironmentSpec) -> core
     )
 
 
-def _lag(lag: wire.Lag, names: tuple[str, ...]) -> core.Lag:
+def _lag(lag: wire.Lag, names: tuple[str, ...]) -> core.LagDefinition:
     if lag.entry is not None:
-        return core.Lag(lag.kind, lag.entry)
-    return core.Lag(lag.kind, 0 if lag.of is None else names.index(lag.of))
+        return core.LagDefinition(lag.kind, lag.entry)
+    return core.LagDefinition(lag.kind, 0 if lag.of is None else names.index(lag.of))
 
 
 def _distribution(distribution: wire.Uniform | wire.Normal | wire.Fixed) -> distributions.Distribution:
     match distribution:
         case wire.Uniform(low=low, high=high):
-            return distributions.Uniform(low, high)
+            return distributions.UniformDefinition(low, high)
         case wire.Normal(mean=mean, std=std):
-            return distributions.Normal(mean, std, *distribution.limits)
+            return distributions.NormalDefinition(mean, std, *distribution.limits)
         case wire.Fixed(value=value):
-            return distributions.Fixed(value)
+            return distributions.FixedDefinition(value)
     raise InvalidSpec(f"unknown distribution {distribution!r}")
 
 
-def _term(term: wire.Term, names: tuple[str, ...]) -> terms.Term:
+def _term(term: wire.Term, names: tuple[str, ...]) -> terms.TermDefinition:
     parts = tuple(
-        terms.Part(p.function, p.coefficient, tuple(p.weights.get(n, 0.0) for n in names)) for p in term.parts
+        terms.PartDefinition(p.function, p.coefficient, tuple(p.weights.get(n, 0.0) for n in names)) for p in term.parts
     )
-    return terms.Term(parts, _or(term.low, -math.inf), _or(term.high, math.inf))
+    return terms.TermDefinition(parts, _or(term.low, -math.inf), _or(term.high, math.inf))
 
 
 def _penalty(spec: wire.EnvironmentSpec) -> float:
@@ -163,12 +163,12 @@ def _penalty(spec: wire.EnvironmentSpec) -> float:
     return _or(spec.reward.penalty, spec.preset.penalty)
 
 
-def _declared_reward(spec: wire.EnvironmentSpec) -> declared_reward.DeclaredReward | None:
+def _declared_reward(spec: wire.EnvironmentSpec) -> declared_reward.DeclaredRewardDefinition | None:
     if not isinstance(spec.reward, wire.DeclaredReward):
         return None
     names = spec.coordinate_names
     reward_terms = tuple(
-        declared_reward.RewardTerm(
+        declared_reward.RewardTermDefinition(
             term.weight,
             term.shape,
             tuple(_quantity(quantity, spec) for quantity in term.of),
@@ -176,16 +176,18 @@ def _declared_reward(spec: wire.EnvironmentSpec) -> declared_reward.DeclaredRewa
         )
         for term in spec.reward.terms
     )
-    return declared_reward.DeclaredReward(reward_terms, spec.reward.timing == "after", spec.reward.terminal, len(names))
+    return declared_reward.DeclaredRewardDefinition(
+        reward_terms, spec.reward.timing == "after", spec.reward.terminal, len(names)
+    )
 
 
-def _quantity(quantity: wire.Quantity, spec: wire.EnvironmentSpec) -> declared_reward.Quantity:
-    term = terms.Term(()) if quantity.term is None else _term(quantity.term, spec.coordinate_names)
-    return declared_reward.Quantity(term, quantity.action or (0.0,) * spec.action.size)
+def _quantity(quantity: wire.Quantity, spec: wire.EnvironmentSpec) -> declared_reward.QuantityDefinition:
+    term = terms.TermDefinition(()) if quantity.term is None else _term(quantity.term, spec.coordinate_names)
+    return declared_reward.QuantityDefinition(term, quantity.action or (0.0,) * spec.action.size)
 
 
-def _inequality(inequality: wire.Inequality, names: tuple[str, ...]) -> conditions.Inequality:
-    return conditions.Inequality(_term(inequality.term, names), inequality.relation, inequality.value)
+def _inequality(inequality: wire.Inequality, names: tuple[str, ...]) -> conditions.InequalityDefinition:
+    return conditions.InequalityDefinition(_term(inequality.term, names), inequality.relation, inequality.value)
 
 
 def _action(action: wire.BoxAction | wire.DiscreteAction | wire.MultiDiscreteAction) -> core.ActionDefinition:

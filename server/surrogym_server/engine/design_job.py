@@ -28,30 +28,31 @@ from surrogym_server.sampling.limits import reached_limits
 from surrogym_server.sampling.prequential import KEPT, Predictions, continued, predicted
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import usual_tolerances
-from surrogym_shared.nouns import Phase, Query, RealSteps, SamplePurpose, Verdict
+from surrogym_shared.nouns import Query, RealSteps
+from surrogym_shared.states import Phase, SamplePurpose, Verdict
 
 Array = NDArray[np.float64]
 
-UNCHOSEN: tuple[SamplePurpose, ...] = ("initial", "logged")  # purposes of samples that nobody chose to test a model
+UNCHOSEN: tuple[SamplePurpose, ...] = ("initial", "logged")  # samples that no model chose
 
 
 @dataclass(frozen=True)
 class DesignJob:
-    """Input of one round."""
+    """Input of one round of a design, as plain arrays and values that pickle."""
 
     definition: EnvironmentDefinition
-    samples: RealSteps  # so far
+    samples: RealSteps  # all real steps so far
     state: dict[str, Any]  # DesignState as JSON; {} before the first round
     budget: int  # limit of the design's real steps
-    target: float  # confidence index
+    target: float  # confidence index to reach
     pending: tuple[Query, ...] = ()  # queries without an answer: open, or set aside
     open_steps: int = 0  # real steps of the pending queries that may still be taken
     refused: tuple[Query, ...] = ()  # queries that the environment refused
-    snapshots: dict[str, tuple[float, ...]] = field(default_factory=dict)  # coordinates (C,) of each, by name
+    snapshots: dict[str, tuple[float, ...]] = field(default_factory=dict)  # coordinates (C,) of each snapshot, by name
     extra_queries: int = 0  # real steps requested with improve, chosen even if the design has ended
     occupancy: Array | None = None  # (m, C) states that policies visited
     threads: int = 1
-    previous: bytes | None = None  # model of the round before, which predicts the samples that are new to it
+    previous: bytes | None = None  # model of the round before, to predict the samples that are new
 
 
 @dataclass(frozen=True)
@@ -65,25 +66,25 @@ class DesignResult:
     state: dict[str, Any]
     verdict: Verdict
     seconds: float
-    queries: tuple[Query, ...] = ()  # of the next round
+    queries: tuple[Query, ...] = ()  # queries that the next round waits for
 
     @property
     def phase(self) -> Phase:
-        """Next phase of the design: it takes the chosen or the open queries, or it has ended."""
+        """Next phase of the design: ``sampling`` if queries are chosen or open, else the verdict."""
         return "sampling" if self.verdict == "continue" or self.queries else self.verdict
 
 
 def run_design_job(job: DesignJob) -> DesignResult:
-    """Fit, judge, choose. Raises like ``advance``."""
+    """Do one round: fit a model, judge it, choose queries. Raises like ``sampling.design.advance``."""
     started = time.perf_counter()
     torch.set_num_threads(job.threads)
-    with threadpool_limits(job.threads):  # many small products, for which threads cost more than they save
+    with threadpool_limits(job.threads):  # the products are small, so more threads would cost more than they save
         decision, samples = _decide(job)
     with plugin_calls(job.definition):
         stored = to_bytes(decision.model)
     return DesignResult(
         model=stored,
-        description=json.loads(json.dumps(decision.model.description)),  # plain data, whatever a family returns
+        description=json.loads(json.dumps(decision.model.description)),  # a family's own types become plain
         fidelity=fidelity_fields(
             decision.model,
             decision.confidences,
@@ -100,9 +101,9 @@ def run_design_job(job: DesignJob) -> DesignResult:
 
 
 def judge_stored(job: DesignJob, stored: bytes) -> DesignResult:
-    """Judge a stored model as the round did that made it, without fitting or choosing.
+    """Judge a stored model of the job's samples, without a fit and without choosing queries.
 
-    A model of other samples than the job's has the verdict ``continue``.
+    The verdict is ``continue`` if the model was fitted to other samples.
 
     Raises:
         InvalidInput: not a model of the job's definition.
@@ -134,8 +135,10 @@ def _decide(job: DesignJob) -> tuple[Decision, Samples]:
 
 
 def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
-    """Predictions of the last new samples by the previous model. None if it is a model of other samples, for example an
-    imported one."""
+    """Predict the latest samples by the model of the round before, which has not learned from them.
+
+    Empty if that model is of other samples, for example an imported one.
+    """
     if job.previous is None:
         return ()
     with suppress(InvalidInput), plugin_calls(job.definition):
@@ -148,12 +151,12 @@ def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
 
 
 def _samples(job: DesignJob) -> Samples:
-    """The samples to learn from: those with known lags."""
+    """Samples of the job that a model can learn from, because all lags are known where they begin."""
     return Samples.of(job.samples).at(_known(job))
 
 
 def _known(job: DesignJob) -> torch.Tensor:
-    """Which samples (n,) begin where all lags are known."""
+    """Whether all lags are known where each of n samples begins, (n,) bool."""
     return job.definition.known(torch.from_numpy(job.samples.coordinates))
 
 

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from surrogym_server.environment.terms import Term, TermSet, compile_terms
+from surrogym_server.environment.terms import TermDefinition, TermSet, compile_terms
 from surrogym_server.tensors import CPU, to_device
-
-Relation = Literal["<", "<=", ">", ">="]
+from surrogym_shared.kinds import Relation
 
 
 @dataclass(frozen=True)
-class Inequality:
-    term: Term
+class InequalityDefinition:
+    """Condition ``term relation value``."""
+
+    term: TermDefinition
     relation: Relation
     value: float
 
@@ -33,7 +33,9 @@ class Conditions:
     membership: Tensor  # (K, G)
 
     @classmethod
-    def of(cls, groups: Sequence[Sequence[Inequality]], coordinates: int, device: torch.device = CPU) -> Conditions:
+    def of(
+        cls, groups: Sequence[Sequence[InequalityDefinition]], coordinates: int, device: torch.device = CPU
+    ) -> Conditions:
         """Compile groups over C coordinates on a device. An empty group always holds."""
         inequalities = [i for group in groups for i in group]
         belongs = [g for g, group in enumerate(groups) for _ in group]

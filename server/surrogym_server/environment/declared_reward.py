@@ -3,45 +3,39 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-from surrogym_server.environment.conditions import Conditions, Inequality
-from surrogym_server.environment.terms import Term, TermSet, compile_terms
+from surrogym_server.environment.conditions import Conditions, InequalityDefinition
+from surrogym_server.environment.terms import TermDefinition, TermSet, compile_terms
 from surrogym_server.tensors import CPU, cached, to_device
-
-Shape = Literal["one", "linear", "absolute", "square", "bump", "ball"]
+from surrogym_shared.kinds import RewardShape
 
 
 @dataclass(frozen=True)
-class Quantity:
-    """x = term(q) + action . u."""
+class QuantityDefinition:
+    """Quantity of a declared reward, x = term(q) + action . u."""
 
-    term: Term
+    term: TermDefinition
     action: tuple[float, ...]  # (F,)
 
 
 @dataclass(frozen=True)
-class RewardTerm:
-    """weight * shape(x_1, x_2, ...) if every inequality in ``when`` holds, else 0.
-
-    ``one``: 1. ``linear``: sum x_i. ``absolute``: sum |x_i|. ``square``: sum x_i^2. ``bump``: exp(-1/2 sum x_i^2).
-    ``ball``: 1 where sum x_i^2 <= 1, else 0.
-    """
+class RewardTermDefinition:
+    """weight * shape(x_1, x_2, ...) if every inequality in ``when`` holds, else 0; see ``spec.RewardTerm``."""
 
     weight: float
-    shape: Shape
-    of: tuple[Quantity, ...]
-    when: tuple[Inequality, ...]
+    shape: RewardShape
+    of: tuple[QuantityDefinition, ...]
+    when: tuple[InequalityDefinition, ...]
 
 
 @dataclass(frozen=True)
-class DeclaredReward:
+class DeclaredRewardDefinition:
     """The sum of its terms at the action and the state, before or after the step."""
 
-    terms: tuple[RewardTerm, ...]
+    terms: tuple[RewardTermDefinition, ...]
     after: bool
     terminal: float  # added to the reward of a step that ends the episode
     coordinates: int
@@ -71,7 +65,7 @@ class DeclaredReward:
         return to_device(compiled, self.device)
 
 
-def _shaped(shape: Shape, x: Tensor) -> Tensor:
+def _shaped(shape: RewardShape, x: Tensor) -> Tensor:
     match shape:
         case "one":
             return x.new_ones(len(x))

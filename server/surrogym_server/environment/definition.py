@@ -1,4 +1,10 @@
-"""EnvironmentDefinition: the core's own frozen description of an environment, converted from the specification."""
+"""EnvironmentDefinition: one environment as the core computes with it.
+
+A specification (``surrogym_shared.spec``) is what a person writes: it names coordinates, leaves defaults open, and is
+checked when it is made. A definition is derived from it, in ``convert.definitions`` alone: it has an index in the place
+of each name, a weight for each coordinate, infinity in the place of an open limit, and every default. Classes of a
+definition end in ``Definition``, those of a specification do not: ``spec.Term``, ``TermDefinition``.
+"""
 
 from __future__ import annotations
 
@@ -13,39 +19,41 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogym_server.environment.conditions import Conditions, Inequality
-from surrogym_server.environment.declared_reward import DeclaredReward
+from surrogym_server.environment.conditions import Conditions, InequalityDefinition
+from surrogym_server.environment.declared_reward import DeclaredRewardDefinition
 from surrogym_server.environment.distributions import Distribution
-from surrogym_server.environment.terms import Term, TermSet, compile_terms
+from surrogym_server.environment.terms import TermDefinition, TermSet, compile_terms
 from surrogym_server.plugins import Choice
 from surrogym_server.tensors import CPU, cached, to_device
+from surrogym_shared.kinds import CoordinateKind, LagKind, RewardTiming
+from surrogym_shared.presets import InputProbability, Moves, Stopping, Tolerance
 
 REWARD = "reward"
 REACH = 1e6
 SCALING_POINTS = 4_096
 Array = NDArray[np.float64]
-Kind = Literal["linear", "angle", "constant"]
 
 
 @dataclass(frozen=True)
-class Lag:
-    """Past value that a coordinate repeats: the change of a coordinate in the step, or its value or an entry of the
-    action before it. Or the number of steps since the reset, up to the coordinate's upper bound."""
+class LagDefinition:
+    """Past value that a coordinate repeats; ``spec.Lag`` explains the kinds."""
 
-    kind: Literal["change", "value", "action", "steps"]
+    kind: LagKind
     source: int = 0  # index of the coordinate, or entry of the action
 
 
 @dataclass(frozen=True)
 class CoordinateDefinition:
+    """One entry of q: its name, its distributions in queries and at the start of episodes, its limits and its lag."""
+
     name: str
-    kind: Kind
+    kind: CoordinateKind
     sampling: Distribution
     start: Distribution
     low: float = -np.inf  # saturation bounds
     high: float = np.inf
     stops: int | None = None  # index of the coordinate that a bound sets to zero
-    lag: Lag | None = None
+    lag: LagDefinition | None = None
 
     @property
     def saturates(self) -> bool:
@@ -96,7 +104,7 @@ class LearningDefinition:
     """
 
     model: Choice
-    moves: Literal["coordinates", "observation"]
+    moves: Moves
     limits_rewards: bool = True
 
 
@@ -121,11 +129,11 @@ class DesignDefinition:
     initial: int
     hypercube_tries: int
     acquisition: Choice
-    tolerance: Literal["relative", "raw"]
+    tolerance: Tolerance
     monte_carlo: int
     visited_candidates: bool
-    input_probability: Literal["uniform", "predicted"]
-    stopping: Literal["confidence", "tested_confidence"]
+    input_probability: InputProbability
+    stopping: Stopping
     seed: int
 
 
@@ -135,19 +143,19 @@ class EnvironmentDefinition:
 
     coordinates: tuple[CoordinateDefinition, ...]
     observation_names: tuple[str, ...]
-    observation_terms: tuple[Term, ...]
+    observation_terms: tuple[TermDefinition, ...]
     observation_low: tuple[float, ...]
     observation_high: tuple[float, ...]
     action: ActionDefinition
-    termination_groups: tuple[tuple[Inequality, ...], ...]
+    termination_groups: tuple[tuple[InequalityDefinition, ...], ...]
     time_limit: int | None
-    reward_timing: Literal["before", "after", "auto"]
+    reward_timing: RewardTiming
     penalty: float
     tolerances: tuple[tuple[str, float], ...]
     learning: LearningDefinition
     design: DesignDefinition
     learns_termination: bool = False  # from samples; no groups are declared then
-    declared_reward: DeclaredReward | None = None
+    declared_reward: DeclaredRewardDefinition | None = None
     max_rollout: int | None = None  # longest action sequence of a query; None where any state can be set
     snapshots: bool = False  # whether such a sequence may begin at a saved state
     starts: tuple[tuple[float, ...], ...] = ()  # states at which episodes start; empty: the coordinates' distributions

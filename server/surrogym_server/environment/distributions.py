@@ -13,7 +13,9 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class Uniform:
+class UniformDefinition:
+    """Uniform on [low, high]."""
+
     low: float
     high: float
 
@@ -27,7 +29,7 @@ class Uniform:
 
 
 @dataclass(frozen=True)
-class Normal:
+class NormalDefinition:
     """Normal, truncated to [low, high]."""
 
     mean: float
@@ -48,7 +50,9 @@ class Normal:
 
 
 @dataclass(frozen=True)
-class Fixed:
+class FixedDefinition:
+    """A single value."""
+
     value: float
 
     @property
@@ -68,15 +72,15 @@ class Fixed:
         return torch.zeros_like(value)
 
 
-Distribution = Uniform | Normal | Fixed
+Distribution = UniformDefinition | NormalDefinition | FixedDefinition
 
 
 def scaling(distribution: Distribution) -> tuple[float, float]:
     """Centre and scale that give a sampled coordinate mean 0 and standard deviation about 1."""
     match distribution:
-        case Uniform(low, high):
+        case UniformDefinition(low, high):
             return (low + high) / 2, (high - low) / math.sqrt(12)
-        case Normal(mean, std):
+        case NormalDefinition(mean, std):
             return mean, std
-        case Fixed(value):
+        case FixedDefinition(value):
             return value, 1.0

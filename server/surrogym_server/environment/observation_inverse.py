@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.environment.terms import Part
+from surrogym_server.environment.terms import PartDefinition
 from surrogym_server.errors import InvalidSpec
 
 
@@ -41,10 +41,10 @@ class ObservationInverse:
 def _source(definition: EnvironmentDefinition, index: int) -> tuple[int, ...]:
     coordinate = definition.coordinates[index]
     unit = tuple(float(i == index) for i in range(len(definition.coordinates)))
-    direct = _entry(definition, Part("linear", 1.0, unit), coordinate.sampling.low, coordinate.sampling.high)
+    direct = _entry(definition, PartDefinition("linear", 1.0, unit), coordinate.sampling.low, coordinate.sampling.high)
     if direct is not None:
         return (direct,)
-    cosine, sine = (_entry(definition, Part(f, 1.0, unit), -1.0, 1.0) for f in ("cos", "sin"))
+    cosine, sine = (_entry(definition, PartDefinition(f, 1.0, unit), -1.0, 1.0) for f in ("cos", "sin"))
     if coordinate.kind == "angle" and cosine is not None and sine is not None:
         return (cosine, sine)
     raise InvalidSpec(
@@ -53,7 +53,7 @@ def _source(definition: EnvironmentDefinition, index: int) -> tuple[int, ...]:
     )
 
 
-def _entry(definition: EnvironmentDefinition, part: Part, low: float, high: float) -> int | None:
+def _entry(definition: EnvironmentDefinition, part: PartDefinition, low: float, high: float) -> int | None:
     """Index of the observation entry that is this part alone, not clipped within [low, high]."""
     for position, term in enumerate(definition.observation_terms):
         if term.parts == (part,) and term.low <= low and term.high >= high:

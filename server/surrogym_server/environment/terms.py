@@ -5,18 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-Function = Literal["one", "linear", "sin", "cos"]
+from surrogym_shared.kinds import Function
 
 
 @dataclass(frozen=True)
-class Part:
-    """coefficient * phi(weights . q), weights (C,)."""
+class PartDefinition:
+    """Part of a term, coefficient * phi(weights . q), with a weight for each coordinate (C,)."""
 
     function: Function
     coefficient: float
@@ -24,8 +23,10 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Term:
-    parts: tuple[Part, ...]
+class TermDefinition:
+    """Sum of parts, clipped to [low, high]."""
+
+    parts: tuple[PartDefinition, ...]
     low: float = -torch.inf
     high: float = torch.inf
 
@@ -50,7 +51,7 @@ class TermSet:
         return value if self.low is None else torch.clamp(value, self.low, self.high)
 
 
-def compile_terms(terms: Sequence[Term], coordinates: int) -> TermSet:
+def compile_terms(terms: Sequence[TermDefinition], coordinates: int) -> TermSet:
     """Compile terms over C coordinates. Equal frequencies are computed once."""
     frequencies = sorted({p.weights for t in terms for p in t.parts if p.function in ("sin", "cos")})
     first = {"sin": coordinates, "cos": coordinates + len(frequencies)}

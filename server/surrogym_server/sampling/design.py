@@ -22,26 +22,29 @@ from surrogym_server.sampling.rules import ROLLOUT_RULES, STEP_RULES
 from surrogym_server.sampling.seeds import generator_for
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
-from surrogym_shared.nouns import Query, Verdict
+from surrogym_shared.nouns import Query
+from surrogym_shared.states import Verdict
 
-FEW_POINTS = 500  # more points leave no large gap, and comparing all pairs takes memory in the square of their number
+FEW_POINTS = 500  # largest Latin hypercube to choose from several; comparing all pairs takes memory in the square
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What a round decides. O outputs."""
+    """Result of a round: a model, its judgement, and the next queries. O outputs."""
 
     model: DynamicsModel
-    confidences: tuple[OutputConfidence, ...]  # per output
-    tolerances: tuple[float, ...]  # (O,) used for the verdict
+    confidences: tuple[OutputConfidence, ...]  # (O,)
+    tolerances: tuple[float, ...]  # (O,) that the verdict is based on
     state: DesignState
     verdict: Verdict
-    queries: tuple[Query, ...]  # next ones
+    queries: tuple[Query, ...]  # the next queries
 
 
 def initial_queries(definition: EnvironmentDefinition, budget: int) -> tuple[Query, ...]:
-    """Return the queries before the first fit, with at most ``budget`` real steps: a Latin hypercube, or random
-    rollouts if the environment can't be set to any state."""
+    """Return the queries before the first fit, with at most ``budget`` real steps in all.
+
+    They are a Latin hypercube, or random rollouts if the environment can't be set to any state.
+    """
     adaptive = acquisition_of(definition.design.acquisition).adaptive
     steps = min(definition.design.initial, budget) if adaptive else budget
     rng = generator_for(definition, "initial")
@@ -57,22 +60,22 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     """Do one round of Algorithm 1.
 
     Raises:
-        InvalidInput, NumericalFailure: as ``Learner.learn`` does.
-        PluginFailed: the family of models raised anything else, or its model can't be used.
-        ChoiceFailed: the acquisition broke its laws.
+        InvalidInput, NumericalFailure: from ``Learner.learn``.
+        PluginFailed: the family of models raised another error, or its model can't be used.
+        ChoiceFailed: the acquisition returned values of a wrong shape, or that are not finite.
     """
-    # Fit.
+    # Fit the model to all samples.
     fit = learn(definition, samples, state.warm)
     default = frozen_tolerances(definition, samples, Usual(state.usual, state.ranges))
 
-    # Judge.
+    # Judge it: may the design end?
     judgement = judge_model(fit.model, samples, default.tolerances, request, state)
     tolerances = definition.tolerances_over(default.tolerances)
     now = (float(len(samples) - request.free), float(request.budget), request.target, *tolerances)
     outcome = outcome_of(judgement, state, request, now)
     testing = outcome == "ready" and _is_untested(definition, samples, state)
 
-    # Choose.
+    # Choose the next queries.
     continues = outcome == "continue" or testing
     round = Round(state.round, fit.model, samples, request, judgement, default.tolerances, continues, testing)
     queries = _choose(round)
@@ -94,16 +97,16 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
 
 
 def _choose(round: Round) -> tuple[Query, ...]:
-    """Let the first rule that applies choose the queries. The last rule of each kind always applies."""
+    """Return the queries of the first rule that applies. The last rule always applies."""
     rules = STEP_RULES if round.definition.max_rollout is None else ROLLOUT_RULES
     return next(queries for rule in rules if (queries := rule(round)) is not None)
 
 
 def _verdict(round: Round, outcome: Verdict, queries: tuple[Query, ...]) -> Verdict:
-    """Decide the verdict of a round: the outcome of its judgement, unless the design may continue.
+    """Decide the verdict of a round.
 
-    A design that may continue can't if it has nothing to ask and nothing to wait for: no distinct query is left,
-    unanswered queries hold the rest of the budget, or there is no rest.
+    It is the outcome of the judgement. But a design that could continue ends, if no query was chosen and none is
+    open: no distinct query is left, or the budget has no real steps left for one.
     """
     if not round.continues:
         return outcome
@@ -113,8 +116,10 @@ def _verdict(round: Round, outcome: Verdict, queries: tuple[Query, ...]) -> Verd
 
 
 def _is_untested(definition: EnvironmentDefinition, samples: Samples, state: DesignState) -> bool:
-    """Whether a design that would be ready needs an excursion first: it has snapshots, and no step was taken since one
-    was planned."""
+    """Whether a design with snapshots, which would be ready, has to take an excursion first.
+
+    It has to unless a step was taken since an excursion was planned.
+    """
     if not definition.snapshots or definition.design.stopping != "tested_confidence":
         return False
     return not state.tested_at or len(samples) <= state.tested_at

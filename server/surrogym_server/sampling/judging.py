@@ -25,17 +25,17 @@ from surrogym_server.sampling.prequential import scores_of
 from surrogym_server.sampling.seeds import generator_for
 from surrogym_server.sampling.serial import noise_of_sensors, sensor_noise
 from surrogym_server.sampling.state import DesignState, Request
-from surrogym_shared.nouns import Verdict
+from surrogym_shared.states import Verdict
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Verdict on a model."""
+    """Judgement of a model: confidences, tolerances, verdict, and candidates for the next queries."""
 
-    confidences: tuple[OutputConfidence, ...]  # per output
-    tolerances: tuple[float, ...]  # per output
+    confidences: tuple[OutputConfidence, ...]  # (O,)
+    tolerances: tuple[float, ...]  # (O,) that the confidences refer to
     verdict: Verdict
-    candidates: Candidates  # m
+    candidates: Candidates  # m points, for the next queries
 
 
 def judge_model(
@@ -45,14 +45,19 @@ def judge_model(
     request: Request,
     state: DesignState,
 ) -> Judgement:
-    """Judge a model by its definition's tolerances, or else by the ``usual`` ones (O,). Raises ``PluginFailed``."""
+    """Judge a model. An output without a declared tolerance has its ``usual`` one (O,).
+
+    Raises:
+        PluginFailed: code of the model's family failed.
+    """
     definition = model.definition
     with plugin_calls(definition):
         limits = definition.tolerances_over(usual)
         past = owed_to_past(model, samples, limits)
         sensors = tuple(None if any(past) else one for one in sensor_noise(model, samples, limits))
         noise = established_noise(model, samples, limits).maximum(noise_of_sensors(model, samples, sensors, limits))
-        noise = torch.zeros_like(noise) if any(past) else noise  # what is hidden may be in every output
+        if any(past):  # a hidden state may influence every output, so no noise is confirmed
+            noise = torch.zeros_like(noise)
     tolerances = widened(definition.tolerances_over(usual), noise)
     points = Points(*monte_carlo(definition))
     with plugin_calls(definition):
@@ -79,7 +84,7 @@ def judge_model(
         )
     if peak is not None:
         settled = False
-        if candidates.reserved is None or state.round % 2:  # the two alternate
+        if candidates.reserved is None or state.round % 2:  # endings and peaks take turns
             candidates = with_reserved(candidates, peak)
     verdict = judge(definition, confidences, tolerances, len(samples), request, settled)
     return Judgement(confidences, tolerances, verdict, candidates)
@@ -101,10 +106,10 @@ def judge(
 ) -> Verdict:
     """Decide whether the design continues.
 
-    With ``tested_confidence`` the index counts only if leave-one-out errors are known and within the tolerances, if the
-    end of episodes is known, and if adaptive queries, half as many as the initial design had, have failed to disprove
-    the model. Logged samples can replace initial queries but not adaptive ones, because nobody chose them to disprove
-    the model.
+    Under ``tested_confidence`` a design is ready only if its confidence index has reached the target, its leave-one-out
+    errors are known and within the tolerances, the end of episodes is known, and enough adaptive queries were answered:
+    half as many as initial ones. Logged samples count as initial ones, not as adaptive ones, because nobody chose them
+    to disprove the model.
     """
     initial, cost = definition.design.initial, samples - request.free
     sure = all(c.confidence_index >= request.target for c in confidences)
@@ -120,17 +125,17 @@ def judge(
 
 
 def agrees(confidence: OutputConfidence, tolerance: float) -> bool:
-    """Whether an output's leave-one-out error is known and within its tolerance."""
+    """Whether the leave-one-out error of an output is known and within the tolerance."""
     limit = SLACK * tolerance if confidence.noise else tolerance
     return confidence.leave_one_out_error is not None and confidence.leave_one_out_error <= limit
 
 
 def outcome_of(judgement: Judgement, state: DesignState, request: Request, now: tuple[float, ...]) -> Verdict:
-    """The verdict on a model, given how the design ended before.
+    """Correct the verdict on a model by how the design ended before, if it did.
 
-    A design that was ready stays ready, unless a person has asked for more or the steps since then contradict it. A fit
-    to more steps may lower a confidence index a little, although the model had predicted them all. Audits and logs
-    don't make a design that has ended take further real steps.
+    A design that was ready stays ready, unless a person has asked for more or later steps contradict the model: a fit
+    to more steps may lower the confidence index a little although the model had predicted all of them. A design that
+    has ended takes no further real steps because of audits or logs.
     """
     if judgement.verdict in ("ready", "from_log"):
         return judgement.verdict
@@ -142,14 +147,16 @@ def outcome_of(judgement: Judgement, state: DesignState, request: Request, now: 
 
 
 def _asks_more(now: tuple[float, ...], before: tuple[float, ...]) -> bool:
-    """Whether budget or target have changed since the design ended, or a tolerance has become smaller."""
+    """Whether a person has changed the budget or the target, or reduced a tolerance, since the design ended."""
     smaller = any(new < old for new, old in zip(now[3:], before[3:], strict=True))
     return now[1:3] != before[1:3] or smaller
 
 
 def _contradicted(judgement: Judgement, request: Request) -> bool:
-    """Whether the errors of an output are larger than its tolerance: those of the predictions of the latest steps or,
-    without any, the leave-one-out errors."""
+    """Whether the errors of an output exceed its tolerance.
+
+    They are the errors of the predictions of the latest steps, or the leave-one-out errors if there are none.
+    """
     surprises = request.surprises
     for i, (confidence, tolerance) in enumerate(zip(judgement.confidences, judgement.tolerances, strict=True)):
         latest = surprises[i] if surprises else ()

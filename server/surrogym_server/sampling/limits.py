@@ -1,15 +1,17 @@
-"""Declared limits at which many samples end. A limit cuts the increments off, so such samples say little about the
-dynamics."""
+"""Find declared limits at which many samples end.
+
+A limit cuts the change of a coordinate off, so such samples say little about the dynamics.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples, limit_sides
+from surrogym_shared.kinds import Side
 
-MANY = 0.2  # share of the samples that is worth a word
+MANY = 0.2  # least share of the samples for which a limit is reported
 
 
 @dataclass(frozen=True)
@@ -17,13 +19,13 @@ class Limit:
     """A declared limit of a coordinate at which samples end."""
 
     coordinate: str
-    side: Literal["lower", "upper"]
+    side: Side
     value: float
-    share: float  # of the samples
+    share: float  # of the samples that end there
 
 
 def reached_limits(definition: EnvironmentDefinition, samples: Samples) -> tuple[Limit, ...]:
-    """Limits at which at least ``MANY`` of the samples end, the most frequent first."""
+    """Return the limits at which a share of ``MANY`` or more of the samples end, the most frequent first."""
     if not len(samples):
         return ()
     limits: list[Limit] = []

@@ -12,7 +12,8 @@ from surrogym_server.services.lines import Lines, Present
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, QueryRecord
-from surrogym_shared.nouns import ENDED, Phase, Purpose, Query, QueryStatus
+from surrogym_shared.nouns import Query
+from surrogym_shared.states import ENDED, Phase, Purpose, QueryStatus
 
 
 @dataclass(frozen=True)

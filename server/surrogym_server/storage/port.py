@@ -44,7 +44,8 @@ from surrogym_server.storage.records import (
     SurrogateRecord,
     SurrogateSummary,
 )
-from surrogym_shared.nouns import Phase, Purpose, Query, QueryStatus, RealSteps, Vector
+from surrogym_shared.nouns import Query, RealSteps, Vector
+from surrogym_shared.states import Phase, Purpose, QueryStatus
 
 MAX_ATTEMPTS = 3
 LATEST = "latest"  # the alias of the newest policy

@@ -14,7 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_shared.nouns import EventKind, Phase, Purpose, Query, QueryStatus, RealStep, SamplePurpose, Vector
+from surrogym_shared.nouns import Query, RealStep, Vector
+from surrogym_shared.states import EventKind, Phase, Purpose, QueryStatus, SamplePurpose
 
 Array = NDArray[np.float64]
 JSON = dict[str, Any]

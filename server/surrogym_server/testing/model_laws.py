@@ -7,7 +7,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import fields
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.tensors import CPU
 from surrogym_server.testing.cases import ModelCase, close
 from surrogym_server.virtual import VirtualSettings, create, reset, step
+from surrogym_shared.kinds import Variant
 
 GUESS = 0.5  # of the deviation of the targets: the error of a family that learns is smaller
 RESERVED = "samples."
@@ -210,7 +211,7 @@ def a_model_stays_where_it_is_until_it_is_moved(case: ModelCase) -> None:
 
 
 def every_variant_steps(case: ModelCase) -> None:
-    variants: tuple[Literal["deterministic", "probabilistic", "pathwise"], ...]
+    variants: tuple[Variant, ...]
     variants = ("deterministic", "probabilistic", "pathwise")
     for variant in variants:
         settings = VirtualSettings(

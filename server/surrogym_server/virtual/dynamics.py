@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -15,8 +14,8 @@ from surrogym_server.models.abilities import ArraySteps
 from surrogym_server.models.draws import function_draws
 from surrogym_server.models.guard import require_shapes
 from surrogym_server.models.port import DynamicsModel, Transition
+from surrogym_shared.kinds import Weighting
 
-Weighting = Literal["inverse_variance", "uniform"]
 WEIGHT_FLOOR = 1e-12  # of the reward's variance, so that a certain particle's weight stays finite
 LEAST_VARIANCE = 1e-290  # smaller, because a hidden reward's variance may be 0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,13 +15,14 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, NotReset
 from surrogym_server.models.abilities import ArraySteps
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.virtual.dynamics import Moved, Weighting, move_mean, move_particles
+from surrogym_server.virtual.dynamics import Moved, move_mean, move_particles
 from surrogym_server.virtual.lanes import ENDED, EVERY, NEW, RUNNING, Chosen, LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 from surrogym_server.virtual.paths import with_paths
 from surrogym_server.virtual.residual import Residual, with_residual
 from surrogym_server.virtual.sensors import SensorNoise, driving, sensed
 from surrogym_server.virtual.start import start_coordinates, start_particles
+from surrogym_shared.kinds import AutoresetMode, Propagation, Variant, Weighting
 
 Floats = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
@@ -33,14 +34,14 @@ class VirtualSettings:
     """Options of a session, chosen when it was opened."""
 
     num_envs: int
-    variant: Literal["deterministic", "probabilistic", "pathwise"] = "deterministic"
-    autoreset_mode: Literal["next_step", "same_step", "disabled"] = "next_step"
+    variant: Variant = "deterministic"
+    autoreset_mode: AutoresetMode = "next_step"
     time_limit: int | None = None
     penalty: float = 0.0  # k of eq. 14
     start_box: float = 0.0  # share of episodes that start anywhere in the sampling range
     start_visited: float = 0.0  # share of episodes that start at one of the states ``visited``
     particles: int = 1_000
-    propagation: Literal["mean", "sample"] = "sample"
+    propagation: Propagation = "sample"
     weighting: Weighting = "inverse_variance"
     spread: float = 0.01  # first deviation of particles, as a share of each coordinate's range
     functions: int | None = None  # number of functions that lanes of variant pathwise share; None: one for each lane

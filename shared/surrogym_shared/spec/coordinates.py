@@ -8,6 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from surrogym_shared.checks import Number, Width, require, require_range
+from surrogym_shared.kinds import CoordinateKind, LagKind
 from surrogym_shared.spec.base import Frozen, Name
 
 
@@ -98,7 +99,7 @@ class Lag(Frozen):
     not learn from the step.
     """
 
-    kind: Literal["change", "value", "action", "steps"]
+    kind: LagKind
     of: Name | None = None
     entry: Annotated[int, Field(ge=0, strict=True)] | None = None
 
@@ -122,7 +123,7 @@ class Coordinate(Frozen):
     """
 
     name: Name
-    kind: Literal["linear", "angle", "constant"] = "linear"
+    kind: CoordinateKind = "linear"
     sampling: SamplingDistribution
     bounds: Bounds | None = None
     unit: str = ""

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BeforeValidator, Field, StrictBool, StrictFloat, StrictInt, StrictStr, model_validator
 
 from surrogym_shared.checks import SHOWN, Number, Positive, require, require_known, require_unique
-from surrogym_shared.presets import PRESETS, Preset, PresetName
+from surrogym_shared.presets import PRESETS, Preset, PresetName, Tolerance
 from surrogym_shared.spec.actions import Action
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, MAX_STARTS, REWARD, Frozen, Name
 from surrogym_shared.spec.coordinates import Coordinate, StartDistribution, limits
@@ -79,7 +79,7 @@ class Design(Frozen):
     target: Annotated[float, Field(gt=0.5, lt=1, strict=True)] = 0.999
     acquisition: Name | AcquisitionChoice | None = None
     model: Name | ModelChoice | None = None
-    tolerance: Literal["relative", "raw"] | None = None
+    tolerance: Tolerance | None = None
     monte_carlo: Annotated[int, Field(ge=16, le=100_000, strict=True)] | None = None
     symmetry: Literal["auto", "none"] = "auto"
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0

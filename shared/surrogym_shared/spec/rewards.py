@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from surrogym_shared.checks import Count, Number, require
+from surrogym_shared.kinds import RewardShape, RewardTiming
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_INEQUALITIES, MAX_TERM_PARTS, Frozen
 from surrogym_shared.spec.terms import Inequality, Term
 
@@ -21,7 +22,7 @@ class Reward(Frozen):
     """
 
     kind: Literal["learned"] = "learned"
-    timing: Literal["before", "after", "auto"] = "before"
+    timing: RewardTiming = "before"
     penalty: Annotated[float, Field(ge=0, le=100, strict=True)] | None = None
 
 
@@ -48,7 +49,7 @@ class RewardTerm(Frozen):
     """
 
     weight: Number = 1.0
-    shape: Literal["one", "linear", "absolute", "square", "bump", "ball"]
+    shape: RewardShape
     of: tuple[Quantity, ...] = Field(default=(), max_length=MAX_TERM_PARTS)
     when: tuple[Inequality, ...] = Field(default=(), max_length=MAX_INEQUALITIES)
 

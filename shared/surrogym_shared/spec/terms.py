@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from surrogym_shared.checks import Finite, Number, require
+from surrogym_shared.kinds import Function, Relation
 from surrogym_shared.spec.base import MAX_INEQUALITIES, MAX_TERM_PARTS, Frozen, Name
 
 
@@ -14,7 +15,7 @@ class Part(Frozen):
     """Part of a term: coefficient * phi(q), where phi is ``one`` = 1, ``linear`` = a.q, ``sin`` = sin(a.q) or
     ``cos`` = cos(a.q)."""
 
-    function: Literal["one", "linear", "sin", "cos"]
+    function: Function
     coefficient: Number = 1.0
     weights: dict[Name, Number] = Field(default_factory=dict, description="a, by coordinate name")
 
@@ -88,7 +89,7 @@ class Inequality(Frozen):
     """Condition ``term relation value``, for instance height > 1."""
 
     term: Term
-    relation: Literal["<", "<=", ">", ">="]
+    relation: Relation
     value: Number
 
 

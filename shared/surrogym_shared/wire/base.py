@@ -8,6 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from surrogym_shared.acting import MAX_ROLLOUT as MAX_ROLLOUT  # for modules that only import the wire
 from surrogym_shared.bounded import FailFast
+from surrogym_shared.kinds import AutoresetMode as AutoresetMode
+from surrogym_shared.kinds import Variant as Variant
 from surrogym_shared.spec import MAX_DIMENSIONS, NAME_PATTERN
 from surrogym_shared.states import Phase as Phase
 from surrogym_shared.states import Purpose as Purpose
@@ -25,8 +27,6 @@ MAX_IMAGINED = 500  # most steps of an imagined episode
 MAX_DRAWS = 64
 MAX_MEASURED = 1e30  # variances overflow beyond it, so one larger sample would prevent every fit
 
-Variant = Literal["deterministic", "probabilistic", "pathwise"]
-AutoresetMode = Literal["next_step", "same_step", "disabled"]
 Role = Literal["read", "train", "sample", "admin"]
 
 SurrogateName = Annotated[str, Field(pattern=NAME_PATTERN)]

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from surrogym_shared.states import JobEnd as JobEnd
+from surrogym_shared.states import JobStatus as JobStatus
 from surrogym_shared.wire.base import LEASE_SECONDS, VISIBLE, Key, Measured, Reply, Request
 
 MAX_JOB_EPISODES = 1_000  # real episodes of an evaluation
@@ -14,8 +16,6 @@ MAX_JOB_POINTS = 200  # of a curve
 
 JobAlgorithm = Literal["ppo", "fastppo", "a2c", "sac", "td3", "ddpg", "dqn", "cmaes", "gradient"]
 JobPreset = Literal["default", "quick"]
-JobStatus = Literal["queued", "running", "done", "failed", "cancelled"]
-JobEnd = Literal["done", "failed", "cancelled"]
 JobStage = Literal["preparing", "training", "auditing", "evaluating", "storing"]
 
 Count = Annotated[int, Field(ge=0, le=2**53)]

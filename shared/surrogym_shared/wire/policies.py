@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from surrogym_shared.kinds import Side
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire.base import MAX_MEASURED, VISIBLE, Key, Measured, Reply, Request, Vector
 
@@ -43,7 +44,7 @@ class PolicyRangeLeft(BaseModel):
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
     coordinate: Text = Field(description="name of the coordinate")
-    side: Literal["lower", "upper"] = Field(description="the end of the range that the way passes")
+    side: Side = Field(description="the end of the range that the way passes")
     end: float = Field(description="value of this end")
     share: float = Field(description="share of the way's states beyond it")
     farthest: float = Field(description="the state farthest beyond it")

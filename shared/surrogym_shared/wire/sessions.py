@@ -8,6 +8,7 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from surrogym_shared.acting import MAX_UNITS
 from surrogym_shared.checks import LARGEST
+from surrogym_shared.kinds import Propagation, Weighting
 from surrogym_shared.network import MAX_LAYERS, Activation
 from surrogym_shared.spec import MAX_DIMENSIONS
 from surrogym_shared.wire.base import (
@@ -104,11 +105,11 @@ class OpenSession(Request):
     particles: Annotated[int, Field(ge=1, le=MAX_PARTICLES)] = Field(
         default=1_000, description="variant probabilistic: number of particles of a lane"
     )
-    propagation: Literal["mean", "sample"] = Field(
+    propagation: Propagation = Field(
         default="sample",
         description="variant probabilistic: each particle moves by the mean, or by a sample of its own",
     )
-    weighting: Literal["inverse_variance", "uniform"] = Field(
+    weighting: Weighting = Field(
         default="inverse_variance", description="variant probabilistic: how the rewards of the particles are averaged"
     )
     spread: Annotated[float, Field(ge=0, le=1)] = Field(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
 from surrogym_shared.checks import Positive
+from surrogym_shared.kinds import Side
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire.base import Phase, Reply, Request, SurrogateName
 
@@ -123,7 +124,7 @@ class ReachedLimit(Reply):
     """A declared limit of a coordinate at which many samples end."""
 
     coordinate: str = Field(description="name of the coordinate")
-    side: Literal["lower", "upper"]
+    side: Side
     value: float = Field(description="the limit, in the coordinate's unit")
     share: float = Field(description="share of the samples that end there")
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.stats import truncnorm
 
-from surrogym_server.environment.distributions import Fixed, Normal, Uniform, scaling
+from surrogym_server.environment.distributions import FixedDefinition, NormalDefinition, UniformDefinition, scaling
 
 P = torch.linspace(0, 1, 501, dtype=torch.float64)
 
@@ -16,19 +16,21 @@ P = torch.linspace(0, 1, 501, dtype=torch.float64)
 )
 def test_truncated_normal(mean, std, low, high):
     reference = truncnorm((low - mean) / std, (high - mean) / std, loc=mean, scale=std)
-    values = Normal(mean, std, low, high).quantile(P).numpy()
+    values = NormalDefinition(mean, std, low, high).quantile(P).numpy()
     np.testing.assert_allclose(values, reference.ppf(P.numpy()), rtol=0, atol=1e-8 * std)
     assert np.all(np.diff(values) > 0)
     assert low <= values.min() < values.max() <= high
 
 
 def test_uniform_and_fixed():
-    torch.testing.assert_close(Uniform(-2, 6).quantile(P), -2 + 8 * P)
-    torch.testing.assert_close(Fixed(1.5).quantile(P), torch.full_like(P, 1.5))
-    assert (Fixed(1.5).low, Fixed(1.5).high) == (1.5, 1.5)
+    torch.testing.assert_close(UniformDefinition(-2, 6).quantile(P), -2 + 8 * P)
+    torch.testing.assert_close(FixedDefinition(1.5).quantile(P), torch.full_like(P, 1.5))
+    assert (FixedDefinition(1.5).low, FixedDefinition(1.5).high) == (1.5, 1.5)
 
 
-@pytest.mark.parametrize("distribution", [Uniform(-2, 6), Normal(1, 0.5, -0.5, 2.5), Normal(0, 2, -6, 6)])
+@pytest.mark.parametrize(
+    "distribution", [UniformDefinition(-2, 6), NormalDefinition(1, 0.5, -0.5, 2.5), NormalDefinition(0, 2, -6, 6)]
+)
 def test_scaling_gives_mean_zero_and_deviation_near_one(distribution):
     centre, scale = scaling(distribution)
     scaled = (distribution.quantile((P[:-1] + P[1:]) / 2) - centre) / scale
@@ -37,4 +39,4 @@ def test_scaling_gives_mean_zero_and_deviation_near_one(distribution):
 
 
 def test_a_fixed_value_is_scaled_to_zero():
-    assert scaling(Fixed(4.0)) == (4.0, 1.0)
+    assert scaling(FixedDefinition(4.0)) == (4.0, 1.0)

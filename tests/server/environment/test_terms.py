@@ -8,23 +8,23 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from surrogym_server.environment.conditions import Inequality
+from surrogym_server.environment.conditions import InequalityDefinition
 from surrogym_server.environment.definition import EnvironmentDefinition, wrap
-from surrogym_server.environment.terms import Part, Term, compile_terms
+from surrogym_server.environment.terms import PartDefinition, TermDefinition, compile_terms
 
 COORDINATES = 3
 numbers = st.floats(-4, 4, width=32)
 weights = st.tuples(*[st.sampled_from([0.0, 1.0, -1.0, 0.5, 2.0])] * COORDINATES)
-part = st.builds(Part, st.sampled_from(["one", "linear", "sin", "cos"]), numbers, weights)
+part = st.builds(PartDefinition, st.sampled_from(["one", "linear", "sin", "cos"]), numbers, weights)
 limits = st.tuples(st.floats(-3, 0), st.floats(0.5, 3)) | st.just((-math.inf, math.inf))
 term = st.builds(
-    lambda parts, limit: Term(tuple(parts), *limit),
+    lambda parts, limit: TermDefinition(tuple(parts), *limit),
     st.lists(part, min_size=1, max_size=5),
     limits,
 )
 
 
-def by_hand(term: Term, q: tuple[float, ...]) -> float:
+def by_hand(term: TermDefinition, q: tuple[float, ...]) -> float:
     total = 0.0
     for p in term.parts:
         phase = sum(a * b for a, b in zip(p.weights, q, strict=True))
@@ -42,7 +42,7 @@ def test_compiled_terms_are_their_sums(terms, points):
 
 
 def test_terms_keep_leading_dimensions():
-    compiled = compile_terms([Term((Part("sin", 2.0, (1.0, 0.0, 0.0)),))], COORDINATES)
+    compiled = compile_terms([TermDefinition((PartDefinition("sin", 2.0, (1.0, 0.0, 0.0)),))], COORDINATES)
     assert compiled(torch.zeros(4, 5, 3, dtype=torch.float64)).shape == (4, 5, 1)
 
 
@@ -59,11 +59,11 @@ def test_a_half_turn_wraps_to_minus_pi():
 
 
 def x_is(relation, value):
-    return Inequality(Term((Part("linear", 1.0, (1.0, 0.0)),)), relation, value)
+    return InequalityDefinition(TermDefinition((PartDefinition("linear", 1.0, (1.0, 0.0)),)), relation, value)
 
 
 def speed_is(relation, value):
-    return Inequality(Term((Part("linear", 1.0, (0.0, 1.0)),)), relation, value)
+    return InequalityDefinition(TermDefinition((PartDefinition("linear", 1.0, (0.0, 1.0)),)), relation, value)
 
 
 @pytest.mark.parametrize(

@@ -13,14 +13,14 @@ from scipy.stats import truncnorm
 from surrogym_sampler.original.classic import acrobot, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import ActionDefinition, CoordinateDefinition
-from surrogym_server.environment.distributions import Distribution, Fixed, Normal, Uniform
+from surrogym_server.environment.distributions import Distribution, FixedDefinition, NormalDefinition, UniformDefinition
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 
 PENDULUM = definition_from_spec(pendulum())
 
-uniform = st.builds(lambda low, width: Uniform(low, low + width), st.floats(-10, 10), st.floats(0.1, 20))
+uniform = st.builds(lambda low, width: UniformDefinition(low, low + width), st.floats(-10, 10), st.floats(0.1, 20))
 normal = st.builds(
-    lambda mean, std, a, b: Normal(mean, std, mean - a * std, mean + b * std),
+    lambda mean, std, a, b: NormalDefinition(mean, std, mean - a * std, mean + b * std),
     st.floats(-10, 10),
     st.floats(0.1, 5),
     st.floats(0.5, 4),
@@ -35,13 +35,13 @@ actions = st.one_of(
 
 
 def coordinate(distribution: Distribution) -> CoordinateDefinition:
-    return CoordinateDefinition("x", "linear", distribution, Fixed(0))
+    return CoordinateDefinition("x", "linear", distribution, FixedDefinition(0))
 
 
 def probability(distribution: Distribution, values: np.ndarray) -> np.ndarray:
     """Share of the distribution below each value, by other means than its quantiles."""
     low, high = distribution.low, distribution.high
-    if isinstance(distribution, Uniform):
+    if isinstance(distribution, UniformDefinition):
         return (values - low) / (high - low)
     mean, std = distribution.mean, distribution.std
     return truncnorm((low - mean) / std, (high - mean) / std, loc=mean, scale=std).cdf(values)
@@ -70,7 +70,7 @@ def test_stratification(distributions, action, count, seed, tries):
     for i, distribution in enumerate(distributions):
         assert_stratified(probability(distribution, q[:, i].numpy()))
     for entry in range(len(action.low)):
-        assert_stratified(probability(Uniform(action.low[entry], action.high[entry]), u[:, entry].numpy()))
+        assert_stratified(probability(UniformDefinition(action.low[entry], action.high[entry]), u[:, entry].numpy()))
     for entry, n in enumerate(action.nvec):
         counts = np.bincount(u[:, entry].long().numpy(), minlength=n)
         assert len(counts) == n
@@ -97,7 +97,7 @@ def test_of_several_designs_the_one_of_the_farthest_closest_pair_is_taken():
 
 
 def test_random_points_follow_the_sampling_distributions():
-    distribution = Normal(1, 2, -2, 3)
+    distribution = NormalDefinition(1, 2, -2, 3)
     definition = replace(PENDULUM, coordinates=(coordinate(distribution),))
     q, u = random_points(definition, 4_000, np.random.default_rng(0))
     p = probability(distribution, q[:, 0].numpy())

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.stats import kstest
 
-from surrogym_server.environment.distributions import Fixed, Normal
+from surrogym_server.environment.distributions import FixedDefinition, NormalDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.virtual import VirtualSettings, create, reset
 
@@ -79,7 +79,8 @@ def test_masks_and_seeds_of_another_length_are_refused(definition, options, comp
 def test_starts_follow_the_declared_distribution(definition):
     angle, speed = definition.coordinates
     declared = replace(
-        definition, coordinates=(replace(angle, start=Fixed(0.5)), replace(speed, start=Normal(1, 2, -3, 5)))
+        definition,
+        coordinates=(replace(angle, start=FixedDefinition(0.5)), replace(speed, start=NormalDefinition(1, 2, -3, 5))),
     )
     observation = starts(declared, 2_000)[0]
     np.testing.assert_allclose(observation[:, 0], math.cos(0.5), atol=1e-6)
@@ -110,7 +111,9 @@ def test_particles_start_around_the_reset_state_with_a_share_of_each_range(defin
 
 def test_constants_and_bounds_hold_for_particles(definition):
     angle, speed = definition.coordinates
-    fixed = replace(definition, coordinates=(replace(angle, kind="constant"), replace(speed, start=Fixed(8.0))))
+    fixed = replace(
+        definition, coordinates=(replace(angle, kind="constant"), replace(speed, start=FixedDefinition(8.0)))
+    )
     settings = VirtualSettings(1, variant="probabilistic", particles=50, spread=0.2)
     lanes, _ = reset(fixed, settings, create(fixed, settings, 0))
     assert (lanes.particles[..., 0] == lanes.q[:, :1]).all()

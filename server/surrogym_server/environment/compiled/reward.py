@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from surrogym_server.compiled.elementary import exponential
 from surrogym_server.compiled.tables import TablesBuilder, matrix
 from surrogym_server.environment.compiled.terms import add_conditions, add_terms, evaluate, holding
-from surrogym_server.environment.declared_reward import DeclaredReward
+from surrogym_server.environment.declared_reward import DeclaredRewardDefinition
 from surrogym_shared.compiled.jit import inlined
 
 Floats = NDArray[np.float64]
@@ -19,7 +19,7 @@ ONE, LINEAR, ABSOLUTE, SQUARE, BUMP, BALL = SHAPES.values()
 HEAD, WEIGHTS, TERMS = range(3)  # places of terms and conditions; action weights (F, X); weight, shape, quantities
 
 
-def add_reward(tables: TablesBuilder, reward: DeclaredReward) -> int:
+def add_reward(tables: TablesBuilder, reward: DeclaredRewardDefinition) -> int:
     """Add a declared reward, and return its place."""
     values, weights, conditions = reward._compiled
     head = [add_terms(tables, values), add_conditions(tables, conditions)]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from surrogym_server.compiled.elementary import wrapped
 from surrogym_server.compiled.tables import TablesBuilder, matrix
-from surrogym_server.environment.definition import EnvironmentDefinition, Lag
+from surrogym_server.environment.definition import EnvironmentDefinition, LagDefinition
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_shared.compiled.jit import compiled, inlined
 
@@ -36,7 +36,7 @@ def add_rules(tables: TablesBuilder, definition: EnvironmentDefinition) -> int:
     )
 
 
-def _lag(definition: EnvironmentDefinition, index: int, lag: Lag) -> tuple[int, int]:
+def _lag(definition: EnvironmentDefinition, index: int, lag: LagDefinition) -> tuple[int, int]:
     match lag.kind:
         case "steps":
             return COUNT, index

@@ -7,13 +7,9 @@ runs it under a lease, as a sampler answers a query: the lease ends by the datab
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 from surrogym_server.storage.records import JSON
-
-JobKind = Literal["train", "evaluate"]
-JobStatus = Literal["queued", "running", "done", "failed", "cancelled"]
-JobEnd = Literal["done", "failed", "cancelled"]
+from surrogym_shared.states import JobEnd, JobKind, JobStatus
 
 MAX_JOBS = 100  # ended jobs of a surrogate; older ones are removed
 MAX_OPEN = 20  # jobs of a surrogate that are queued or running

@@ -14,11 +14,9 @@ from surrogym_server.features.jobs.records import (
     MAX_OPEN,
     MAX_RUNS,
     SILENT,
-    JobKind,
     JobProgress,
     JobRecord,
     JobResult,
-    JobStatus,
     LeasedJob,
     NewJob,
 )
@@ -27,6 +25,7 @@ from surrogym_server.storage.sql import expiry
 from surrogym_server.storage.sql.database import NOW, Database
 from surrogym_server.storage.sql.rows import append_event, find, hold, recall, remember
 from surrogym_server.storage.sql.tables import Id, Json, Word, checked, metadata, owner, row_id, surrogates
+from surrogym_shared.states import JobKind, JobStatus
 
 jobs = checked(
     sa.Table(

@@ -18,7 +18,7 @@ from surrogym_server.storage.records import NewSample, fingerprint
 from surrogym_server.storage.sql.leases import foreign_lease, set_outcome, unknown_query
 from surrogym_server.storage.sql.rows import append_event
 from surrogym_server.storage.sql.tables import leases, queries, samples
-from surrogym_shared.nouns import Purpose, SamplePurpose
+from surrogym_shared.states import Purpose, SamplePurpose
 
 NAMED_QUERIES: sa.Select[Any] = (
     sa.select(queries.c.id, queries.c.purpose, queries.c.steps)

@@ -27,7 +27,8 @@ from surrogym_server.storage.sql.models import insert_model
 from surrogym_server.storage.sql.removal import NO_RIGHT
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, recall, remember, touch
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
-from surrogym_shared.nouns import Phase, Query
+from surrogym_shared.nouns import Query
+from surrogym_shared.states import Phase
 
 INTERRUPTED_SECONDS = 60.0  # initial queries that stay incomplete for so long are those of a server that has died
 # conditions on a row of surrogates

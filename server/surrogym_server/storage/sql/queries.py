@@ -34,7 +34,8 @@ from surrogym_server.storage.sql.rows import (
 )
 from surrogym_server.storage.sql.snapshots import give_up_lost
 from surrogym_server.storage.sql.tables import leases, queries, surrogates
-from surrogym_shared.nouns import Purpose, Query, QueryStatus
+from surrogym_shared.nouns import Query
+from surrogym_shared.states import Purpose, QueryStatus
 
 CONTENT = [getattr(queries.c, name) for name in ("coordinates", "action", "steps", "snapshot")]
 STATE = [getattr(queries.c, name) for name in ("id", "purpose", "status", "round", "attempts", "sampler", "error")]

@@ -12,7 +12,8 @@ from sqlalchemy.engine import Connection, Row
 from surrogym_server.errors import IdempotencyConflict, UnknownSurrogate
 from surrogym_server.storage.sql.database import NOW
 from surrogym_server.storage.sql.tables import events, queries, requests, surrogates
-from surrogym_shared.nouns import EventKind, Purpose, Query
+from surrogym_shared.nouns import Query
+from surrogym_shared.states import EventKind, Purpose
 
 Span = tuple[int, int]  # of ids of surrogates: the first and the last
 

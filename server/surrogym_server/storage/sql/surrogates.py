@@ -17,7 +17,7 @@ from surrogym_server.storage.sql.rows import NAMED, append_event, hold, touch, u
 from surrogym_server.storage.sql.sample_counts import CountedSamples
 from surrogym_server.storage.sql.summaries import Counted, read_summaries
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
-from surrogym_shared.nouns import Phase
+from surrogym_shared.states import Phase
 
 COLUMNS = [
     getattr(surrogates.c, name)

@@ -17,7 +17,8 @@ from sqlalchemy.engine import Dialect
 
 from surrogym_server.storage.records import Array
 from surrogym_server.storage.sql.damage import damaged
-from surrogym_shared.nouns import EventKind, Phase, Purpose, QueryKind, QueryStatus, SamplePurpose, Vector
+from surrogym_shared.nouns import Vector
+from surrogym_shared.states import EventKind, Phase, Purpose, QueryKind, QueryStatus, SamplePurpose
 
 metadata = sa.MetaData(
     naming_convention={

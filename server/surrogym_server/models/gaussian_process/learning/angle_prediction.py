@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 
 from surrogym_server.environment.angle_unwrapping import angle_increments
-from surrogym_server.environment.definition import EnvironmentDefinition, Lag
+from surrogym_server.environment.definition import EnvironmentDefinition, LagDefinition
 from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.features import Drift
 from surrogym_server.environment.samples import Samples
@@ -32,5 +32,5 @@ def learn_drift(definition: EnvironmentDefinition, samples: Samples) -> Drift:
     return tuple(tuple(row) for row in weights.tolist())
 
 
-def _is_action(lag: Lag | None) -> bool:
+def _is_action(lag: LagDefinition | None) -> bool:
     return lag is not None and lag.kind == "action"

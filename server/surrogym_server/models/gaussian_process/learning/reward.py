@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from surrogym_server.environment.declared_reward import DeclaredReward
+from surrogym_server.environment.declared_reward import DeclaredRewardDefinition
 from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
 from surrogym_server.environment.features import FeatureMap, encode
 from surrogym_server.environment.samples import Samples
@@ -53,7 +53,7 @@ def _without_action(definition: EnvironmentDefinition, samples: Samples) -> dict
     }
 
 
-def _declared(known: DeclaredReward, samples: Samples) -> OutputModel:
+def _declared(known: DeclaredRewardDefinition, samples: Samples) -> OutputModel:
     """The declared reward without a process. Its score is the largest error over the samples."""
     paid = known(samples.q_next if known.after else samples.q, samples.u) + known.terminal * samples.terminated
     off = float((samples.reward - paid).abs().max())

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import encode
-from surrogym_server.environment.terms import Part, Term, TermSet, compile_terms
+from surrogym_server.environment.terms import PartDefinition, TermDefinition, TermSet, compile_terms
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.tensors import cached, to_device
 
@@ -41,7 +41,7 @@ class Axes:
         size, found = len(definition.coordinates), {}
         for index in definition.moving:
             weights = tuple(float(i == index) for i in range(size))
-            found[Term((Part("linear", 1.0, weights),))] = definition.coordinates[index].name
+            found[TermDefinition((PartDefinition("linear", 1.0, weights),))] = definition.coordinates[index].name
         for name, term in zip(definition.observation_names, definition.observation_terms, strict=True):
             found.setdefault(term, name)
         return cls(tuple(found.values()), to_device(compile_terms(list(found), size), definition.device))
