@@ -1,5 +1,4 @@
-"""Compile steps before the first session opens, in another process, because numba would block the threads of
-this one."""
+"""Compile steps before the first session opens, in a child process, because numba blocks all threads of its process."""
 
 from __future__ import annotations
 
@@ -20,17 +19,17 @@ import surrogym_server.virtual.compiled.step
 import surrogym_server.virtual.words
 """
 PACKAGE = "surrogym_server"
-LONGEST = 120.0  # seconds that a session waits for it; after that it compiles itself
+LONGEST = 120.0  # seconds that a session waits for the compilation; then it compiles by itself
 
 
 class Compiling:
-    """A process that compiles steps."""
+    """A child process that compiles steps for the cache on the disk."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """Start it, unless steps can't be compiled and kept on disk, or an earlier process has compiled them."""
+        """Start the process, unless compiled steps can't be stored on the disk, or are there already."""
         to_be_kept = compiled.available() and kept.folder(PACKAGE) is not None and not kept.has_any(PACKAGE)
         if self._process is None and to_be_kept:
             self._process = subprocess.Popen(
@@ -38,7 +37,7 @@ class Compiling:
             )
 
     def wait(self) -> None:
-        """Wait until it has ended, with or without success. Call it in a thread."""
+        """Wait until the process has ended, with or without success. It blocks, so call it in a thread."""
         if self._process is not None:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(LONGEST)

@@ -37,12 +37,12 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 SESSION_ID_BYTES = 16
-MAX_PARTICLES = 4_000_000  # of all lanes of a session
-MAX_PATHWISE_LANES = 4_096  # the function of each is some thousand numbers
+MAX_PARTICLES = 4_000_000  # of all lanes of a session together
+MAX_PATHWISE_LANES = 4_096  # each lane has a sampled function of some thousand numbers
 
 
 class Models(Protocol):
-    """Source of the models of sessions; ``engine.models.ModelCache`` is one."""
+    """Source of models for sessions. ``engine.models.ModelCache`` implements it."""
 
     def get(self, surrogate: int, version: int, device: torch.device, /) -> DynamicsModel:
         """Return the model of a version, on a device."""
@@ -96,8 +96,11 @@ def opened(
 
 
 def resolved(opening: Opening, definition: EnvironmentDefinition) -> VirtualSettings:
-    """Settings in which the surrogate's values replace those that the trainer left open. Raises ``InvalidInput`` for
-    sensor noise of an unknown coordinate, and for a residual that does not fit."""
+    """Fill in what a trainer left open in the settings of its session, with the surrogate's values.
+
+    Raises:
+        InvalidInput: sensor noise of an unknown coordinate, or a residual that does not fit the environment.
+    """
     check_sensors(definition, opening.settings.sensor_noise)
     if opening.settings.residual is not None:
         opening.settings.residual.check(definition)
@@ -109,20 +112,22 @@ def resolved(opening: Opening, definition: EnvironmentDefinition) -> VirtualSett
 
 
 def limits_rewards(definition: EnvironmentDefinition) -> bool:
-    """Whether the samples limit virtual rewards. They don't if the reward is declared, which is exact, or in preset
-    paper."""
+    """Whether virtual rewards are limited by the samples' rewards.
+
+    A declared reward is exact, so it is not limited. In preset ``paper`` no reward is.
+    """
     return definition.declared_reward is None and definition.learning.limits_rewards
 
 
 def _limited(settings: VirtualSettings, rewards: SampledRewards | None, model: DynamicsModel) -> VirtualSettings:
-    """Add limits of rewards to settings, unless an imported model has learned from more than these samples."""
+    """Add the limits of virtual rewards to settings, unless an imported model has learned from further samples."""
     if rewards is None or not limits_rewards(model.definition) or model.samples > rewards.samples:
         return settings
     return replace(settings, reward_limits=reward_limits(rewards.low, rewards.high))
 
 
 def _visited(settings: VirtualSettings, definition: EnvironmentDefinition, states: Array | None) -> Tensor | None:
-    """States (k, C) at which a share of the episodes starts; None if there is no such share.
+    """States of real steps, (k, C), at which a share of the episodes starts; None if the settings have no such share.
 
     Raises:
         InvalidInput: there are no real steps.
@@ -135,7 +140,7 @@ def _visited(settings: VirtualSettings, definition: EnvironmentDefinition, state
 
 
 def fingerprint_of(request: Advance) -> Fingerprint:
-    """The fingerprint of a request; a repeat must have the same one, on any transport."""
+    """Fingerprint of a request. Only a request with the same fingerprint is a repeat, on any transport."""
     match request:
         case Step():
             return Fingerprint("step", _columns(request.action, 2), request.mask, request.deviations)
@@ -143,14 +148,14 @@ def fingerprint_of(request: Advance) -> Fingerprint:
             return Fingerprint("reset", request.seed, request.mask)
         case Rollout():
             return Fingerprint("rollout", _columns(request.actions, 3))
-        case PolicySteps():  # at once, because its parts would keep the policy in memory
+        case PolicySteps():  # hashed at once, because a lazy hash would keep the policy in memory
             return Fingerprint(digest=digest_of("policy", *parts_of(request.run)))
         case _:
             assert_never(request)
 
 
 def steps_asked(request: Advance) -> int:
-    """The largest number of steps that a request takes; a reset counts as one."""
+    """Largest number of virtual steps that a request may take; a reset counts as one."""
     match request:
         case Rollout():
             return len(request.actions)
@@ -168,10 +173,10 @@ def carried_out(
     Args:
         request: the request.
         models: of the session's surrogate.
-        require_wanted: called before each step of a rollout; raises if nobody wants the rollout any more.
-        interrupts: whether ``KeyboardInterrupt`` in a model's code is a failure of that code. True in a server, where a
-            person's Ctrl-C arrives differently.
-        session: the present session.
+        require_wanted: called before each step of a rollout; raises if its caller no longer waits.
+        interrupts: whether a ``KeyboardInterrupt`` from a model's code is a failure of that code. True in a server,
+            where Ctrl-C does not raise it.
+        session: the session before the request.
 
     Raises:
         InvalidInput: wrong shape, not finite, or out of bounds.
@@ -227,12 +232,15 @@ def _stepped(
         )
     except SurrogymError:
         raise
-    except BaseException as error:  # of a family's code; written out, because ``plugin_calls`` would slow each step
+    except BaseException as error:  # from a family's code; a ``plugin_calls`` block would slow each step
         if isinstance(error, KeyboardInterrupt) and not interrupts:
             raise
         raise failure_of(session.definition, error) from error
 
 
 def _columns(action: Array, dimensions: int) -> Array:
-    """Actions with their last axis, which some transports omit if it has one entry; for the fingerprint."""
+    """Add the last axis to actions without it, so that all transports give the same fingerprint.
+
+    Some transports omit that axis if it has one entry.
+    """
     return action[..., None] if action.ndim == dimensions - 1 else action

@@ -1,4 +1,4 @@
-"""Fidelity of a model as JSON, for models that a round has fitted and for imported ones."""
+"""Fidelity of a model as JSON, for models that a round fitted and for imported models."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ def fidelity_fields(
     target: float,
     limits: Sequence[Limit] = (),
 ) -> dict[str, Any]:
-    """The fields of ``wire.Fidelity``, from the confidence and tolerance of each output, (O,) each, and the limits at
-    which many samples end."""
+    """Return the fields of ``wire.Fidelity``, from confidences (O,), tolerances (O,), and the reached limits."""
     rows = [
         {"name": name, "structure": structure, "tolerance": tolerance, **asdict(output)}
         for name, structure, output, tolerance in zip(
@@ -40,7 +39,7 @@ def fidelity_fields(
 
 
 def fidelity_of(model: DynamicsModel, usual: Sequence[float], target: float) -> dict[str, Any]:
-    """The fields of ``wire.Fidelity`` of any model of the surrogate.
+    """Judge a model of a surrogate, and return the fields of ``wire.Fidelity``.
 
     Args:
         model: the model to judge.

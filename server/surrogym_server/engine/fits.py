@@ -1,4 +1,4 @@
-"""Fits run in other processes, so that steps never wait for them, and so that each of them can be stopped."""
+"""Fits in child processes, so that steps never wait for a fit, and so that a fit can be stopped."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from surrogym_server.engine.port import Compute
 from surrogym_server.errors import ChoiceFailed, PluginFailed, SurrogymError, Unavailable
 from surrogym_server.plugins import in_one_line
 
-NICENESS = 10  # a step on the same core keeps nine tenths of it
+NICENESS = 10  # of a fit; a step that shares a core with it gets nine tenths of the core
 Function = Callable[[DesignJob], DesignResult]
 
 
 @dataclass(frozen=True)
 class Failure:
-    """Error of a job, as text. The exception itself might not pickle, or might end the process that receives it."""
+    """Error of a job, as text, because the exception might not pickle, or might end the process that receives it."""
 
     kind: type[PluginFailed]
     said: str
@@ -35,11 +35,11 @@ class Failure:
 
 
 class Fits(Compute):
-    """A process for each running fit. The processes end with this one, however it ends.
+    """Runs each fit in a child process of its own. The children end with this process, however it ends.
 
     Args:
-        function: does a job.
-        kept: number of idle processes that are kept for the next jobs.
+        function: carries out a job.
+        kept: number of idle child processes to keep for the next jobs.
     """
 
     def __init__(self, function: Function = run_design_job, kept: int = 1) -> None:
@@ -49,7 +49,7 @@ class Fits(Compute):
         self._busy: list[_Process] = []
 
     def start(self) -> None:
-        """Start a process, and let it import the packages of a fit before the first one comes."""
+        """Start a process that imports what fits need, so that the first fit does not wait for that."""
         self._idle.append(_Process())
 
     async def run(self, job: DesignJob) -> DesignResult:
@@ -75,14 +75,13 @@ class Fits(Compute):
         )
 
     def close(self) -> None:
-        """End all processes, even in the middle of a fit or of their start. Harmless if they have ended."""
+        """End all child processes, even while they start or run a fit. Harmless if they have ended."""
         for process in (*self._idle, *self._busy):
             process.close()
         self._idle = []
 
     def _give_back(self, process: _Process, whole: bool) -> None:
-        """Keep a process for the next fit. End it if enough processes wait already, or if it is in the middle
-        of a job."""
+        """Keep a process for the next fit, or end it if enough idle ones are kept or it still runs a job."""
         self._busy.remove(process)
         if whole and len(self._idle) < self._kept:
             self._idle.append(process)
@@ -91,10 +90,10 @@ class Fits(Compute):
 
 
 class _Process:
-    """A pool of one process for fits. Its process ends when this process ends.
+    """One child process for fits, which ends when this process ends.
 
-    The process holds one end of a pipe whose other end is here and never written. When this process dies and its end
-    closes, the other process ends at once, even in the middle of a fit.
+    The child reads from a pipe that this process holds open and never writes to. When this process dies, the pipe
+    closes, and the child ends at once, even in the middle of a fit.
     """
 
     def __init__(self) -> None:
@@ -108,8 +107,7 @@ class _Process:
         self._processes: list[BaseProcess] = [child for child in active_children() if child not in others]
 
     def close(self) -> None:
-        """End the process, even in the middle of a job or of its start. Harmless if it has ended. Any thread may call
-        it."""
+        """End the process, even while it starts or runs a job. Harmless if it has ended. Any thread may call this."""
         with self._closing:
             for process in self._processes:
                 process.kill()
@@ -119,7 +117,7 @@ class _Process:
 
 
 def done(function: Function, job: DesignJob) -> DesignResult | Failure:
-    """Do a job, in another process. Whatever it raises is returned, even what would end the process."""
+    """Carry out a job in a child process. Return any exception as a failure, even one that would end the process."""
     try:
         return function(job)
     except BaseException as error:
@@ -129,7 +127,7 @@ def done(function: Function, job: DesignJob) -> DesignResult | Failure:
 
 
 def error_of(outcome: Failure) -> PluginFailed:
-    """The error to raise for a failure, with its details as a note."""
+    """Return the exception that a failure stands for, with its traceback as a note."""
     failure = outcome.kind(outcome.said)
     if outcome.details:
         failure.add_note(outcome.details)
@@ -138,8 +136,10 @@ def error_of(outcome: Failure) -> PluginFailed:
 
 @contextmanager
 def _terminal_blocked() -> Iterator[None]:
-    """Block the signals that a terminal sends to all its processes, by Ctrl-C or when it closes, for processes started
-    within the context. They inherit the mask; this process receives its signals afterwards."""
+    """Context in which new processes inherit a block of the signals that a terminal sends: Ctrl-C, and its closing.
+
+    This process receives its own signals when the context ends.
+    """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
     try:
         yield

@@ -45,23 +45,23 @@ from surrogym_server.tensors import CPU
 from surrogym_server.virtual import expected_bytes
 
 STEP_THREADS, ROLLOUT_THREADS = 4, 2
-Tolerances = Callable[[int, int], tuple[float, ...]]  # of a surrogate's version, (O,)
+Tolerances = Callable[[int, int], tuple[float, ...]]  # from surrogate id and version to tolerances (O,)
 
 
 class LocalEngine(SessionEngine):
     """Sessions of this process. All methods but ``counts`` belong to the event loop's thread.
 
     Args:
-        models: of all surrogates.
-        tolerances: of a stored model.
-        limits: of all sessions together.
-        max_lanes: of one session.
+        models: models of all surrogates.
+        tolerances: function from a surrogate's id and a version to the tolerances of that model.
+        limits: limits of all sessions together.
+        max_lanes: largest number of lanes of one session.
         idle_seconds: a session that is not used for so long expires.
-        device: where sessions are stepped; what comes in and goes out is not on it.
-        place: ending of the ids of its sessions, where engines in several processes have to be told apart.
+        device: device on which sessions step; requests and replies are on the CPU.
+        place: suffix of the ids of its sessions, which tells engines in several processes apart.
     """
 
-    def __init__(  # seven parameters: each is one that its builder reads from the settings, or shares with others
+    def __init__(  # seven parameters, because each comes from another setting or part of the server
         self,
         models: ModelCache,
         tolerances: Tolerances,
@@ -137,15 +137,15 @@ class LocalEngine(SessionEngine):
         self.end(session)
 
     def end(self, session: str) -> None:
-        """End a session, like ``close``, but without waiting for the event loop."""
+        """End a session like ``close``, for callers outside of a coroutine."""
         self._live.close(session)
 
     def session(self, id: str) -> Session:
-        """A session as it is now, which never changes. Raises ``UnknownSession`` or ``SessionExpired``."""
+        """Return a session's present, immutable state. Raises ``UnknownSession`` or ``SessionExpired``."""
         return self._live.get(id)
 
     def sessions(self) -> list[Session]:
-        """All sessions as they are now."""
+        """Return the present states of all sessions."""
         return list(self._live)
 
     async def forget(self, surrogate: int) -> None:
@@ -194,7 +194,7 @@ class LocalEngine(SessionEngine):
         return None if request.within is None else self._live.clock() + request.within
 
     def _counted(self, request: Advance, answer: Answer, began: float) -> Reply:
-        """Count the request and its steps, and return the reply. A repeat counts as a request, but has no steps."""
+        """Count a request and its steps, and return the reply. A repeated request counts, but its steps don't."""
         reply = Reply(answer.seq, answer.outcome)
         tally = self._tallies.of(request.session)
         if isinstance(request, Reset):

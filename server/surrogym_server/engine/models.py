@@ -1,4 +1,4 @@
-"""Loaded models by surrogate and version. The most recently used ones are kept.
+"""Cache of loaded models by surrogate and version. It keeps the most recently used ones.
 
 A surrogate is identified by its id, because its name may be deleted and used again, here or by another server.
 """
@@ -54,22 +54,22 @@ class ModelCache:
             return self._load(surrogate, version)
         except Damaged:
             with self._lock:
-                self._latest.pop(surrogate, None)  # it may have been this version
+                self._latest.pop(surrogate, None)  # the damaged version may be the one that was known as the newest
             raise
 
     def latest(self, surrogate: int) -> int:
-        """Return the newest version that is known here. Raises ``NoModel`` or ``UnknownSurrogate``."""
+        """Return the newest version that this process knows. Raises ``NoModel`` or ``UnknownSurrogate``."""
         with self._lock:
             if version := self._latest.get(surrogate):
                 return version
         return self.refresh(surrogate)
 
     def refresh(self, surrogate: int) -> int:
-        """Return the newest stored version that is not damaged, of any server.
+        """Look in the storage for the newest version that is not damaged, and return it.
 
         Raises:
             NoModel, UnknownSurrogate: as the classes say.
-            Damaged: it can't be read, and was not set aside.
+            Damaged: the model can't be read, and was not set aside.
         """
         while (version := self._newest().get(surrogate)) is not None:
             try:
@@ -80,10 +80,10 @@ class ModelCache:
         raise NoModel("expected a surrogate with a model, but no model has been fitted yet")
 
     def look(self) -> list[int]:
-        """Publish the versions that other servers have stored of surrogates in use here.
+        """Publish the versions that other servers have stored of the surrogates in this cache.
 
         Returns:
-            The surrogates that are deleted. Their models stay until ``forget``, so that their sessions can end before.
+            The ids of deleted surrogates. Their models stay until ``forget``, so that their sessions can end first.
         """
         with self._lock:
             versions = list(self._latest.items())
@@ -96,14 +96,14 @@ class ModelCache:
         return [surrogate for surrogate, _ in versions if surrogate not in newest]
 
     def publish(self, surrogate: int, version: int) -> int:
-        """Let lanes use a version from their next reset on, unless a newer one is known. Returns the newest version."""
+        """Make a version the newest for lanes that reset, unless a newer one is known. Returns the newest version."""
         self.get(surrogate, version)
         with self._lock:
             self._latest[surrogate] = max(version, self._latest.get(surrogate, 0))
             return self._latest[surrogate]
 
     def forget(self, surrogate: int) -> None:
-        """Forget a surrogate that was deleted."""
+        """Drop the models of a deleted surrogate."""
         with self._lock:
             self._latest.pop(surrogate, None)
             for key in [key for key in self._models if key[0] == surrogate]:

@@ -14,10 +14,10 @@ CAPACITY = 4_096
 
 @dataclass(frozen=True)
 class Reservoir:
-    """The ``CAPACITY`` visited coordinates of highest priority.
+    """Uniform sample of the coordinates that a session visited: the ``CAPACITY`` visits of highest priority.
 
-    The priority of the t-th visit is the t-th draw of a generator keyed by ``seed``. So the sample is uniform over all
-    visits, and does not depend on how the visits were divided into requests.
+    The priority of the t-th visit is the t-th random number of a generator keyed by ``seed``. So the sample does not
+    depend on how the visits were divided into requests.
     """
 
     seed: int
@@ -26,7 +26,7 @@ class Reservoir:
     priority: Array = field(default_factory=lambda: np.zeros(0))  # (m,)
 
     def visit(self, states: Array) -> Reservoir:
-        """The reservoir after visits to states (n, C), in order."""
+        """Return the reservoir after further visits to states (n, C), in order."""
         priority = _priorities(self.seed, self.seen, len(states))
         full = len(self.priority) == CAPACITY
         candidates = np.flatnonzero(priority > self.priority.min()) if full else np.arange(len(states))
@@ -41,7 +41,7 @@ class Reservoir:
 
 
 def _priorities(seed: int, first: int, count: int) -> Array:
-    """Draws ``first`` to ``first + count - 1`` of the stream of ``seed``; a Philox block holds four."""
+    """Random numbers ``first`` to ``first + count - 1`` of the stream of ``seed``. A Philox block has four of them."""
     block, offset = divmod(first, 4)
     generator = np.random.Generator(np.random.Philox(key=seed, counter=block))
     return generator.random(offset + count)[offset:]

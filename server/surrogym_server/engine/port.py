@@ -1,4 +1,4 @@
-"""SessionEngine: the port of live sessions. Compute: the port of computing rounds of designs.
+"""Two ports: ``SessionEngine`` for live sessions, and ``Compute`` for rounds of designs.
 
 Requests and replies are data; an engine owns everything between them.
 
@@ -35,8 +35,8 @@ class SessionEngine(ABC):
     """
 
     idle_seconds: float  # a session without requests for this long expires
-    lasting: bool = False  # whether sessions outlive this process, and other processes can use them
-    replay: int = 0  # how many of its last requests a client should keep: a session may go back to a checkpoint
+    lasting: bool = False  # whether sessions outlive this process and are open to other processes
+    replay: int = 0  # number of last requests that a client should keep, to repeat them after a checkpoint
 
     @abstractmethod
     async def open(self, request: Open) -> SessionInfo:
@@ -56,15 +56,15 @@ class SessionEngine(ABC):
             InvalidInput: the action has the wrong shape, is not finite, or is out of bounds.
             NotReset: a lane to step has not been reset.
             TooLarge: a rollout of too many steps.
-            DeadlineExceeded: it would take longer than the caller waits, and was not begun.
+            DeadlineExceeded: the request would take longer than the caller waits, so it was not begun.
             Overloaded: too many requests are running or waiting.
-            PluginFailed, NotInstalled: from the model's family.
+            PluginFailed, NotInstalled: code of the model's family failed, or is not installed.
         """
 
     def try_now(self, request: Advance) -> Reply | None:
-        """Return the reply if that needs no waiting, not even for the event loop. Otherwise do nothing and return None.
+        """Do ``advance`` at once if that is possible without waiting; otherwise do nothing and return None.
 
-        Raises as ``advance``.
+        Raises like ``advance``.
         """
         del request
         return None
@@ -88,7 +88,7 @@ class SessionEngine(ABC):
 
     @abstractmethod
     async def close(self, session: str) -> None:
-        """End a session. An unknown session is ignored."""
+        """End a session. Does nothing if it does not exist."""
 
     @abstractmethod
     async def forget(self, surrogate: int) -> None:
@@ -120,7 +120,7 @@ class SessionEngine(ABC):
 
     @abstractmethod
     async def restore(self, request: Restore) -> None:
-        """Restore a saved session. Its next reply is the same, bit for bit, as without the interruption.
+        """Restore a saved session. Its next reply is the same, bit for bit, as if it had not been saved.
 
         Raises:
             InvalidInput: the session was saved by another version of this program.
@@ -140,18 +140,18 @@ class Compute(ABC):
 
     @abstractmethod
     def start(self) -> None:
-        """Prepare for the first job."""
+        """Prepare for the first job, for example by starting a process."""
 
     @abstractmethod
     async def run(self, job: DesignJob) -> DesignResult:
         """Run a job, and return its result.
 
         Raises:
-            Unavailable: the job was lost and can't run now, because a process or machine died.
-            PluginFailed: the job raised an error of any kind; notes have the traceback of unexpected ones.
+            Unavailable: the process or machine of the job died, and the job can't run again now.
+            PluginFailed: the job raised an error; its notes have the traceback of an unexpected one.
             ChoiceFailed: the job itself raised this.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """End all jobs. Harmless if they have ended. Callers run it in a thread, because it may block."""
+        """End all jobs, if any run. It may block, so callers run it in a thread."""

@@ -21,8 +21,10 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Opening:
-    """A trainer's request for a session. A time limit or penalty of None is the surrogate's; a seed of None
-    is drawn."""
+    """What a trainer chooses for its session.
+
+    A time limit or penalty of None takes the surrogate's. A seed of None is replaced by a random one.
+    """
 
     settings: VirtualSettings
     penalty: float | None
@@ -46,7 +48,7 @@ class SampledRewards:
 
 @dataclass(frozen=True)
 class Open:
-    """Open a session of a stored surrogate."""
+    """Request to open a session of a stored surrogate."""
 
     surrogate: str
     surrogate_id: int
@@ -58,40 +60,40 @@ class Open:
 
 @dataclass(frozen=True, eq=False)
 class Reset:
-    """New episodes in the lanes of the mask, or in all of them."""
+    """Request for new episodes in the lanes of a mask, or in all lanes."""
 
     session: str
-    seq: int | None  # the session's next one, or None to give up replay
+    seq: int | None  # sequence number, the session's next one; None gives up replay
     seed: Seeds = None
-    mask: Bools | None = None  # (N,)
-    within: float | None = None  # seconds that the caller waits from now on
+    mask: Bools | None = None  # (N,) lanes that take part; None: all
+    within: float | None = None  # seconds that the caller will wait for the reply
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One step of the lanes of the mask, or of all of them."""
+    """Request for one step of the lanes of a mask, or of all lanes."""
 
     session: str
     seq: int | None
-    action: Array  # (N, F), or (N,) where F = 1; a policy's
-    mask: Bools | None = None  # (N,)
+    action: Array  # (N, F), or (N,) if F = 1, as policies send it
+    mask: Bools | None = None  # (N,) lanes that take part; None: all
     deviations: bool = False
     within: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """T steps with given actions, all or none."""
+    """Request for T steps with these actions; either all steps are taken or none."""
 
     session: str
     seq: int | None
-    actions: Array  # (T, N, F), or (T, N) where F = 1
+    actions: Array  # (T, N, F), or (T, N) if F = 1, as policies send them
     within: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class PolicySteps:
-    """Steps in which a policy acts in all lanes, all or none."""
+    """Request for steps in which a policy chooses the actions of all lanes; either all steps are taken or none."""
 
     session: str
     seq: int | None
@@ -104,7 +106,7 @@ Advance = Reset | Step | Rollout | PolicySteps
 
 @dataclass(frozen=True, eq=False)
 class Reply:
-    """The answer to an ``Advance``; a repeat of the request gets the same."""
+    """Answer to a reset, step or rollout. A repeat of the request gets the same answer."""
 
     seq: int
     outcome: Outcome
@@ -112,7 +114,7 @@ class Reply:
 
 @dataclass(frozen=True, eq=False)
 class SessionInfo:
-    """A session as everyone but its engine knows it."""
+    """Description of a session, for callers of the engine."""
 
     id: str
     surrogate: str
@@ -121,23 +123,23 @@ class SessionInfo:
     settings: VirtualSettings
     seed: int
     model: WantedVersion
-    versions: Versions  # (N,) the model each lane's episode runs under
-    seq: int  # the last one answered
-    behind: bool = False  # at a checkpoint, and its client has to send the requests since then again
+    versions: Versions  # (N,) model version of each lane's episode
+    seq: int  # sequence number of the last answered request
+    behind: bool = False  # restored from a checkpoint, so its client has to repeat the requests since then
 
 
 @dataclass(frozen=True, eq=False)
 class Visited:
-    """States that a session visited, and how well its model is known there."""
+    """States that a session visited, and the model's confidence index over them."""
 
     surrogate_id: int
-    states: Array  # (v, C)
+    states: Array  # (v, C) visited states
     confidence_index: float
 
 
 @dataclass(frozen=True)
 class Saved:
-    """A session as bytes, without the definition of its surrogate."""
+    """A saved session as bytes. The definition is not among them, because its surrogate has it."""
 
     id: str
     surrogate: str
@@ -146,7 +148,7 @@ class Saved:
 
 @dataclass(frozen=True)
 class Restore:
-    """Take a saved session back, under the surrogate that has its surrogate's name now."""
+    """Request to restore a saved session, under the surrogate that has its surrogate's name now."""
 
     saved: Saved
     surrogate_id: int

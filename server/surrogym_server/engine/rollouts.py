@@ -22,18 +22,18 @@ from surrogym_shared.port import PolicyRollout, StepResult
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-OneStep = Callable[[Session, Floats], tuple[Session, StepResult]]  # by the model's actions (N, F)
+OneStep = Callable[[Session, Floats], tuple[Session, StepResult]]  # steps with actions (N, F) in the model's units
 
 
 def parts_of(run: PolicyRun) -> tuple[object, ...]:
-    """Return everything that distinguishes a policy's rollout from others, for the fingerprint of its request."""
+    """Return what determines a policy's rollout, for the fingerprint of its request."""
     policy = run.policy
     arrays = (policy.mean, policy.deviation, policy.vector, policy.log_deviations, run.until)
     return (run.steps, policy.units, policy.activation, run.noise, *arrays)
 
 
 def roll(session: Session, actions: NDArray[np.float64], step: OneStep) -> tuple[Session, tuple[StepResult, ...]]:
-    """Step with given actions (T, N, F) or (T, N), all or none.
+    """Take T steps with actions (T, N, F), or (T, N) if F = 1; either all steps are taken or none.
 
     Raises:
         InvalidInput: wrong shape, not finite, or out of bounds; found before the first step.
@@ -48,7 +48,7 @@ def roll(session: Session, actions: NDArray[np.float64], step: OneStep) -> tuple
 
 
 def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Session, PolicyRollout]:
-    """Let a policy act, all steps or none.
+    """Take steps with the actions of a policy; either all steps are taken or none.
 
     Raises:
         InvalidInput: the policy has other observations or actions, ``until`` has another length, or actions are not

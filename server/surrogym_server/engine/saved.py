@@ -23,13 +23,13 @@ from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
 
 FORMAT = 2
 MALFORMED = (BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, ValueError, LookupError, TypeError)
-RAGGED = ("final_lanes", "final_observation")  # of different lengths in each step
+RAGGED = ("final_lanes", "final_observation")  # arrays whose length differs from step to step
 
 Arrays = dict[str, NDArray[Any]]
 
 
 def session_to_bytes(session: Session) -> bytes:
-    """Convert a session to bytes, without its definition, which its surrogate has."""
+    """Convert a session to bytes. Its definition is not stored, because its surrogate has it."""
     header: dict[str, Any] = {
         "format": FORMAT,
         "id": session.id,
@@ -59,13 +59,13 @@ def session_from_bytes(definition: EnvironmentDefinition, data: bytes, surrogate
     """Restore the session that ``session_to_bytes`` saved. Its next step is the same, bit for bit.
 
     Args:
-        definition: of its surrogate.
+        definition: definition of the session's surrogate.
         data: the saved bytes.
-        surrogate_id: of the surrogate that has the name of the session's surrogate now.
+        surrogate_id: id of the surrogate that now has the name of the session's surrogate.
 
     Raises:
-        InvalidInput: saved by another version of this program.
-        UnknownSession: its surrogate was deleted, and another one has its name.
+        InvalidInput: the session was saved by another version of this program.
+        UnknownSession: its surrogate was deleted, and another surrogate has its name.
         Damaged: the bytes have changed; each array is stored with a checksum.
     """
     try:

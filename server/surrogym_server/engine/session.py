@@ -28,8 +28,8 @@ ModelOf = Callable[[int], DynamicsModel]
 Seeds = int | Sequence[int] | None
 Outcome = ResetResult | tuple[StepResult, ...] | PolicyRollout
 
-RESULT_BYTES = 2_048  # of one step's arrays, in addition to their numbers
-LANE_BYTES = 48  # of one lane in them, in addition to its observation and its action
+RESULT_BYTES = 2_048  # memory of the array objects of one step's result, without their numbers
+LANE_BYTES = 48  # memory of one lane in a step's result, without observation and action
 
 
 class Fingerprint:
@@ -41,7 +41,7 @@ class Fingerprint:
     __slots__ = ("_digest", "_parts")
 
     def __init__(self, *parts: object, digest: str | None = None) -> None:
-        """Take the parts of a request, as ``digest_of`` does, or its digest. Arrays among the parts must not change."""
+        """Take the digest of a request, or the parts from which it is computed later. The parts must not change."""
         self._parts = parts
         self._digest = digest
 
@@ -61,7 +61,7 @@ class Fingerprint:
 
 @dataclass(frozen=True)
 class Answer:
-    """The last reply, kept for a repeat of its request."""
+    """The last answer of a session, kept for a repeat of its request."""
 
     seq: int
     request: Fingerprint
@@ -79,15 +79,15 @@ class Session:
     seed: int
     model: WantedVersion
     lanes: LaneState
-    versions: Versions  # (N,) the model each lane's episode runs under
+    versions: Versions  # (N,) model version of each lane's episode
     answer: Answer | None = None
     visited: Reservoir | None = None
     opened_by: tuple[str, str] | None = None  # idempotency key and digest of the opening
-    surrogate_id: int = 0  # in storage, if there is one
+    surrogate_id: int = 0  # id of the surrogate in storage; 0 without a storage
 
     @property
     def nbytes(self) -> int:
-        """Approximate memory of its lanes and its kept answer, in bytes."""
+        """Approximate memory of the session's lanes and kept answer, in bytes."""
         outcome = None if self.answer is None else self.answer.outcome
         return self.lanes.nbytes + self.answer_bytes(1 if outcome is None else steps_of(outcome))
 
@@ -98,7 +98,7 @@ class Session:
 
     @property
     def seq(self) -> int:
-        """The last answered seq."""
+        """Sequence number of the last answered request."""
         return 0 if self.answer is None else self.answer.seq
 
 
@@ -108,7 +108,7 @@ def steps_of(outcome: Outcome) -> int:
 
 
 def replay(session: Session, seq: int | None, request: Fingerprint) -> Answer | None:
-    """The kept answer if the request repeats the last one; None if it is the next one.
+    """Return the kept answer if the request repeats the last one, or None if it is the next one.
 
     Raises:
         SeqConflict: it is neither.
@@ -123,7 +123,7 @@ def replay(session: Session, seq: int | None, request: Fingerprint) -> Answer | 
 
 
 def answered(session: Session, request: Fingerprint, outcome: Outcome) -> tuple[Session, Answer]:
-    """The session with the outcome as its last answer."""
+    """Return the session with this outcome as its last answer."""
     answer = Answer(session.seq + 1, request, outcome)
     return _with(session, answer=answer), answer
 
@@ -182,7 +182,7 @@ def _step_versions(
 
 
 def _join(parts: Sequence[tuple[NDArray[np.intp], LaneTransition]]) -> LaneTransition:
-    """Join the transitions of disjoint groups of lanes, each with its lane numbers, to one of all lanes."""
+    """Join the transitions of disjoint groups of lanes to one of all lanes; each group has its lane numbers."""
     order = np.argsort(np.concatenate([index for index, _ in parts]))
 
     def lanewise(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -237,7 +237,7 @@ def _check_mask(mask: Bools, num_envs: int) -> None:
 
 
 def check_opening(session: Session, digest: str) -> Session:
-    """The session that an idempotency key opened, if its opening had the same body.
+    """Return the session that an idempotency key opened, if its opening had the same body.
 
     Raises:
         IdempotencyConflict: the body was different.

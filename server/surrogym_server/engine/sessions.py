@@ -28,8 +28,8 @@ from surrogym_shared.port import PolicyRollout
 
 logger = logging.getLogger(__name__)
 
-# Work below this is done in the event loop: a hop to a thread and back costs about 70 us idle and several times
-# that on a busy machine, and nobody else notices a wait of two milliseconds.
+# Requests predicted to be shorter run in the event loop. A thread would add about 70 us, and several times that on a
+# busy machine; other sessions don't notice a wait of two milliseconds.
 INLINE_SECONDS = 2e-3
 MEBIBYTE = 2**20
 REMEMBERED_EXPIRED = 10_000
@@ -43,9 +43,9 @@ class _Live:
     session: Session
     used: float
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
-    reserved: int = 0  # bytes that its lanes may take
-    seconds_per_step: float = float("inf")  # measured, so infinite before the first step
-    requests: int = 0  # running or waiting ones of this session
+    reserved: int = 0  # bytes that the session may grow to
+    seconds_per_step: float = float("inf")  # moving average of measurements; infinite before the first step
+    requests: int = 0  # requests of this session that run or wait
 
     @property
     def nbytes(self) -> int:
@@ -54,15 +54,15 @@ class _Live:
 
 @dataclass
 class Threads:
-    """A pool of threads for long work."""
+    """Pool of threads for long requests, with the predicted time of its queue."""
 
     executor: Executor
-    workers: int  # number of its threads
-    queued: list[float] = field(default_factory=list)  # predicted seconds of the work in it
+    workers: int  # number of threads
+    queued: list[float] = field(default_factory=list)  # predicted seconds of each request that runs or waits
 
     @property
     def wait(self) -> float:
-        """Approximate seconds until new work would begin."""
+        """Predicted seconds until a new request would begin in this pool."""
         return sum(self.queued) / self.workers if len(self.queued) >= self.workers else 0.0
 
 
@@ -71,8 +71,8 @@ class Limits:
     """Limits of all sessions of this process together."""
 
     sessions: int = 256
-    nbytes: int = 2048 * MEBIBYTE  # of lanes and kept answers
-    requests: int = 1_024  # running or waiting
+    nbytes: int = 2048 * MEBIBYTE  # memory of all lanes and kept answers
+    requests: int = 1_024  # requests that run or wait
 
 
 class LiveSessions:
@@ -113,14 +113,14 @@ class LiveSessions:
 
     @property
     def requests(self) -> int:
-        """Number of running or waiting requests."""
+        """Number of requests that run or wait, in all sessions."""
         return self._requests
 
     def check_room(self, nbytes: int) -> None:
-        """Check that a session of a size in bytes may be opened.
+        """Check that a session of this size in bytes may be opened.
 
         Raises:
-            TooLarge: it takes more than all sessions together may.
+            TooLarge: the session would take more memory than all sessions together may.
             Overloaded: the number of open sessions, or their memory, has reached its limit.
         """
         if len(self._live) >= self._limits.sessions:
@@ -128,18 +128,18 @@ class LiveSessions:
         self._check_memory(nbytes)
 
     def add(self, session: Session, reserved: int = 0) -> Session:
-        """Keep a session, which may grow to ``reserved`` bytes. Raises like ``check_room``."""
+        """Add an open session, which may grow to ``reserved`` bytes. Raises like ``check_room``."""
         live = _Live(session, self.clock(), reserved=reserved)
         self.check_room(live.nbytes)
         self._live[session.id] = live
         return session
 
     def get(self, id: str) -> Session:
-        """Return the present session. Raises ``SessionExpired`` or ``UnknownSession``."""
+        """Return a session's present state. Raises ``SessionExpired`` or ``UnknownSession``."""
         return self._get(id).session
 
     def opened_by(self, surrogate: str, key: str, digest: str) -> Session | None:
-        """Return the session that an idempotency key opened, if it exists. Raises ``IdempotencyConflict``."""
+        """Return the session that an idempotency key opened, or None. Raises ``IdempotencyConflict``."""
         for session in self:
             if session.opened_by is not None and (session.surrogate, session.opened_by[0]) == (
                 surrogate,
@@ -149,7 +149,7 @@ class LiveSessions:
         return None
 
     def prompt(self, id: str, steps: int = 1) -> bool:
-        """Whether ``advance`` would take a number of steps of a session now, without waiting."""
+        """Whether ``advance`` would take ``steps`` of a session at once: nothing waits, and the steps are short."""
         live = self._live.get(id)
         if live is None or live.requests or self._requests >= self._limits.requests:
             return False
@@ -158,7 +158,7 @@ class LiveSessions:
     def advance_now(
         self, id: str, seq: int | None, request: Fingerprint, work: Work, steps: int = 1, deadline: float | None = None
     ) -> Answer:
-        """Do ``advance`` in this call and this thread. Call it only if ``prompt`` returns True."""
+        """Do ``advance`` at once, in the caller's thread. Allowed only if ``prompt`` has returned True."""
         live = self._get(id)
         live.used = self.clock()
         if repeat := replay(live.session, seq, request):
@@ -170,18 +170,18 @@ class LiveSessions:
     async def advance(
         self, id: str, seq: int | None, request: Fingerprint, work: Work, steps: int = 1, deadline: float | None = None
     ) -> Answer:
-        """Do the work of a request once, and keep its outcome as the session's last answer.
+        """Carry a request out once, and keep its outcome as the session's last answer.
 
-        The same seq with the same fingerprint gets the kept answer, even if it comes while the first is being computed.
-        Work that raises an error changes nothing.
+        A repeat, with the same seq and fingerprint, gets that answer, even if it arrives while the first request is
+        still being computed. A request that raises an error changes nothing.
 
         Args:
-            id: of the session.
-            seq: the session's next one, or None to give up replay.
-            request: its fingerprint.
-            work: from the session to the new session and the outcome; pure.
+            id: the session's id.
+            seq: sequence number of the request, the session's next one; None gives up replay.
+            request: fingerprint of the request.
+            work: pure function from the session to the new session and the outcome.
             steps: number of virtual steps, to predict the duration.
-            deadline: by the clock; work that would end later is not begun.
+            deadline: time by the clock; a request that would end later is not begun.
 
         Raises:
             SeqConflict: neither the next seq nor a repeat.
@@ -207,11 +207,11 @@ class LiveSessions:
             live.requests -= 1
 
     def check_wanted(self, id: str) -> None:
-        """Check that long work may continue, between two of its steps. Any thread may call it.
+        """Check, between two steps of a long request, that it may continue. Any thread may call it.
 
         Raises:
             UnknownSession: the session was closed meanwhile.
-            Unavailable: this process stops.
+            Unavailable: this process shuts down.
         """
         if self._stopping:
             raise Unavailable("the server is stopping and took no step of this request: send it again")
@@ -219,7 +219,7 @@ class LiveSessions:
             raise UnknownSession(f"session {id!r} was closed during this request")
 
     def stop(self) -> None:
-        """End long work at its next call of ``check_wanted``."""
+        """Make running long requests end at their next call of ``check_wanted``."""
         self._stopping = True
 
     def close(self, id: str) -> None:
@@ -233,7 +233,7 @@ class LiveSessions:
                 self.close(session.id)
 
     def sweep(self) -> list[str]:
-        """Expire the sessions that were idle for too long. Returns their ids."""
+        """End the sessions that were idle for too long, and return their ids."""
         now = self.clock()
         idle = [id for id, live in self._live.items() if now - live.used > self.idle_seconds and not live.lock.locked()]
         for id in idle:
@@ -286,7 +286,7 @@ class LiveSessions:
         self._check_deadline(deadline, threads.wait + expected)
 
         def in_time(session: Session) -> tuple[Session, Outcome]:
-            self._check_deadline(deadline, expected)  # the wait may have been longer than predicted
+            self._check_deadline(deadline, expected)  # again: the wait may have been longer than predicted
             return work(session)
 
         threads.queued.append(expected)
@@ -303,7 +303,7 @@ class LiveSessions:
 
 
 def _learned(live: _Live, result: tuple[Session, Outcome], seconds: float, steps: int) -> tuple[Session, Outcome]:
-    """Return the result, after an update of the session's predicted time for a step."""
+    """Update the session's predicted seconds per step by a measurement, and pass the result on."""
     outcome = result[1]
     taken = len(outcome) if isinstance(outcome, PolicyRollout) else steps  # a policy's rollout may have stopped early
     each = seconds / taken

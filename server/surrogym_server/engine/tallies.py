@@ -1,4 +1,4 @@
-"""Activity of an engine's sessions, shown to people. Written in the event loop's thread.
+"""Activity of an engine's sessions, which the page and the metrics show. Only the event loop's thread writes it.
 
 Shapes: N lanes, T steps.
 """
@@ -22,14 +22,14 @@ Clock = Callable[[], float]
 
 RATE_SECONDS = 10.0  # steps per second are an exponential average over about this time
 KEPT_EPISODES = 100
-FOLD_STEPS = 32  # steps that are collected before they are summed, so that a step stays fast
-FOLD_LANE_STEPS = 16_384  # the same limit for steps of all lanes
+FOLD_STEPS = 32  # requests' steps that are collected before they are summed, so that each step stays fast
+FOLD_LANE_STEPS = 16_384  # steps of all lanes that are collected before they are summed
 BUCKETS = (1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 60.0)
 
 
 @dataclass
 class Durations:
-    """A histogram of seconds. An observation costs one lookup in a table."""
+    """Histogram of durations in seconds. Adding a duration costs one lookup in a table."""
 
     sum: float = 0.0
     _counts: list[int] = field(default_factory=lambda: [0] * (len(BUCKETS) + 1))
@@ -39,7 +39,7 @@ class Durations:
         self.sum += seconds
 
     def cumulative(self) -> Iterator[tuple[str, int]]:
-        """Pairs of upper bound and number of durations up to it; the last bound is infinite."""
+        """Pairs of an upper bound in seconds and the number of durations up to it; the last bound is infinite."""
         total = 0
         for bound, count in zip((*map(str, BUCKETS), "+Inf"), self._counts, strict=True):
             total += count
@@ -47,7 +47,7 @@ class Durations:
 
     @classmethod
     def together(cls, parts: Iterable[Durations]) -> Durations:
-        """The sum of the histograms of several processes."""
+        """Add up the histograms of several processes."""
         parts = list(parts)
         columns = zip(*(part._counts for part in parts), strict=True)
         return cls(sum(part.sum for part in parts), [sum(column) for column in columns]) if parts else cls()
@@ -66,18 +66,18 @@ class Episode:
 
 @dataclass(frozen=True)
 class SessionActivity:
-    """A session, and its activity since this process opened or restored it."""
+    """A session with its counts since this process opened or restored it."""
 
     session: SessionInfo
-    steps: int  # of all lanes
+    steps: int  # virtual steps of all lanes
     steps_per_second: float
     episodes: int
-    recent: tuple[Episode, ...]  # the last ones, oldest first
-    idle_seconds: float  # since its last step
+    recent: tuple[Episode, ...]  # latest episodes, oldest first
+    idle_seconds: float  # seconds since the session's last step
 
 
 class Tally:
-    """Sums over one session's steps."""
+    """Counts and sums over the steps of one session."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -92,7 +92,7 @@ class Tally:
         self._recent: deque[Episode] = deque(maxlen=KEPT_EPISODES)
 
     def stepped(self, answer: Reply) -> None:
-        """Count an answer. A repeated answer counts once."""
+        """Count the steps of an answer, unless it was counted before."""
         if answer.seq <= self._seq or isinstance(answer.outcome, ResetResult):
             return
         self._seq = answer.seq
@@ -148,14 +148,14 @@ class Tally:
 
 
 class Tallies:
-    """A tally for each session that is alive."""
+    """The tallies of all live sessions, by id."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock = clock
         self._tallies: dict[str, Tally] = {}
 
     def of(self, id: str) -> Tally:
-        """The tally of a session; a new one if it has none."""
+        """Return the tally of a session, and make one if it has none."""
         tally = self._tallies.get(id)
         if tally is None:
             tally = self._tallies[id] = Tally(self._clock)
@@ -165,18 +165,18 @@ class Tallies:
         return [self.of(session.id).read(session) for session in alive]
 
     def forget_all_but(self, alive: Iterable[str]) -> None:
-        """Keep only the tallies of these sessions, by their ids."""
+        """Drop the tallies of all sessions except these ids."""
         ids = set(alive)
         self._tallies = {id: tally for id, tally in self._tallies.items() if id in ids}
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Present counts of an engine, and totals since its start."""
+    """Counts of an engine: what is open now, and totals since its start."""
 
-    sessions: Mapping[str, int]  # open ones by the name of their surrogate
-    lanes: int  # of all open sessions
-    requests: int  # running or waiting
-    steps: Durations  # requests with steps, waiting and computing included
-    lane_steps: int  # virtual environment steps
-    expired: int  # sessions that were idle for too long
+    sessions: Mapping[str, int]  # number of open sessions, by the name of the surrogate
+    lanes: int  # lanes of all open sessions
+    requests: int  # requests that run or wait
+    steps: Durations  # durations of requests with steps, from arrival to reply
+    lane_steps: int  # virtual steps, counted in each lane
+    expired: int  # sessions that were ended because they were idle for too long

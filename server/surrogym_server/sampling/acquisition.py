@@ -40,7 +40,7 @@ class CandidateView:
     model: DynamicsModel
     points: Points  # m states and actions
     output: int  # number of the output, in the order of the definition
-    tolerance: float  # of the output, in its unit
+    tolerance: float  # of the output, in the output's unit
     deviation: (
         Tensor  # (m,) latent standard deviation, in the output's unit, as if all pending queries had been answered
     )
@@ -59,7 +59,7 @@ class CandidateView:
 class PathView:
     """View of b predicted paths of T steps that an acquisition reads, with respect to one output."""
 
-    tolerance: float  # of the output, in its unit
+    tolerance: float  # of the output, in the output's unit
     weight: Tensor  # (b, T) at least 0; depends on where the step lies and how well it can be predicted
     _deviation: Callable[[], Tensor]
     _information: Callable[[], Tensor]
@@ -92,7 +92,7 @@ class Acquisition(ABC):
 
     @abstractmethod
     def value(self, candidates: CandidateView) -> Tensor:
-        """Value of asking each candidate, (m,)."""
+        """Value of a query at each of m candidates, (m,)."""
 
     def path_value(self, paths: PathView) -> Tensor:
         """Value of following each path up to each step, (b, T). It does not decrease along a path.
@@ -105,7 +105,7 @@ class Acquisition(ABC):
 
 @dataclass(frozen=True)
 class IntegratedVariance(Acquisition):
-    """Reduction of the variance over the sampling range and the visited states by an answer.
+    """Criterion: how much an answer would reduce the variance over the sampling range and the visited states.
 
     Reference: D. Cohn (1993), NIPS 6.
     """
@@ -118,7 +118,7 @@ class IntegratedVariance(Acquisition):
 
 @dataclass(frozen=True)
 class Variance(Acquisition):
-    """Standard deviation at the candidate."""
+    """Criterion: the latent standard deviation at the candidate."""
 
     def value(self, candidates: CandidateView) -> Tensor:
         return candidates.deviation
@@ -129,7 +129,7 @@ class Variance(Acquisition):
 
 @dataclass(frozen=True)
 class UncertaintyIndex(Acquisition):
-    """The uncertainty index of the paper, log U = log U_m + log P_i (eq. 12)."""
+    """Criterion of the paper: the uncertainty index, log U = log U_m + log P_i (eq. 12)."""
 
     reads_probability: ClassVar[bool] = True
 
@@ -143,7 +143,7 @@ class UncertaintyIndex(Acquisition):
 
 @dataclass(frozen=True)
 class LatinHypercube(Acquisition):
-    """No criterion: the whole budget is one Latin hypercube. Queries beyond it fill the largest gaps."""
+    """Not adaptive: the whole budget is one Latin hypercube. Later queries fill the largest gaps."""
 
     adaptive: ClassVar[bool] = False
 

@@ -27,13 +27,13 @@ def choose(
     outputs: Sequence[int],
     tolerances: Sequence[float],
 ) -> list[int]:
-    """Choose a greedy batch: for each of the ``outputs`` the best candidate, given answers to those chosen before it.
+    """Choose queries greedily: for each of the ``outputs`` the best candidate, as if the earlier choices were answered.
 
     Args:
         model: the model whose standard deviations the batch should lower.
-        candidates: points to choose from; the first query is a reserved one, if there is one.
+        candidates: points to choose from. If some are reserved, the first query is one of them.
         earlier: all queries so far, answered or not; no query close to one of them is chosen.
-        unanswered: those without an answer, which are treated as answered.
+        unanswered: queries without an answer yet, which are treated as answered.
         outputs: for each query, the number of the output that it is chosen for.
         tolerances: (O,) in each output's unit.
 
@@ -42,7 +42,7 @@ def choose(
     """
     definition, points = model.definition, candidates.points
     acquisition = definition.design.acquisition
-    # The covariances of the reference cost the most.
+    # Read only where an acquisition needs it, because covariances with the reference take most of the time.
     reads = acquisition_of(acquisition).reads_reference
     reference = candidates.reference if reads else candidates.reference[:0]
     outlook = outlook_of(model, points, reference, unanswered)
@@ -76,15 +76,15 @@ def candidate_view(
     tolerance: float,
     distance: Tensor,
 ) -> CandidateView:
-    """Build an acquisition's view of the candidates, for the output ``column``, which has varied.
+    """Return the candidates as an acquisition sees them, for the output with number ``column``.
 
     Args:
-        model: the model.
+        model: the model of the round.
         candidates: m points.
-        column: number of the output.
-        outlook: of the output at the candidates.
-        tolerance: in the output's unit.
-        distance: (m,) to the queries so far.
+        column: number of the output, whose samples are not all equal.
+        outlook: predicted effect of answers on the variance of this output.
+        tolerance: of this output, in its unit.
+        distance: (m,) of each candidate to the nearest query so far.
     """
     return CandidateView(
         model=model,
@@ -99,7 +99,7 @@ def candidate_view(
 
 
 def nearest(definition: EnvironmentDefinition, points: Points, earlier: Points) -> Tensor:
-    """Distance of m points to the nearest taken query, in standard deviations of the sampling range, (m,)."""
+    """Distance (m,) of each point to the nearest query so far, in standard deviations of the sampling range."""
     if not len(earlier):
         return points.q.new_full((len(points),), torch.inf)
     return distances(definition, points, earlier).amin(1)

@@ -15,24 +15,24 @@ from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.latin_hypercube import random_points
 from surrogym_server.sampling.occupancy import log_occupancy
 
-MAX_CANDIDATES = 4_096  # of each kind; covariances with the reference are held for all of them
-REFERENCE = 256  # points of each kind
+MAX_CANDIDATES = 4_096  # of each kind; memory holds their covariances with the reference
+REFERENCE = 256  # reference points of each kind: from the Monte Carlo set, and visited
 OCCUPIED = 0.75  # share of the visited states in the reference; the rest is the whole sampling range
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Candidate points, their probabilities, and the reference points at which the variance should become small."""
+    """Candidate points, their input probabilities, and the reference points whose variance should become small."""
 
-    points: Points  # m
+    points: Points  # m candidates
     log_p: Tensor  # (m,) log P_i; 0 unless the acquisition reads it
-    reference: Points  # r
-    weights: Tensor  # (r,) add up to 1
-    reserved: Tensor | None = None  # (m,) bool: those to be queried first; see ``endings`` and ``peaks``
+    reference: Points  # r reference points
+    weights: Tensor  # (r,) of the reference points; they add up to 1
+    reserved: Tensor | None = None  # (m,) bool: candidates to query first; see ``endings`` and ``peaks``
 
 
 def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, rng: np.random.Generator) -> Candidates:
-    """Build candidates from the Monte Carlo set ``points`` (m) and as many visited states (v, C) under random actions.
+    """Build candidates from the Monte Carlo set, m ``points``, and from visited states (v, C) under random actions.
 
     The visited states are needed because few points of a set over the whole range lie where a policy goes. The
     reference is the Monte Carlo set, mixed with visited states if there are any. Visited states outside the sampling
@@ -54,7 +54,7 @@ def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, r
 
 
 def with_reserved(candidates: Candidates, points: Points) -> Candidates:
-    """Add k candidates, each as likely as the likeliest one, and reserve them alone."""
+    """Add k candidates, each with the largest probability of all, and reserve only these."""
     log_p = torch.cat([candidates.log_p, candidates.log_p.max().expand(len(points))])
     joined = Points.joined([candidates.points, points])
     reserved = torch.arange(len(joined)) >= len(candidates.points)
@@ -62,9 +62,10 @@ def with_reserved(candidates: Candidates, points: Points) -> Candidates:
 
 
 def input_probability(model: DynamicsModel, points: Points, states: Tensor | None) -> Tensor:
-    """log P_i (eq. 11) at m points, from visited states (v, C): (m,).
+    """Logarithm of the input probability P_i (eq. 11) at m points, from visited states (v, C): (m,).
 
-    Without visited states every state is equally likely, or as likely as the density of predicted next states at it.
+    Without visited states every point is equally likely, or the density of the predicted next states takes their
+    place, as the definition says.
     """
     definition = model.definition
     if states is not None and len(states):

@@ -19,22 +19,24 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.prequential import PrequentialScores
 from surrogym_server.sampling.regions import Region, regions_of
 
-SUREST = 1e9  # largest ratio of tolerance to standard deviation; larger ones are clipped to it
+SUREST = 1e9  # larger ratios of tolerance to standard deviation are clipped to this one
 
 
 @dataclass(frozen=True)
 class OutputConfidence:
+    """How well a model knows one output, and what limits it."""
+
     confidence_index: float
     confidence_index_paper: float
     coverage: float  # share of the set whose standard deviation is below the tolerance
-    leave_one_out_error: float | None  # root mean square, in the output's unit; None where the family can't tell
+    leave_one_out_error: float | None  # root mean square, in the output's unit; None if the model does not offer it
     leave_one_out_within_one: float | None  # share of the samples within one predictive standard deviation
     leave_one_out_within_two: float | None
     noise: float = 0.0  # of a single step, established by repeated or by consecutive steps, in the output's unit
     sensor_noise: float = 0.0  # standard deviation of one measurement, if most of the noise is the sensor's
-    past: float = 0.0  # share of the squared residuals that the step before explains: a dead time or a hidden state
-    region: Region | None = None  # where most of the doubt is
-    prequential: PrequentialScores | None = None  # of samples that were predicted before they were learned from
+    past: float = 0.0  # share of the squared errors that earlier steps explain: a dead time or a hidden state
+    region: Region | None = None  # where most of the model uncertainty is
+    prequential: PrequentialScores | None = None  # scores of predictions made before learning from the sample
 
 
 def deviations(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:
@@ -47,20 +49,20 @@ def deviations(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:
 
 
 def certainty(deviation: Tensor, tolerance: Tensor | float) -> Tensor:
-    """C_m (eq. 9). A standard deviation of 0 is certain."""
+    """Certainty C_m = Phi(tau / sigma) (eq. 9); 1 if sigma is 0."""
     index: Tensor = torch.special.ndtr(tolerance / deviation)
     return index
 
 
 def log_model_uncertainty(deviation: Tensor, tolerance: Tensor | float) -> Tensor:
-    """log U_m (eq. 10) = log Phi(-tau / sigma), finite where sigma is 0 as well."""
+    """Logarithm of the model uncertainty, log U_m = log Phi(-tau / sigma) (eq. 10); finite also if sigma is 0."""
     log_uncertainty: Tensor = torch.special.log_ndtr(-(tolerance / deviation).clamp_max(SUREST))
     return log_uncertainty
 
 
 def log_uncertainty_index(log_model_uncertainty: Tensor, log_probability: Tensor) -> Tensor:
-    """log U, the uncertainty index of the paper."""
-    return log_model_uncertainty + log_probability  # eq. 12
+    """Logarithm of the paper's uncertainty index U (eq. 12), from those of U_m and P_i."""
+    return log_model_uncertainty + log_probability
 
 
 def confidences_of(
@@ -76,7 +78,7 @@ def confidences_of(
 
 
 def confidence(deviation: Tensor, tolerance: float, errors: LeaveOneOutErrors | None) -> OutputConfidence:
-    """Confidence of one output: from its standard deviations (m,) over the Monte Carlo set and leave-one-out errors."""
+    """Confidence of one output, from standard deviations (m,) over the Monte Carlo set and leave-one-out errors."""
     return OutputConfidence(
         float(certainty(deviation, tolerance).mean()),
         float(certainty(deviation, 1.0).mean()),

@@ -1,4 +1,4 @@
-"""Which initial queries of a design a log already covers. Pure."""
+"""Find the initial queries of a design that a log makes unnecessary. Pure."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ Bools = NDArray[np.bool_]
 
 
 def covered(definition: EnvironmentDefinition, q: Array, u: Array, logged_q: Array, logged_u: Array) -> Bools:
-    """Which of m queries a log makes unnecessary, (m,) bool: a logged step lies nearer than half the distance to the
-    nearest other query.
+    """Whether a log makes each of m queries unnecessary, (m,) bool.
+
+    It does if a logged step lies nearer to the query than half the distance to the nearest other query.
 
     Distances are measured over states and actions, in widths of the sampling range, angles around the circle. Two
     discrete actions are 1 apart. A single query counts as covered by any log.
 
     Args:
-        definition: of the environment.
+        definition: the environment.
         q, u: the queries, (m, C) and (m, F).
         logged_q, logged_u: the logged steps, (n, C) and (n, F).
     """
@@ -28,14 +29,14 @@ def covered(definition: EnvironmentDefinition, q: Array, u: Array, logged_q: Arr
         return np.zeros(len(q), dtype=np.bool_)
     queries, steps = _places(definition, q, u), _places(definition, logged_q, logged_u)
     tree = scipy.spatial.cKDTree(queries)
-    other = tree.query(queries, k=2)[0][:, 1]  # infinite where there is none
+    other = tree.query(queries, k=2)[0][:, 1]  # infinite if there is no other query
     nearest: Array = scipy.spatial.cKDTree(steps).query(queries)[0]
     result: Bools = nearest < 0.5 * other
     return result
 
 
 def _places(definition: EnvironmentDefinition, q: Array, u: Array) -> Array:
-    """Points whose distances are those of ``covered``, (n, D)."""
+    """Map n states and actions to points (n, D) whose Euclidean distances are those that ``covered`` describes."""
     columns: list[Array] = []
     for index, coordinate in enumerate(definition.coordinates):
         if coordinate.kind == "angle":

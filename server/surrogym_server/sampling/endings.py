@@ -13,18 +13,17 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import RewardEdges, offers
 from surrogym_server.models.port import DynamicsModel
 
-FRONTIER = 0.1  # of the seen range of the coordinates: states that lie less far beyond it are not worth a query
-DOUBT = 0.005  # acceptable probability of a wrong ending, averaged over the candidates
+FRONTIER = 0.1  # widths of the range of the states so far; states less far outside are not worth a query
+DOUBT = 0.005  # acceptable mean probability, over the candidates, that the model is wrong about an ending
 
 
 def ending(model: DynamicsModel, samples: Samples, points: Points) -> Tensor | None:
-    """Which of m candidate points, (m,) bool, are reserved for a query about the end of episodes. None if none is
-    needed.
+    """Whether each of m candidates is reserved for a query about the end of episodes, (m,) bool; None if none is.
 
-    Declared termination: the points predicted to end an episode, until a sample has ended one. Learned termination: the
-    most doubtful points, until little doubt is left; then the points farthest beyond the states known to be
-    non-terminal, because another end may lie there. In both cases, if the reward jumps, the points at which the side of
-    the jump is doubtful.
+    With a declared termination these are the points predicted to end an episode, until a sample has ended one. With a
+    learned termination they are the most doubtful points, until little doubt is left, and then the points farthest
+    beyond the states known to be non-terminal, where another end may lie. If the reward jumps, the points at which the
+    side of the jump is doubtful are added.
     """
     q_next = model.transition(points.q, points.u).q_next
     if not model.definition.learns_termination:
@@ -46,8 +45,10 @@ def in_doubt(model: DynamicsModel, q_next: Tensor) -> Tensor:
 
 
 def edge_in_doubt(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Tensor:
-    """Probability that the model is wrong about the side of a reward's edge, for steps from q (m, C) to q_next (m, C),
-    (m,): the largest over all edges."""
+    """Probability (m,) that the model is wrong about the side of an edge of the reward: the largest over all edges.
+
+    The steps lead from q (m, C) to q_next (m, C).
+    """
     doubt = q.new_zeros(len(q))
     for of_one in _edge_doubts(model, q, q_next):
         doubt = doubt.maximum(of_one)
@@ -55,7 +56,7 @@ def edge_in_doubt(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Tensor:
 
 
 def _edges(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor | None:
-    """Points at which the side of a reward's edge is the most doubtful."""
+    """Whether each candidate is among those at which the side of an edge of the reward is most doubtful, (m,) bool."""
     for doubt in _edge_doubts(model, points.q, q_next):
         if float(doubt.mean()) > DOUBT:
             return doubt >= 0.5 * doubt.max()
@@ -63,7 +64,7 @@ def _edges(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor | Non
 
 
 def _edge_doubts(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Iterator[Tensor]:
-    """For each edge of the reward, the probability that the model is wrong about the side, (m,)."""
+    """For each edge of the reward, the probability (m,) that the model is wrong about the side of m points."""
     edged = offers(model, RewardEdges)
     return iter(()) if edged is None else edged.reward_edge_doubts(q, q_next)
 
@@ -74,8 +75,11 @@ def _predicted(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor |
 
 
 def unexplored(definition: EnvironmentDefinition, states: Tensor, q: Tensor) -> Tensor:
-    """Distance of q (m, C) beyond the seen states (n, C), (m,): the sum over both ends of every moving coordinate, in
-    units of the seen range. An unseen ending may lie there."""
+    """How far states q (m, C) lie outside of the range of the states so far (n, C): (m,).
+
+    An unknown ending may lie there. The result is the sum over both ends of every moving coordinate, in widths of that
+    range.
+    """
     columns = list(definition.moving)
     if not len(states):
         return q.new_ones(len(q))

@@ -22,22 +22,25 @@ from surrogym_server.sampling.rollouts import Sequences, best_rollout, predict_p
 from surrogym_shared.nouns import Query, Vector
 
 FAR = 0.5  # standard deviations of the sampling range between the end of an excursion and the nearest sample
-LONGEST = 16  # actions in an excursion
+LONGEST = 16  # most actions of an excursion
 
 
 def excursion(
     model: DynamicsModel, samples: Tensor, snapshots: Mapping[str, Vector], longest: int, rng: np.random.Generator
 ) -> Query:
-    """Plan the shortest sequence whose predicted state is ``FAR`` from all sampled states (n, C); if none is, the
-    sequence that leads farthest. It begins at a reset or at one of the snapshots, whose coordinates (C,) are given by
-    name."""
+    """Plan the shortest sequence whose predicted state gets ``FAR`` from all sampled states (n, C).
+
+    If none does, the sequence that leads farthest is planned. It begins at a reset or at one of the snapshots, which
+    have coordinates (C,) by name."""
     longest = min(longest, LONGEST, model.definition.max_rollout or 1)
     return best_rollout(model.definition, partial(_reach, model, samples), longest, snapshots, rng)
 
 
 def _reach(model: DynamicsModel, samples: Tensor, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
-    """Value of each sequence (k, T, F) from its equally likely states (k, s, C), and its length, (k,). Sequences that
-    get ``FAR`` come first, the shortest of them before the others."""
+    """Rate sequences (k, T, F), each from s equally likely states (k, s, C): the values, (k,), and the lengths, (k,).
+
+    A sequence that gets ``FAR`` is rated above all that don't, and above longer ones.
+    """
     count, lanes = starts.shape[:2]
     paths = predict_paths(model, starts.flatten(0, 1), torch.from_numpy(sequences).repeat_interleave(lanes, 0))
     states = paths.q_next.flatten(0, 1)
@@ -45,7 +48,7 @@ def _reach(model: DynamicsModel, samples: Tensor, starts: Tensor, sequences: Seq
     away = (away.reshape(paths.running.shape) * paths.running).reshape(count, lanes, -1).mean(1)
     farthest = away.max(1)
     reached = away >= FAR
-    first = reached.double().argmax(1)  # of equal values the first
+    first = reached.double().argmax(1)  # argmax of equal values is the first
     value = torch.where(reached.any(1), FAR + away.shape[1] - first, farthest.values)
     return value, torch.where(reached.any(1), first, farthest.indices) + 1
 

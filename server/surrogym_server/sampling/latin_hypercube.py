@@ -19,9 +19,9 @@ def latin_hypercube(
 ) -> tuple[Tensor, Tensor]:
     """Draw a Latin hypercube of ``count`` points: coordinates (count, C) and actions (count, F).
 
-    Each coordinate is stratified in probability, so truncated distributions keep their shape; discrete actions are
-    balanced, no two counts differ by more than one. Of ``tries`` designs the one whose closest pair is farthest apart
-    is taken.
+    Each coordinate is stratified in probability, so truncated distributions keep their shape. Discrete actions are
+    balanced: the counts of two of them differ by at most one. Of ``tries`` random hypercubes, the one whose closest
+    pair of points is farthest apart is returned.
     """
     dimensions = len(definition.coordinates) + definition.action.size
     designs = [_unit_hypercube(count, dimensions, rng, definition.action.nvec) for _ in range(tries)]
@@ -38,8 +38,7 @@ def random_points(definition: EnvironmentDefinition, count: int, rng: np.random.
 def going_on(
     definition: EnvironmentDefinition, q: Tensor, u: Tensor, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Replace the points q (n, C), u (n, F) at which the declared termination holds by independent draws at which it
-    does not.
+    """Replace points q (n, C), u (n, F) at which the declared termination holds by random ones at which it does not.
 
     No episode passes through a terminated state, so a query there would teach nothing. If the termination holds in the
     whole range, the points stay.

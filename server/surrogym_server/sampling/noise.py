@@ -22,27 +22,27 @@ from surrogym_server.environment.samples import Samples, increments, preceding, 
 from surrogym_server.models.abilities import LearnedNoise, LeaveOneOut, offers
 from surrogym_server.models.port import DynamicsModel
 
-ENOUGH = 3  # degrees of freedom from repeated steps, before noise counts as established
+ENOUGH = 3  # degrees of freedom of the repeats that noise needs to count as established
 STAGES = (1, ENOUGH, 6, 9)  # degrees of freedom after which the repeats are tested
-LEVEL = 0.01  # of each test
+LEVEL = 0.01  # significance level of each test
 NEGLIGIBLE = 0.5  # of the tolerance: noise of this size is established in at most ``LEVEL`` of the cases
-AT_MOST = 3.0  # largest ratio of learned noise to that of the repeats; the rest is misfit, even if repeats are few
-SLACK = 1.25  # a leave-one-out error beyond the noise that few samples leave
+AT_MOST = 3.0  # learned noise above this multiple of the repeats' noise is misfit of the model
+SLACK = 1.25  # factor by which few samples may raise a leave-one-out error above the noise
 
 
 @dataclass(frozen=True)
 class Repeats:
-    """Differences between results of the same step."""
+    """Pooled differences between results of the same step."""
 
-    degrees: int  # of freedom
+    degrees: int  # degrees of freedom
     deviation: Tensor  # (O,) standard deviation of one result, in each output's unit
 
 
 def repeats(model: DynamicsModel, samples: Samples) -> Repeats:
     """Pool the differences between results of the same step.
 
-    Two samples are the same step if their states and actions are equal and, in an episode, those of the steps before.
-    Otherwise, what an environment remembers of the step before would count as noise.
+    Samples are of the same step if their states and actions are equal, and, in an environment that is reset, those of
+    the steps before too. Otherwise what the environment remembers of the step before would count as noise.
     """
     targets = torch.cat([increments(model.definition, samples), samples.reward[:, None]], -1)
     groups, member = torch.unique(_conditions(model.definition, samples), dim=0, return_inverse=True)
@@ -54,7 +54,11 @@ def repeats(model: DynamicsModel, samples: Samples) -> Repeats:
 
 
 def _conditions(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """State and action of each step (n, d), and those of the step before it in an episode, zeros for its first step."""
+    """What may determine the result of each of n steps, (n, d): its state and action, and those of the step before.
+
+    The first step of an episode has zeros for the step before. An environment that can be set to any state remembers no
+    step before.
+    """
     now = torch.cat([samples.q, samples.u], -1)
     if definition.max_rollout is None:
         return now
@@ -64,9 +68,9 @@ def _conditions(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Tensor:
-    """Standard deviation of each output's noise that repeated steps confirm, in its unit, (O,).
+    """Standard deviation of the noise of each output that repeated steps confirm, in the output's unit, (O,).
 
-    It is 0 if there is none, or if it is below the tolerance.
+    It is 0 if repeats confirm no noise, or if the noise is below the tolerance.
     """
     model_noise, limits = _model_noise(model, tolerances)
     differences = repeats(model, samples)
@@ -79,11 +83,10 @@ def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequen
 def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Points | None:
     """Return the steps to take again; None if none are needed.
 
-    They are needed if noise beyond a tolerance explains the samples, and no repeat has confirmed or refuted it. One
-    step comes first, which refutes the noise in a deterministic environment, then as many as the next of ``STAGES``
-    lacks. An output whose confirmed noise does not explain its leave-one-out error is doubtful again, because few
-    repeats may have found too little noise. Steps that ended at a bound are not repeated, because the bound hides their
-    noise.
+    Repeats are needed if noise above a tolerance would explain the samples and no repeat has confirmed or refuted it
+    yet. One repeat comes first, because it refutes the noise of a deterministic environment. Then follow as many as the
+    next of ``STAGES`` needs. An output whose confirmed noise does not explain its leave-one-out error is tested again,
+    because few repeats may show too little noise. Steps that ended at a bound are not repeated: the bound hides noise.
     """
     model_noise, limits = _model_noise(model, tolerances)
     differences = repeats(model, samples)
@@ -105,13 +108,13 @@ def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float
 
 
 def _confirmed(differences: Repeats, limits: Tensor) -> Tensor:
-    """Whether repeats show that the noise exceeds ``NEGLIGIBLE`` times the limits (O,), (O,) bool."""
+    """Whether repeats show that each output's noise exceeds ``NEGLIGIBLE`` times its limit (O,), (O,) bool."""
     bound = (NEGLIGIBLE * limits).square() * float(scipy.special.chdtri(differences.degrees, LEVEL))
     return differences.degrees * differences.deviation.square() > bound
 
 
 def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
-    """Whether leave-one-out errors are larger than tolerance (O,) and noise (O,) explain, (O,) bool."""
+    """Whether each leave-one-out error is larger than tolerance (O,) and noise (O,) together explain, (O,) bool."""
     able = offers(model, LeaveOneOut)
     if able is None:
         return torch.zeros_like(noise, dtype=torch.bool)
@@ -120,7 +123,7 @@ def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
 
 
 def _refuted(differences: Repeats, model_noise: Tensor) -> Tensor:
-    """Whether repeats show that most of the learned noise (O,) is misfit, (O,) bool."""
+    """Whether repeats show that most of each output's learned noise (O,) is misfit of the model, (O,) bool."""
     bound = (model_noise / AT_MOST).square() * float(scipy.special.chdtri(differences.degrees, 1 - LEVEL))
     return differences.degrees * differences.deviation.square() <= bound
 
@@ -132,13 +135,13 @@ def widened(tolerances: Sequence[float], noise: Tensor) -> tuple[float, ...]:
 
 
 def _possible(model: DynamicsModel, limits: Tensor) -> Tensor:
-    """Noise that explains the samples at least as well as what a model has learned, (O,)."""
+    """Largest noise that explains the samples as well as the noise that the model has learned, (O,)."""
     able = offers(model, LearnedNoise)
     return torch.zeros_like(limits) if able is None else torch.tensor(able.possible_noise, dtype=limits.dtype)
 
 
 def _model_noise(model: DynamicsModel, tolerances: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """The noise that a model has learned, and the tolerances, (O,) each."""
+    """Standard deviation of the noise that a model has learned, and the tolerances, as tensors (O,)."""
     limits = torch.tensor(list(tolerances), dtype=torch.float64)
     able = offers(model, LearnedNoise)
     if able is None:

@@ -14,8 +14,8 @@ from torch import Tensor
 from surrogym_server.environment.definition import CoordinateDefinition, EnvironmentDefinition
 from surrogym_server.environment.distributions import scaling
 
-FLOOR = 0.1  # share of the uniform density
-BLOCK = 2**17  # kernels at once, which stay in a core's cache
+FLOOR = 0.1  # share of the uniform density in the mixture
+BLOCK = 2**17  # kernel values computed at once, so that they stay in a core's cache
 
 
 def log_occupancy(definition: EnvironmentDefinition, states: Tensor, q: Tensor, floor: float = FLOOR) -> Tensor:
@@ -33,7 +33,7 @@ def log_occupancy(definition: EnvironmentDefinition, states: Tensor, q: Tensor, 
 
 
 def _log_kernel(coordinate: CoordinateDefinition, at: Tensor, states: Tensor, bandwidth: float) -> Tensor:
-    """Log kernel of one coordinate, at (m,) against states (v,), relative to its uniform density: (m, v)."""
+    """Log density (m, v) of one coordinate at m points under a kernel at each of v states, over the uniform one."""
     difference = at[:, None] - states[None]
     if coordinate.kind == "angle":
         spread = _circular_deviation(states)

@@ -1,4 +1,4 @@
-"""Predicted effect of further queries on a model's variance: the model's own outlook, or a fallback by distance."""
+"""Outlook: the predicted effect of further queries on a model's variance, by the model or by distances."""
 
 from __future__ import annotations
 
@@ -19,14 +19,17 @@ from surrogym_server.sampling.confidence import deviations
 def outlook_of(
     model: DynamicsModel, candidates: Points, reference: Points, unanswered: Points
 ) -> tuple[OutputOutlook | None, ...]:
-    """Outlook of every output at m candidates and r reference points, after the ``unanswered`` queries are answered."""
+    """Return the predicted effect of answers at m candidates on the variance at r reference points, for every output.
+
+    The ``unanswered`` queries count as answered.
+    """
     if (able := offers(model, Lookahead)) is not None:
         return able.outlook(candidates, reference, unanswered)
     return NearbyAnswers.of(model, candidates, reference, unanswered)
 
 
 def path_outlook(model: DynamicsModel, steps: PredictedSteps, column: int) -> PathOutlook | None:
-    """Outlook of the output ``column`` along predicted steps (b, T, ...)."""
+    """Return the predicted information of steps along b paths of T steps, for the output with number ``column``."""
     if (able := offers(model, Lookahead)) is not None:
         return able.along(steps, column)
     spread = deviations(model, steps.flat.q, steps.flat.u)[:, column].reshape(steps.q.shape[:-1])
@@ -34,31 +37,31 @@ def path_outlook(model: DynamicsModel, steps: PredictedSteps, column: int) -> Pa
 
 
 def as_if_answered(model: DynamicsModel, steps: PredictedSteps) -> DynamicsModel:
-    """Condition the model on predicted real steps (T, ...). A family that can't do this returns the model unchanged."""
+    """Condition the model on T predicted real steps. A model that can't be conditioned is returned unchanged."""
     able = offers(model, Lookahead)
     return model if able is None else able.as_if_answered(steps)
 
 
 @dataclass(frozen=True)
 class NearbyAnswers(OutputOutlook):
-    """Outlook from distances alone.
+    """Predicted effect of further answers by distances alone, for models that can't predict it.
 
     Two points at distance d, in standard deviations of the sampling range, have the correlation exp(-d^2 / 2). An
     answer removes all variance at its point.
     """
 
     definition: EnvironmentDefinition
-    candidates: Points  # m
-    reference: Points  # r
-    own: Tensor  # (m,) variance at the candidates
-    there: Tensor  # (r,) variance at the reference
+    candidates: Points  # m candidates
+    reference: Points  # r reference points
+    own: Tensor  # (m,) remaining share of the variance at each candidate
+    there: Tensor  # (r,) remaining share of the variance at each reference point
     learns: Tensor  # (m,) bool
 
     @classmethod
     def of(
         cls, model: DynamicsModel, candidates: Points, reference: Points, unanswered: Points
     ) -> tuple[NearbyAnswers, ...]:
-        """Build the outlook of every output (O,), after the ``unanswered`` queries are answered."""
+        """Build the outlook of every output (O,). The ``unanswered`` queries count as answered."""
         own, there = (deviations(model, points.q, points.u).square() for points in (candidates, reference))
         definition, learns = model.definition, torch.ones(len(candidates), dtype=torch.bool)
         outputs = (
@@ -79,7 +82,7 @@ class NearbyAnswers(OutputOutlook):
         return self.answered(self.candidates[index : index + 1])
 
     def answered(self, query: Points) -> NearbyAnswers:
-        """Outlook after one more query is answered."""
+        """Return the outlook that follows when one more query is answered."""
         own, there = (
             _removed_share(self.definition, points, query)[:, 0] for points in (self.candidates, self.reference)
         )
@@ -88,9 +91,9 @@ class NearbyAnswers(OutputOutlook):
 
 @dataclass(frozen=True)
 class IndependentSteps(PathOutlook):
-    """Outlook along paths that treats steps as independent: I(t) = 1/2 sum log(1 + (w sigma / tau)^2)."""
+    """Predicted information along paths, as if steps were independent: I(t) = 1/2 sum log(1 + (w sigma / tau)^2)."""
 
-    spread: Tensor  # (b, T) standard deviation, in the output's unit
+    spread: Tensor  # (b, T) latent standard deviation at each step, in the output's unit
     learns: Tensor  # (b, T) bool
 
     @property

@@ -1,16 +1,17 @@
-"""Tell what a step owes to the steps before it from noise, by consecutive steps of one episode.
+"""Distinguish the influence of earlier steps from noise, by consecutive steps of one episode.
 
-A dead time, or a state that is not measured, makes equal steps differ, as noise does. But then the steps before tell
-what follows: their actions u_{t-1}, u_{t-2}, ..., or the change d_{t-1} = q_t - q_{t-1} that led to this step. Linear
-regressions predict each step from all others, with and without them:
+A dead time, or a state that is not measured, makes equal steps differ, as noise does. But then earlier steps predict
+the difference: their actions u_{t-1}, u_{t-2}, ..., or the change d_{t-1} = q_t - q_{t-1} in the step before. The test
+compares linear regressions of the increments, and of the model's residuals r_t, by leave-one-out errors:
 
-    increments and residuals r_t of the model, over (q_t, u_t) and over (q_t, u_t, d_{t-1}, u_{t-1}, ...).
+    on (q_t, u_t), without the past, and on (q_t, u_t, d_{t-1}, u_{t-1}, ...), with it.
 
-The share is that of the smallest squared error without the past, the model's own included, that vanishes with it.
+The explained share is the reduction of the squared error by the past, relative to the smallest squared error without
+the past, that of the model included.
 
-Noise of the process is independent of the past. A sensor's error e falsifies the end of one step and the start of the
-next: r_t = e_{t+1} - a e_t. The past tells e_t - a e_{t-1} at best, which explains at most a quarter of
-r_t. Earlier changes would tell more, so they are left out. A past that explains more than ``EXPLAINED`` is no noise.
+Noise of the process is independent of the past. An error e of a sensor falsifies the end of one step and the start of
+the next: r_t = e_{t+1} - a e_t. The past contains e_t - a e_{t-1} at best, which explains at most a quarter of r_t.
+Earlier changes would explain more of it, so they are left out. An explained share above ``EXPLAINED`` is not noise.
 """
 
 from __future__ import annotations
@@ -25,16 +26,19 @@ from surrogym_server.environment.samples import Samples, increments, preceding
 from surrogym_server.models.abilities import AtSamples, LeaveOneOut, SampledFunctions, offers
 from surrogym_server.models.port import DynamicsModel
 
-EXPLAINED = 0.5  # of the squared error
-PAIRS = 3  # consecutive steps for each coefficient of a regression, at least
-DEPTHS = (1, 3)  # earlier actions; a longer dead time needs more, and more steps to show it
+EXPLAINED = 0.5  # least explained share of the squared error that counts
+PAIRS = 3  # least number of consecutive steps for each coefficient of a regression
+DEPTHS = (1, 3)  # numbers of earlier actions to try; a longer dead time is not found
 MOST = 400  # samples in a test, because its time grows with their third power
-RIDGE = 1e-6  # of the inputs' variance
+RIDGE = 1e-6  # ridge of the regressions, relative to the variance of the inputs
 
 
 def owed_to_past(model: DynamicsModel, samples: Samples, limits: Sequence[float]) -> tuple[float, ...]:
-    """Share of each output's squared error (O,) that the steps before explain. It is 0 if that share is below
-    ``EXPLAINED``, if the error is within the limit (O,), or if there are too few consecutive steps."""
+    """Share of each output's squared error that earlier steps of the episode explain, (O,).
+
+    The share is 0 if it would be below ``EXPLAINED``, if the error is within the limit (O,), or if there are too few
+    consecutive steps.
+    """
     definition, able, errors = model.definition, offers(model, SampledFunctions), offers(model, LeaveOneOut)
     nothing = (0.0,) * len(definition.outputs)
     newest = samples.at(torch.arange(max(0, len(samples) - MOST), len(samples)))
@@ -53,31 +57,38 @@ def owed_to_past(model: DynamicsModel, samples: Samples, limits: Sequence[float]
 
 
 def pairs_lacking(definition: EnvironmentDefinition, samples: Samples) -> int:
-    """How many more consecutive steps ``owed_to_past`` needs."""
+    """Number of consecutive steps that ``owed_to_past`` needs in addition."""
     state, size, changes = _state(definition, samples.q[:1]).shape[1], samples.u.shape[1], len(definition.moving)
     needed = PAIRS * (state + size + changes + DEPTHS[0] * size + 1)
     return max(0, needed - int((preceding(definition, samples) >= 0).sum()))
 
 
 def _state(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Coordinates (n, C), of angles cosine and sine."""
+    """Coordinates of n states, with the cosine and the sine in the place of each angle."""
     turning = torch.tensor([c.kind == "angle" for c in definition.coordinates])
     return torch.cat([q[:, ~turning], q[:, turning].cos(), q[:, turning].sin()], -1)
 
 
 def _past(u: Tensor, change: Tensor, follows: Tensor, depth: int) -> tuple[Tensor, Tensor]:
-    """The last change and ``depth`` actions before each of n samples (n, d), and which of these are known (n,)."""
+    """Change of state in the step before each of n samples, and ``depth`` earlier actions, (n, d); also whether the
+    sample has so many steps before it, (n,)."""
     place, known, columns = torch.arange(len(follows)), torch.ones(len(follows), dtype=torch.bool), [change[follows]]
     for _ in range(depth):
-        place = follows[place]  # a row without a step before stays unknown
+        place = follows[place]  # -1 for a row without a step before it
         known &= place >= 0
         columns.append(u[place])
     return torch.cat(columns, -1), known
 
 
 def _explained(at: AtSamples, now: Tensor, past: Tensor, known: Tensor) -> float:
-    """Share of the squared error of an output at n samples that their ``past`` (n, d) explains, where it is ``known``
-    (n,), beside state and action ``now`` (n, e)."""
+    """Share of an output's squared error at n samples that their past explains in addition to state and action.
+
+    Args:
+        at: the model's residuals of the output.
+        now: (n, e) state and action.
+        past: (n, d) earlier change and actions.
+        known: (n,) whether the past of a sample is known; the other samples are left out.
+    """
     some = known[at.rows]
     x, y, r = now[at.rows][some], at.targets[some], _residuals(at)[some]
     whole = torch.cat([x, past[at.rows][some]], -1)
@@ -89,7 +100,7 @@ def _explained(at: AtSamples, now: Tensor, past: Tensor, known: Tensor) -> float
 
 
 def _left_out(x: Tensor, y: Tensor) -> float:
-    """Sum of the squared errors of y (n,) by a linear regression on x (n, d) with each row left out in turn."""
+    """Sum of the squared leave-one-out errors of a linear regression of y (n,) on x (n, d)."""
     spread = x.std(0)
     z = torch.cat([torch.ones_like(y)[:, None], (x - x.mean(0)) / torch.where(spread > 0, spread, 1.0)], -1)
     hat = z @ torch.linalg.solve(z.T @ z + RIDGE * len(z) * torch.eye(z.shape[1], dtype=z.dtype), z.T)
@@ -97,7 +108,7 @@ def _left_out(x: Tensor, y: Tensor) -> float:
 
 
 def _residuals(at: AtSamples) -> Tensor:
-    """Errors (k,) of each target's prediction from all others."""
+    """Leave-one-out errors (k,): each target less its prediction from all others."""
     noisy = at.covariance + at.noise_variance * torch.eye(len(at.targets), dtype=at.covariance.dtype)
     inverse = torch.linalg.inv(noisy)
     residuals: Tensor = (inverse @ at.targets) / inverse.diagonal()

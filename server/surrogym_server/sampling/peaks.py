@@ -20,19 +20,19 @@ from surrogym_server.models.port import DynamicsModel
 
 CLIMBERS, TRIES, CLIMBS = 16, 16, 24  # points that climb, random steps of each in one iteration, and iterations
 WIDEST = 0.25  # of the sampling range: standard deviation of the random steps of the first iteration
-SHRINK = 0.75  # its factor from one iteration to the next
+SHRINK = 0.75  # factor of the random steps' length from one iteration to the next
 NOTHING = torch.finfo(torch.float32).tiny  # trainers compute in float32, in which a smaller reward is 0
-UNMET = 0.1  # of how far a predicted reward lies above the lowest: clearly more than any sample was paid
-NEW = 0.01  # of the range: a place nearer to a sample than this was already queried
+UNMET = 0.1  # share of the range of rewards by which a prediction above all samples is clearly above them
+NEW = 0.01  # share of the sampling range: a point nearer to a sample than this counts as queried
 
 
 def highest(
     model: DynamicsModel, samples: Samples, points: Points, tolerance: float, rng: np.random.Generator
 ) -> Points | None:
-    """Step to query where the reward may be highest, climbed from m points. None if the highest reward is known to the
-    tolerance, or the reward is not a hidden one.
+    """Return the step at which the reward may be highest, found by climbing from m points.
 
-    While no sample was paid anything, there is nothing to climb. Then it is the point farthest from all samples.
+    None if the highest reward is known to the tolerance, or if the reward does not pay almost nowhere (the module says
+    more). While all samples have the reward 0, there is nothing to climb: then it is the point farthest from them.
     """
     definition = model.definition
     points = points[~_over(definition, points.q)]
@@ -51,13 +51,16 @@ def highest(
 
 
 def _least(samples: Samples) -> float:
-    """Smallest difference of rewards that a trainer can distinguish."""
+    """Smallest difference of rewards that counts; a trainer's float32 can't distinguish smaller ones."""
     return max(NOTHING, torch.finfo(torch.float32).eps * float(samples.reward.abs().max()))
 
 
 def _unknown(model: DynamicsModel, samples: Samples, points: Points, tolerance: float) -> Tensor:
-    """Which of m points pay an amount that is not known to the tolerance, or clearly more than any sample was paid,
-    (m,) bool. All of them, while no sample was paid more than a trainer can distinguish from 0."""
+    """Whether the reward at each of m points deserves a query, (m,) bool.
+
+    It does if it is not known to the tolerance, or if it is predicted to be clearly above the reward of every sample.
+    While no sample has a reward that a trainer can distinguish from 0, every point does.
+    """
     foretold = model.transition(points.q, points.u, reward_deviation=True)
     assert foretold.reward_deviation is not None
     low, best = float(samples.reward.min()), float(samples.reward.max())
@@ -66,8 +69,10 @@ def _unknown(model: DynamicsModel, samples: Samples, points: Points, tolerance: 
 
 
 def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Points, rng: np.random.Generator) -> Points:
-    """Points of high promise, the highest first: the best of m points, moved by the best of random steps of decreasing
-    length."""
+    """Climb from the best of m points to points of higher promise, and return these, the highest first.
+
+    Each climber tries random steps, whose length decreases, and takes the best one.
+    """
     low, high = _limits(definition)
     value = able.promise(points.q, points.u)
     best = value.topk(min(CLIMBERS, len(value))).indices
@@ -87,8 +92,7 @@ def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Point
 
 
 def _over(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Whether the declared termination holds at q (m, C), (m,). No episode passes there, so the design never queries
-    it."""
+    """Whether the declared termination holds at q (m, C), (m,). A query there would teach nothing, so none is made."""
     return q.new_zeros(len(q), dtype=torch.bool) if definition.learns_termination else definition.terminated(q)
 
 
@@ -102,7 +106,7 @@ def _in_space(definition: EnvironmentDefinition, points: Tensor) -> Tensor:
 
 
 def _limits(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
-    """Least and largest of each coordinate and action, (C + F,) each."""
+    """Lower and upper ends of the ranges of all coordinates and action entries, (C + F,) each."""
     action = definition.action
     ranges = [(c.sampling.low, c.sampling.high) for c in definition.coordinates]
     ranges += [(0.0, n - 1.0) for n in action.nvec] or list(zip(action.low, action.high, strict=True))
@@ -111,7 +115,7 @@ def _limits(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
 
 
 def _distance(definition: EnvironmentDefinition, samples: Samples, points: Points) -> Tensor:
-    """Distance of the states of m points to the nearest of a sample, in widths of the sampling range, (m,)."""
+    """Distance (m,) of the states of m points to the nearest sample's state, in widths of the sampling range."""
     low, high = _limits(definition)
     width = (high - low)[: points.q.shape[1]].clamp_min(1e-12)
     return torch.cdist(points.q / width, samples.q / width).amin(1)

@@ -3,8 +3,8 @@
 References: A. P. Dawid (1984), Journal of the Royal Statistical Society A 147(2), for the principle; T. Gneiting, A. E.
 Raftery (2007), Journal of the American Statistical Association 102(477), eq. 43, for the interval score.
 
-Deviations are those of each process at the optimum of its hyperparameters, with the noise of a single step. Functions
-with uncertain hyperparameters would take a second of every round.
+Predictive standard deviations contain the noise of a single step. Hyperparameters are fixed at their optimum, because
+averaging over their posterior would add a second to every round.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from surrogym_server.models.abilities import LearnedNoise, offers
 from surrogym_server.models.port import DynamicsModel
 
 LEVELS = (0.5, 0.8, 0.9)
-KEPT = 20  # predictions of each output, the latest
+KEPT = 20  # predictions that are kept for each output
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """One output of one sample, as a model predicted it before any model learned from the sample."""
+    """Prediction of one output of a sample, by a model that had not learned from the sample."""
 
-    error: float  # sample less mean, in the output's unit
-    deviation: float  # standard deviation, with the noise of a single step
+    error: float  # sample less predicted mean, in the output's unit
+    deviation: float  # predictive standard deviation, with the noise of a single step
 
 
 Predictions = tuple[tuple[Prediction, ...], ...]  # of each output (O,), in order of arrival
@@ -37,13 +37,13 @@ Predictions = tuple[tuple[Prediction, ...], ...]  # of each output (O,), in orde
 
 @dataclass(frozen=True)
 class PrequentialScores:
-    """Scores of one output's last predictions. An error within the tolerance counts as inside every interval."""
+    """Prequential scores of one output. An error within the tolerance counts as inside every interval."""
 
     predictions: int
     within_50: float  # share of the samples in the central 50 % interval, or within the tolerance
     within_80: float
     within_90: float
-    interval_score: float  # mean, of 90 % intervals that are at least as wide as the tolerance, over the tolerance
+    interval_score: float  # mean over 90 % intervals, each at least as wide as the tolerance; in units of the tolerance
 
 
 def scores_of(predictions: Sequence[Prediction], tolerance: float) -> PrequentialScores | None:
@@ -59,13 +59,12 @@ def scores_of(predictions: Sequence[Prediction], tolerance: float) -> Prequentia
 
 
 def half_width(level: float) -> float:
-    """Half the width of the central interval of a standard normal number that holds with ``level``."""
+    """Half the width of the central interval that contains a standard normal number with probability ``level``."""
     return NormalDist().inv_cdf((1 + level) / 2)
 
 
 def interval_score(low: Tensor, high: Tensor, value: Tensor, level: float) -> Tensor:
-    """Score central prediction intervals from ``low`` to ``high`` at what happened, (m,) each (eq. 43). Lower is
-    better."""
+    """Interval score (m,), eq. 43, of central prediction intervals from ``low`` to ``high`` (m,). Lower is better."""
     missed = (low - value).clamp_min(0) + (value - high).clamp_min(0)
     return high - low + 2 / (1 - level) * missed
 
@@ -73,8 +72,8 @@ def interval_score(low: Tensor, high: Tensor, value: Tensor, level: float) -> Te
 def predicted(model: DynamicsModel, samples: Samples) -> Predictions:
     """Predict samples that the model has not learned from.
 
-    Changes that ended at a declared limit are left out, because the limit cuts them. So are rewards of steps that ended
-    the episode, because they contain the terminal reward.
+    Left out are outputs of steps that ended at a declared limit, because the limit cuts the change off, and rewards of
+    steps that ended the episode, because they contain the terminal reward.
     """
     transition = model.transition(samples.q, samples.u, deviations=True, reward_deviation=True)
     assert transition.deviation is not None
@@ -93,30 +92,30 @@ def predicted(model: DynamicsModel, samples: Samples) -> Predictions:
 
 
 def continued(before: Predictions, new: Predictions) -> Predictions:
-    """The last ``KEPT`` predictions of each output."""
+    """Append new predictions to earlier ones, and keep the last ``KEPT`` of each output."""
     return tuple((*old, *more)[-KEPT:] for old, more in zip(before or [()] * len(new), new, strict=True))
 
 
 def pairs_of(predictions: Predictions) -> list[list[list[float]]]:
-    """The predictions as JSON: [error, standard deviation] of each, by output."""
+    """Convert predictions to JSON: for each output a list of pairs [error, standard deviation]."""
     return [[[p.error, p.deviation] for p in output] for output in predictions]
 
 
 def from_pairs(pairs: Sequence[Sequence[Sequence[float]]]) -> Predictions:
-    """The predictions that ``pairs_of`` wrote."""
+    """Convert JSON of ``pairs_of`` back to predictions."""
     return tuple(tuple(Prediction(*pair) for pair in output) for output in pairs)
 
 
 def _noise(model: DynamicsModel, like: Tensor) -> Tensor:
-    """Standard deviation of the noise of a single step that the model has learned, (O,)."""
+    """Standard deviation of the noise of a single step, as the model has learned it, (O,)."""
     able = offers(model, LearnedNoise)
     return like.new_zeros(like.shape[1]) if able is None else like.new_tensor(able.noise_deviations)
 
 
 def _reward_deviation_by_state(model: DynamicsModel, samples: Samples) -> Tensor:
-    """Standard deviation (m,) of the reward that the uncertain next state causes: 0 unless the reward depends on it.
+    """Standard deviation (m,) of the reward because the next state is uncertain; 0 if the reward does not depend on it.
 
-    To first order: the reward's change when one output after the other moves by one standard deviation.
+    First order: the root sum of squares of the reward's changes when each output moves by one standard deviation.
     """
     count, outputs = len(samples), len(model.definition.outputs) - 1
     one = torch.eye(outputs, dtype=samples.q.dtype).repeat_interleave(count, 0)

@@ -1,8 +1,7 @@
-"""Where an output is in doubt: the range of one coordinate or action entry that has most of its uncertainty.
+"""Where a model is uncertain about an output: a range of one coordinate or action entry.
 
-The range separates the doubt from the points best: of all ranges of all inputs, it has the largest difference between
-its share of the doubt and its share of the points (Youden's index). Inputs without such a range don't say where the
-doubt is.
+Of all ranges of all inputs, the chosen one has the largest difference between its share of the doubt and its share of
+the Monte Carlo points (Youden's index). If that difference is small, the doubt is spread, and there is no region.
 """
 
 from __future__ import annotations
@@ -17,19 +16,19 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 
-LEAST_GAIN = 0.5  # of the share of the doubt over that of the points; with less, the doubt is nearly everywhere
+LEAST_GAIN = 0.5  # least difference between the share of the doubt and the share of the points in a region
 LEAST_DOUBT = 1e-12  # mean model uncertainty below which there is no doubt
 
 
 @dataclass(frozen=True)
 class Region:
-    """A range of one input. None as an end: the range has no end on this side."""
+    """A range of one input. An end that is None is open."""
 
     input: str  # name of the coordinate, or of the action entry
     low: float | None
     high: float | None
     outside: bool  # whether the doubt is outside of the range, which then has both ends
-    share: float  # of the doubt that is in the region
+    share: float  # share of all doubt that lies in the region
 
 
 def regions_of(
@@ -41,7 +40,7 @@ def regions_of(
         definition: names the inputs.
         points: the Monte Carlo set, m of them.
         doubt: model uncertainty 1 - C of each output, (m, O).
-        names: of the action's entries; empty takes ``action`` or ``action 1``, ``action 2``...
+        names: of the action's entries; if empty, they are called ``action`` or ``action 1``, ``action 2``...
 
     Returns:
         one for each output; None where there is no doubt, or where no single input separates it.
@@ -63,9 +62,9 @@ def _region(inputs: Tensor, doubt: Tensor, names: Sequence[str]) -> Region | Non
 
 
 def _ranges(values: Tensor, share: Tensor, name: str) -> list[tuple[float, Region]]:
-    """The best range of one input, and the best one to leave out, with their gains."""
+    """The range of an input with the most doubt for its size, and the one with the least, each with its gain."""
     ordered, order = values.sort(stable=True)
-    last = torch.cat([ordered[1:] != ordered[:-1], torch.tensor([True])])  # equal values stay together
+    last = torch.cat([ordered[1:] != ordered[:-1], torch.tensor([True])])  # a range may not separate equal values
     doubt = torch.cat([torch.zeros(1, dtype=share.dtype), share[order].cumsum(0)[last]])
     gain = doubt - torch.cat([torch.zeros(1, dtype=share.dtype), (torch.arange(len(values)) + 1.0)[last] / len(values)])
     distinct = ordered[last]
@@ -73,7 +72,10 @@ def _ranges(values: Tensor, share: Tensor, name: str) -> list[tuple[float, Regio
 
 
 def _range(gain: Tensor, doubt: Tensor, values: Tensor, name: str, *, outside: bool) -> tuple[float, Region]:
-    """The interval of the distinct ``values`` (d,) with the largest increase of ``gain`` (d + 1,)."""
+    """Find the interval of an input over which the cumulative ``gain`` (d + 1,) rises most.
+
+    ``values`` (d,) are distinct and sorted. Returns the rise and the region.
+    """
     lowest, at = gain.cummin(0)
     end = int((gain - lowest).argmax())
     begin = int(at[end])
@@ -81,6 +83,6 @@ def _range(gain: Tensor, doubt: Tensor, values: Tensor, name: str, *, outside: b
     high = None if end == len(values) else float((values[end - 1] + values[end]) / 2)
     inside = float(doubt[end] - doubt[begin])
     share = 1 - inside if outside else inside
-    if outside and (low is None or high is None):  # beyond a region with one end lies one with one end
+    if outside and (low is None or high is None):  # the complement of a half-line is the other half-line
         return float(gain[end] - gain[begin]), Region(name, high, low, False, share)
     return float(gain[end] - gain[begin]), Region(name, low, high, outside, share)

@@ -29,27 +29,27 @@ from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.outlook import as_if_answered, path_outlook
 from surrogym_shared.nouns import Query, Vector
 
-STARTS = 6  # drawn from the start distribution for each plan
+STARTS = 6  # start states drawn for each plan
 POPULATION = 48  # action sequences compared at once
-ELITE = 12  # of them that the next generation varies
+ELITE = 12  # best sequences, which the next generation varies
 GENERATIONS = 3
 DOUBTFUL = 0.25  # least chance of an ending for which a rollout is planned
 
 Sequences = NDArray[np.float64]  # (k, T, F)
-Worth = Callable[[Tensor, Sequences], tuple[Tensor, Tensor]]  # see ``_worth``
+Worth = Callable[[Tensor, Sequences], tuple[Tensor, Tensor]]  # rates sequences from states, as ``_worth`` does
 
 
 @dataclass(frozen=True)
 class Aim:
-    """What a plan should find out."""
+    """Objective and limits of a plan."""
 
-    columns: Sequence[int]  # numbers of the outputs to learn
+    columns: Sequence[int]  # numbers of the outputs about which to learn
     tolerances: Sequence[float]  # of every output
     longest: int  # actions in a sequence
     snapshots: Mapping[str, Vector] = field(default_factory=dict)  # states at which a sequence may begin, by name
-    states: Tensor | None = None  # (v, C) visited by policies: information is weighted by their density
+    states: Tensor | None = None  # (v, C) states that policies visited; their density weights the information
     ending: bool = False  # look first for an end of the episode, or an edge of the reward, if one is within reach
-    ended: bool = False  # an end was seen, so a declared one need not be looked for
+    ended: bool = False  # a sample has ended an episode, so plans need not look for a declared end
 
 
 @dataclass(frozen=True)
@@ -59,14 +59,17 @@ class Paths:
     q: Tensor  # (b, T, C)
     u: Tensor  # (b, T, F)
     q_next: Tensor  # (b, T, C)
-    running: Tensor  # (b, T) 1 while the episode runs, 0 after its end
-    ended: Tensor  # (b, T) 1 from the step on that ended it
+    running: Tensor  # (b, T) 1 for steps of a running episode, 0 after its end
+    ended: Tensor  # (b, T) 1 from the step on that ends the episode, 0 before
     drift: Tensor  # (b, T) variance of the mean path before the step, in units of that of the sampling range
 
 
 def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random.Generator) -> tuple[Query, ...]:
-    """Draw random sequences of 1, 2, 3, ... actions, with ``steps`` actions in all. Each sequence holds its actions
-    for a different time, so that states spread. Steps from which nothing is learned come in addition."""
+    """Draw random sequences of 1, 2, 3, ... actions, with ``steps`` actions in all.
+
+    Each sequence repeats its actions for a different number of steps, so that the states spread. First steps from which
+    a model does not learn, because lags are not known yet, come in addition.
+    """
     rollouts: list[Query] = []
     while steps > definition.unknown_steps:
         length = min(len(rollouts) + 1 + definition.unknown_steps, steps, definition.max_rollout or 1)
@@ -78,8 +81,10 @@ def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random
 def plan_round(
     model: DynamicsModel, aim: Aim, steps: int, unanswered: Sequence[Query], rng: np.random.Generator
 ) -> list[Query]:
-    """Plan action sequences with ``steps`` real steps in all. Each one is planned as if the earlier and the unanswered
-    ones had already been answered."""
+    """Plan action sequences with ``steps`` real steps in all.
+
+    Each sequence is planned as if the earlier ones and the unanswered queries had been answered.
+    """
     rollouts: list[Query] = []
     latest = list(unanswered)
     while steps > model.definition.unknown_steps:
@@ -93,8 +98,10 @@ def plan_round(
 
 
 def plan_rollout(model: DynamicsModel, aim: Aim, rng: np.random.Generator) -> Query:
-    """Plan the sequence of at most ``aim.longest`` actions with the highest value per expected real step, from a reset
-    or from the best snapshot. It is found by random shooting and by varying the best sequences."""
+    """Plan the action sequence, from a reset or from the best snapshot, with the highest value per expected real step.
+
+    The search compares random sequences of at most ``aim.longest`` actions, then variations of the best ones.
+    """
     return best_rollout(model.definition, partial(_worth, model, aim), aim.longest, aim.snapshots, rng)
 
 
@@ -105,7 +112,7 @@ def best_rollout(
     snapshots: Mapping[str, Vector],
     rng: np.random.Generator,
 ) -> Query:
-    """Search the best sequence of at most ``longest`` actions, from a reset or from one of the snapshots."""
+    """Search for the best sequence of at most ``longest`` actions, from a reset or from one of the snapshots."""
     starts = start_points(definition, STARTS, rng)[None]
     actions, _, value = _search(definition, worth, longest, starts, POPULATION, rng)
     if snapshots:
@@ -124,8 +131,10 @@ def _search(
     population: int,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], int, float]:
-    """Search the best sequence (T, F) from one of k origins, each of several equally likely states (k, s, C). Also
-    return the number of its origin, and its value."""
+    """Search for the best sequence (T, F) from any of k origins, each with s equally likely states (k, s, C).
+
+    Returns the sequence, the number of its origin, and its value.
+    """
     sequences = random_sequences(definition, population, longest, rng)
     places = np.resize(rng.permutation(len(origins)), population)
     elite = population * ELITE // POPULATION
@@ -143,8 +152,10 @@ def _search(
 def as_if_done(
     model: DynamicsModel, query: Query, snapshots: Mapping[str, Vector], rng: np.random.Generator
 ) -> DynamicsModel:
-    """Condition the model on a rollout along a predicted path: variances shrink, means stay. A rollout from a snapshot
-    that is not among ``snapshots`` begins at a reset."""
+    """Condition the model on a rollout along its predicted path: variances shrink, means stay.
+
+    If the rollout's snapshot is not among ``snapshots``, the path begins at a reset.
+    """
     start = start_points(model.definition, 1, rng)
     if (at := snapshots.get(query.snapshot or "")) is not None:
         start = torch.tensor([at], dtype=torch.float64)
@@ -154,7 +165,7 @@ def as_if_done(
 
 
 def start_points(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> Tensor:
-    """States after a reset (count, C), stratified over the declared distribution."""
+    """Draw states after a reset, (count, C), stratified over the declared start distribution."""
     columns = [
         c.start.quantile(torch.from_numpy((rng.permutation(count) + rng.random(count)) / count))
         for c in definition.coordinates
@@ -165,7 +176,7 @@ def start_points(definition: EnvironmentDefinition, count: int, rng: np.random.G
 
 
 def random_sequences(definition: EnvironmentDefinition, count: int, length: int, rng: np.random.Generator) -> Sequences:
-    """Piecewise constant action sequences (count, length, F); holding times double from 1 to the whole length."""
+    """Draw piecewise constant sequences (count, length, F); the constant stretches last 1, 2, 4, ... steps."""
     times = 2 ** np.arange(int(np.log2(length)) + 1)
     sequences = np.empty((count, length, definition.action.size))
     for sequence in sequences:
@@ -176,7 +187,7 @@ def random_sequences(definition: EnvironmentDefinition, count: int, length: int,
 
 
 def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Paths:
-    """Paths of the mean from starts (b, C) under actions (b, T, F)."""
+    """Predict the path of the mean state from each start (b, C) under actions (b, T, F)."""
     spread = [scaling(c.sampling)[1] for c in (model.definition.coordinates[i] for i in model.definition.moving)]
     q, running, drift = starts, starts.new_ones(len(starts)), starts.new_zeros(len(starts))
     steps: list[tuple[Tensor, ...]] = []
@@ -191,7 +202,7 @@ def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Path
 
 
 def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
-    """The acquisition's value of each beginning of paths (b, T), summed over the outputs of the aim: (b, T)."""
+    """The acquisition's value of each path up to each step, (b, T), summed over the outputs in ``aim.columns``."""
     acquisition = model.definition.design.acquisition
     weight = _weights(model.definition, aim, paths)
     total = torch.zeros_like(weight)
@@ -203,13 +214,15 @@ def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
 
 
 def _view(output: PathOutlook, weight: Tensor, tolerance: float) -> PathView:
-    """Build an acquisition's view of one output along paths, whose steps have the weights (b, T)."""
+    """Return paths, whose steps have the weights (b, T), as an acquisition sees them for one output."""
     return PathView(tolerance, weight, lambda: output.deviation, lambda: output.information(weight, tolerance))
 
 
 def _worth(model: DynamicsModel, aim: Aim, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
-    """Information per expected real step of the best beginning of each sequence (k, T, F) from its states (k, s, C),
-    and the length of that beginning, (k,)."""
+    """Rate the sequences (k, T, F), each from s equally likely states (k, s, C), by their best beginning.
+
+    Returns the value per expected real step of that beginning, (k,), and its length, (k,).
+    """
     count, lanes = starts.shape[:2]
     actions = torch.from_numpy(sequences).repeat_interleave(lanes, 0)
     paths = predict_paths(model, starts.flatten(0, 1), actions)
@@ -222,8 +235,10 @@ def _worth(model: DynamicsModel, aim: Aim, starts: Tensor, sequences: Sequences)
 
 
 def _endings(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
-    """Probability that the model is wrong about an end, or about the side of a reward's edge, along the way, (b, T).
-    Also whether paths have ended, if ends are declared and none was seen."""
+    """Probability (b, T) that, up to a step, the model is wrong about an ending or about the side of a reward's edge.
+
+    If ends are declared and no sample has ended, it is 1 from the step on at which a path ends.
+    """
     q, q_next = paths.q.flatten(0, 1), paths.q_next.flatten(0, 1)
     doubt = in_doubt(model, q_next).maximum(edge_in_doubt(model, q, q_next)).reshape(paths.running.shape)
     wrong = (doubt * paths.running).cummax(1).values
@@ -231,10 +246,10 @@ def _endings(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
 
 
 def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tensor:
-    """Weight of each step (b, T).
+    """Weight of each step of each path in the value of a plan, (b, T).
 
-    With snapshots a step also counts the less, the less likely the sampling range has its state: a plan could go on
-    and on to states that hardly count for the verdict.
+    With snapshots the weight also contains the sampling density at the state. Otherwise plans could lead ever farther
+    away, to states that hardly matter for the verdict.
     """
     weight = paths.running * definition.in_range(paths.q) * definition.known(paths.q) * (-0.5 * paths.drift).exp()
     if aim.snapshots:
@@ -247,14 +262,14 @@ def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tenso
 
 
 def vary(definition: EnvironmentDefinition, sequences: Sequences, rng: np.random.Generator) -> None:
-    """Hold one stretch of each sequence (k, T, F) at another action, in place."""
+    """Change each sequence (k, T, F) in place: one random stretch of it gets a new constant action."""
     for sequence in sequences:
         first, last = sorted(rng.integers(sequence.shape[0] + 1, size=2))
         sequence[first : last + 1] = _random_actions(definition, 1, rng)
 
 
 def _random_actions(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> Sequences:
-    """Random actions (count, F). Half of the continuous ones lie at their limits, which reach farthest."""
+    """Random actions (count, F). Half of the continuous entries are at a limit, because such actions reach farthest."""
     action = definition.action
     if action.nvec:
         return rng.integers(action.nvec, size=(count, action.size)).astype(np.float64)

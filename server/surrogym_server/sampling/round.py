@@ -23,7 +23,7 @@ class Round:
     samples: Samples
     request: Request
     judgement: Judgement
-    default_tolerances: tuple[float, ...]  # (O,) where the specification has none
+    default_tolerances: tuple[float, ...]  # (O,) for outputs without a declared tolerance
     continues: bool  # the round may spend what the budget has left; otherwise it may take ``request.extra`` steps
     testing: bool  # the model is sure, and an excursion is to test it
 
@@ -38,24 +38,27 @@ class Round:
 
     @property
     def room(self) -> int:
-        """Real steps that the budget has left beside those of the unanswered queries."""
+        """Real steps that the budget has left, after those that unanswered queries may take."""
         return max(0, self.request.budget - self.cost - self.request.pending_steps)
 
     @property
     def may_examine(self) -> bool:
-        """Whether the causes of large errors may be examined: in the second half of a budget, once half as many
-        adaptive queries as initial ones are answered. The preset of the paper examines nothing."""
+        """Whether rules may spend steps on the causes of large errors.
+
+        They may in the second half of the budget, once half as many adaptive queries as initial ones are answered. In
+        preset ``paper`` they never may.
+        """
         design = self.definition.design
         enough = self.cost >= max(self.request.budget / 2, 1.5 * design.initial)
         return self.continues and design.stopping == "tested_confidence" and enough
 
     @property
     def below_target(self) -> list[int]:
-        """Outputs below their target, the least confident first. If there is none, the least confident output."""
+        """Numbers of the outputs below the target, the least confident first; without any, the least confident one."""
         index = [confidence.confidence_index for confidence in self.judgement.confidences]
         order = sorted(range(len(index)), key=index.__getitem__)
         return [i for i in order if index[i] < self.request.target] or order[:1]
 
     def generator(self) -> np.random.Generator:
-        """Return the random numbers of this round's rollouts, from their beginning."""
+        """Return a new random generator for this round's rollouts; each call returns the same numbers."""
         return generator_for(self.definition, f"rollouts {self.number}")

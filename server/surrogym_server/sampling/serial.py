@@ -30,25 +30,28 @@ from surrogym_server.models.port import DynamicsModel
 FEWEST = 12  # pairs of consecutive steps for a test
 MOST = 256  # samples in a test, because its time grows with their third power
 CRITICAL = 5.41  # upper 2 % point of chi-squared with one degree of freedom: the one-sided test has level 1 %
-MAINLY = 0.5  # share of the noise from which on it counts as noise of the sensors
+MAINLY = 0.5  # noise counts as the sensor's if at least this share of it comes from the sensor
 SHARES = torch.linspace(0, 1, 21, dtype=torch.float64)
-FACTORS = torch.logspace(-0.6, 0.6, 9, dtype=torch.float64)  # c
+FACTORS = torch.logspace(-0.6, 0.6, 9, dtype=torch.float64)  # values of c to try; see the module's formula
 CARRIED = 1.25  # safety factor on an estimated standard deviation, because the slopes are those of a model
-DIFFERENCE = 1e-4  # of a coordinate's sampling range, for slopes
+DIFFERENCE = 1e-4  # step of the numerical derivatives, as a share of a coordinate's sampling range
 
 
 @dataclass(frozen=True)
 class SensorNoise:
     """Noise of one output's sensor."""
 
-    share: float  # of the variance of a single step's noise
+    share: float  # of the noise's variance that comes from the sensor
     deviation: float  # of one measurement, in the output's unit
-    step: float  # standard deviation of a single step's noise, of which it is a share
+    step: float  # standard deviation of all noise of a single step
 
 
 def sensor_noise(model: DynamicsModel, samples: Samples, limits: Sequence[float]) -> tuple[SensorNoise | None, ...]:
-    """Noise of each output's sensor (O,), if its learned noise exceeds the limit (O,), and consecutive steps show that
-    most of it is noise of the sensor. None for all others, for which the kinds can't be told or are not proved."""
+    """Noise of the sensor of each output (O,).
+
+    None for an output whose learned noise is below its limit (O,), or whose consecutive steps don't show that most of
+    that noise comes from the sensor.
+    """
     definition, able = model.definition, offers(model, SampledFunctions)
     follows = preceding(definition, samples)
     if able is None or definition.moves_observation or int((follows >= 0).sum()) < FEWEST:
@@ -68,8 +71,11 @@ def sensor_noise(model: DynamicsModel, samples: Samples, limits: Sequence[float]
 def noise_of_sensors(
     model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoise | None], limits: Sequence[float]
 ) -> Tensor:
-    """Standard deviation of a single step's noise of each output (O,) that comes from the sensors, in its unit: that of
-    its own sensor, or else what errors of all measured starts cause. It is 0 if it is below the limit (O,)."""
+    """Standard deviation of the part of each output's noise that comes from the sensors, (O,), in the output's unit.
+
+    It is the noise of the output's own sensor. An output without one has the noise that errors in the measured start of
+    a step cause. A value below the limit (O,) is returned as 0.
+    """
     if not any(sensors):
         return torch.zeros(len(sensors), dtype=torch.float64)
     model_noise = _model_noise(model)
@@ -79,8 +85,7 @@ def noise_of_sensors(
 
 
 def _carried(model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoise | None]) -> Tensor:
-    """Standard deviation of each output (O,) that errors of measured starts cause: root mean square over the
-    samples."""
+    """Standard deviation of each output (O,) that errors in the measured start of a step cause, over the samples."""
     variance = torch.zeros(len(sensors), dtype=torch.float64)
     for index, sensor in zip(model.definition.moving, sensors, strict=False):
         if sensor is not None:
@@ -89,14 +94,18 @@ def _carried(model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoi
 
 
 def _model_noise(model: DynamicsModel) -> Tensor:
-    """Standard deviation of each output's learned noise, (O,)."""
+    """Standard deviation of the noise that the model has learned for each output, (O,)."""
     able = offers(model, LearnedNoise)
     result = [0.0] * len(model.definition.outputs) if able is None else able.noise_deviations
     return torch.tensor(result, dtype=torch.float64)
 
 
 def _told(at: AtSamples, follows: Tensor, slope: Tensor) -> SensorNoise | None:
-    """Noise of a sensor at n samples, each of which continues the sample ``follows`` (n,) with a slope (n,)."""
+    """Test for noise of the sensor of one output; None if the test does not show it.
+
+    Sample i begins where sample ``follows[i]`` ended (-1: none did). ``slope`` (n,) is the derivative of the next
+    value of the output's coordinate by its present value.
+    """
     slope = slope[at.rows]
     pattern = sensor_pattern(slope, _among(follows, at.rows))
     share, factor, ratio = best_share(at.targets, at.covariance, at.noise_variance, pattern)
@@ -107,14 +116,17 @@ def _told(at: AtSamples, follows: Tensor, slope: Tensor) -> SensorNoise | None:
 
 
 def _among(follows: Tensor, rows: Tensor) -> Tensor:
-    """``follows`` of the rows alone, as places among them."""
-    places = torch.full((len(follows) + 1,), -1)  # the last one for -1
+    """Restrict ``follows`` to a selection of rows, and renumber it by their positions in the selection."""
+    places = torch.full((len(follows) + 1,), -1)  # the last entry answers -1, which stands for no step before
     places[rows] = torch.arange(len(rows))
     return places[follows[rows]]
 
 
 def sensor_pattern(slope: Tensor, follows: Tensor) -> Tensor:
-    """S (n, n) of steps with slopes (n,), each of which continues the step ``follows`` (n,), or none, -1."""
+    """Correlation pattern S (n, n) that noise of a sensor causes between consecutive steps; see the module.
+
+    Step i begins where step ``follows[i]`` ended, -1 for none, and has the slope ``slope[i]``.
+    """
     pattern = torch.diag(1 + slope.square())
     later = (follows >= 0).nonzero()[:, 0]
     pattern[later, follows[later]] = pattern[follows[later], later] = -slope[later]
@@ -122,7 +134,9 @@ def sensor_pattern(slope: Tensor, follows: Tensor) -> Tensor:
 
 
 def best_share(y: Tensor, function: Tensor, noise: float, pattern: Tensor) -> tuple[float, float, float]:
-    """The most likely share, its factor c, and twice its log likelihood over that of share 0.
+    """Fit the share of the noise that comes from the sensor, by maximum likelihood.
+
+    Returns the share, the factor c, and twice the difference between its log likelihood and that of share 0.
 
     Args:
         y: (n,) targets, of mean 0.
@@ -155,12 +169,12 @@ def _log_likelihood(y: Tensor, covariance: Tensor) -> Tensor:
 
 
 def _slopes(model: DynamicsModel, samples: Samples, column: int, index: int) -> Tensor:
-    """Slope of the next value of a coordinate over its value, at the samples, (n,)."""
+    """Derivative of a coordinate's next value by its present value, at the samples, (n,)."""
     return 1 + _differences(model, samples, index)[:, column]
 
 
 def _differences(model: DynamicsModel, samples: Samples, index: int) -> Tensor:
-    """Slopes of all outputs over a coordinate, at the samples, (n, O)."""
+    """Derivatives of all outputs by one coordinate, at the samples, (n, O)."""
     sampling = model.definition.coordinates[index].sampling
     step = torch.zeros_like(samples.q)
     step[:, index] = DIFFERENCE * max(sampling.high - sampling.low, 1e-12)

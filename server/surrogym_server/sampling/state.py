@@ -16,15 +16,15 @@ from surrogym_shared.nouns import Query, Vector
 
 @dataclass(frozen=True)
 class DesignState:
-    """State that one round passes to the next; can be written as JSON."""
+    """State that one round passes to the next. It can be stored as JSON."""
 
     round: int = 0
-    usual: tuple[float, ...] = ()  # default tolerances, per output; see ``tolerances``
+    usual: tuple[float, ...] = ()  # (O,) default tolerances; see ``sampling.tolerances``
     warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # what a fit passes to the next one
-    ended_with: tuple[float, ...] = ()  # at the end: real steps that count, budget, target, tolerances
-    ended_as: str = ""  # the verdict at that end; "" while the design continues
-    ranges: tuple[float, ...] = ()  # of the targets, from which each tolerance was computed
-    predictions: Predictions = ()  # the last ones of each output, of samples that were then learned from
+    ended_with: tuple[float, ...] = ()  # real steps that count, budget, target and tolerances when the design ended
+    ended_as: str = ""  # the verdict with which the design ended; "" while it continues
+    ranges: tuple[float, ...] = ()  # (O,) ranges of the targets that the default tolerances were computed from
+    predictions: Predictions = ()  # last predictions of each output before the model learned from the sample
     tested_at: int = 0  # number of samples when the model became sure and an excursion was planned; 0: it is not sure
 
     def to_json(self) -> dict[str, Any]:
@@ -57,13 +57,13 @@ class Request:
     pending: tuple[Query, ...] = ()
     refused: tuple[Query, ...] = ()
     extra: int = 0  # real steps to choose even if the design has ended
-    states: Tensor | None = None  # (v, C) visited by policies
-    snapshots: Mapping[str, Vector] = field(default_factory=dict)  # coordinates (C,) to which one can return, by name
-    logged: int = 0  # of the samples, from a log
-    audited: int = 0  # of the samples, steps of audits
-    unlearned: int = 0  # further real steps, whose lags were not known
+    states: Tensor | None = None  # (v, C) states that policies visited
+    snapshots: Mapping[str, Vector] = field(default_factory=dict)  # coordinates (C,) of each snapshot, by its name
+    logged: int = 0  # number of the samples that come from a log
+    audited: int = 0  # number of the samples that are steps of audits
+    unlearned: int = 0  # real steps that are no samples here, because their lags were not known
     open: int = 0  # real steps of the pending queries that may still be answered
-    surprises: Predictions = ()  # predictions of the samples that the last model had not learned from
+    surprises: Predictions = ()  # predictions, by the last model, of the samples that are new in this round
 
     @property
     def free(self) -> int:
@@ -75,7 +75,7 @@ class Request:
 
     @property
     def unanswered(self) -> tuple[Query, ...]:
-        """Queries without an answer, which the acquisition treats as answered."""
+        """All queries without an answer, pending or refused. The acquisition treats them as answered."""
         return (*self.pending, *self.refused)
 
     @property
@@ -84,8 +84,9 @@ class Request:
         return sum(query.steps for query in self.pending)
 
     def is_mostly_refused(self, cost: float) -> bool:
-        """Whether the environment refused as many steps as it has taken, ``cost``, and the budget has in addition.
+        """Whether the environment has refused so many steps that the design should end.
 
-        Without this limit, a design whose queries are all refused would never end.
+        The limit is the budget plus ``cost``, the real steps that count. Without it, a design whose queries are all
+        refused would never end.
         """
         return sum(query.steps for query in self.refused) >= self.budget + cost

@@ -18,20 +18,20 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.samples import Samples, increments
 
-TOLERANCE = 0.05  # of the output's standard deviation over the initial design
+TOLERANCE = 0.05  # default, as a share of the output's standard deviation over the initial design
 FLOOR = 1e-9  # of a coordinate's standard deviation over its range: a smaller increment is rounding
-NOTHING = 1e-3  # of the range seen later: the first samples are useless if they lie closer together
+NOTHING = 1e-3  # share of the later range: a smaller range of the first samples says nothing about the size
 
 
 def sizes_of(definition: EnvironmentDefinition, samples: Samples) -> list[float]:
-    """Size of each output (O,): its standard deviation over the samples, or that of its mean if it never varied."""
+    """Size of each output (O,): its standard deviation over the samples, or its absolute mean if it never varied."""
     targets = _targets(definition, samples)
     spread, mean = targets.std(0, correction=0), targets.mean(0).abs()
     return torch.where(spread > 0, spread, torch.where(mean > 0, mean, 1.0)).tolist()
 
 
 def usual_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]) -> tuple[float, ...]:
-    """Default tolerance of each output, of sizes (O,): 5 % of its size, or 1 in its unit as in the paper."""
+    """Default tolerance (O,) of outputs of these sizes (O,): 5 % of the size, or 1 in the unit, as in the paper."""
     if definition.design.tolerance == "raw":
         return (1.0,) * len(sizes)
     floors = _floors(definition)
@@ -40,19 +40,19 @@ def usual_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]) 
 
 @dataclass(frozen=True)
 class Usual:
-    """Default tolerances (O,) of a design, and the ranges (O,) that they were computed from."""
+    """Default tolerances (O,) of a design, and the ranges (O,) of the targets that they were computed from."""
 
     tolerances: tuple[float, ...] = ()
     ranges: tuple[float, ...] = ()
 
 
 def frozen_tolerances(definition: EnvironmentDefinition, samples: Samples, before: Usual) -> Usual:
-    """Keep the tolerances of the round before. Compute them from the samples if there are none, or if the range of the
-    targets has grown by more than 1 / ``NOTHING`` since. With snapshots, take larger ones than before in each round.
+    """Return the default tolerances of a round: those of the round before, unless they have to change.
 
-    A pure function of samples and state, so that a repeated round gives the same result. States of older designs have
-    no ranges; then nothing changes. Rewards of terminating steps are not counted, because the reward's process does not
-    model them.
+    They are computed from the samples in the first round, and again for an output whose range of targets has grown by
+    a factor of more than 1 / ``NOTHING``. With snapshots they are computed in each round, and never become smaller.
+    States of older designs have no ranges; their tolerances stay. Rewards of terminating steps are left out, because
+    the reward's process does not model them. A pure function, so that a repeated round gives the same result.
     """
     sizes, ranges = sizes_of(definition, samples), _ranges(definition, samples)
     current = usual_tolerances(definition, sizes)
@@ -66,14 +66,14 @@ def frozen_tolerances(definition: EnvironmentDefinition, samples: Samples, befor
 
 
 def _later(last: tuple[float, float], new: tuple[float, float], *, grows: bool) -> tuple[float, float]:
-    """Tolerance and range of one output after a round, from those before it and those of all samples."""
+    """Choose between the ``last`` tolerance and range of an output and the ``new`` ones, computed from all samples."""
     if new[1] * NOTHING > last[1]:
         return new
     return max(last, new) if grows else last
 
 
 def _ranges(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
-    """Range of the targets of non-terminating steps, (O,); 0 if it is mere rounding."""
+    """Largest less smallest target of non-terminating steps, (O,); 0 if the difference is a rounding error."""
     targets = _targets(definition, samples)[~samples.terminated]
     if not len(targets):
         return (0.0,) * len(definition.outputs)
@@ -86,7 +86,7 @@ def _targets(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def _floors(definition: EnvironmentDefinition) -> list[float]:
-    """Smallest size of each output (O,) that is more than rounding. For the reward, whose range is unknown, 0."""
+    """Smallest size of each output (O,) that is not a rounding error; 0 for the reward, whose range is unknown."""
     if definition.moves_observation:
         return [0.0] * len(definition.outputs)
     return [FLOOR * scaling(definition.coordinates[i].sampling)[1] for i in definition.moving] + [0.0]

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class UncertaintyResult:
-    """Each (n, O), outputs in the order of definition.outputs."""
+    """Prediction and uncertainty at n points, arrays (n, O) with the outputs in the order of ``definition.outputs``."""
 
     mean: Array  # increments of the moving outputs, then the reward
     deviation: Array
@@ -31,7 +31,7 @@ class UncertaintyResult:
 def query_uncertainty(
     model: DynamicsModel, q: Array, u: Array, tolerances: Array, occupancy: Array | None = None
 ) -> UncertaintyResult:
-    """Mean, standard deviation, U_m, P_i and log U at q (n, C), u (n, F) under tolerances (O,)."""
+    """Return mean, standard deviation, U_m, P_i and log U at q (n, C) and u (n, F), for tolerances (O,)."""
     at, action = torch.from_numpy(q), torch.from_numpy(u)
     states = None if occupancy is None else torch.from_numpy(occupancy)
     mean, deviation = model.means(at, action), deviations(model, at, action)
@@ -42,8 +42,9 @@ def query_uncertainty(
 
 
 def visited_confidence(model: DynamicsModel, states: Array, tolerances: Sequence[float]) -> float:
-    """Confidence index (eq. 8, 9) over visited states (v, C) instead of the Monte Carlo set, under tolerances (O,): the
-    smallest over outputs. It shows how well the model is known where a policy goes.
+    """Smallest confidence index (eq. 8, 9) of the outputs over visited states (v, C), for tolerances (O,).
+
+    With these states in the place of the Monte Carlo set, it shows how well the model is known where a policy goes.
 
     States outside the sampling range count as well, although the design never queries there. Each state is taken under
     one random action, as in the acquisition's reference, because a policy that learns tries actions other than its own.

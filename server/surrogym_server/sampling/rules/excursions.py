@@ -1,4 +1,4 @@
-"""Test a model that is sure, far away from all samples."""
+"""Rule: test a confident model by an action sequence that leads far away from all samples."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from surrogym_shared.nouns import Query
 
 
 def take_excursion(round: Round) -> tuple[Query, ...] | None:
-    """Take an excursion, if the budget has room for it."""
+    """Return an excursion as the next query, if the model is to be tested and the budget has room."""
     if not round.testing:
         return None
     if not round.room:

@@ -1,4 +1,4 @@
-"""Complete an initial design whose rollouts ended early."""
+"""Rule: replace the steps that an initial design lacks because its rollouts ended early."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from surrogym_shared.nouns import Query
 
 
 def complete_initial_rollouts(round: Round) -> tuple[Query, ...] | None:
-    """Take further random rollouts, if more steps of the initial design are missing than a planned round has.
+    """Return further random rollouts, if the initial design lacks more steps than a planned round takes.
 
-    Otherwise many small rounds would follow, each with a fit to few steps. Logged steps can replace initial ones.
+    Without them many small rounds would follow, each with a fit to few samples. Logged steps replace initial ones.
     """
     if not round.continues or round.definition.snapshots:
         return None

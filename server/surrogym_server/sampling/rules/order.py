@@ -11,5 +11,5 @@ from surrogym_server.sampling.rules.valued import ask_best_candidates
 # An environment that can be set to any state answers single steps.
 STEP_RULES: tuple[Rule, ...] = (repeat_steps, ask_best_candidates)
 
-# One that begins at resets or snapshots answers rollouts.
+# An environment that begins at resets or snapshots answers rollouts.
 ROLLOUT_RULES: tuple[Rule, ...] = (take_excursion, see_the_past, complete_initial_rollouts, plan_rollouts)

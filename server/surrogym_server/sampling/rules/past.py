@@ -1,4 +1,4 @@
-"""Take consecutive steps that show whether an error is noise or follows from the steps before."""
+"""Rule: take consecutive steps that show whether an error is noise or depends on the steps before."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from surrogym_server.sampling.rollouts import random_sequences
 from surrogym_server.sampling.round import Round
 from surrogym_shared.nouns import Query
 
-LENGTH = 8  # steps of a rollout
+LENGTH = 8  # steps of each rollout
 
 
 def see_the_past(round: Round) -> tuple[Query, ...] | None:
-    """Take random rollouts that give enough consecutive steps for the test, if an error exceeds its tolerance. With
-    snapshots none are needed, because they keep the past."""
+    """Return random rollouts, if an error exceeds its tolerance and ``sampling.past`` lacks consecutive steps.
+
+    An environment with snapshots needs none, because a snapshot contains what the environment remembers.
+    """
     definition, judgement = round.definition, round.judgement
     if not round.may_examine or definition.snapshots or round.request.pending:
         return None

@@ -1,4 +1,4 @@
-"""Plan rollouts in the model, by the acquisition's value along their paths."""
+"""Rule: plan rollouts in the model, which maximise the acquisition's value along their predicted paths."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from surrogym_server.sampling.rollouts import Aim, plan_round
 from surrogym_server.sampling.round import Round
 from surrogym_shared.nouns import Query
 
-SHORTEST = 4  # real steps of a round
+SHORTEST = 4  # least number of real steps of a planned round
 
 
 def plan_rollouts(round: Round) -> tuple[Query, ...]:
-    """Plan rollouts for the outputs below their target."""
+    """Return planned rollouts for the outputs whose confidence is below the target."""
     request, judgement = round.request, round.judgement
     aim = Aim(
         columns=round.below_target,
@@ -26,10 +26,10 @@ def plan_rollouts(round: Round) -> tuple[Query, ...]:
 
 
 def steps_of_a_round(round: Round) -> int:
-    """Return a quarter as many real steps as there are samples, so that plans become longer and fits are few.
+    """Return the number of real steps of a planned round: a quarter of the number of samples.
 
-    With snapshots, which need no way from a reset, it is half as many, and at least one for each output below its
-    target, as with single steps.
+    So rounds grow with the data, and fits are few. With snapshots it is half the number of samples, because a plan
+    need not first lead away from a reset, and at least one step for each output below its target.
     """
     samples = len(round.samples)
     if round.definition.snapshots:

@@ -1,4 +1,4 @@
-"""Repeat steps, to tell noise from misfit."""
+"""Rule: take steps again, to distinguish noise from misfit of the model."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from surrogym_shared.nouns import Query
 
 
 def repeat_steps(round: Round) -> tuple[Query, ...] | None:
-    """Repeat the steps with the largest errors, if they were not repeated yet."""
+    """Return repeats of the steps with the largest errors, unless they were repeated already."""
     if not round.may_examine:
         return None
     with plugin_calls(round.definition):

@@ -1,4 +1,4 @@
-"""The signature of the rules that choose the queries of a round."""
+"""Rule: the signature of the functions that may choose the queries of a round."""
 
 from __future__ import annotations
 

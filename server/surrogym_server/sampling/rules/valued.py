@@ -1,4 +1,4 @@
-"""Ask the candidates that the acquisition values most (eq. 13)."""
+"""Rule: query the candidates with the largest value of the acquisition (eq. 13)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from surrogym_shared.nouns import Query
 
 
 def ask_best_candidates(round: Round) -> tuple[Query, ...]:
-    """Choose one query for each output below its target, the least confident first. The first query is a reserved
-    candidate, if there is one."""
+    """Return one query for each output below its target, the least confident output first.
+
+    If candidates are reserved (see ``Candidates``), the first query is one of them.
+    """
     below, judgement = round.below_target, round.judgement
     unanswered = Points.of(round.definition, round.request.unanswered)
     if round.continues:
