@@ -96,7 +96,7 @@ def test_a_run_leaves_its_points_and_is_not_repeated(lab, tmp_path):
     assert "0 of 1 runs, 1 at once" in said.err
     assert "pendulum ppo seed 0: 64 real steps, mean return " in said.err
     assert "| ppo | 1 | 0 of 1 | not reached by 64 |" in said.out
-    assert (tmp_path / "out" / "peers-pendulum.png").exists()
+    assert (tmp_path / "out" / "peers.png").exists()
     again = lab(*asked, "--episodes=1")
     assert again.out == said.out
     assert "pendulum ppo" not in again.err

@@ -19,7 +19,7 @@ from surrogym_sampler.original.classic import mountain_car_continuous as mountai
 
 IMAGES = ROOT / "docs" / "images"
 QUEUED = "CartPole-v1"
-TRAININGS = {"short": "30000", "long": "150000"}  # virtual steps
+TRAININGS = {"short": "30000", "long": "450000"}  # virtual steps; the second policy is a good one
 
 
 def surrogym(url: str, *words: str) -> None:
@@ -44,7 +44,7 @@ def take(browser: Browser, url: str, name: str, path: str, scheme: str, width: i
     page = context.new_page()
     page.goto(f"{url}/{path}")
     settle(page, path)
-    page.screenshot(path=IMAGES / f"{name}.png", full_page=path != "#/")
+    page.screenshot(path=IMAGES / f"{name}.png")  # what fits the window, no strip
     context.close()
 
 

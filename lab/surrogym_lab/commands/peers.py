@@ -53,7 +53,7 @@ def command(
 ) -> None:
     """Run other methods on our tasks, and draw learning curves.
 
-    The folder --out gets points.csv, peers.md and a picture of each task. A finished run is not repeated, so the same
+    The folder --out gets points.csv, peers.md and a picture of all tasks. A finished run is not repeated, so the same
     command continues after Ctrl-C. Runs with other settings need another --out. lab/records/results/peers.md has the
     rules. The methods default and latin_hypercube are ours; their runs come from files of rows, which python -m
     surrogym_lab efficiency writes.

@@ -9,7 +9,9 @@ import matplotlib
 
 matplotlib.use("Agg")
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
 from surrogym_lab.arms import ARMS
 from surrogym_lab.reproduce.rows import Row
@@ -54,5 +56,14 @@ def draw_task(task: str, groups: dict[Group, list[Row]]) -> Figure:
         )
         axes.scatter((1 + BESIDE) * steps, means, s=9, color=COLOURS[arm], alpha=0.5, linewidths=0)
     axes.set(xscale="log", xlabel="real steps", ylabel="real return of an episode", title=task)
+    axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]) if narrow(axes) else LogLocator(numticks=4))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     figure.legend(loc="outside right upper", frameon=False)
     return figure
+
+
+def narrow(axes: Axes) -> bool:
+    """Whether the steps span less than a power of ten, where a logarithmic axis has no round ticks."""
+    low, high = axes.get_xlim()
+    return high < 10 * low

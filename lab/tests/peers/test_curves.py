@@ -71,8 +71,8 @@ def test_points_come_back_from_their_file(tmp_path):
         read_records(tmp_path / "rows.csv", Point)
 
 
-def test_a_picture_has_a_line_for_each_method(tmp_path):
+def test_all_tasks_are_drawn_into_one_picture(tmp_path):
     points = [*rounds(0, (10, -100.0), (30, -50.0)), *rounds(0, (20, -80.0), method="ppo")]
     (picture,) = draw_tasks(tmp_path, points)
-    assert picture.name == "peers-pendulum.png"
+    assert picture.name == "peers.png"
     assert np.frombuffer(picture.read_bytes()[:4], np.uint8)[1:].tobytes() == b"PNG"
