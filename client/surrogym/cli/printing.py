@@ -49,7 +49,7 @@ def unregistered(steps: Callable[[], int], what: str) -> Iterator[None]:
 
 
 def found_aside(findings: Iterator[Finding]) -> Iterator[Finding]:
-    """The same findings. What an environment prints while one is made goes to standard error."""
+    """Return the findings; what an environment prints while one is made goes to standard error."""
     while True:
         with prints_aside():
             finding = next(findings, None)

@@ -24,7 +24,7 @@ class StatePart(Protocol):
     variables: tuple[Variable, ...]
 
     def read(self) -> Array:
-        """Their values (n,)."""
+        """Values (n,) of the variables."""
         ...
 
     def write(self, values: Array) -> None:

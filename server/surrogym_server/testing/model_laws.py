@@ -78,7 +78,7 @@ def points_do_not_see_those_beside_them(case: ModelCase) -> None:
 
 
 def without_points_there_are_no_steps(case: ModelCase) -> None:
-    """And no warning, because the standard deviation of no values is not a number."""
+    """A prediction of no points has no rows, and gives no warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         made = case.model.transition(case.points.q[:0], case.points.u[:0], deviations=True, reward_deviation=True)
