@@ -35,7 +35,7 @@ def tokens_in(path: Path) -> dict[str, Role]:
     """
     lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
     if not any(lines):
-        raise ValueError("expected lines like 'sample:token', got none")
+        raise ValueError("expected lines like 'sample:token', got none: write one")
     return dict(parse_token(line) for line in lines if line)
 
 

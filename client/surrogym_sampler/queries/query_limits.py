@@ -23,7 +23,7 @@ def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSp
     expected, got = _shape(asked), _shape(own)
     if expected != got:
         raise UnknownEnvironment(
-            f"the environment does not fit surrogate {surrogate!r}: expected {expected}, got {got}"
+            f"the environment does not fit surrogate {surrogate!r}: expected {expected}, got {got}; register it anew"
         )
     if is_other(asked.sampling_period, own.sampling_period):
         raise UnknownEnvironment(

@@ -71,7 +71,9 @@ def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
     try:
         card_sent, curve = as_pushed(card), thinned(card.curve)
     except ValidationError as error:
-        raise UnusablePolicy(f"the card beside {policy} can't be stored: {first_fault(error)}") from error
+        raise UnusablePolicy(
+            f"the card beside {policy} can't be stored: {first_fault(error)}; correct the card"
+        ) from error
     sent = api.policies.push(name, card_sent, curve, form, policy.read_bytes())
     waiting = _read(policy)
     for evaluation in waiting:

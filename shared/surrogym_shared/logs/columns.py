@@ -214,7 +214,9 @@ def _content(path: Path) -> Mapping[str, Any]:
     except UnicodeDecodeError as error:
         raise UnusableLog(f"expected JSON or TOML in {path}, got bytes that are no text in UTF-8") from error
     except RecursionError as error:
-        raise UnusableLog(f"expected a table of columns in {path}, got lists or tables nested too deeply") from error
+        raise UnusableLog(
+            f"expected a table of columns in {path}, got lists or tables nested too deeply: write one level"
+        ) from error
     except ValueError as error:
         raise UnusableLog(f"expected JSON or TOML in {path}: {error}") from error
     return content

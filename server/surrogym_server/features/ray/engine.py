@@ -69,7 +69,7 @@ class RayEngine(SessionEngine):
         if key is not None:
             if (known := await asyncio.to_thread(self._store.opened, request.surrogate_id, key)) is not None:
                 if known[1] != digest_of("open", request.opening):
-                    raise IdempotencyConflict("this idempotency key opened a session with another body")
+                    raise IdempotencyConflict("this idempotency key opened a session with another body: use a new key")
                 return await self.describe(known[0])
             turn = crc32(f"{request.surrogate}|{key}".encode())
         for host in self._in_turn(turn):
