@@ -57,7 +57,7 @@ from surrogym_server.sampling.acquisition import ACQUISITIONS
 from surrogym_server.sampling.design import initial_queries
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions
-from surrogym_server.services.designer import Designer
+from surrogym_server.services.designer import Designer, DesignerSettings
 from surrogym_server.services.events import EventService
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.models import ModelService, load_model, stored_tolerances
@@ -264,11 +264,13 @@ def _build_services(settings: Settings, design: DesignPort, process: _Process) -
         process.models,
         notices,
         process.metrics,
-        owner=uuid4().hex,
-        threads=settings.threads,
-        look_seconds=settings.sweep_seconds,
-        fit_seconds=settings.fit_seconds,
-        fit_workers=settings.fit_workers,
+        DesignerSettings(
+            owner=uuid4().hex,
+            threads=settings.threads,
+            look_seconds=settings.sweep_seconds,
+            fit_seconds=settings.fit_seconds,
+            fit_workers=settings.fit_workers,
+        ),
     )
     return Services(
         surrogates=SurrogateService(

@@ -25,7 +25,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.design import initial_queries
 from surrogym_server.services.definitions import Definitions
-from surrogym_server.services.designer import Designer
+from surrogym_server.services.designer import Designer, DesignerSettings
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.models import load_model
 from surrogym_server.services.notices import Notices
@@ -76,8 +76,8 @@ def fit_all_due(storage: Storage) -> None:
 
     async def fit() -> None:
         cache, notices, metrics = ModelCache(load, storage.models.newest), Notices(), ProcessMetrics()
-        options = {"owner": "here", "threads": 1, "look_seconds": 1.0, "fit_seconds": 60.0}
-        await Designer(storage, definitions, initial_queries, Here(), cache, notices, metrics, **options).fit_all_due()
+        settings = DesignerSettings("here", threads=1, look_seconds=1.0, fit_seconds=60.0)
+        await Designer(storage, definitions, initial_queries, Here(), cache, notices, metrics, settings).fit_all_due()
 
     asyncio.run(fit())
 

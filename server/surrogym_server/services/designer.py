@@ -7,6 +7,7 @@ import logging
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 
 from surrogym_server.engine.design_job import UNCHOSEN, DesignJob, DesignResult
 from surrogym_server.engine.models import ModelCache
@@ -70,8 +71,29 @@ class _Turn:
         self._usual.release()
 
 
+@dataclass(frozen=True)
+class DesignerSettings:
+    """Settings of a ``Designer``.
+
+    Attributes:
+        owner: name of this server in the right to fit.
+        threads: number of torch's threads in a fit.
+        look_seconds: interval of searches for surrogates that became due without a notice.
+        fit_seconds: a fit that takes longer is stopped and counts as failed.
+        fit_workers: number of fits at a time, not counting long ones.
+    """
+
+    owner: str
+    threads: int
+    look_seconds: float
+    fit_seconds: float
+    fit_workers: int = 1
+
+
 class Designer:
-    def __init__(
+    """Fits the surrogates that are due, each under a right that no other server has at the same time."""
+
+    def __init__(  # eight parameters: seven parts of the server that a fit reads or informs, and the settings
         self,
         storage: Storage,
         definitions: Definitions,
@@ -80,12 +102,7 @@ class Designer:
         models: ModelCache,
         notices: Notices,
         metrics: ProcessMetrics,
-        *,
-        owner: str,
-        threads: int,
-        look_seconds: float,
-        fit_seconds: float,
-        fit_workers: int = 1,
+        settings: DesignerSettings,
     ) -> None:
         """Args:
         storage: holds the right to fit.
@@ -94,12 +111,8 @@ class Designer:
         fits: runs the jobs.
         models: is informed of each new version.
         notices: wake this designer, and are posted after each fit.
-        metrics: of this process.
-        owner: name of this server in the right to fit.
-        threads: of torch in a fit.
-        look_seconds: interval of searches for surrogates that became due without a notice.
-        fit_seconds: a fit that takes longer is stopped and counts as failed.
-        fit_workers: number of fits at a time, not counting long ones."""
+        metrics: counters of this process.
+        settings: how often it looks, and how long and how many fits run."""
         self._storage = storage
         self._definitions = definitions
         self._plan = plan
@@ -107,11 +120,8 @@ class Designer:
         self._models = models
         self._notices = notices
         self._metrics = metrics
-        self._owner = owner
-        self._threads = threads
-        self._look_seconds = look_seconds
-        self._fit_seconds = fit_seconds
-        self._usual, self._passed = asyncio.Semaphore(fit_workers), asyncio.Semaphore(MOST_PASSED)
+        self._settings = settings
+        self._usual, self._passed = asyncio.Semaphore(settings.fit_workers), asyncio.Semaphore(MOST_PASSED)
         self._tasks: dict[str, asyncio.Task[None]] = {}  # of the surrogates that are fitted or wait for their turn
         self._unavailable: dict[str, int] = {}  # consecutive fits without a process or storage, by surrogate
 
@@ -126,7 +136,7 @@ class Designer:
                         logger.warning("the storage is unavailable or damaged, so the design waits: %s", error)
                     except Exception:  # one surrogate's trouble must not end the design of all others
                         logger.exception("the search for due fits failed; it is repeated shortly")
-                    await listener.wait(self._look_seconds)
+                    await listener.wait(self._settings.look_seconds)
         finally:
             tasks = list(self._tasks.values())
             for task in tasks:
@@ -188,7 +198,7 @@ class Designer:
         return granted
 
     async def _fit(self, name: str, turn: _Turn) -> None:
-        lease = await asyncio.to_thread(self._storage.designs.begin, name, self._owner, FIT_LEASE_SECONDS)
+        lease = await asyncio.to_thread(self._storage.designs.begin, name, self._settings.owner, FIT_LEASE_SECONDS)
         if lease is None:
             return
         self._notices.post(name)
@@ -231,14 +241,14 @@ class Designer:
         keeper = asyncio.create_task(self._keep(lease))
         passing = asyncio.create_task(turn.let_others_pass())
         try:
-            await asyncio.wait({work, keeper}, timeout=self._fit_seconds, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({work, keeper}, timeout=self._settings.fit_seconds, return_when=asyncio.FIRST_COMPLETED)
             if work.done():
                 return work.result()
             if keeper.done():
                 keeper.result()
             family = job.definition.learning.model.name
             raise PluginFailed(
-                f"the model family {family!r} took longer than {self._fit_seconds:g} s, and was stopped: "
+                f"the model family {family!r} took longer than {self._settings.fit_seconds:g} s, and was stopped: "
                 "surrogym serve --fit-seconds sets a longer limit"
             )
         finally:
@@ -261,7 +271,7 @@ class Designer:
                     logger.debug("the right to fit %s is not renewed: %s", lease.surrogate, error)
                 if (took := time.monotonic() - began) > tell_after:
                     tell_after *= 2
-                    name, most = lease.surrogate, self._fit_seconds
+                    name, most = lease.surrogate, self._settings.fit_seconds
                     logger.warning(
                         "the fit of %s has been running for %.0f s, and is stopped after %g s", name, took, most
                     )
@@ -291,7 +301,7 @@ class Designer:
                 lease.extra_queries, max(0, record.budget - spoken)
             ),  # the budget may have been lowered since
             occupancy=None if visited is None else visited.states,
-            threads=self._threads,
+            threads=self._settings.threads,
             previous=self._previous(name) if set(samples.purpose).difference(UNCHOSEN) else None,
         )
 

@@ -21,7 +21,7 @@ from surrogym_server.engine.models import ModelCache
 from surrogym_server.errors import ChoiceFailed, InvalidInput, NoModel, NumericalFailure, Unavailable
 from surrogym_server.sampling.design import initial_queries
 from surrogym_server.services.definitions import Definitions
-from surrogym_server.services.designer import ATTEMPTS, Designer
+from surrogym_server.services.designer import ATTEMPTS, Designer, DesignerSettings
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.models import load_model
 from surrogym_server.services.notices import Notices
@@ -85,11 +85,7 @@ def designer(storage: Storage, definitions: Definitions, cache: ModelCache, runn
             cache,
             Notices(),
             ProcessMetrics(),
-            owner="here",
-            threads=1,
-            look_seconds=0.05,
-            fit_seconds=fit_seconds,
-            fit_workers=fit_workers,
+            DesignerSettings("here", 1, look_seconds=0.05, fit_seconds=fit_seconds, fit_workers=fit_workers),
         )
 
     return make

@@ -14,7 +14,7 @@ from surrogym_server.engine.models import ModelCache
 from surrogym_server.errors import InvalidInput
 from surrogym_server.sampling.design import initial_queries
 from surrogym_server.services.definitions import Definitions
-from surrogym_server.services.designer import Designer
+from surrogym_server.services.designer import Designer, DesignerSettings
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.models import load_model
 from surrogym_server.services.notices import Notices
@@ -49,7 +49,7 @@ def fit(storage: Storage, definitions: Definitions):
         async def once() -> None:
             designer = Designer(
                 storage, definitions, initial_queries, Here(), cache, Notices(), ProcessMetrics(),
-                owner="here", threads=1, look_seconds=0.05, fit_seconds=3600,
+                DesignerSettings("here", threads=1, look_seconds=0.05, fit_seconds=3600),
             )  # fmt: skip
             await designer.fit_all_due()
 
