@@ -25,7 +25,7 @@ from surrogym_server.models.guard import plugin_calls
 from surrogym_server.sampling.design import Decision, advance
 from surrogym_server.sampling.judging import judge_model
 from surrogym_server.sampling.limits import reached_limits
-from surrogym_server.sampling.prequential import KEPT, Predictions, continued, predicted
+from surrogym_server.sampling.prequential import LATEST, Predictions, latest, predicted
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import usual_tolerances
 from surrogym_shared.nouns import Query, RealSteps
@@ -130,7 +130,7 @@ def _decide(job: DesignJob) -> tuple[Decision, Samples]:
     samples, state = _samples(job), DesignState.from_json(job.state)
     new = _new_predictions(job, samples)
     if new:
-        state = replace(state, predictions=continued(state.predictions, new))
+        state = replace(state, predictions=latest(state.predictions, new))
     return advance(job.definition, samples, state, replace(_request(job), surprises=new)), samples
 
 
@@ -145,7 +145,7 @@ def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
         model = from_bytes(job.definition, job.previous)
         if model.digest == samples.at(torch.arange(min(model.samples, len(samples)))).digest:
             chosen = torch.tensor([purpose not in UNCHOSEN for purpose in job.samples.purpose])
-            new = chosen[_known(job)].index_fill(0, torch.arange(model.samples), value=False).nonzero()[-KEPT:, 0]
+            new = chosen[_known(job)].index_fill(0, torch.arange(model.samples), value=False).nonzero()[-LATEST:, 0]
             return predicted(model, samples.at(new))
     return ()
 

@@ -30,7 +30,7 @@ class Failure:
     """Error of a job, as text, because the exception might not pickle, or might end the process that receives it."""
 
     kind: type[PluginFailed]
-    said: str
+    message: str
     details: str  # traceback of an unexpected error
 
 
@@ -39,12 +39,12 @@ class Fits(Compute):
 
     Args:
         function: carries out a job.
-        kept: number of idle child processes to keep for the next jobs.
+        idle: number of idle child processes to keep for the next jobs.
     """
 
-    def __init__(self, function: Function = run_design_job, kept: int = 1) -> None:
+    def __init__(self, function: Function = run_design_job, idle: int = 1) -> None:
         self._function = function
-        self._kept = kept
+        self._most_idle = idle
         self._idle: list[_Process] = []
         self._busy: list[_Process] = []
 
@@ -83,7 +83,7 @@ class Fits(Compute):
     def _give_back(self, process: _Process, whole: bool) -> None:
         """Keep a process for the next fit, or end it if enough idle ones are kept or it still runs a job."""
         self._busy.remove(process)
-        if whole and len(self._idle) < self._kept:
+        if whole and len(self._idle) < self._most_idle:
             self._idle.append(process)
         else:
             process.close()
@@ -128,7 +128,7 @@ def done(function: Function, job: DesignJob) -> DesignResult | Failure:
 
 def error_of(outcome: Failure) -> PluginFailed:
     """Return the exception that a failure stands for, with its traceback as a note."""
-    failure = outcome.kind(outcome.said)
+    failure = outcome.kind(outcome.message)
     if outcome.details:
         failure.add_note(outcome.details)
     return failure

@@ -21,23 +21,23 @@ class Reservoir:
     """
 
     seed: int
-    seen: int = 0
+    visits: int = 0
     states: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, C)
     priority: Array = field(default_factory=lambda: np.zeros(0))  # (m,)
 
     def visit(self, states: Array) -> Reservoir:
         """Return the reservoir after further visits to states (n, C), in order."""
-        priority = _priorities(self.seed, self.seen, len(states))
+        priority = _priorities(self.seed, self.visits, len(states))
         full = len(self.priority) == CAPACITY
         candidates = np.flatnonzero(priority > self.priority.min()) if full else np.arange(len(states))
-        seen = self.seen + len(states)
+        visits = self.visits + len(states)
         if len(candidates) == 0:
-            return Reservoir(self.seed, seen, self.states, self.priority)
+            return Reservoir(self.seed, visits, self.states, self.priority)
         before = self.states if len(self.states) else np.zeros((0, states.shape[1]))
         joined_states = np.concatenate([before, states[candidates]])
         joined = np.concatenate([self.priority, priority[candidates]])
         rows = np.sort(np.argsort(joined, kind="stable")[-CAPACITY:])
-        return Reservoir(self.seed, seen, joined_states[rows], joined[rows])
+        return Reservoir(self.seed, visits, joined_states[rows], joined[rows])
 
 
 def _priorities(seed: int, first: int, count: int) -> Array:

@@ -61,8 +61,8 @@ def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Sessio
         raise TooLarge(f"expected at most {MAX_ACTIVATIONS} units of a layer in all lanes, got {wide}")
     actor = _actor(len(definition.observation_names), definition.action, run)
     waiting = _awaited(run, lanes)
-    shown = sensed(definition, session.settings.sensor_noise, session.lanes)
-    observation = definition.observe(shown).to(torch.float32).cpu().numpy()
+    sensed_states = sensed(definition, session.settings.sensor_noise, session.lanes)
+    observation = definition.observe(sensed_states).to(torch.float32).cpu().numpy()
     results, actions, logs = [], [], []
     for number in range(run.steps):
         acted = _act(actor, observation, None if run.noise is None else run.noise.later(number))

@@ -47,7 +47,7 @@ def session_to_bytes(session: Session) -> bytes:
         header["answer"] = {"seq": session.answer.seq, "digest": session.answer.request.digest}
         arrays |= _outcome_arrays(session.answer.outcome)
     if session.visited is not None:
-        header["visited"] = {"seed": session.visited.seed, "seen": session.visited.seen}
+        header["visited"] = {"seed": session.visited.seed, "seen": session.visited.visits}
         arrays |= _prefixed("visited", {"states": session.visited.states, "priority": session.visited.priority})
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     buffer = io.BytesIO()

@@ -252,12 +252,12 @@ class LiveSessions:
         raise UnknownSession(f"no session {id!r}: open a new one")
 
     def _check_memory(self, nbytes: int) -> None:
-        most, taken = self._limits.nbytes, sum(live.nbytes for live in self._live.values())
+        most, used = self._limits.nbytes, sum(live.nbytes for live in self._live.values())
         if nbytes > most:
             raise TooLarge(f"expected lanes and answers of at most {_mebibytes(most)}, got {_mebibytes(nbytes)}")
-        if taken + nbytes > most:
+        if used + nbytes > most:
             raise Overloaded(
-                f"expected all sessions to take at most {_mebibytes(most)}, got {_mebibytes(taken)} "
+                f"expected all sessions to take at most {_mebibytes(most)}, got {_mebibytes(used)} "
                 f"and {_mebibytes(nbytes)} more: close some, or try later"
             )
 
@@ -305,8 +305,8 @@ class LiveSessions:
 def _learned(live: _Live, result: tuple[Session, Outcome], seconds: float, steps: int) -> tuple[Session, Outcome]:
     """Update the session's predicted seconds per step by a measurement, and pass the result on."""
     outcome = result[1]
-    taken = len(outcome) if isinstance(outcome, PolicyRollout) else steps  # a policy's rollout may have stopped early
-    each = seconds / taken
+    count = len(outcome) if isinstance(outcome, PolicyRollout) else steps  # a policy's rollout may have stopped early
+    each = seconds / count
     known = live.seconds_per_step if live.seconds_per_step < float("inf") else each
     live.seconds_per_step = (1 - FORGETTING) * known + FORGETTING * each
     return result

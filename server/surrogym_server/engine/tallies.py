@@ -97,12 +97,12 @@ class Tally:
             return
         self._seq = answer.seq
         results = (answer.outcome,) if isinstance(answer.outcome, PolicyRollout) else answer.outcome
-        now, taken, lanes = self._clock(), len(answer.outcome), results[0].reward.shape[-1]
-        self._steps += taken * lanes
-        self._decayed = self._decayed * math.exp((self._last - now) / RATE_SECONDS) + taken * lanes
+        now, steps, lanes = self._clock(), len(answer.outcome), results[0].reward.shape[-1]
+        self._steps += steps * lanes
+        self._decayed = self._decayed * math.exp((self._last - now) / RATE_SECONDS) + steps * lanes
         self._last = now
         self._pending.extend(results)
-        self._unfolded += taken
+        self._unfolded += steps
         if self._unfolded >= FOLD_STEPS or self._unfolded * lanes >= FOLD_LANE_STEPS:
             self._fold()
 

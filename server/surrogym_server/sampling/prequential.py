@@ -21,7 +21,7 @@ from surrogym_server.models.abilities import LearnedNoise, offers
 from surrogym_server.models.port import DynamicsModel
 
 LEVELS = (0.5, 0.8, 0.9)
-KEPT = 20  # predictions that are kept for each output
+LATEST = 20  # predictions that are kept for each output
 
 
 @dataclass(frozen=True)
@@ -91,9 +91,9 @@ def predicted(model: DynamicsModel, samples: Samples) -> Predictions:
     )
 
 
-def continued(before: Predictions, new: Predictions) -> Predictions:
-    """Append new predictions to earlier ones, and keep the last ``KEPT`` of each output."""
-    return tuple((*old, *more)[-KEPT:] for old, more in zip(before or [()] * len(new), new, strict=True))
+def latest(before: Predictions, new: Predictions) -> Predictions:
+    """Append new predictions to earlier ones, and keep the last ``LATEST`` of each output."""
+    return tuple((*old, *more)[-LATEST:] for old, more in zip(before or [()] * len(new), new, strict=True))
 
 
 def pairs_of(predictions: Predictions) -> list[list[list[float]]]:

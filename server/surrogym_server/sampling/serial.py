@@ -63,7 +63,9 @@ def sensor_noise(model: DynamicsModel, samples: Samples, limits: Sequence[float]
         at = able.at_samples(some, column)
         exceeds = at is not None and math.sqrt(at.noise_variance) > limits[column]
         result.append(
-            _told(at, preceding(definition, some), _slopes(model, some, column, index)) if at and exceeds else None
+            _sensor_noise(at, preceding(definition, some), _slopes(model, some, column, index))
+            if at and exceeds
+            else None
         )
     return (*result, None)
 
@@ -100,7 +102,7 @@ def _model_noise(model: DynamicsModel) -> Tensor:
     return torch.tensor(result, dtype=torch.float64)
 
 
-def _told(at: AtSamples, follows: Tensor, slope: Tensor) -> SensorNoise | None:
+def _sensor_noise(at: AtSamples, follows: Tensor, slope: Tensor) -> SensorNoise | None:
     """Test for noise of the sensor of one output; None if the test does not show it.
 
     Sample i begins where sample ``follows[i]`` ended (-1: none did). ``slope`` (n,) is the derivative of the next

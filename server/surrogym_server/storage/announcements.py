@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
-Hear = Callable[[str | None], None]  # the name of a surrogate, or None: announcements may have been missed
+Hear = Callable[[str | None], None]  # called with a surrogate's name; None: announcements may be lost
 
 
 class Announcements(ABC):
@@ -23,14 +23,14 @@ class Announcements(ABC):
 
     @abstractmethod
     def listen(self, hear: Hear) -> None:
-        """From now on call ``hear``, in a thread, for what other servers announce. Called once.
+        """Call ``hear``, in a thread, for each announcement of another server from now on. To be called once.
 
         After a lost connection, it is called with None once the connection is back.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """End. Closing twice is harmless."""
+        """Stop sending and listening. Closing twice is harmless."""
 
 
 class Alone(Announcements):

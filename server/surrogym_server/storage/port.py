@@ -54,7 +54,7 @@ T = TypeVar("T")
 
 
 class Surrogates(ABC):
-    """Surrogates by name."""
+    """Part of the storage for surrogates, which are identified by name."""
 
     @abstractmethod
     def create(self, new: NewSurrogate) -> tuple[SurrogateRecord, bool]:
@@ -72,7 +72,7 @@ class Surrogates(ABC):
 
     @abstractmethod
     def standing(self, name: str) -> Standing:
-        """Return the few fields that every claim and every answer reads. Raises ``UnknownSurrogate``."""
+        """Return the fields of a surrogate that every claim and answer reads. Raises ``UnknownSurrogate``."""
 
     @abstractmethod
     def name_of(self, id: int) -> str:
@@ -123,11 +123,11 @@ class Surrogates(ABC):
 
     @abstractmethod
     def complete_removals(self) -> int:
-        """Remove what a crash has left of deleted surrogates. Returns the number of these surrogates."""
+        """Complete the deletions that a crash has interrupted. Returns the number of surrogates concerned."""
 
 
 class Designs(ABC):
-    """Right to fit: at any time at most one server fits a surrogate."""
+    """Part of the storage for designs: at any time at most one server has the right to fit a surrogate."""
 
     @abstractmethod
     def improve(
@@ -186,7 +186,7 @@ class Designs(ABC):
 
     @abstractmethod
     def ask_first(self, name: str, queries: Sequence[Query]) -> None:
-        """Queue the initial queries of an ``unbegun`` surrogate that are missing. If none are, nothing changes."""
+        """Queue the missing initial queries of a surrogate that ``unbegun`` returned; none if none are missing."""
 
     @abstractmethod
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
@@ -240,7 +240,7 @@ class Queries(ABC):
         """Queue queries by hand, or of an audit, and return their ids.
 
         Raises:
-            BeyondBudget: all audits of the surrogate together would have more steps than its budget, and than 64.
+            BeyondBudget: all audits of the surrogate together would have more steps than its budget, and more than 128.
         """
 
     @abstractmethod
@@ -285,7 +285,7 @@ class Queries(ABC):
 
     @abstractmethod
     def list(self, name: str, statuses: Sequence[QueryStatus] = (), limit: int = 10_000) -> list[QueryRecord]:
-        """Return queries, oldest first: those with one of the ``statuses``, or all if there are none."""
+        """Return the queries with one of the ``statuses``, oldest first; all queries if ``statuses`` is empty."""
 
     @abstractmethod
     def counts(self, name: str) -> QueryCounts: ...
@@ -348,7 +348,7 @@ class Samples(ABC):
 
 
 class Snapshots(ABC):
-    """Snapshots that samplers hold, by name. ``Samples.add`` makes one known, unless the name is there."""
+    """Part of the storage for the names of snapshots that samplers keep. ``Samples.add`` adds new names."""
 
     @abstractmethod
     def all(self, name: str) -> dict[str, Vector]:
@@ -356,7 +356,7 @@ class Snapshots(ABC):
 
     @abstractmethod
     def drop(self, name: str, snapshots: Sequence[str]) -> int:
-        """Forget snapshots, and return how many were there. Names that are not there are skipped.
+        """Forget snapshots, and return how many were known. Unknown names are skipped.
 
         Pending queries that begin there are removed, and a fit becomes due, which chooses anew. Those of them that a
         sampler has begun are set aside.
@@ -364,7 +364,7 @@ class Snapshots(ABC):
 
 
 class Ledger(ABC):
-    """Counts of real steps by purpose."""
+    """Part of the storage that counts real steps by purpose."""
 
     @abstractmethod
     def report(self, name: str, steps: int, *, key: str, episodes: int = 0, note: str = "") -> LedgerRecord:
@@ -375,7 +375,7 @@ class Ledger(ABC):
 
 
 class Models(ABC):
-    """Models by version: 1, 2, ... for each surrogate. ``None`` is the latest that is not set aside."""
+    """Part of the storage for models, with versions 1, 2, ... The version None means the latest undamaged one."""
 
     @abstractmethod
     def list(self, name: str) -> list[ModelRecord]:
@@ -406,7 +406,7 @@ class Models(ABC):
     def set_aside(self, name: str, version: int, damage: str) -> bool:
         """Mark a version as damaged. The version before it becomes the newest, and a fit becomes due.
 
-        Returns whether the mark is new. A repeat changes nothing, and no version number is used again.
+        Returns True unless the version was marked before. Version numbers are never used again.
         """
 
     @abstractmethod
@@ -415,7 +415,7 @@ class Models(ABC):
 
 
 class Occupancy(ABC):
-    """Occupancies: states that policies visited, by checkpoint."""
+    """Part of the storage for occupancies: the states that policies visited, by training checkpoint."""
 
     @abstractmethod
     def put(self, name: str, checkpoint: str, states: Array) -> None:
@@ -430,7 +430,7 @@ class Occupancy(ABC):
 
 
 class Sessions(ABC):
-    """Sessions that a clean shutdown saves for the next start."""
+    """Part of the storage for sessions that a clean shutdown saves for the next start."""
 
     @abstractmethod
     def save(self, sessions: Sequence[SavedSession]) -> None:
@@ -438,13 +438,13 @@ class Sessions(ABC):
 
     @abstractmethod
     def take(self) -> list[SavedSession]:
-        """Return all saved sessions and remove them, so that each is given out once."""
+        """Return all saved sessions and remove them from the storage, so that each is restored once."""
 
 
 class Events(ABC):
-    """Events of a surrogate.
+    """Part of the storage for events of surrogates.
 
-    Whatever may end a wait appends one: a claim that waits for queries or jobs looks again after an event.
+    Every change that may end a wait appends an event: a claim that waits for queries or jobs looks again after one.
     """
 
     @abstractmethod
@@ -472,15 +472,15 @@ class PolicyNames(ABC):
 
     @abstractmethod
     def version(self, name: str, which: str) -> int:
-        """Return the version that ``which`` means: a version, an alias, or ``latest``. Raises ``UnknownPolicy``."""
+        """Return the version that ``which`` names: a number, an alias, or ``latest``. Raises ``UnknownPolicy``."""
 
     @abstractmethod
     def has_evaluation(self, name: str, version: int, id: int) -> bool:
-        """Return whether a version has this evaluation. Raises ``UnknownPolicy`` if there is no such version."""
+        """Return whether a policy version has this evaluation. Raises ``UnknownPolicy`` if there is no such version."""
 
 
 class Storage(ABC):
-    """All parts of the storage. ``open_storage`` makes one."""
+    """The whole storage, by its parts. ``open_storage`` of an adapter makes one."""
 
     surrogates: Surrogates
     designs: Designs
@@ -497,7 +497,7 @@ class Storage(ABC):
 
     @abstractmethod
     def part(self, store: Callable[[Any], T]) -> T:
-        """Return a feature's own store: ``store`` is called with the adapter's database."""
+        """Return the store of a feature, made by calling ``store`` with the adapter's database."""
 
     @abstractmethod
     def ping(self) -> None:

@@ -41,7 +41,7 @@ class NewSurrogate:
 
 @dataclass(frozen=True)
 class Standing:
-    """What changes of a surrogate, and its id."""
+    """Id of a surrogate, and its fields that change often."""
 
     id: int
     phase: Phase
@@ -50,27 +50,27 @@ class Standing:
 
 @dataclass(frozen=True)
 class SurrogateRecord:
-    id: int  # never used twice, unlike a name
+    id: int  # unlike a name, never used again after a deletion
     name: str
     spec: JSON
     budget: int
     target: float
-    tolerances: dict[str, float]  # set since it was created, by output
+    tolerances: dict[str, float]  # tolerances that people set after its creation, by output
     phase: Phase
     paused: bool
-    round: int  # designs committed so far
-    state: JSON  # of the design
+    round: int  # rounds of the design so far
+    state: JSON  # state of the design
     error: str | None
-    extra_queries: int  # requested by ``Designs.improve`` and not yet chosen
-    checkpoint: str | None  # the occupancy that the last such request named
+    extra_queries: int  # real steps that ``Designs.improve`` requested and no fit has chosen yet
+    checkpoint: str | None  # occupancy that the last request to improve named
     created_at: float
 
 
 @dataclass(frozen=True)
 class Granted:
-    """Result of ``Designs.improve``."""
+    """Result of ``Designs.improve``: the surrogate, and by how much its budget was raised."""
 
-    record: SurrogateRecord  # the present record
+    record: SurrogateRecord  # the surrogate after the change
     raised: int  # real steps by which the budget was raised
 
 
@@ -81,7 +81,7 @@ class FitLease:
     surrogate: str
     token: str
     revision: int  # revision of the surrogate when the fit began
-    extra_queries: int  # to be chosen by this fit even if the design has ended
+    extra_queries: int  # real steps that this fit has to choose even if the design has ended
     checkpoint: str | None
     expires: float
 
@@ -137,8 +137,8 @@ class QueryRecord(Query):
     status: QueryStatus
     round: int
     attempts: int  # number of leases so far
-    sampler: str | None  # the last one to claim it
-    error: str | None  # of the last attempt that failed
+    sampler: str | None  # name of the sampler that claimed the query last
+    error: str | None  # error of the last failed attempt
     lease_seconds_left: float | None = None  # of the open lease, by the database's clock; negative if it has expired
 
 
@@ -147,7 +147,7 @@ class LeasedQuery(Query):
     """A stored query and the lease under which a sampler answers it."""
 
     id: int
-    number: int  # number of the surrogate's earlier queries
+    number: int  # number of earlier queries of the same surrogate
     purpose: Purpose
     attempt: int  # 1 for the first lease of this query
     token: str
@@ -169,7 +169,7 @@ class QueryCounts:
 
 @dataclass(frozen=True)
 class Sample(RealStep):
-    """A real step as a sample: its entries are floats, and it may answer a query."""
+    """A real step as a sampler took it; its entries are floats, and it may answer a query."""
 
     coordinates: Vector
     action: Vector
@@ -182,7 +182,7 @@ class Sample(RealStep):
 
 @dataclass(frozen=True)
 class NewSample(Sample):
-    """A sample of a report. ``query_id`` and ``lease_token`` are both present or both absent."""
+    """A sample that a sampler reports. ``query_id`` and ``lease_token`` are both present or both absent."""
 
     lease_token: str | None = None
     snapshot: str | None = None  # name of the snapshot that the sampler made after the step
@@ -190,15 +190,15 @@ class NewSample(Sample):
 
 @dataclass(frozen=True)
 class LogPart:
-    """Place in a log of the samples of a report."""
+    """Where in a log the samples of a report belong."""
 
-    after: str | None = None  # ``digest`` of the reply to the part before; None: the log begins with this part
-    complete: bool = True  # no further part follows
+    after: str | None = None  # digest from the reply to the part before; None for the first part of a log
+    complete: bool = True  # this is the last part of the log
 
 
 @dataclass(frozen=True)
 class AddedSamples:
-    """``ids`` are in the order of the batch; ``duplicates`` of them existed already.
+    """Result of adding a batch of samples: their ``ids`` in order, of which ``duplicates`` existed already.
 
     Of logged samples, ``digest`` identifies the log up to the end of the batch. With a ``restart`` nothing was stored:
     the log differs here from a stored one that begins in the same way, and has to come again after ``restart``.
@@ -217,14 +217,14 @@ class SampleRecord(Sample):
     id: int
     purpose: SamplePurpose
     sampler: str
-    attempt: int  # 0 without a query
-    late: bool  # answered under a lease that had ended
+    attempt: int  # number of the lease of its query; 0 without a query
+    late: bool  # the sample came under a lease that had ended
     trajectory: int | None  # equal for the samples of one rollout, each beginning where the one before ended
     requested_coordinates: Vector | None  # (C,); None without a query, and in a rollout
     created_at: float
 
 
-# The rest
+# Ledger, lists and memory
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,7 @@ class LedgerRecord:
 
     @property
     def total(self) -> int:
-        """Cost of the design."""
+        """Real steps that count towards the budget."""
         return self.initial + self.adaptive + self.manual
 
     @property
@@ -266,21 +266,21 @@ class SurrogateSummary:
     phase: Phase
     paused: bool
     round: int
-    error: str | None  # read together with the phase, of which it may be the reason
+    error: str | None  # error of the design, which may explain the phase
     created_at: float
     environment: str
     ledger: LedgerRecord
     queries: QueryCounts
-    model_version: int | None  # the latest one
-    confidence_index: float | None  # of it
+    model_version: int | None  # version of the latest model
+    confidence_index: float | None  # of the latest model
 
 
 @dataclass(frozen=True)
 class OccupancyRecord:
     checkpoint: str
-    round: int  # of the design when it was submitted
+    round: int  # round of the design in which the occupancy was submitted
     created_at: float
-    states: Array  # (m, C)
+    states: Array  # (m, C) visited states
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ def visit(batch: int, visits: int, seed: int = 5) -> Reservoir:
 def test_all_are_kept_while_there_is_room():
     reservoir = visit(batch=7, visits=100)
     np.testing.assert_array_equal(reservoir.states[:, 0], np.arange(100))
-    assert reservoir.seen == 100
+    assert reservoir.visits == 100
 
 
 def test_the_sample_does_not_depend_on_the_batches(monkeypatch: pytest.MonkeyPatch):
@@ -36,7 +36,7 @@ def test_beyond_its_capacity_it_is_a_uniform_sample():
     visits = 8 * CAPACITY
     reservoir = visit(batch=1000, visits=visits)
     assert reservoir.states.shape == (CAPACITY, 2)
-    assert reservoir.seen == visits
+    assert reservoir.visits == visits
     quarters = np.histogram(reservoir.states[:, 0], bins=4, range=(0, visits))[0]
     expected, deviation = CAPACITY / 4, np.sqrt(CAPACITY * 3 / 16)
     assert np.abs(quarters - expected).max() < 5 * deviation
@@ -50,4 +50,4 @@ def test_another_seed_keeps_others():
 def test_a_visit_changes_nothing_of_the_old_one():
     before = visit(batch=10, visits=10)
     before.visit(np.zeros((5, 2)))
-    assert (before.seen, len(before.states)) == (10, 10)
+    assert (before.visits, len(before.states)) == (10, 10)

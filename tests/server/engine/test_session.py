@@ -79,7 +79,7 @@ def test_only_stepped_lanes_count_as_visits(opened: Open, fitted: Fitted):
     mask = np.array([True, False, False, False])
     session, _ = step_session(session, np.zeros((4, 1)), mask, False, lambda _: fitted(6), 1)
     assert session.visited is not None
-    assert session.visited.seen == 5
+    assert session.visited.visits == 5
     np.testing.assert_array_equal(session.visited.states[4], session.lanes.q[0])
 
 

@@ -11,10 +11,10 @@ from surrogym_sampler.original.swingup import swing_up
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples, increments, saturated
 from surrogym_server.sampling.prequential import (
-    KEPT,
+    LATEST,
     Prediction,
-    continued,
     interval_score,
+    latest,
     predicted,
     scores_of,
 )
@@ -100,13 +100,13 @@ def test_the_uncertainty_of_the_next_state_is_part_of_its_rewards_deviation():
 
 
 def test_only_the_last_predictions_are_kept_and_survive_as_json():
-    old = (tuple(Prediction(float(i), 1.0) for i in range(KEPT)), ())
+    old = (tuple(Prediction(float(i), 1.0) for i in range(LATEST)), ())
     new = ((Prediction(-1.0, 2.0),), (Prediction(0.5, 0.25),))
-    kept = continued(old, new)
-    assert [len(output) for output in kept] == [KEPT, 1]
+    kept = latest(old, new)
+    assert [len(output) for output in kept] == [LATEST, 1]
     assert kept[0][0].error == 1.0
     assert kept[0][-1] == Prediction(-1.0, 2.0)
-    assert continued((), new) == new
+    assert latest((), new) == new
     state = DesignState(predictions=kept)
     assert DesignState.from_json(state.to_json()) == state
     assert DesignState.from_json({}).predictions == ()

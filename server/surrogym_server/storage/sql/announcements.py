@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 CHANNEL = "surrogym"
-QUIET_SECONDS = 30.0  # of a connection, before the end of this server is looked for
+QUIET_SECONDS = 30.0  # longest wait on the connection before the thread checks whether the server ends
 FIRST_DELAY, LONGEST_DELAY = 0.1, 10.0  # seconds before another try to connect
 CLOSING_SECONDS = 2.0
-GAP_SECONDS = 0.05  # between two transactions that announce; many answers of a surrogate make one announcement
+GAP_SECONDS = 0.05  # pause between announcements, so that many answers of a surrogate make one
 
 
 class NotifiedAnnouncements(Announcements):
-    """The threads begin with ``listen``: a program that only reads and writes needs none."""
+    """Announcements by PostgreSQL. Its threads start with ``listen``, because many programs need none."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -63,7 +63,7 @@ class NotifiedAnnouncements(Announcements):
                 names, self._waiting = list(self._waiting), {}
             try:
                 self._database.notify(CHANNEL, [f"{self._origin} {name}" for name in names])
-            except Unavailable as error:  # the others look by themselves
+            except Unavailable as error:  # no harm: the other servers also look from time to time
                 logger.debug("other servers were not told of %s: %s", names, error)
             self._ended.wait(GAP_SECONDS)
 

@@ -42,7 +42,7 @@ NEW_SAMPLES = sa.insert(samples).returning(samples.c.id, sort_by_parameter_order
 
 
 class Reported(NamedTuple):
-    """A sample that was stored before."""
+    """A stored sample, to compare with one that is reported again."""
 
     sample_id: int
     fingerprint: str
@@ -50,16 +50,16 @@ class Reported(NamedTuple):
 
 @dataclass(frozen=True)
 class Answered:
-    """The lease under which a sample was reported."""
+    """A lease under which samples were reported, with its query."""
 
     lease_id: int
     query_id: int
     purpose: Purpose
-    steps: int  # number that the query may take
+    steps: int  # most real steps that the query may take
     attempt: int
     live: bool
     contested: bool  # another lease of the query is live
-    reported: dict[int, Reported]  # samples reported under it before, by step
+    reported: dict[int, Reported]  # samples that are stored under this lease already, by step
 
 
 def read_answered(connection: Connection, surrogate: Row[Any], batch: Sequence[NewSample]) -> list[Answered | None]:
@@ -82,7 +82,7 @@ def read_answered(connection: Connection, surrogate: Row[Any], batch: Sequence[N
 
 
 def settle(connection: Connection, answered: Iterable[Answered]) -> None:
-    """Mark the leases as answered, and their queries too unless another lease of the query is live."""
+    """Mark leases as answered, and their queries too, except a query of which another lease is live."""
     leases_done = {one.lease_id: one for one in answered}
     if not leases_done:
         return
@@ -93,7 +93,7 @@ def settle(connection: Connection, answered: Iterable[Answered]) -> None:
 
 
 def _check_steps(lease: Answered, steps: set[int]) -> None:
-    """Raise an error if the answer of a lease lacks a step, has too many, or has more than when it first came."""
+    """Raise an error if a lease's answer lacks a step, has too many, or has more steps than when first reported."""
     if lease.reported:
         if more := steps - lease.reported.keys():
             raise IdempotencyConflict(
@@ -113,7 +113,7 @@ def _lock_queries(connection: Connection, surrogate: Row[Any], named: set[int]) 
 
 
 def _leases(connection: Connection, surrogate: Row[Any], by_id: dict[int, Row[Any]]) -> dict[tuple[int, str], Answered]:
-    """All leases of these queries, by query and token."""
+    """Read all leases of these queries, by query id and token."""
     if not by_id:
         return {}
     rows = connection.execute(LEASES, {"asked": list(by_id), "now": surrogate.now}).all()
@@ -170,7 +170,7 @@ def insert_samples(connection: Connection, surrogate: Row[Any], sampler: str, ro
 def row_of(
     surrogate: Row[Any], sampler: str, sample: NewSample, lease: Answered | None = None, *, logged: bool = False
 ) -> dict[str, Any]:
-    """A sample as a row of its table: an answer under a lease, a logged sample, or one by hand."""
+    """Convert a sample to a row of its table. It may be an answer under a lease, logged, or reported by hand."""
     purpose: SamplePurpose = "logged" if logged else "manual"
     return {
         "surrogate_id": surrogate.id,

@@ -99,7 +99,7 @@ class Readiness:
         self._thread.shutdown(wait=False)
 
     def _latest(self) -> Future[None]:
-        """The last probe, or a new one if the last is finished and old."""
+        """Return the last check of the database, or begin a new one if that is finished and old."""
         with self._lock:
             now = time.monotonic()
             if self._probe is None or (self._probe.done() and now - self._begun >= FRESH_SECONDS):

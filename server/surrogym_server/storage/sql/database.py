@@ -30,8 +30,8 @@ from surrogym_server.storage.sql.write_ahead_log import marks
 
 BUSY_SECONDS = 5  # wait of a statement for locks of other programs or threads
 STALLED_SECONDS = 10  # PostgreSQL ends a transaction whose process has stopped, and its locks with it
-BATCH = 250  # rows that one transaction writes or removes at most, where there may be many
-PAUSE_SECONDS = 0.002  # in which a waiting writer takes its turn
+BATCH = 250  # most rows that one transaction writes or removes
+PAUSE_SECONDS = 0.002  # pause between transactions, so that a waiting writer gets its turn
 POOL = {"pool_size": 8, "max_overflow": 56, "pool_timeout": BUSY_SECONDS}
 POSTGRESQL = {  # text is UTF-8 whatever the database's encoding; if that is SQL_ASCII, psycopg would return bytes
     "client_encoding": "utf8",
@@ -53,14 +53,14 @@ class _Now(FunctionElement[float]):
 
 @compiles(_Now)
 def _now(_: _Now, compiler: SQLCompiler, **__: Any) -> str:
-    return CLOCKS.get(compiler.dialect.name, "now()")  # of another one in a message only
+    return CLOCKS.get(compiler.dialect.name, "now()")  # another dialect appears only in messages
 
 
 NOW = _Now()  # seconds since 1970 by the database's clock
 
 
 def constant(word: str) -> sa.ColumnElement[str]:
-    """A word of this program within a statement, where a parameter would hide from the planner that it is rare."""
+    """Write a constant into a statement. A parameter would hide from the planner that the value is rare."""
     return sa.literal_column(f"'{word}'", sa.Text())
 
 
@@ -75,7 +75,7 @@ class Database:
         self._writing = engine.execution_options(begin="BEGIN IMMEDIATE")
         # SQLite's own waiting polls; a lock in this process wakes the next writer at once
         self._turn = threading.RLock() if engine.dialect.name == "sqlite" else None
-        self._held: Connection | None = None
+        self._open_connection: Connection | None = None
         self._broken: str | None = None
 
     def hold_open(self) -> None:
@@ -88,12 +88,12 @@ class Database:
         if self._lock is None:
             return
         with self._translated():
-            self._held = self._engine.connect()
-            driver = self._held.connection.driver_connection
+            self._open_connection = self._engine.connect()
+            driver = self._open_connection.connection.driver_connection
             assert driver is not None
             driver.execute("PRAGMA wal_checkpoint").close()
-            self._held.execute(sa.text("SELECT count(*) FROM sqlite_master"))
-            self._held.rollback()
+            self._open_connection.execute(sa.text("SELECT count(*) FROM sqlite_master"))
+            self._open_connection.rollback()
         self._lock.watch()
 
     @contextlib.contextmanager
@@ -146,7 +146,7 @@ class Database:
 
     @property
     def notifies(self) -> bool:
-        """Whether connections can be told of each other's changes."""
+        """Whether the database can notify connections of changes by others (PostgreSQL can)."""
         return self._engine.dialect.name == "postgresql"
 
     def notify(self, channel: str, payloads: Sequence[str]) -> None:
@@ -156,7 +156,7 @@ class Database:
                 connection.execute(sa.select(sa.func.pg_notify(channel, payload)))
 
     def detached(self) -> Any:
-        """A connection of the driver's, outside of transactions; the caller closes it. Raises ``Unavailable``."""
+        """Open a connection of the driver outside of transactions; the caller closes it. Raises ``Unavailable``."""
         with self._translated():
             own = self._engine.raw_connection()
             driver = own.driver_connection
@@ -166,8 +166,8 @@ class Database:
         return driver
 
     def close(self) -> None:
-        if self._held is not None:
-            self._held.close()
+        if self._open_connection is not None:
+            self._open_connection.close()
         self._engine.dispose()
         if self._lock is not None:
             self._lock.close()
@@ -211,7 +211,7 @@ class Database:
 
 
 def conflict_insert(connection: Connection, table: sa.Table) -> sqlite.Insert | postgresql.Insert:
-    """An INSERT that supports ON CONFLICT."""
+    """Return the INSERT construct of this database's dialect, which supports ON CONFLICT."""
     return sqlite.insert(table) if connection.dialect.name == "sqlite" else postgresql.insert(table)
 
 
@@ -296,11 +296,11 @@ UNSTORABLE = (sa.exc.DataError, OverflowError, UnicodeEncodeError)
 
 
 def never_connected(error: BaseException | None) -> bool:
-    """Whether an error of PostgreSQL is that of a connection, and not of a statement, which has a code."""
+    """Whether an error of PostgreSQL is of the connection. Errors of statements have a code; these have none."""
     return isinstance(error, sa.exc.OperationalError) and getattr(error.orig, "sqlstate", None) is None
 
 
 def _reason(error: Exception) -> str:
-    """The driver's message, without the position in a statement that no person typed."""
+    """The driver's message, without the position in the statement, which no person typed."""
     message = str(getattr(error, "orig", None) or error)
     return message.partition("\n")[0]

@@ -1,4 +1,4 @@
-"""The right to fit, and the storage of a fit's result."""
+"""Adapter of ``Designs``: the right to fit, and the storage of a fit's result."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from surrogym_server.storage.sql.tables import queries, samples, surrogates
 from surrogym_shared.nouns import Query
 from surrogym_shared.states import Phase
 
-INTERRUPTED_SECONDS = 60.0  # initial queries that stay incomplete for so long are those of a server that has died
-# conditions on a row of surrogates
+INTERRUPTED_SECONDS = 60.0  # the server that queues initial queries has died if they stay incomplete for so long
+# Conditions on a row of the table of surrogates.
 OWN_QUERIES = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogates.c.id)
 OWN_SAMPLES = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogates.c.id)
 # Constants in the statement: once PostgreSQL plans for any status, it reads all queries, because most are answered.
@@ -40,8 +40,8 @@ OPEN_QUERY = sa.exists(OWN_QUERIES.where(queries.c.status.in_(OPEN)))
 
 
 _EXPIRES = surrogates.c.fit_expires
-_SET_BACK = NOW + surrogates.c.fit_seconds < _EXPIRES  # the clock was, so the age of the right is unknown
-IS_DUE = sa.and_(  # the law of ``Designs.due``
+_SET_BACK = NOW + surrogates.c.fit_seconds < _EXPIRES  # the clock was set back: the right lasts too long
+IS_DUE = sa.and_(  # what the docstring of ``Designs.due`` says
     surrogates.c.paused.is_(False),
     surrogates.c.revision > surrogates.c.fitted_revision,
     _EXPIRES.is_(None) | (_EXPIRES <= NOW) | _SET_BACK,
@@ -158,8 +158,8 @@ class SqlDesigns(port.Designs):
                 surrogate = _hold_right(connection, lease)
             except (LeaseExpired, UnknownSurrogate):
                 return
-            seen = {} if error is None else {"fitted_revision": lease.revision}
-            _update(connection, surrogate, **NO_RIGHT, **seen)
+            changes = {} if error is None else {"fitted_revision": lease.revision}
+            _update(connection, surrogate, **NO_RIGHT, **changes)
             stored.update_phase(connection, surrogate, _phase_after(surrogate, error), error)
 
 
@@ -168,7 +168,7 @@ def _lasting(expires: float, seconds: float) -> dict[str, float]:
 
 
 def _unspoken(connection: Connection, record: SurrogateRecord) -> int:
-    """Real steps left of the budget; negative if the budget was lowered, or if people handed in more."""
+    """Real steps that the budget has left; negative if it was lowered, or if people reported more samples."""
     return record.budget - stored.spoken_for(connection, record.id) - record.extra_queries
 
 

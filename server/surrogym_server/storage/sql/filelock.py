@@ -13,15 +13,15 @@ from surrogym_server.errors import Unavailable
 from surrogym_server.storage.sql import write_ahead_log
 
 LOCKED_BYTE = 2**62  # beyond any database, and far from the bytes at 2**30 that SQLite locks
-WHOLE_DESCRIPTION = getattr(fcntl, "F_OFD_SETLK", None)  # Linux
+WHOLE_DESCRIPTION = getattr(fcntl, "F_OFD_SETLK", None)  # Linux has it; other systems may not
 SQLITE_SHARED = (2**30 + 2, 510)  # bytes that SQLite's readers share a lock on; who merges the log locks them alone
-BUSY = (BlockingIOError, PermissionError)  # EAGAIN, EACCES
+BUSY = (BlockingIOError, PermissionError)  # what fcntl raises if another process holds a lock
 
 BESIDE = ("-wal", "-shm")  # suffixes of SQLite's files beside a database: its write-ahead log, and the log's index
 
-Identity = tuple[int, int]  # device and inode
+Identity = tuple[int, int]  # device and inode, which identify a file
 
-_held: set[Identity] = set()  # files that this process has locked
+_locked_files: set[Identity] = set()  # files that this process has locked
 _turn = threading.Lock()
 
 
@@ -46,14 +46,14 @@ class FileLock:
         with _turn:
             if not path.exists():
                 self._require_own_log(b"")
-            if _identity(path) in _held:  # and don't open it, for the reason in the docstring of the class
-                raise _taken(path)
+            if _identity(path) in _locked_files:  # before opening it: closing a descriptor would drop its locks
+                raise _unavailable(path)
             self._descriptors = [_lock_byte(path)] if WHOLE_DESCRIPTION else [_lock_beside(path), _open(path)]
             self._index_descriptor: int | None = None
             identity = _identity(path)
             assert identity is not None
             self._identity = identity
-            _held.add(identity)
+            _locked_files.add(identity)
         try:
             self._require_own_log(self.header())
         except Unavailable:
@@ -67,11 +67,11 @@ class FileLock:
     def log_is_merged(self) -> bool:
         """Whether the next transaction may begin a new log. Only a caller with the right to write may ask."""
         if self._index_descriptor is None:
-            self._index_descriptor = os.open(self._index, os.O_RDONLY | os.O_CLOEXEC)  # SQLite has made it by now
+            self._index_descriptor = os.open(self._index, os.O_RDONLY | os.O_CLOEXEC)  # SQLite has created it
         return write_ahead_log.is_merged(os.pread(self._index_descriptor, write_ahead_log.INDEX_BYTES, 0))
 
     def watch(self) -> None:
-        """Note the present beginning of the file, and its write-ahead log and index."""
+        """Remember the file's first bytes, its write-ahead log and the log's index, to notice changes by others."""
         self._beside = {path: _identity(path) for path in (self._log, self._index)}
         self._noted = self.header()
 
@@ -92,7 +92,7 @@ class FileLock:
                 )
 
     def is_as_noted(self) -> bool:
-        """Whether the file still has its noted beginning: nobody wrote to it, and no log was merged into it."""
+        """Whether the file's first bytes are those remembered: nobody wrote to it, and no log was merged into it."""
         return self._noted is None or self.header() == self._noted
 
     def require_own_content(self) -> None:
@@ -117,7 +117,7 @@ class FileLock:
         for descriptor in self._descriptors + index:
             os.close(descriptor)
         if self._descriptors:
-            _held.discard(self._identity)
+            _locked_files.discard(self._identity)
         self._descriptors, self._index_descriptor = [], None
 
     def _require_own_log(self, header: bytes) -> None:
@@ -159,12 +159,12 @@ def _lock_byte(path: Path) -> int:
         fcntl.fcntl(descriptor, WHOLE_DESCRIPTION, _range(fcntl.F_WRLCK, LOCKED_BYTE, 1))
     except OSError as error:
         os.close(descriptor)
-        raise _taken(path, error) from None
+        raise _unavailable(path, error) from None
     return descriptor
 
 
 def _range(kind: int, first: int, count: int) -> bytes:
-    """A struct flock."""
+    """Pack a ``struct flock`` for ``fcntl``, which describes the range of bytes to lock."""
     return struct.pack("hhqqi0q", kind, os.SEEK_SET, first, count, 0)
 
 
@@ -177,7 +177,7 @@ def _lock_beside(path: Path) -> int:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         os.close(descriptor)
-        raise _taken(path, error) from None
+        raise _unavailable(path, error) from None
     return descriptor
 
 
@@ -194,6 +194,6 @@ def _displaced(path: Path, way_out: str) -> Unavailable:
     )
 
 
-def _taken(path: Path, error: OSError | None = None) -> Unavailable:
+def _unavailable(path: Path, error: OSError | None = None) -> Unavailable:
     why = "another server has it open" if error is None or isinstance(error, BUSY) else f"no lock: {error.strerror}"
     return Unavailable(f"expected to be the only server on the database {path}, but {why}")

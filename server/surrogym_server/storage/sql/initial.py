@@ -19,19 +19,19 @@ from surrogym_shared.nouns import Query
 
 OPERATION, KEY = "initial", ""  # no request of a client has an empty key
 _OF_DESIGN = (requests.c.operation == OPERATION) & (requests.c.key == KEY)
-IS_INCOMPLETE = sa.exists(  # a condition on a row of surrogates
+IS_INCOMPLETE = sa.exists(  # condition on a surrogate's row: initial queries are missing
     sa.select(requests.c.key).where(requests.c.surrogate_id == surrogates.c.id, _OF_DESIGN)
 )
 
 
 def begin(connection: Connection, surrogate: Row[Any], queries: Sequence[Query]) -> None:
-    """Queue the first of the initial queries, as many as one transaction may, and note whether others are missing."""
+    """Queue as many initial queries as one transaction may, and note in the table whether others are missing."""
     remember(connection, surrogate, OPERATION, KEY, "", 0)
     _ask_some(connection, surrogate, queries)
 
 
 def end(connection: Connection, surrogate: Row[Any]) -> None:
-    """Let the queries that are queued be all."""
+    """Note that no initial query is missing any more: those in the queue are all."""
     connection.execute(sa.delete(requests).where(requests.c.surrogate_id == surrogate.id, _OF_DESIGN))
 
 
@@ -48,7 +48,7 @@ def ask(database: Database, name: str, queries: Sequence[Query]) -> None:
 
 
 def _ask_some(connection: Connection, surrogate: Row[Any], queries: Sequence[Query]) -> int:
-    """Queue a batch of those that are missing. Returns how many were queued; 0 if none was missing."""
+    """Queue a batch of the missing initial queries. Returns how many; 0 if none were missing."""
     own = (requests.c.surrogate_id == surrogate.id) & _OF_DESIGN
     queued = connection.execute(sa.select(requests.c.result).where(own)).scalar()
     if queued is None:

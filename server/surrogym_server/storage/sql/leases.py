@@ -29,7 +29,7 @@ LEASE_QUERIES = (
 SET_OUTCOME = (
     sa.update(leases).where(leases.c.id.in_(sa.bindparam("ended", expanding=True))).values(outcome=sa.bindparam("how"))
 )
-# A constant in the statement: PostgreSQL takes the index of open leases for no parameter, once it plans for any value.
+# The value is a constant in the statement: with a parameter, PostgreSQL would not use the index of open leases.
 IS_OPEN = leases.c.outcome == constant("open")
 ENDED = sa.exists().where(leases.c.surrogate_id == surrogates.c.id, expiry.has_ended(leases, IS_OPEN))
 SHARE = (
@@ -42,7 +42,7 @@ SHARE = (
 def begin(
     connection: Connection, surrogate: Row[Any], rows: Sequence[Row[Any]], sampler: str, seconds: float
 ) -> list[LeasedQuery]:
-    """Lease the queries of these rows, which the caller has locked."""
+    """Make leases of the queries in these rows, which the caller has locked, for one sampler."""
     if not rows:
         return []
     leased = [
@@ -77,7 +77,7 @@ def _new(surrogate: Row[Any], query: LeasedQuery, sampler: str, seconds: float) 
 
 
 def of_query(connection: Connection, surrogate_id: int, query_id: int, token: str) -> Row[Any]:
-    """The lease with this token: (id, expires, outcome). The caller need not hold the surrogate.
+    """Return the lease of a query with this token: (id, expires, outcome). The surrogate need not be locked.
 
     Raises:
         UnknownQuery: the surrogate has no such query.
@@ -109,9 +109,9 @@ def set_outcome(connection: Connection, lease_ids: Sequence[int], outcome: str) 
 
 
 def share(connection: Connection, name: str) -> Row[Any]:
-    """Keep the surrogate from being deleted, without blocking writers: (id, paused, now, has_ended).
+    """Lock a surrogate against deletion, without blocking writers. Returns (id, paused, now, has_ended).
 
-    ``has_ended``: whether leases of it have expired. They are ended then, which does block writers.
+    ``has_ended``: whether leases of its queries have expired. The caller then ends them, which blocks writers.
     """
     row = connection.execute(SHARE, {"named": name}).one_or_none()
     if row is None:
@@ -138,7 +138,7 @@ def sweep(connection: Connection, surrogate: Row[Any]) -> int:
 def give_back(
     connection: Connection, surrogate: Row[Any], query_ids: Sequence[int], error: str, outcome: Returned
 ) -> None:
-    """Make leased queries pending again, or set them aside after their last attempt or a refusal.
+    """Return leased queries to the queue, or set them aside after their last attempt or a refusal.
 
     A query has the same number of attempts each time it is requeued. A lease that ended before a real step does not
     count as an attempt. The leases already have their ``outcome``.

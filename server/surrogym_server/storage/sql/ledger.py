@@ -19,7 +19,7 @@ from surrogym_server.storage.sql.tables import evaluations, leases, queries, sur
 OPERATION = "report_steps"
 
 
-BOUNDS: tuple[sa.BindParameter[int], sa.BindParameter[int]] = (sa.bindparam("first"), sa.bindparam("last"))  # a span
+BOUNDS: tuple[sa.BindParameter[int], sa.BindParameter[int]] = (sa.bindparam("first"), sa.bindparam("last"))
 
 
 def _evaluations() -> sa.Select[Any]:

@@ -27,7 +27,7 @@ from surrogym_server.storage.sql.tables import samples, surrogates
 def store_logged(
     connection: Connection, surrogate: Row[Any], sampler: str, batch: Sequence[NewSample], after: str | None
 ) -> AddedSamples:
-    """Insert the new samples of a part of a log, which comes ``after`` another part, or begins the log.
+    """Insert the new samples of one part of a log. ``after`` is the digest of the part before; None for the first.
 
     Raises:
         InvalidInput: a sample that names a query.
@@ -44,7 +44,7 @@ def store_logged(
         old = next((place for place, link in enumerate(links) if link not in stored_ids), len(links))
         if old == len(links) or not _continued(connection, surrogate, chain[old]):
             break
-        before = chain[old + 1]  # shared by all logs that differ here in the same way, as one that grows does
+        before = chain[old + 1]  # logs that continue in the same way from here share this digest
         if after is not None:
             return AddedSamples((), 0, restart=before)
     new = [row | {"fingerprint": link} for row, link in zip(rows[old:], links[old:], strict=True)]
@@ -62,14 +62,14 @@ def complete_log(connection: Connection, surrogate: Row[Any]) -> None:
 
 
 def _stored_ids(connection: Connection, surrogate: Row[Any], fingerprints: Sequence[str]) -> dict[str, int]:
-    """The stored logged samples with these fingerprints, by fingerprint."""
+    """Return the ids of stored logged samples with these fingerprints, by fingerprint."""
     same = samples.c.fingerprint.in_(set(fingerprints))
     statement = sa.select(samples.c.fingerprint, samples.c.id).where(samples.c.surrogate_id == surrogate.id, same)
     return {row.fingerprint: row.id for row in connection.execute(statement.where(samples.c.purpose == "logged"))}
 
 
 def _continued(connection: Connection, surrogate: Row[Any], digest: str) -> bool:
-    """Whether a sample is stored that follows the log with this digest."""
+    """Whether a stored sample continues the log that has this digest."""
     follows = samples.c.fingerprint.startswith(f"{digest}:")
     statement = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogate.id, follows).limit(1)
     return connection.execute(statement).first() is not None

@@ -33,7 +33,7 @@ def migrate(database: Database) -> None:
 
 
 def _present(connection: Connection) -> list[str]:
-    """The revisions of the database's schema: one, none if it is new, or more if it was tampered with."""
+    """Return the schema's revisions: one; none in a new database; several if somebody has changed the table."""
     if not sa.inspect(connection).has_table(VERSION.name):
         return []
     return list(connection.execute(sa.select(VERSION.c.version_num)).scalars())
@@ -55,8 +55,8 @@ def _upgrade(connection: Connection) -> None:
 
 def _take_turn(connection: Connection) -> None:
     if connection.dialect.name == "postgresql":
-        connection.execute(sa.text("SET LOCAL lock_timeout = 0"))  # the server before may take its time
-        connection.execute(sa.text("SET LOCAL idle_in_transaction_session_timeout = 0"))  # a migration may compute
+        connection.execute(sa.text("SET LOCAL lock_timeout = 0"))  # another migration may take long
+        connection.execute(sa.text("SET LOCAL idle_in_transaction_session_timeout = 0"))  # it may pause to compute
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(MIGRATION_LOCK)))
 
 

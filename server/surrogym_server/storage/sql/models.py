@@ -1,4 +1,4 @@
-"""Models by version."""
+"""Adapter of ``Models``: models by version."""
 
 from __future__ import annotations
 

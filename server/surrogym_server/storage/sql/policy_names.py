@@ -1,4 +1,4 @@
-"""Versions and aliases of policies."""
+"""Adapter of ``PolicyNames``: versions and aliases of policies."""
 
 from __future__ import annotations
 

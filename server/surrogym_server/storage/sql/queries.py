@@ -1,4 +1,4 @@
-"""The queue of queries."""
+"""Adapter of ``Queries``: the queue of queries and their leases."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ OLDEST_FREE: sa.Select[Any] = (
     .limit(sa.bindparam("most", type_=sa.Integer()))
     .with_for_update(skip_locked=True)
 )
-LEAST_AUDITED = 128  # real steps of audits that every surrogate may take: three undecided ones take 120
+LEAST_AUDITED = 128  # real steps of audits that any surrogate may take; three audits without a result take 120
 
 
 class SqlQueries(port.Queries):
@@ -196,7 +196,7 @@ def _ended(query_id: int) -> LeaseExpired:
 
 
 def _records() -> sa.Select[Any]:
-    """Queries, with the time left of their open lease. A query has at most one."""
+    """Return the SELECT of queries, each with the time left of its open lease, of which it has at most one."""
     left = (leases.c.expires - NOW).label("lease_seconds_left")
     is_open = (leases.c.query_id == queries.c.id) & (leases.c.outcome == "open")
     return sa.select(*STATE, *CONTENT, left).outerjoin(leases, is_open)

@@ -23,7 +23,7 @@ NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None, "fit_seco
 
 
 def take_name(connection: Connection, name: str) -> int:
-    """Let nobody find a surrogate any more, and return its id. Raises ``UnknownSurrogate``."""
+    """Take the name from a surrogate, so that nobody finds it, and return its id. Raises ``UnknownSurrogate``."""
     id = int(hold(connection, name).id)
     for table in metadata.tables.values():
         if AT_ONCE in table.info:
@@ -34,7 +34,7 @@ def take_name(connection: Connection, name: str) -> int:
 
 
 def interrupted(connection: Connection) -> list[int]:
-    """Ids of the surrogates without a name."""
+    """Ids of the surrogates whose removal is not complete: they have no name any more."""
     return [*connection.execute(NAMELESS).scalars()]
 
 

@@ -15,7 +15,7 @@ from surrogym_server.storage.sql.tables import events, queries, requests, surrog
 from surrogym_shared.nouns import Query
 from surrogym_shared.states import EventKind, Purpose
 
-Span = tuple[int, int]  # of ids of surrogates: the first and the last
+Span = tuple[int, int]  # first and last id of a range of surrogates
 
 # Statements of every answer and claim are built once: SQLAlchemy takes four times as long to build and name one as to
 # send it.
@@ -30,7 +30,7 @@ NEW_EVENT, NEW_REQUEST = sa.insert(events), sa.insert(requests)
 
 
 def find(connection: Connection, name: str) -> int:
-    """Return the surrogate's id."""
+    """Return the id of the surrogate with a name. Raises ``UnknownSurrogate``."""
     row = connection.execute(FIND, {"named": name}).scalar()
     if row is None:
         raise unknown_surrogate(name)
@@ -64,7 +64,7 @@ def append_event(connection: Connection, surrogate: Row[Any], kind: EventKind, *
 
 
 def touch(connection: Connection, surrogate: Row[Any], **changes: Any) -> None:
-    """Make the design look at the surrogate again, and change other fields with it."""
+    """Increase the surrogate's revision, so that its design becomes due, and change other fields."""
     connection.execute(TOUCH.values(**changes) if changes else TOUCH, {"touched": surrogate.id})
 
 
@@ -91,7 +91,7 @@ def recall(connection: Connection, surrogate: Row[Any], operation: str, key: str
 def remember(
     connection: Connection, surrogate: Row[Any], operation: str, key: str | None, body: str, result: Any
 ) -> None:
-    """Keep the result of the operation for this key."""
+    """Store the result of an operation under its idempotency key, for a repeat."""
     if key is not None:
         row = {"surrogate_id": surrogate.id, "operation": operation, "key": key, "fingerprint": body, "result": result}
         connection.execute(NEW_REQUEST, row)
@@ -119,7 +119,7 @@ def insert_queries(
 
 
 def _columns(query: Query) -> dict[str, Any]:
-    """Columns of a query; its actions (T, F) are stored one after the other."""
+    """Convert a query to the columns of its row. Its actions (T, F) become one vector."""
     return {
         "kind": query.kind,
         "coordinates": query.coordinates,
@@ -130,7 +130,7 @@ def _columns(query: Query) -> dict[str, Any]:
 
 
 def query_in(row: Row[Any]) -> dict[str, Any]:
-    """Fields of the ``Query`` in a row with the columns ``coordinates``, ``action``, ``steps`` and ``snapshot``."""
+    """Convert a row with columns ``coordinates``, ``action``, ``steps`` and ``snapshot`` to fields of a ``Query``."""
     size = max(1, len(row.action) // row.steps)
     actions = tuple(row.action[first : first + size] for first in range(0, len(row.action), size))
     return {"coordinates": row.coordinates, "actions": actions, "snapshot": row.snapshot}

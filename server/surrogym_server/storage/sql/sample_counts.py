@@ -1,4 +1,4 @@
-"""Numbers of samples by purpose. Counting a million rows takes 0.3 s, so what was counted is kept in memory."""
+"""Numbers of samples by purpose, kept in memory, because counting a million rows takes 0.3 s."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from surrogym_server.storage.sql.damage import damaged
 from surrogym_server.storage.sql.tables import samples
 
 COUNTED = ("initial", "adaptive", "manual", "audit", "logged", "evaluation", "failed", "expired")
-MOST_KEPT = 100_000  # surrogates
+MOST_KEPT = 100_000  # surrogates whose counts are kept
 
-PURPOSE = sa.type_coerce(samples.c.purpose, sa.Text)  # its own type would refuse the words of other tables
+PURPOSE = sa.type_coerce(samples.c.purpose, sa.Text)  # the column's own type would refuse unknown words
 BY_PURPOSE: sa.Select[Any] = sa.select(
     samples.c.surrogate_id, PURPOSE, sa.func.count(), sa.func.max(samples.c.id)
 ).group_by(samples.c.surrogate_id, samples.c.purpose)

@@ -54,7 +54,7 @@ class SqlSamples(port.Samples):
         body = fingerprint(sampler, [asdict(sample) for sample in samples] if key else [])  # compared if there is a key
         with self._database.write() as connection:
             surrogate = hold(connection, name)
-            if log is not None:  # the log identifies its samples
+            if log is not None:  # a sample of a log is identified by the log before it
                 added = store_logged(connection, surrogate, sampler, samples, log.after)
                 if log.complete and added.restart is None:
                     complete_log(connection, surrogate)
@@ -140,12 +140,12 @@ def _store(
 
 
 def _identity(place: int, sample: NewSample, lease: Answered | None) -> Identity:
-    """The lease and the step; without a lease, the place in the batch."""
+    """What identifies a sample in a batch: its lease and step, or its place if it has no lease."""
     return (lease.lease_id, sample.step) if lease else (None, place)
 
 
 def _raw_arrays(surrogate_id: int) -> sa.Select[Any]:
-    """Rows of bytes, reward and flag: a bulk read without a Python float for each coordinate."""
+    """Read samples in bulk, with vectors as bytes, so that no Python float is made for each coordinate."""
     vectors = (samples.c.coordinates, samples.c.action, samples.c.next_coordinates)
     raw: list[Any] = [sa.type_coerce(column, sa.LargeBinary()) for column in vectors]
     statement = sa.select(*raw, samples.c.reward, samples.c.terminated, samples.c.purpose)
@@ -153,5 +153,5 @@ def _raw_arrays(surrogate_id: int) -> sa.Select[Any]:
 
 
 def _matrix(rows: Sequence[bytes]) -> Array:
-    """A matrix (n, k) from n rows of bytes."""
+    """Convert n byte strings of k floats to a matrix (n, k)."""
     return np.frombuffer(b"".join(rows), dtype="<f8").reshape(len(rows), -1).astype(np.float64)

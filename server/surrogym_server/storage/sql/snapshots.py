@@ -1,4 +1,4 @@
-"""Snapshots that samplers hold."""
+"""Adapter of ``Snapshots``: the snapshots that samplers keep."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class SqlSnapshots(port.Snapshots):
 
 
 def insert_snapshots(connection: Connection, surrogate: Row[Any], new: dict[str, Vector]) -> None:
-    """Make snapshots known, by name with their coordinates (C,). A name that is there stays as it is."""
+    """Store snapshots by name with their coordinates (C,). A name that is stored already does not change."""
     if new:
         rows = [{"surrogate_id": surrogate.id, "name": name, "coordinates": at} for name, at in new.items()]
         insert = conflict_insert(connection, snapshots).on_conflict_do_nothing()
@@ -61,8 +61,10 @@ def _forget(connection: Connection, surrogate: Row[Any], names: Sequence[str]) -
 
 
 def _give_up_queries(connection: Connection, surrogate: Row[Any], names: Sequence[str]) -> None:
-    """Remove the pending queries that begin at a snapshot that is gone, or set them aside if steps may have been taken.
-    What ``improve`` asked for is asked for again."""
+    """Remove the pending queries that begin at dropped snapshots; set aside those of which steps may have been taken.
+
+    Steps of removed queries that ``improve`` had requested are requested again.
+    """
     from_there = queries.c.snapshot.in_(names)
     unbegun = leasing.is_unbegun(surrogate.id) & from_there
     removed = connection.execute(sa.delete(queries).where(unbegun).returning(queries.c.steps, queries.c.extra)).all()

@@ -1,4 +1,4 @@
-"""All stores of one database."""
+"""SqlStorage: the storage on one SQLite or PostgreSQL database."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from surrogym_server.storage.sql.surrogates import SqlSurrogates
 
 
 class SqlStorage(Storage):
-    """The port on SQLite or PostgreSQL."""
+    """The ``Storage`` port on a SQLite or PostgreSQL database."""
 
     def __init__(self, database: Database) -> None:
         self._database, counted = database, CountedSamples()
@@ -83,7 +83,7 @@ def open_storage(url: str, synchronous: Synchronous = "full") -> Storage:
 
 
 def _way_out(url: str, message: str) -> str:
-    """Return what to do about a PostgreSQL database that can't be opened."""
+    """Return advice to people about a PostgreSQL database that can't be opened."""
     name = sa.make_url(url).database
     if f'database "{name}" does not exist' in message:
         return f"createdb {name} makes it, or check --database"

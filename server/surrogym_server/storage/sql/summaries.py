@@ -17,7 +17,7 @@ from surrogym_server.storage.sql.models import newest_of
 from surrogym_server.storage.sql.sample_counts import MOST_KEPT, CountedSamples, SampleCounts
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
 
-FIELDS = ("id", "name", "budget", "target", "phase", "paused", "round", "error", "created_at")  # as in the record
+FIELDS = ("id", "name", "budget", "target", "phase", "paused", "round", "error", "created_at")  # of the summary
 COLUMNS = [getattr(surrogates.c, name) for name in FIELDS]
 
 
@@ -29,7 +29,7 @@ ANSWERED = (
 
 
 class _Named(msgspec.Struct):
-    """The parsed part of a specification, because parsing all of it takes ten times as long."""
+    """The only part of a specification that a list needs; parsing all of it takes ten times as long."""
 
     environment: str = ""
 
@@ -37,7 +37,7 @@ class _Named(msgspec.Struct):
 _NAMED = msgspec.json.Decoder(_Named)
 
 
-UNANSWERED = ("pending", "leased", "set_aside", "refused")  # statuses of queries; a look into the index counts each
+UNANSWERED = ("pending", "leased", "set_aside", "refused")  # statuses that an index counts
 OPEN_COUNTS = [
     sa.select(sa.func.count())
     .where(queries.c.surrogate_id == surrogates.c.id, queries.c.status == status)
@@ -46,7 +46,7 @@ OPEN_COUNTS = [
     for status in UNANSWERED
 ]
 NEWEST = sa.select(sa.func.max(samples.c.id)).where(samples.c.surrogate_id == surrogates.c.id).scalar_subquery()
-AT_ONCE = 1_000  # surrogates of one statement
+AT_ONCE = 1_000  # most surrogates that one statement reads
 
 
 class Counted:
@@ -58,7 +58,7 @@ class Counted:
 
     def __init__(self, samples: CountedSamples) -> None:
         self._samples = samples
-        self._answered: dict[int, tuple[int | None, int]] = {}  # with the id of the newest sample before the count
+        self._answered: dict[int, tuple[int | None, int]] = {}  # by surrogate: its newest sample's id, and the number
 
     def read(self, connection: Connection, newest: Mapping[int, int | None]) -> dict[int, tuple[SampleCounts, int]]:
         """The numbers of each surrogate, given the id of its newest sample, which was read before."""

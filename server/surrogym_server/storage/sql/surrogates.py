@@ -1,4 +1,4 @@
-"""Surrogates by name."""
+"""Adapter of ``Surrogates``: surrogates by name."""
 
 from __future__ import annotations
 
@@ -202,15 +202,17 @@ def _withdraw_unbegun(
 
 
 def spoken_for(connection: Connection, surrogate_id: int) -> int:
-    """Number of real steps that count towards the budget: samples, and the steps of unanswered queries. These are open,
-    or set aside, in which case steps may have been taken. A refused query had none."""
-    taken = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id, samples.c.purpose.not_in(FREE))
+    """Number of real steps that count towards the budget: samples, and the steps of unanswered queries.
+
+    Queries that were set aside count, because steps may have been taken; refused ones don't.
+    """
+    sampled = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id, samples.c.purpose.not_in(FREE))
     awaited = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0)).where(
         queries.c.surrogate_id == surrogate_id,
         queries.c.status.not_in(("answered", "refused")),
         queries.c.purpose.not_in(FREE),
     )
-    return int(connection.execute(sa.select(taken.scalar_subquery() + awaited.scalar_subquery())).scalar_one())
+    return int(connection.execute(sa.select(sampled.scalar_subquery() + awaited.scalar_subquery())).scalar_one())
 
 
 def _apply(connection: Connection, surrogate: Row[Any], changes: dict[str, Any]) -> None:

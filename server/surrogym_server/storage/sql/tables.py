@@ -33,7 +33,7 @@ Id = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
 
 
 class Floats(sa.types.TypeDecorator[Vector]):
-    """A vector of floats."""
+    """Column type of a vector of float64, stored as bytes."""
 
     impl = sa.LargeBinary
     cache_ok = True
@@ -53,7 +53,7 @@ class Floats(sa.types.TypeDecorator[Vector]):
 
 
 class Json(sa.types.TypeDecorator[Any]):
-    """Any JSON value; ``place`` is its table and column."""
+    """Column type of any JSON value; ``place`` names table and column in errors."""
 
     impl = sa.Text
     cache_ok = True
@@ -73,7 +73,7 @@ class Json(sa.types.TypeDecorator[Any]):
 
 
 class Word(sa.types.TypeDecorator[str]):
-    """One of the values of a ``Literal``; ``place`` is its table and column."""
+    """Column type of one of the words of a ``Literal``; ``place`` names table and column in errors."""
 
     impl = sa.Text
     cache_ok = True
@@ -98,7 +98,7 @@ PLAIN: dict[type[sa.types.TypeEngine[Any]], tuple[str, tuple[type, ...]]] = {
 
 
 class Checked(sa.types.TypeDecorator[Any]):
-    """Column of numbers or text that checks the type of each value it reads.
+    """Column type of numbers or text, which checks the type of each value that it reads.
 
     SQLite stores any value in any column, so a damaged file may hold a value of another type.
     """
@@ -127,12 +127,12 @@ def checked(table: sa.Table) -> sa.Table:
 
 
 def row_id() -> sa.Column[int]:
-    """The column of a row's id."""
+    """Return the column of a row's id, the primary key."""
     return sa.Column("id", Id, primary_key=True, autoincrement=True)
 
 
 def owner(**options: Any) -> sa.Column[int]:
-    """The column of the surrogate that a row belongs to, and is deleted with."""
+    """Return the column with the id of a row's surrogate. Rows are deleted with their surrogate."""
     key = sa.ForeignKey("surrogates.id", ondelete="CASCADE")
     return sa.Column("surrogate_id", Id, key, nullable=False, **options)
 
@@ -153,16 +153,16 @@ surrogates = sa.Table(
     sa.Column("error", sa.Text),
     sa.Column("extra_queries", sa.Integer, nullable=False),
     sa.Column("checkpoint", sa.Text),
-    sa.Column("revision", sa.BigInteger, nullable=False),  # grows with whatever the design has to look at
-    sa.Column("fitted_revision", sa.BigInteger, nullable=False),  # what the last fit has seen
+    sa.Column("revision", sa.BigInteger, nullable=False),  # increases with each change that makes a fit due
+    sa.Column("fitted_revision", sa.BigInteger, nullable=False),  # revision at the last fit
     sa.Column(
         "logged_revision", sa.BigInteger, nullable=False, server_default="0"
-    ),  # the one that has all of the last log
+    ),  # revision that has all of the last log; see ``sql.logged``
     sa.Column("fit_token", sa.Text),
     sa.Column("fit_owner", sa.Text),
     sa.Column("fit_expires", sa.Double),
-    sa.Column("fit_seconds", sa.Double),  # for how long the right was given out last
-    sa.Column("policy_versions", sa.Integer, nullable=False, server_default="0"),  # so many were ever given out
+    sa.Column("fit_seconds", sa.Double),  # duration of the last right to fit
+    sa.Column("policy_versions", sa.Integer, nullable=False, server_default="0"),  # number of versions ever used
     sa.Column("created_at", sa.Double, nullable=False),
     sqlite_autoincrement=True,
 )
@@ -177,10 +177,10 @@ queries = sa.Table(
     sa.Column("round", sa.Integer, nullable=False),
     sa.Column("kind", Word("queries.kind", QueryKind), nullable=False, server_default="step"),
     sa.Column("coordinates", Floats, nullable=False),  # empty for a rollout
-    sa.Column("action", Floats, nullable=False),  # for a rollout one after the other
+    sa.Column("action", Floats, nullable=False),  # all actions, one after the other
     sa.Column("steps", sa.Integer, nullable=False, server_default="1"),
     sa.Column("snapshot", sa.Text),  # where a rollout begins; NULL: at a reset
-    sa.Column("extra", sa.Boolean, nullable=False, server_default=sa.false()),  # asked for, whatever the verdict
+    sa.Column("extra", sa.Boolean, nullable=False, server_default=sa.false()),  # requested by ``improve``
     sa.Column("attempts", sa.Integer, nullable=False),
     sa.Column("sampler", sa.Text),
     sa.Column("error", sa.Text),
@@ -199,7 +199,7 @@ leases = sa.Table(
     sa.Column("attempt", sa.Integer, nullable=False),
     sa.Column("begun", sa.Double, nullable=False),
     sa.Column("expires", sa.Double, nullable=False),
-    sa.Column("seconds", sa.Double, nullable=False, server_default="0"),  # for how long it was given out last
+    sa.Column("seconds", sa.Double, nullable=False, server_default="0"),  # duration of the lease at its last renewal
     sa.Column("outcome", sa.Text, nullable=False),  # open, answered, failed, unbegun, refused, expired
     sa.Index(None, "surrogate_id", "outcome", "expires"),
     sa.Index(  # a query has one open lease at most
@@ -240,7 +240,7 @@ samples = sa.Table(
     sqlite_autoincrement=True,
 )
 
-snapshots = sa.Table(  # that samplers hold
+snapshots = sa.Table(  # snapshots that samplers keep
     "snapshots",
     metadata,
     row_id(),
@@ -286,7 +286,7 @@ models = sa.Table(
     sa.Column("fit_seconds", sa.Double, nullable=False),
     sa.Column("blob", sa.LargeBinary, nullable=False),
     sa.Column("checksum", sa.Text, nullable=False, server_default=""),  # SHA-256 of the blob
-    sa.Column("damage", sa.Text),  # what is wrong with it, once it was found
+    sa.Column("damage", sa.Text),  # description of the damage; NULL: none was found
 )
 
 occupancies = sa.Table(
@@ -335,7 +335,7 @@ policies = sa.Table(
 
 
 def policy_key() -> sa.ForeignKeyConstraint:
-    """The policy that a row belongs to, and is deleted with."""
+    """Return the key to a row's policy. Rows are deleted with their policy."""
     columns = ["surrogate_id", "version"]
     return sa.ForeignKeyConstraint(columns, [f"policies.{name}" for name in columns], ondelete="CASCADE")
 
@@ -360,7 +360,7 @@ policy_evaluations = sa.Table(
     sa.Column("summary", Json("policy_evaluations.summary"), nullable=False),
     sa.Column("bytes", sa.BigInteger, nullable=False),
     sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of its episodes
-    sa.Column("blob", sa.Text),  # NULL: not there
+    sa.Column("blob", sa.Text),  # NULL: no file is stored
     sa.UniqueConstraint("surrogate_id", "version", "key"),
     policy_key(),
     sqlite_autoincrement=True,

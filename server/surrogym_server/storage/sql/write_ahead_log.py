@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-HEADER_BYTES = 100  # of a database
-USER_VERSION, APPLICATION_ID = slice(60, 64), slice(68, 72)  # of it; SQLite leaves both to applications
+HEADER_BYTES = 100  # size of the header of a SQLite database
+USER_VERSION, APPLICATION_ID = slice(60, 64), slice(68, 72)  # in the header; SQLite leaves both to applications
 LOG_HEADER, FRAME_HEADER = struct.Struct(">8I"), struct.Struct(">6I")
 BIG_ENDIAN = 1  # bit of the log's magic number: byte order of the words in its checksums
 INDEX_BYTES = 136  # of the log's index: two headers, then the position up to which the log was merged
@@ -25,7 +25,7 @@ WORD = 0xFFFF_FFFF
 
 
 def marks(header: bytes) -> tuple[str, ...]:
-    """The statements that mark a new log as one of the database with this header, for its first transaction."""
+    """Return the statements by which the first transaction of a log marks it as belonging to this header's database."""
     number = 1 + secrets.randbelow(2**31 - 1)
     return f"PRAGMA user_version={number}", f"PRAGMA application_id={_signed(zlib.crc32(header))}"
 
@@ -92,7 +92,7 @@ def _frames(file: BinaryIO) -> Iterator[tuple[tuple[int, ...], int]]:
 
 
 def _first_pages(file: BinaryIO) -> Iterator[bytes]:
-    """The database's header, in each version in the log."""
+    """Yield each version of the database's header that the log contains."""
     for (page, *_), place in _frames(file):
         if page == 1:
             file.seek(place)
@@ -100,7 +100,7 @@ def _first_pages(file: BinaryIO) -> Iterator[bytes]:
 
 
 def _has_a_whole_transaction(file: BinaryIO) -> bool:
-    """Whether the log holds anything that SQLite would merge. After a loss of power its checksums may be wrong."""
+    """Whether the log contains a transaction that SQLite would merge. After a power loss its checksums may be wrong."""
     file.seek(0)
     begin = file.read(LOG_HEADER.size)
     if len(begin) < LOG_HEADER.size:
