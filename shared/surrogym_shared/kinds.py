@@ -4,13 +4,13 @@ from typing import Literal
 
 CoordinateKind = Literal["linear", "angle", "constant"]
 LagKind = Literal["change", "value", "action", "steps"]
-Function = Literal["one", "linear", "sin", "cos"]  # of a part of a term
+Function = Literal["one", "linear", "sin", "cos"]  # phi of a part of a term
 Relation = Literal["<", "<=", ">", ">="]  # of an inequality
-RewardShape = Literal["one", "linear", "absolute", "square", "bump", "ball"]  # of a term of a declared reward
+RewardShape = Literal["one", "linear", "absolute", "square", "bump", "ball"]  # of a declared reward's term
 RewardTiming = Literal["before", "after", "auto"]  # the state that a learned reward depends on
 Side = Literal["lower", "upper"]  # end of a range
 
 Variant = Literal["deterministic", "probabilistic", "pathwise"]
 AutoresetMode = Literal["next_step", "same_step", "disabled"]
-Propagation = Literal["mean", "sample"]  # of particles
-Weighting = Literal["inverse_variance", "uniform"]  # of the particles' rewards
+Propagation = Literal["mean", "sample"]  # how particles move: by the mean, or by a posterior sample each
+Weighting = Literal["inverse_variance", "uniform"]  # how the particles' rewards are averaged

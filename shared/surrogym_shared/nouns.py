@@ -29,7 +29,7 @@ class Query:
     """
 
     coordinates: Vector  # (C,) state to set; () for a query that begins at a snapshot or a reset
-    actions: tuple[Vector, ...]  # (T, F)
+    actions: tuple[Vector, ...]  # (T, F) to apply, one after the other
     snapshot: str | None = None  # name of the snapshot to begin at
 
     @staticmethod
@@ -61,26 +61,26 @@ class Query:
 class RealStep:
     """One real step. ``coordinates`` and ``action`` are the achieved values, not the requested ones."""
 
-    coordinates: ArrayLike  # (C,)
-    action: ArrayLike  # (F,)
-    next_coordinates: ArrayLike  # (C,)
+    coordinates: ArrayLike  # (C,) before the step
+    action: ArrayLike  # (F,) that was applied
+    next_coordinates: ArrayLike  # (C,) after the step
     reward: float
     terminated: bool = False
     truncated: bool = False
-    observation: ArrayLike | None = None  # (D,)
-    next_observation: ArrayLike | None = None  # (D,)
+    observation: ArrayLike | None = None  # (D,) before the step, if it was measured
+    next_observation: ArrayLike | None = None  # (D,) after the step, if it was measured
 
 
 @dataclass(frozen=True)
 class RealSteps:
     """Real steps as columns, in order of arrival: the samples from which a model is learned."""
 
-    coordinates: NDArray[np.float64]  # (n, C)
-    action: NDArray[np.float64]  # (n, F)
-    next_coordinates: NDArray[np.float64]  # (n, C)
-    reward: NDArray[np.float64]  # (n,)
-    terminated: NDArray[np.bool_]  # (n,)
-    purpose: tuple[SamplePurpose, ...]  # (n,)
+    coordinates: NDArray[np.float64]  # (n, C) before each step
+    action: NDArray[np.float64]  # (n, F) applied in each step
+    next_coordinates: NDArray[np.float64]  # (n, C) after each step
+    reward: NDArray[np.float64]  # (n,) of each step
+    terminated: NDArray[np.bool_]  # (n,) whether each step ended the episode
+    purpose: tuple[SamplePurpose, ...]  # (n,) why each step was taken
 
     def __len__(self) -> int:
         return len(self.reward)

@@ -78,13 +78,13 @@ def run_design_job(job: DesignJob) -> DesignResult:
     """Do one round: fit a model, judge it, choose queries. Raises like ``sampling.design.advance``."""
     started = time.perf_counter()
     torch.set_num_threads(job.threads)
-    with threadpool_limits(job.threads):  # the products are small, so more threads would cost more than they save
+    with threadpool_limits(job.threads):  # matrix products are small: more threads would slow them
         decision, samples = _decide(job)
     with plugin_calls(job.definition):
         stored = to_bytes(decision.model)
     return DesignResult(
         model=stored,
-        description=json.loads(json.dumps(decision.model.description)),  # a family's own types become plain
+        description=json.loads(json.dumps(decision.model.description)),  # a family's own types become JSON's
         fidelity=fidelity_fields(
             decision.model,
             decision.confidences,

@@ -21,7 +21,7 @@ from surrogym_server.engine.port import Compute
 from surrogym_server.errors import ChoiceFailed, PluginFailed, SurrogymError, Unavailable
 from surrogym_server.plugins import in_one_line
 
-NICENESS = 10  # of a fit; a step that shares a core with it gets nine tenths of the core
+NICENESS = 10  # nice value of fits; a step that shares a core with a fit gets nine tenths of the core
 Function = Callable[[DesignJob], DesignResult]
 
 
@@ -63,7 +63,7 @@ class Fits(Compute):
                 whole = True
             except BrokenProcessPool:
                 continue
-            except Exception as error:  # the result can't be pickled
+            except Exception as error:  # raised if the result of the job can't be pickled
                 raise PluginFailed(in_one_line(error)) from error
             finally:
                 self._give_back(process, whole)

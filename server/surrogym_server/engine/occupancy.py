@@ -21,9 +21,9 @@ class Reservoir:
     """
 
     seed: int
-    visits: int = 0
-    states: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, C)
-    priority: Array = field(default_factory=lambda: np.zeros(0))  # (m,)
+    visits: int = 0  # number of visits so far
+    states: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, C) sampled visits
+    priority: Array = field(default_factory=lambda: np.zeros(0))  # (m,) priorities of these visits
 
     def visit(self, states: Array) -> Reservoir:
         """Return the reservoir after further visits to states (n, C), in order."""

@@ -2,7 +2,7 @@
 
 Requests and replies are data; an engine owns everything between them.
 
-The laws in the docstrings are functions of ``surrogym_server.testing``.
+The docstrings state laws. Functions in ``surrogym_server.testing`` test an implementation of a port by them.
 """
 
 from __future__ import annotations

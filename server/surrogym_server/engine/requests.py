@@ -139,7 +139,7 @@ class Visited:
 
 @dataclass(frozen=True)
 class Saved:
-    """A saved session as bytes. The definition is not among them, because its surrogate has it."""
+    """A saved session as bytes. The environment's definition is not stored in it, because the surrogate has it."""
 
     id: str
     surrogate: str

@@ -134,7 +134,7 @@ class Tally:
         ended = np.concatenate([np.atleast_2d(result.terminated | result.truncated) for result in self._pending])
         self._pending.clear()
         self._unfolded = 0
-        gains = np.stack([reward, penalty], 1)  # (T, 2, N)
+        gains = np.stack([reward, penalty], 1)  # (T, 2, N) for T steps of N lanes
         sums = np.zeros(gains.shape[1:]) if self._sums is None else self._sums
         begin = 0
         for step in np.flatnonzero(ended.any(1)).tolist():

@@ -40,11 +40,11 @@ class CandidateView:
     model: DynamicsModel
     points: Points  # m states and actions
     output: int  # number of the output, in the order of the definition
-    tolerance: float  # of the output, in the output's unit
+    tolerance: float  # tolerance of the output, in the output's unit
     deviation: (
         Tensor  # (m,) latent standard deviation, in the output's unit, as if all pending queries had been answered
     )
-    distance: Tensor  # (m,) to the nearest query so far, in standard deviations of the sampling range
+    distance: Tensor  # (m,) distance to the nearest query so far, in standard deviations of the sampling range
     log_probability: Tensor  # (m,) log P_i (eq. 11); 0 unless the acquisition reads it
     _reduction: Callable[[], Tensor]
 
@@ -59,7 +59,7 @@ class CandidateView:
 class PathView:
     """View of b predicted paths of T steps that an acquisition reads, with respect to one output."""
 
-    tolerance: float  # of the output, in the output's unit
+    tolerance: float  # tolerance of the output, in the output's unit
     weight: Tensor  # (b, T) at least 0; depends on where the step lies and how well it can be predicted
     _deviation: Callable[[], Tensor]
     _information: Callable[[], Tensor]

@@ -15,7 +15,7 @@ from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.latin_hypercube import random_points
 from surrogym_server.sampling.occupancy import log_occupancy
 
-MAX_CANDIDATES = 4_096  # of each kind; memory holds their covariances with the reference
+MAX_CANDIDATES = 4_096  # most candidates of each kind, because memory holds their covariances with the reference
 REFERENCE = 256  # reference points of each kind: from the Monte Carlo set, and visited
 OCCUPIED = 0.75  # share of the visited states in the reference; the rest is the whole sampling range
 

@@ -32,7 +32,7 @@ class OutputConfidence:
     leave_one_out_error: float | None  # root mean square, in the output's unit; None if the model does not offer it
     leave_one_out_within_one: float | None  # share of the samples within one predictive standard deviation
     leave_one_out_within_two: float | None
-    noise: float = 0.0  # of a single step, established by repeated or by consecutive steps, in the output's unit
+    noise: float = 0.0  # standard deviation of a single step's noise that real steps confirm, in the output's unit
     sensor_noise: float = 0.0  # standard deviation of one measurement, if most of the noise is the sensor's
     past: float = 0.0  # share of the squared errors that earlier steps explain: a dead time or a hidden state
     region: Region | None = None  # where most of the model uncertainty is

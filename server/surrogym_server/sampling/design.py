@@ -25,7 +25,7 @@ from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
 from surrogym_shared.nouns import Query
 from surrogym_shared.states import Verdict
 
-FEW_POINTS = 500  # largest Latin hypercube to choose from several; comparing all pairs takes memory in the square
+FEW_POINTS = 500  # points above which only one Latin hypercube is made, because comparing all pairs takes much memory
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Decision:
     """Result of a round: a model, its judgement, and the next queries. O outputs."""
 
     model: DynamicsModel
-    confidences: tuple[OutputConfidence, ...]  # (O,)
+    confidences: tuple[OutputConfidence, ...]  # (O,) one for each output
     tolerances: tuple[float, ...]  # (O,) that the verdict is based on
     state: DesignState
     verdict: Verdict

@@ -32,7 +32,7 @@ from surrogym_shared.states import Verdict
 class Judgement:
     """Judgement of a model: confidences, tolerances, verdict, and candidates for the next queries."""
 
-    confidences: tuple[OutputConfidence, ...]  # (O,)
+    confidences: tuple[OutputConfidence, ...]  # (O,) one for each output
     tolerances: tuple[float, ...]  # (O,) that the confidences refer to
     verdict: Verdict
     candidates: Candidates  # m points, for the next queries

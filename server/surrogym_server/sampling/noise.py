@@ -23,9 +23,9 @@ from surrogym_server.models.abilities import LearnedNoise, LeaveOneOut, offers
 from surrogym_server.models.port import DynamicsModel
 
 ENOUGH = 3  # degrees of freedom of the repeats that noise needs to count as established
-STAGES = (1, ENOUGH, 6, 9)  # degrees of freedom after which the repeats are tested
+STAGES = (1, ENOUGH, 6, 9)  # degrees of freedom of the repeats at which they are tested
 LEVEL = 0.01  # significance level of each test
-NEGLIGIBLE = 0.5  # of the tolerance: noise of this size is established in at most ``LEVEL`` of the cases
+NEGLIGIBLE = 0.5  # noise of this share of the tolerance is confirmed by mistake with probability ``LEVEL`` at most
 AT_MOST = 3.0  # learned noise above this multiple of the repeats' noise is misfit of the model
 SLACK = 1.25  # factor by which few samples may raise a leave-one-out error above the noise
 

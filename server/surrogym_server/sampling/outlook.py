@@ -55,7 +55,7 @@ class NearbyAnswers(OutputOutlook):
     reference: Points  # r reference points
     own: Tensor  # (m,) remaining share of the variance at each candidate
     there: Tensor  # (r,) remaining share of the variance at each reference point
-    learns: Tensor  # (m,) bool
+    learns: Tensor  # (m,) bool: whether a model learns from a step at the candidate, because its lags are known
 
     @classmethod
     def of(
@@ -94,7 +94,7 @@ class IndependentSteps(PathOutlook):
     """Predicted information along paths, as if steps were independent: I(t) = 1/2 sum log(1 + (w sigma / tau)^2)."""
 
     spread: Tensor  # (b, T) latent standard deviation at each step, in the output's unit
-    learns: Tensor  # (b, T) bool
+    learns: Tensor  # (b, T) bool: whether a model learns from the step, because its lags are known
 
     @property
     def deviation(self) -> Tensor:

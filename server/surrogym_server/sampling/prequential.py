@@ -32,7 +32,7 @@ class Prediction:
     deviation: float  # predictive standard deviation, with the noise of a single step
 
 
-Predictions = tuple[tuple[Prediction, ...], ...]  # of each output (O,), in order of arrival
+Predictions = tuple[tuple[Prediction, ...], ...]  # for each output (O,) its predictions, the oldest first
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ ELITE = 12  # best sequences, which the next generation varies
 GENERATIONS = 3
 DOUBTFUL = 0.25  # least chance of an ending for which a rollout is planned
 
-Sequences = NDArray[np.float64]  # (k, T, F)
+Sequences = NDArray[np.float64]  # k sequences of T actions, (k, T, F)
 Worth = Callable[[Tensor, Sequences], tuple[Tensor, Tensor]]  # rates sequences from states, as ``_worth`` does
 
 
@@ -44,7 +44,7 @@ class Aim:
     """Objective and limits of a plan."""
 
     columns: Sequence[int]  # numbers of the outputs about which to learn
-    tolerances: Sequence[float]  # of every output
+    tolerances: Sequence[float]  # (O,) tolerance of every output
     longest: int  # actions in a sequence
     snapshots: Mapping[str, Vector] = field(default_factory=dict)  # states at which a sequence may begin, by name
     states: Tensor | None = None  # (v, C) states that policies visited; their density weights the information
@@ -56,9 +56,9 @@ class Aim:
 class Paths:
     """Paths of the predicted mean state: b lanes over T steps."""
 
-    q: Tensor  # (b, T, C)
-    u: Tensor  # (b, T, F)
-    q_next: Tensor  # (b, T, C)
+    q: Tensor  # (b, T, C) states before each step
+    u: Tensor  # (b, T, F) actions
+    q_next: Tensor  # (b, T, C) states after each step
     running: Tensor  # (b, T) 1 for steps of a running episode, 0 after its end
     ended: Tensor  # (b, T) 1 from the step on that ends the episode, 0 before
     drift: Tensor  # (b, T) variance of the mean path before the step, in units of that of the sampling range

@@ -1,17 +1,17 @@
-"""Tell noise of the sensors from noise of the process, by consecutive steps of one episode.
+"""Distinguish noise of the sensors from noise of the process, by consecutive steps of one episode.
 
 A sensor's error v falsifies the end of one step and the start of the next: with s_t + v_t measured, the residual of a
 step is r_t = v_{t+1} - a_t v_t + w_t, where a_t is the slope of the next state over the state and w_t the noise of the
 process. So the residuals of neighbouring steps have the covariance -a_t var(v), and those of process noise have none.
 
-A residual of a learned function is no noise: its errors at near states are alike. So the test compares Gaussian
-processes, whose noise has the covariance
+The residuals of a learned function are not only noise, because its errors at near states are alike. So the test
+compares Gaussian processes whose noise has the covariance
 
     c s^2 ((1 - share) I + share S),  S_tt ~ 1 + a_t^2,  S_{t-1,t} ~ -a_t,  mean diagonal of S 1,
 
-s^2 the learned variance of the noise, by the likelihood ratio of the best share against 0. A share of 0 lies at the
-edge of the allowed ones, so the ratio has half the chi-squared distribution of one degree of freedom (Self and Liang
-1987).
+where s^2 is the learned variance of the noise and c a factor near 1. The statistic is the likelihood ratio of the best
+share against a share of 0. Because 0 lies at the edge of the allowed shares, half the chi-squared distribution of one
+degree of freedom applies (Self and Liang 1987).
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ DIFFERENCE = 1e-4  # step of the numerical derivatives, as a share of a coordina
 class SensorNoise:
     """Noise of one output's sensor."""
 
-    share: float  # of the noise's variance that comes from the sensor
-    deviation: float  # of one measurement, in the output's unit
+    share: float  # share of the noise's variance that comes from the sensor
+    deviation: float  # standard deviation of one measurement, in the output's unit
     step: float  # standard deviation of all noise of a single step
 
 

@@ -19,7 +19,7 @@ from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.samples import Samples, increments
 
 TOLERANCE = 0.05  # default, as a share of the output's standard deviation over the initial design
-FLOOR = 1e-9  # of a coordinate's standard deviation over its range: a smaller increment is rounding
+FLOOR = 1e-9  # increments below this share of a coordinate's standard deviation over its range are rounding errors
 NOTHING = 1e-3  # share of the later range: a smaller range of the first samples says nothing about the size
 
 

@@ -20,7 +20,7 @@ from surrogym_shared.states import EventKind, Phase, Purpose, QueryStatus, Sampl
 Array = NDArray[np.float64]
 JSON = dict[str, Any]
 FREE = ("audit", "logged")  # purposes of samples that don't count towards the budget
-Synchronous = Literal["full", "normal"]  # of a SQLite file: whether every commit waits for the disk
+Synchronous = Literal["full", "normal"]  # full: every commit of a SQLite file waits for the disk
 
 OPEN_STATUSES: tuple[QueryStatus, ...] = ("pending", "leased")
 
@@ -177,7 +177,7 @@ class Sample(RealStep):
     observation: Vector | None = None
     next_observation: Vector | None = None
     query_id: int | None = None
-    step: int = 0  # place in the rollout that it is part of
+    step: int = 0  # position of this step in its rollout, from 0
 
 
 @dataclass(frozen=True)
@@ -219,8 +219,8 @@ class SampleRecord(Sample):
     sampler: str
     attempt: int  # number of the lease of its query; 0 without a query
     late: bool  # the sample came under a lease that had ended
-    trajectory: int | None  # equal for the samples of one rollout, each beginning where the one before ended
-    requested_coordinates: Vector | None  # (C,); None without a query, and in a rollout
+    trajectory: int | None  # the same number for all samples of one rollout, which follow each other
+    requested_coordinates: Vector | None  # (C,) of the query; None without a query, and for a rollout
     created_at: float
 
 
@@ -272,7 +272,7 @@ class SurrogateSummary:
     ledger: LedgerRecord
     queries: QueryCounts
     model_version: int | None  # version of the latest model
-    confidence_index: float | None  # of the latest model
+    confidence_index: float | None  # confidence index of the latest model
 
 
 @dataclass(frozen=True)

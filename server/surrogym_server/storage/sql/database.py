@@ -290,7 +290,7 @@ def _postgresql(url: URL) -> Database:
     return Database(engine, way_out="restore a copy")
 
 
-# exactly these: IntegrityError and ProgrammingError also derive from DatabaseError, and are bugs of this program
+# Compared by exact class: IntegrityError and ProgrammingError derive from DatabaseError, but are bugs of this program.
 UNUSABLE = (sa.exc.OperationalError, sa.exc.InternalError, sa.exc.InterfaceError, sa.exc.DatabaseError)
 UNSTORABLE = (sa.exc.DataError, OverflowError, UnicodeEncodeError)
 

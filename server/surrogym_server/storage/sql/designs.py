@@ -34,7 +34,7 @@ INTERRUPTED_SECONDS = 60.0  # the server that queues initial queries has died if
 # Conditions on a row of the table of surrogates.
 OWN_QUERIES = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogates.c.id)
 OWN_SAMPLES = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogates.c.id)
-# Constants in the statement: once PostgreSQL plans for any status, it reads all queries, because most are answered.
+# The statuses are constants in the statement: with parameters, PostgreSQL would read all queries, not use an index.
 OPEN = [constant(status) for status in OPEN_STATUSES]
 OPEN_QUERY = sa.exists(OWN_QUERIES.where(queries.c.status.in_(OPEN)))
 

@@ -18,7 +18,7 @@ REMOVED = "/removed/"  # no name has a slash; the id follows
 IS_THERE = surrogates.c.name.not_like(f"{REMOVED}%")
 NAMELESS = sa.select(surrogates.c.id).where(~IS_THERE)
 LARGE = {models: 8, policies: 8}  # tables whose rows have many bytes, or further rows
-AT_ONCE = "at once"  # in the ``info`` of a table whose rows go together with the name
+AT_ONCE = "at once"  # mark in the ``info`` of tables whose rows are removed together with the surrogate's name
 NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None, "fit_seconds": None}
 
 

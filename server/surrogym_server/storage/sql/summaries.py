@@ -17,7 +17,7 @@ from surrogym_server.storage.sql.models import newest_of
 from surrogym_server.storage.sql.sample_counts import MOST_KEPT, CountedSamples, SampleCounts
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
 
-FIELDS = ("id", "name", "budget", "target", "phase", "paused", "round", "error", "created_at")  # of the summary
+FIELDS = ("id", "name", "budget", "target", "phase", "paused", "round", "error", "created_at")  # read as they are
 COLUMNS = [getattr(surrogates.c, name) for name in FIELDS]
 
 

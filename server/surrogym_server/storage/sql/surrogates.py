@@ -176,11 +176,12 @@ def _set_or_taken_back(before: dict[str, float], changes: dict[str, float | None
 def _withdraw_unbegun(
     connection: Connection, surrogate: Row[Any], before: SurrogateRecord, budget: int | None
 ) -> dict[str, Any]:
-    """Withdraw the queries that the design chose for another target, tolerance or budget and that no sampler has begun,
-    and the right of a running fit.
+    """Withdraw what a design planned for another target, tolerance or budget.
 
-    Queries added by ``improve`` are requested again, unless there is a smaller ``budget``; initial queries beyond that
-    are withdrawn too. Returns the resulting changes of the surrogate.
+    This is the right of a running fit, and the queries that no sampler has begun.
+
+    Steps that ``improve`` requested are requested again, unless the new ``budget`` is smaller. Initial queries beyond a
+    smaller budget are withdrawn too. Returns the fields of the surrogate that change.
     """
     unbegun = is_unbegun(surrogate.id)
     statement = sa.delete(queries).where(unbegun, queries.c.purpose == "adaptive")

@@ -202,7 +202,7 @@ leases = sa.Table(
     sa.Column("seconds", sa.Double, nullable=False, server_default="0"),  # duration of the lease at its last renewal
     sa.Column("outcome", sa.Text, nullable=False),  # open, answered, failed, unbegun, refused, expired
     sa.Index(None, "surrogate_id", "outcome", "expires"),
-    sa.Index(  # a query has one open lease at most
+    sa.Index(  # unique, so that a query has at most one open lease
         "uq_leases_open",
         "query_id",
         unique=True,

@@ -19,7 +19,7 @@ HEADER_BYTES = 100  # size of the header of a SQLite database
 USER_VERSION, APPLICATION_ID = slice(60, 64), slice(68, 72)  # in the header; SQLite leaves both to applications
 LOG_HEADER, FRAME_HEADER = struct.Struct(">8I"), struct.Struct(">6I")
 BIG_ENDIAN = 1  # bit of the log's magic number: byte order of the words in its checksums
-INDEX_BYTES = 136  # of the log's index: two headers, then the position up to which the log was merged
+INDEX_BYTES = 136  # bytes to read of the log's index: two headers, then the position up to which the log was merged
 INDEX_VERSION = 3_007_000
 WORD = 0xFFFF_FFFF
 
@@ -115,7 +115,7 @@ def _has_a_whole_transaction(file: BinaryIO) -> bool:
         sums = _checksum(struct.pack(">2I", page, size) + file.read(page_size), order, sums)
         if sums != (first, second):
             return False
-        if size:  # of the database; the last frame of a transaction has it
+        if size:  # the last frame of a transaction has the database's size, others have 0
             return True
     return False
 

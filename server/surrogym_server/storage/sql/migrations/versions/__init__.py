@@ -1,1 +1,1 @@
-"""One file per step of the schema. A step that was released never changes."""
+"""Migrations of the schema, a file each. A migration never changes after its release."""
