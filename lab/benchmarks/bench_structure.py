@@ -79,8 +79,8 @@ def _tasks() -> dict[str, Callable[[], Any]]:
 def fewer(case: Case, posterior: Posterior) -> Iterator[dict[str, Any]]:
     """Backward elimination: by evidence alone, and as it is built."""
     found = select_inputs(posterior, case.options, case.may, ODDS)
-    left, less = found.kept.nonzero()[:, 0].tolist(), case.only(found.kept)
-    row = {"left": left, "gain": found.gain, "chosen": len(left) < len(found.kept)} | less.judged(found.hyper)
+    left, less = found.mask.nonzero()[:, 0].tolist(), case.only(found.mask)
+    row = {"left": left, "gain": found.gain, "chosen": len(left) < len(found.mask)} | less.judged(found.hyper)
     yield {"structure": "fewer inputs, by evidence", **row}
     before, after = (made.left_out.error for made in (posterior, condition(found.hyper, less.x, less.y)))
     wins = found.gain > WIN * len(case.y) and len(case.y) >= FEWEST and before > EXPLAINED and after <= LESS * before

@@ -254,8 +254,8 @@ class EnvironmentDefinition:
     def observation_scaling(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the observation over the sampling range, (D,) each. An entry that never varies
         has standard deviation 1."""
-        drawn = np.random.default_rng(0).uniform(size=(SCALING_POINTS, len(self.coordinates)))
-        p = torch.from_numpy(drawn).to(self.device)
+        probabilities = np.random.default_rng(0).uniform(size=(SCALING_POINTS, len(self.coordinates)))
+        p = torch.from_numpy(probabilities).to(self.device)
         q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(self.coordinates)], -1)
         shown = self.observe(q)
         deviation = shown.std(0, correction=0)

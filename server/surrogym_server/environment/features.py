@@ -104,17 +104,17 @@ def feature_names(definition: EnvironmentDefinition, feature_map: FeatureMap) ->
 
 def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tuple[Feature, ...]:
     """The features of a map, in order."""
-    made = [] if feature_map.state == "none" else _of_point(definition, feature_map)
+    result = [] if feature_map.state == "none" else _of_point(definition, feature_map)
     if feature_map.lead:
-        made += [
+        result += [
             Feature("lead", place, *scaling(definition.coordinates[index].sampling))
             for place, index in enumerate(leading(definition))
         ]
-    made = [feature for place, feature in enumerate(made) if place not in feature_map.dropped]
+    result = [feature for place, feature in enumerate(result) if place not in feature_map.dropped]
     for place, rate in enumerate(feature_map.rates):
-        if rate and made[place].function == "affine":
-            made[place] = made[place]._replace(function="grown", rate=rate)
-    return tuple(made)
+        if rate and result[place].function == "affine":
+            result[place] = result[place]._replace(function="grown", rate=rate)
+    return tuple(result)
 
 
 def distances(definition: EnvironmentDefinition, a: Points, b: Points) -> Tensor:
@@ -204,18 +204,18 @@ class Encoder:
 
 def _of_point(definition: EnvironmentDefinition, feature_map: FeatureMap) -> list[Feature]:
     """Features of coordinates and action, without those of the lead."""
-    made: list[Feature] = []
+    result: list[Feature] = []
     if feature_map.state == "observation":
-        made += _of_observation(definition)
+        result += _of_observation(definition)
     else:
         for index in _read(definition, feature_map):
-            made += _of_coordinate(definition, feature_map, index)
+            result += _of_coordinate(definition, feature_map, index)
     for index, weights in zip(definition.angles, feature_map.drift, strict=False):
         turned = tuple(w + (i == index) for i, w in enumerate(weights))
-        made += [Feature("turned_cos", index, weights=turned), Feature("turned_sin", index, weights=turned)]
+        result += [Feature("turned_cos", index, weights=turned), Feature("turned_sin", index, weights=turned)]
     for entry in range(definition.action.size if feature_map.action != "none" else 0):
-        made += _of_action(definition, feature_map, entry)
-    return made
+        result += _of_action(definition, feature_map, entry)
+    return result
 
 
 def _read(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Iterator[int]:

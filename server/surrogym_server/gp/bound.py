@@ -114,7 +114,7 @@ def is_noisy(hyper: Hyperparameters) -> bool:
 class Fewer:
     """A process of some of the inputs."""
 
-    kept: Tensor  # (d,) bool
+    mask: Tensor  # (d,) bool
     posterior: Posterior
 
 
@@ -144,7 +144,7 @@ def fewer_inputs(
             out = sets.pop()
             if not inputs.without(out, odds) and len(out) > 1:
                 sets += [out[len(out) // 2 :], out[: len(out) // 2]]
-        return None if bool(inputs.kept.all()) else inputs.process()
+        return None if bool(inputs.mask.all()) else inputs.process()
 
 
 class _Inputs:
@@ -154,29 +154,29 @@ class _Inputs:
         self._x, self._y, self._options, self._inducing, self._mirror = x, y, options, inducing, hyper.reflection
         self._theta = Parameters(x.shape[1], options, hyper.reflection).theta(hyper)
         self._cost, _ = Bound(x, y, pivots(hyper, x, inducing), options, hyper.reflection)(self._theta)
-        self.kept = torch.ones(x.shape[1], dtype=torch.bool)
+        self.mask = torch.ones(x.shape[1], dtype=torch.bool)
 
     def without(self, out: Sequence[int], odds: float) -> bool:
         """Leave out further inputs, if that makes the cost less."""
-        kept = self.kept.index_fill(0, torch.tensor(out), value=False)
-        mirror = self._reflection(kept)
+        mask = self.mask.index_fill(0, torch.tensor(out), value=False)
+        mirror = self._reflection(mask)
         if mirror is not None and mirror.parity < 0 and bool((mirror.signs > 0).all()):
             return False  # such a function is zero
-        others = np.ones(len(self._theta) - int(self.kept.sum()), dtype=bool)
-        start = self._theta[np.concatenate([kept[self.kept].numpy(), others])]
-        cost, theta = _searched(self._x[:, kept], self._y, self._options, start, self._inducing, mirror)
+        others = np.ones(len(self._theta) - int(self.mask.sum()), dtype=bool)
+        start = self._theta[np.concatenate([mask[self.mask].numpy(), others])]
+        cost, theta = _searched(self._x[:, mask], self._y, self._options, start, self._inducing, mirror)
         if cost - odds * len(out) >= self._cost:
             return False
-        self._cost, self._theta, self.kept = cost, theta, kept
+        self._cost, self._theta, self.mask = cost, theta, mask
         return True
 
     def process(self) -> Fewer:
-        x = self._x[:, self.kept]
-        hyper = Parameters(x.shape[1], self._options, self._reflection(self.kept)).hyper(self._theta)
-        return Fewer(self.kept, condition_sparse(hyper, x, self._y, self._inducing))
+        x = self._x[:, self.mask]
+        hyper = Parameters(x.shape[1], self._options, self._reflection(self.mask)).hyper(self._theta)
+        return Fewer(self.mask, condition_sparse(hyper, x, self._y, self._inducing))
 
-    def _reflection(self, kept: Tensor) -> Reflection | None:
-        return None if self._mirror is None else replace(self._mirror, signs=self._mirror.signs[kept])
+    def _reflection(self, mask: Tensor) -> Reflection | None:
+        return None if self._mirror is None else replace(self._mirror, signs=self._mirror.signs[mask])
 
 
 def _effects(posterior: Posterior, x: Tensor) -> Tensor:

@@ -208,13 +208,13 @@ def _played(known: Posterior, x: Tensor, y: Tensor, may: Tensor) -> Inputs | Non
 
 def _neighbours(inputs: Inputs, size: int) -> list[Inputs]:
     """The inputs with one exchanged for another of all ``size``, or with two in each other's place."""
-    made = []
+    swaps = []
     for place, old in enumerate(inputs):
         for new in set(range(size)) - {old}:
             swapped = [old if played == new else played for played in inputs]
             swapped[place] = new
-            made.append(tuple(swapped))
-    return made
+            swaps.append(tuple(swapped))
+    return swaps
 
 
 def _allowed(may: Tensor, inputs: Inputs) -> bool:

@@ -24,7 +24,7 @@ from surrogym_server.gp.search import Evidence, blas, minimum
 class Selection:
     """A process of some of the inputs."""
 
-    kept: Tensor  # (d,) bool
+    mask: Tensor  # (d,) bool
     theta: Array  # its free parameters
     score: float  # log evidence, priors included
     gain: float  # above that of the process with all inputs
@@ -46,13 +46,13 @@ def select_inputs(posterior: Posterior, options: FitOptions, may: Tensor, odds: 
         while (less := search.without_one(subset, subset.cost + odds)) is not None:
             subset = less
         subset = search.fitted(subset)
-    hyper = search.objective(subset.kept).hyper(subset.theta)
-    return Selection(subset.kept, subset.theta, -subset.cost, whole.cost - subset.cost, hyper)
+    hyper = search.objective(subset.mask).hyper(subset.theta)
+    return Selection(subset.mask, subset.theta, -subset.cost, whole.cost - subset.cost, hyper)
 
 
 @dataclass(frozen=True)
 class _Subset:
-    kept: Tensor  # (d,) bool
+    mask: Tensor  # (d,) bool
     theta: Array
     cost: float  # negative log evidence, priors included
 
@@ -63,20 +63,20 @@ class _Search:
     def __init__(self, posterior: Posterior, options: FitOptions, may: Tensor) -> None:
         self._posterior, self._options, self._may = posterior, options, may
 
-    def objective(self, kept: Tensor) -> Evidence:
+    def objective(self, mask: Tensor) -> Evidence:
         mirror = self._posterior.hyper.reflection
-        part = None if mirror is None else replace(mirror, signs=mirror.signs[kept])
-        return Evidence(self._posterior.x[:, kept], self._posterior.y, self._options, part)
+        part = None if mirror is None else replace(mirror, signs=mirror.signs[mask])
+        return Evidence(self._posterior.x[:, mask], self._posterior.y, self._options, part)
 
     def whole(self) -> _Subset:
         """All inputs, with hyperparameters near those of the process, which may come from other points."""
-        kept = torch.ones_like(self._may)
-        theta = self.objective(kept).theta(self._posterior.hyper)
-        return self.fitted(_Subset(kept, theta, 0.0))
+        mask = torch.ones_like(self._may)
+        theta = self.objective(mask).theta(self._posterior.hyper)
+        return self.fitted(_Subset(mask, theta, 0.0))
 
     def fitted(self, subset: _Subset) -> _Subset:
         """The subset with hyperparameters of its own."""
-        cost, theta = minimum(self.objective(subset.kept), subset.theta)
+        cost, theta = minimum(self.objective(subset.mask), subset.theta)
         return replace(subset, theta=theta, cost=cost)
 
     def without_one(self, subset: _Subset, most: float) -> _Subset | None:
@@ -89,11 +89,11 @@ class _Search:
 
     def _each_without_one(self, subset: _Subset) -> Iterator[_Subset]:
         """All with one input less that can still vary, with the hyperparameters as they are."""
-        mirror, places = self._posterior.hyper.reflection, subset.kept.nonzero()[:, 0].tolist()
+        mirror, places = self._posterior.hyper.reflection, subset.mask.nonzero()[:, 0].tolist()
         for position, place in enumerate(places):
-            kept = subset.kept.clone()
-            kept[place] = False
-            nothing = mirror is not None and mirror.parity < 0 and bool((mirror.signs[kept] > 0).all())
-            if self._may[place] and bool(kept.any()) and not nothing:
+            mask = subset.mask.clone()
+            mask[place] = False
+            nothing = mirror is not None and mirror.parity < 0 and bool((mirror.signs[mask] > 0).all())
+            if self._may[place] and bool(mask.any()) and not nothing:
                 theta = subset.theta[torch.arange(len(subset.theta)).numpy() != position]
-                yield _Subset(kept, theta, self.objective(kept)(theta)[0])
+                yield _Subset(mask, theta, self.objective(mask)(theta)[0])

@@ -54,20 +54,20 @@ class _Turn:
     """A turn to fit: a few fits run at a time. A long fit lets others start beside it."""
 
     def __init__(self, usual: asyncio.Semaphore, passed: asyncio.Semaphore) -> None:
-        self._usual, self._passed, self._held = usual, passed, usual
+        self._usual, self._passed, self._current = usual, passed, usual
 
     async def __aenter__(self) -> _Turn:
         await self._usual.acquire()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        self._held.release()
+        self._current.release()
 
     async def let_others_pass(self) -> None:
         """Let other fits start beside this one after a while, as soon as there are few long ones."""
         await asyncio.sleep(PASSED_SECONDS)
         await self._passed.acquire()
-        self._held = self._passed
+        self._current = self._passed
         self._usual.release()
 
 

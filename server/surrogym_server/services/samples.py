@@ -99,15 +99,15 @@ class SampleService:
         pending = [query for query in self._storage.queries.list(name, ("pending",)) if query.purpose == "initial"]
         if not pending:
             return
-        taken = self._storage.samples.arrays(name)
-        logged = np.array([purpose == "logged" for purpose in taken.purpose], dtype=np.bool_)
-        q, u = taken.coordinates[logged], taken.action[logged]
+        real_steps = self._storage.samples.arrays(name)
+        logged = np.array([purpose == "logged" for purpose in real_steps.purpose], dtype=np.bool_)
+        q, u = real_steps.coordinates[logged], real_steps.action[logged]
         if definition.max_rollout is not None:
             steps = np.cumsum([query.steps for query in pending])
             chosen = steps <= len(q)
         else:
-            asked = [np.array([getattr(query, field) for query in pending]) for field in ("coordinates", "action")]
-            chosen = covered(definition, asked[0], asked[1], q, u)
+            columns = [np.array([getattr(query, field) for query in pending]) for field in ("coordinates", "action")]
+            chosen = covered(definition, columns[0], columns[1], q, u)
         covering = [query.id for query, one in zip(pending, chosen, strict=True) if one]
         if covering:
             self._storage.queries.withdraw(name, covering)

@@ -92,11 +92,11 @@ class SessionService:
     async def restore(self) -> int:
         """Take the saved sessions back; returns how many. The log names each that can't be, and why."""
         try:
-            taken = self._storage.sessions.take()
+            saved_sessions = self._storage.sessions.take()
         except Damaged as error:
             logger.error("the saved sessions can't be read, so trainers must open new ones: %s", error)
             return 0
-        return sum([await self._restored(saved) for saved in taken])
+        return sum([await self._restored(saved) for saved in saved_sessions])
 
     async def _restored(self, saved: SavedSession) -> bool:
         try:
@@ -120,8 +120,8 @@ class SessionService:
         if opening.settings.start_visited == 0:
             return None
         states = self._storage.samples.arrays(surrogate).coordinates
-        kept = np.linspace(0, len(states) - 1, min(len(states), MOST_STARTS)).astype(int)
-        chosen: Array = states[kept]
+        rows = np.linspace(0, len(states) - 1, min(len(states), MOST_STARTS)).astype(int)
+        chosen: Array = states[rows]
         return chosen
 
     def _rewards(self, surrogate: str, definition: EnvironmentDefinition) -> SampledRewards | None:

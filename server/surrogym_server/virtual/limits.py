@@ -30,9 +30,9 @@ def within(limits: Limits | None, transition: LaneTransition) -> LaneTransition:
     mean, (low, high) = transition.reward_mean, limits
     if np.minimum.reduce(mean) >= low and np.maximum.reduce(mean) <= high:
         return transition
-    kept: NDArray[Any] = np.clip(mean, low, high)
+    clipped: NDArray[Any] = np.clip(mean, low, high)
     if transition.left is not None:
-        kept = np.where(transition.left, mean, kept)
-    if (kept == mean).all():
+        clipped = np.where(transition.left, mean, clipped)
+    if (clipped == mean).all():
         return transition
-    return replace(transition, reward_mean=kept, reward=transition.reward - mean + kept)
+    return replace(transition, reward_mean=clipped, reward=transition.reward - mean + clipped)

@@ -24,5 +24,5 @@ def with_paths(model: DynamicsModel, lanes: LaneState, functions: int | None = N
     drawing, draws = lanes.take(fresh), function_draws(model, functions)
     keyed = drawing if functions is None else replace(drawing, lane=drawing.lane % functions)
     noise = normal_noise(keyed, Purpose.PATH, 1, draws.path_size)[:, 0]
-    drawn = replace(drawing, path=draws.draw(noise))
-    return drawn if len(drawn) == len(lanes) else lanes.put(fresh, drawn)
+    started = replace(drawing, path=draws.draw(noise))
+    return started if len(started) == len(lanes) else lanes.put(fresh, started)

@@ -44,6 +44,6 @@ def check(definition: EnvironmentDefinition, noise: SensorNoise) -> None:
 
 
 def _spread(definition: EnvironmentDefinition, noise: SensorNoise) -> Tensor:
-    given = dict(noise)
-    values = [given.get(name, 0.0) for name in definition.coordinate_names]
+    by_name = dict(noise)
+    values = [by_name.get(name, 0.0) for name in definition.coordinate_names]
     return torch.tensor(values, dtype=torch.float64, device=definition.device)

@@ -179,12 +179,12 @@ def test_inputs_that_are_not_read_are_left_out():
     whole, may = fitted(x, y, 60), torch.ones(6, dtype=torch.bool)
     found = fewer_inputs(x, y, whole, FitOptions(), 60, may, -1.0)
     assert found is not None
-    assert found.kept.tolist() == [True, True, False, False, False, False]
+    assert found.mask.tolist() == [True, True, False, False, False, False]
     assert found.posterior.x.shape[1] == 2
     may[4] = False
     again = fewer_inputs(x, y, whole, FitOptions(), 60, may, -1.0)
     assert again is not None
-    assert again.kept.tolist() == [True, True, False, False, True, False]
+    assert again.mask.tolist() == [True, True, False, False, True, False]
 
 
 def test_inputs_that_are_read_are_kept():
@@ -201,7 +201,7 @@ def test_an_odd_process_keeps_an_input_that_turns():
     hyper = Hyperparameters(torch.full((2,), 2.0, dtype=torch.float64), 1e-6, 1e-6, 0.0, 1e-2, odd)
     whole, may = condition_sparse(hyper, x, y, 30), torch.ones(2, dtype=torch.bool)
     found = fewer_inputs(x, y, whole, FitOptions(), 30, may, 100.0)
-    assert found is None or bool(found.kept[0])
+    assert found is None or bool(found.mask[0])
 
 
 @pytest.mark.parametrize("parity", [0, -1])

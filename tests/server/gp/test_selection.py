@@ -22,8 +22,8 @@ def selected(x: Tensor, y: Tensor, may: Tensor, mirror: Reflection | None = None
     """What is kept, and the log evidence with it and with all inputs."""
     fitted = fit(x, y, OPTIONS, reflection=mirror)
     found = select_inputs(fitted.posterior, OPTIONS, may, ODDS)
-    assert found.hyper.lengthscale.shape == (int(found.kept.sum()),)
-    return found.kept.nonzero()[:, 0].tolist(), found.score, fitted.score
+    assert found.hyper.lengthscale.shape == (int(found.mask.sum()),)
+    return found.mask.nonzero()[:, 0].tolist(), found.score, fitted.score
 
 
 def test_inputs_that_are_not_read_are_left_out():
@@ -35,7 +35,7 @@ def test_inputs_that_are_not_read_are_left_out():
 def test_score_is_that_of_a_process_of_these_inputs_alone():
     x, y = points(25)
     found = select_inputs(fit(x, y, OPTIONS).posterior, OPTIONS, torch.ones(5, dtype=torch.bool), ODDS)
-    cost, _ = Evidence(x[:, found.kept], y, OPTIONS, None)(found.theta)
+    cost, _ = Evidence(x[:, found.mask], y, OPTIONS, None)(found.theta)
     assert abs(found.score + cost) < 1e-6
 
 
@@ -49,7 +49,7 @@ def test_inputs_that_are_all_read_stay():
     y = y + x[:, 1] * x[:, 2] + torch.cos(x[:, 4])
     fitted = fit(x, y, OPTIONS)
     found = select_inputs(fitted.posterior, OPTIONS, torch.ones(5, dtype=torch.bool), ODDS)
-    assert bool(found.kept.all())
+    assert bool(found.mask.all())
     assert abs(found.gain) < 0.1
     torch.testing.assert_close(found.hyper.lengthscale, fitted.posterior.hyper.lengthscale, rtol=0.05, atol=0)
 

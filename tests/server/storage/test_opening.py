@@ -197,9 +197,9 @@ def test_where_no_byte_can_be_locked_a_file_beside_refuses_a_second_server(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(filelock, "WHOLE_DESCRIPTION", None)
-    monkeypatch.setattr(filelock, "_held", set())  # as if the second were another process
+    monkeypatch.setattr(filelock, "_locked_files", set())  # as if the second were another process
     first = FileLock(tmp_path / "surrogym.db")
-    monkeypatch.setattr(filelock, "_held", set())
+    monkeypatch.setattr(filelock, "_locked_files", set())
     with pytest.raises(Unavailable, match="only server"):
         FileLock(by_symbolic_link(tmp_path / "surrogym.db"))
     first.close()

@@ -38,10 +38,10 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name, known in CHOICES.items():
-            if (given := getattr(self, name)) not in known:
-                raise ValueError(f"expected {name} to be one of {', '.join(known)}, got {given!r}")
+            if (value := getattr(self, name)) not in known:
+                raise ValueError(f"expected {name} to be one of {', '.join(known)}, got {value!r}")
         for name in ("reward_jumps", "reward_peaks", "rates", "drop_inputs", "repeated_parts"):
-            if not isinstance(given := getattr(self, name), bool):
-                raise ValueError(f"expected {name} to be true or false, got {given!r}")
+            if not isinstance(value := getattr(self, name), bool):
+                raise ValueError(f"expected {name} to be true or false, got {value!r}")
         if self.inducing != 0 or isinstance(self.inducing, bool):
             require_whole("inducing", self.inducing, FEWEST, MOST)

@@ -39,10 +39,10 @@ def without_inputs(
             return _of_many(learner, output, posterior, may, x, y)
         rows = spread(len(y), subsets.FEW)
         some = condition(posterior.hyper, x[rows], y[rows])
-        found = select_inputs(some, learner.options(output.name), may, ODDS)
-        learner.selections[output.name] = found
-        wins = found.gain > WIN * len(rows)
-        return _with_fewer(learner, output, x, y, found) if wins else output
+        selection = select_inputs(some, learner.options(output.name), may, ODDS)
+        learner.selections[output.name] = selection
+        wins = selection.gain > WIN * len(rows)
+        return _with_fewer(learner, output, x, y, selection) if wins else output
     except NumericalFailure:
         return output
 
@@ -51,10 +51,10 @@ def _of_many(
     learner: OutputLearner, output: OutputModel, posterior: Posterior, may: Tensor, x: Tensor, y: Tensor
 ) -> OutputModel:
     """The output of a process through inducing points, which are of the points x (n, d), y (n,)."""
-    found = learner.many.fewer_inputs(x, y, learner.options(output.name), posterior, may, ODDS)
-    if found is None:
+    selection = learner.many.fewer_inputs(x, y, learner.options(output.name), posterior, may, ODDS)
+    if selection is None:
         return output
-    return replace(output, feature_map=map_without(output.feature_map, found.kept), posterior=found.posterior)
+    return replace(output, feature_map=map_without(output.feature_map, selection.mask), posterior=selection.posterior)
 
 
 def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
@@ -73,23 +73,23 @@ def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
     return may if posterior.points >= FEWEST and enough else none
 
 
-def _with_fewer(learner: OutputLearner, output: OutputModel, x: Tensor, y: Tensor, found: Selection) -> OutputModel:
+def _with_fewer(learner: OutputLearner, output: OutputModel, x: Tensor, y: Tensor, selection: Selection) -> OutputModel:
     """The output with the inputs that were found, if with these each of its points x (n, d), y (n,) is predicted better
     from the others."""
     assert output.posterior is not None
-    kept, x = found.kept, x[:, found.kept]
-    feature_map = map_without(output.feature_map, kept)
+    mask, x = selection.mask, x[:, selection.mask]
+    feature_map = map_without(output.feature_map, mask)
     if len(y) <= subsets.FEW:
-        fewer = condition(found.hyper, x, y)
+        fewer = condition(selection.hyper, x, y)
     else:
-        fewer = learner.refined(output.name, feature_map, x, y, found.theta)
+        fewer = learner.refined(output.name, feature_map, x, y, selection.theta)
     if fewer.left_out.error > LESS * output.posterior.left_out.error:
         return output
-    scores = (*output.scores, (str(feature_map), found.score))
+    scores = (*output.scores, (str(feature_map), selection.score))
     return replace(output, feature_map=feature_map, posterior=fewer, scores=scores)
 
 
-def map_without(feature_map: FeatureMap, kept: Tensor) -> FeatureMap:
+def map_without(feature_map: FeatureMap, mask: Tensor) -> FeatureMap:
     """The map with the features kept (d,)."""
-    rates = tuple(rate for rate, left in zip(feature_map.rates, kept.tolist(), strict=False) if left)
-    return replace(feature_map, dropped=tuple((~kept).nonzero()[:, 0].tolist()), rates=rates)
+    rates = tuple(rate for rate, left in zip(feature_map.rates, mask.tolist(), strict=False) if left)
+    return replace(feature_map, dropped=tuple((~mask).nonzero()[:, 0].tolist()), rates=rates)

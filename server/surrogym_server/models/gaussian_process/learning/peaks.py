@@ -100,16 +100,16 @@ def _learned(
     nothing, few = going & ~paid, int(paid.sum()) < FEWEST
     least = float(height[paid].min().log()) - few * BELOW
     target = torch.where(paid, height.log(), least)
-    told = going if few else paid
-    output = learner.output(PEAK, target, inputs, told, told)
+    learned = going if few else paid
+    output = learner.output(PEAK, target, inputs, learned, learned)
     for _ in range(REFITS):
-        against = nothing & ~told & (output.mean(inputs[output.feature_map]) > least)
+        against = nothing & ~learned & (output.mean(inputs[output.feature_map]) > least)
         if not bool(against.any()):
             break
-        told = told | against
-        output = learner.output(PEAK, target, inputs, told, told)
+        learned = learned | against
+        output = learner.output(PEAK, target, inputs, learned, learned)
     structure = _structure(output)
-    if output.posterior is not None and bool((going & ~told).any()):
+    if output.posterior is not None and bool((going & ~learned).any()):
         x = inputs[output.feature_map]
         y = (torch.where(nothing, output.mean(x).clamp_max(least), target) - output.centre) / output.scale
         posterior = condition_many([output.posterior.hyper], x[going], y[going])

@@ -33,16 +33,20 @@ def with_samples_of_others(learner: OutputLearner, outputs: Sequence[OutputModel
     shared = list(outputs)
     if not learner.settings.repeated_parts or not any(_is_to_learn(learner, output) for output in outputs):
         return tuple(shared)
-    found = [made for place, output in enumerate(outputs) if (made := _candidate(learner, place, output)) is not None]
+    candidates = [
+        candidate
+        for place, output in enumerate(outputs)
+        if (candidate := _candidate(learner, place, output)) is not None
+    ]
     try:
-        together = pools([made.part for made in found], ROLES)
+        together = pools([candidate.part for candidate in candidates], ROLES)
     except NumericalFailure:
         return tuple(shared)
     for pool in together:
         if pool.gain > WIN * max(len(part.y) for part in pool.parts):
-            members = [found[number] for number in pool.numbers]
-            for member, made in enumerate(members):
-                shared[made.place] = _sharing(members, pool, member)
+            members = [candidates[number] for number in pool.numbers]
+            for member, candidate in enumerate(members):
+                shared[candidate.place] = _sharing(members, pool, member)
     return tuple(shared)
 
 
@@ -63,7 +67,7 @@ def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Cand
     size = posterior.x.shape[1]
     reads, fewer = tuple(range(size)), posterior.hyper
     if not chosen.dropped and selection is not None:
-        reads, fewer = tuple(selection.kept.nonzero()[:, 0].tolist()), selection.hyper
+        reads, fewer = tuple(selection.mask.nonzero()[:, 0].tolist()), selection.hyper
     part = Part(
         posterior.x,
         posterior.y,
@@ -81,7 +85,7 @@ def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Cand
 
 def _sharing(members: Sequence[_Candidate], pool: Pool, member: int) -> OutputModel:
     """A member with the samples of its pool, if its own are predicted no worse by them."""
-    made, output = members[member], members[member].output
+    candidate, output = members[member], members[member].output
     assert output.posterior is not None
     x, y, hyper = pool.samples_of(member, MOST)
     try:
@@ -89,13 +93,13 @@ def _sharing(members: Sequence[_Candidate], pool: Pool, member: int) -> OutputMo
     except NumericalFailure:
         return output
     foretold, _ = posterior.leave_one_out()
-    off = (foretold - y)[: len(made.part.y)].square().mean().sqrt()
+    off = (foretold - y)[: len(candidate.part.y)].square().mean().sqrt()
     if float(off) > output.posterior.left_out.error:
         return output
     whole = replace(output.feature_map, dropped=(), parity=members[0].output.feature_map.parity)
-    kept = torch.zeros(len(made.every) + len(output.feature_map.dropped), dtype=torch.bool)
-    kept[[made.every[place] for place in pool.inputs[member]]] = True
-    others = tuple(other.output.name for other in members if other is not made)
-    scores = (*output.scores, (str(chosen := map_without(whole, kept)), pool.gain))
+    mask = torch.zeros(len(candidate.every) + len(output.feature_map.dropped), dtype=torch.bool)
+    mask[[candidate.every[place] for place in pool.inputs[member]]] = True
+    others = tuple(other.output.name for other in members if other is not candidate)
+    scores = (*output.scores, (str(chosen := map_without(whole, mask)), pool.gain))
     centre = pool.parts[0].centre
     return replace(output, feature_map=chosen, posterior=posterior, centre=centre, scores=scores, shared=others)
