@@ -216,10 +216,12 @@ def visited(folder: Path, count: int, *, single: bool) -> None:
     largest = (np.abs(actions - expected) / (controller.high - controller.low)).max()
     off = np.abs(kept - lags).max()
     print(f"visited, {'float' if single else 'double'}: {count} states, lags differ by at most {off:.2g}", end="")
-    if not single:  # in float, a change is the difference of two rounded numbers
-        ulps = int(np.abs(shown.view(np.int32) - meant.view(np.int32)).max())
-        print(f", observations by {ulps} units in the last place of float32", end="")
-    print(f", actions from the policy's by {largest:.2g} of their range")
+    # In float, a change is the difference of two rounded numbers: its error is that of the numbers, not its own.
+    apart = np.abs(shown.astype(np.float64) - meant)
+    print(f", observations by at most {apart.max():.2g}, and in units in the last place of float32:", end="")
+    for entry, column in zip(spec.observation, (apart / np.spacing(np.abs(meant))).T, strict=True):
+        print(f" {entry.name} {column.max():.0f},", end="")
+    print(f" actions from the policy's by {largest:.2g} of their range")
 
 
 def strict(folder: Path, options: Any) -> None:

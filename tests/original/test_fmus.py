@@ -305,7 +305,7 @@ def test_a_state_that_does_not_read_back_can_only_be_reset(tmp_path: Path) -> No
     try:
         assert not fmu.settable
         assert fmu.fixed == "x was started at 0.35 and read back as 0.25, so it can only be reset"
-        with pytest.raises(UnknownEnvironment, match="can only be reset"):
+        with pytest.raises(UnknownEnvironment, match="--access reset"):
             fmu.write(np.ones(1))
     finally:
         fmu.close()

@@ -7,12 +7,15 @@ from pathlib import Path
 from textwrap import dedent
 from types import SimpleNamespace
 
+import gymnasium
 import pytest
 
 from surrogym_sampler import original
+from surrogym_sampler.original.classic import TASKS
 from surrogym_sampler.original.describing import describe
 from surrogym_sampler.original.errors import PolicyMisfit, UnknownEnvironment
 from surrogym_sampler.original.fitting import check_policy
+from surrogym_sampler.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_sampler.original.periods import period_of
 from surrogym_sampler.queries.query_limits import check_environment
 
@@ -78,3 +81,11 @@ def test_a_class_of_ones_own_is_checked(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_a_draft_declares_the_period_that_the_environment_tells() -> None:
     assert describe("Pendulum-v1", 40).spec.sampling_period == 0.05
+
+
+@pytest.mark.parametrize("name", [*TASKS, *SPECIFICATIONS])
+def test_a_built_in_environment_declares_the_period_that_it_has(name: str) -> None:
+    environment = gymnasium.make(name).unwrapped
+    own = period_of(environment) or getattr(environment, "tau", None)  # CartPole calls it tau
+    assert original.make(name).spec().sampling_period == own
+    assert (own is None) == name.startswith("MountainCar")

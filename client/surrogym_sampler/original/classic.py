@@ -1,6 +1,7 @@
 """Gymnasium's classic control tasks and the swing-up of this package: specifications, and access to their state.
 
-The source of every number is the task's Gymnasium class. Angles are in radians.
+The source of every number is the task's Gymnasium class. Angles are in radians. Gymnasium's mountain cars have no unit
+of time, so no sampling period.
 """
 
 from __future__ import annotations
@@ -66,6 +67,7 @@ def pendulum() -> EnvironmentSpec:
         action=BoxAction(low=(-2.0,), high=(2.0,)),
         start={"theta": CIRCLE, "speed": Uniform(low=-1, high=1)},
         time_limit=200,
+        sampling_period=0.05,
         reward=Reward(timing="before"),
         success=Success(hold=(Inequality(term=Term.cos(theta=1), relation=">", value=0.95),), hold_steps=20),
     )
@@ -114,6 +116,7 @@ def _cartpole(
         start={n: Uniform(low=-0.05, high=0.05) for n in sampling},
         termination=termination,
         time_limit=time_limit,
+        sampling_period=0.02,
         reward=Reward(timing="after"),
         success=Success(min_steps=min_steps),
     )
@@ -189,6 +192,7 @@ def acrobot() -> EnvironmentSpec:
         start={name: Uniform(low=-0.1, high=0.1) for name in ("theta1", "theta2", "speed1", "speed2")},
         termination=((Inequality(term=height, relation=">", value=1),),),
         time_limit=500,
+        sampling_period=0.2,
         reward=Reward(timing="after"),
         success=Success(terminated=True),
     )

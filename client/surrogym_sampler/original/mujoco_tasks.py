@@ -35,6 +35,7 @@ def inverted_pendulum() -> EnvironmentSpec:
         start={name: Uniform(low=-0.01, high=0.01) for name in sampling},
         termination=(*_outside("hinge", 0.2), *_outside("slider", 0.95)),
         time_limit=1000,
+        sampling_period=0.04,
         reward=Reward(timing="after"),
         success=Success(min_steps=1000),
     )
@@ -72,6 +73,7 @@ def inverted_double_pendulum() -> EnvironmentSpec:
             *_outside("slider", 0.9),
         ),
         time_limit=1000,
+        sampling_period=0.05,
         reward=Reward(timing="after"),
         success=Success(min_return=9000),
     )
@@ -100,6 +102,7 @@ def reacher() -> EnvironmentSpec:
             "target_y": square,
         },
         time_limit=50,
+        sampling_period=0.02,
         reward=Reward(timing="after"),
         success=Success(min_return=-6),
     )

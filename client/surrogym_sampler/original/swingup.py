@@ -53,6 +53,7 @@ class CartPoleSwingUp(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     stands above the origin. No state ends an episode. The picture has a mark there.
     """
 
+    dt = STEP_SECONDS
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / STEP_SECONDS)}  # noqa: RUF012 (Gymnasium's type)
 
     def __init__(self, reward: Literal["smooth", "narrow"] = "smooth", render_mode: str | None = None) -> None:
@@ -174,6 +175,7 @@ def _specification(environment: str) -> EnvironmentSpec:
         action=BoxAction(low=(-MAX_FORCE,), high=(MAX_FORCE,)),
         start={name: Uniform(low=-START, high=START) for name in ("x", "velocity", "angle", "omega")},
         time_limit=SWING_UP_STEPS,
+        sampling_period=STEP_SECONDS,
         reward=Reward(timing="after"),
         success=Success(hold=(Inequality(term=Term.cos(angle=1), relation="<", value=-0.95),), hold_steps=20),
     )
