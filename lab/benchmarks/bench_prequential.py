@@ -37,7 +37,7 @@ from surrogym_server.models.gaussian_process.prediction.several import Functions
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.design import Decision, advance, initial_queries
 from surrogym_server.sampling.latin_hypercube import random_points
-from surrogym_server.sampling.prequential import Prediction, Predictions, continued, half_width, predicted, scores_of
+from surrogym_server.sampling.prequential import Prediction, Predictions, half_width, latest, predicted, scores_of
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -119,8 +119,8 @@ def replay(machine: Machine, budget: int, *, judged: bool) -> tuple[Decision, Sa
         if not made.queries:
             return made, samples, mixed
         new = machine.answer(*arrays(made.queries))
-        state = replace(made.state, predictions=continued(made.state.predictions, predicted(made.model, new)))
-        mixed = continued(mixed, mixture_of(made.model, new))
+        state = replace(made.state, predictions=latest(made.state.predictions, predicted(made.model, new)))
+        mixed = latest(mixed, mixture_of(made.model, new))
         samples = join(samples, new)
 
 
