@@ -199,7 +199,61 @@ def test_the_arduino_layout_has_what_its_tools_read_and_a_sketch_that_compiles(t
     if shutil.which("g++") is None:
         pytest.skip("g++ is not on this machine")
     stub = tmp_path / "Arduino.h"
-    stub.write_text("unsigned long millis();\n")
+    stub.write_text("#include <stdint.h>\nunsigned long millis();\nunsigned long micros();\n")
     sketch = folder / "examples" / "control" / "control.ino"
     strict = ["-Wall", "-Wextra", "-Werror", "-include", stub, f"-I{folder / 'src'}"]
     subprocess.run(["g++", *strict, "-x", "c++", "-c", sketch, "-o", tmp_path / "sketch.o"], check=True)
+
+
+SIMULATED = """
+#include <stdint.h>
+#include <stdio.h>
+static uint32_t now = 4294000000u;
+static bool fresh = false;
+static int applied = 0;
+unsigned long micros() { return now; }
+#include "sketch.cpp"
+static int decisions(uint32_t after) {
+    int before = applied;
+    now += after;
+    for (int i = 0; i < 3; i++) loop();
+    return applied - before;
+}
+int main() {
+    setup();
+    const uint32_t times[] = {0, 2499, 1, 100000};
+    for (uint32_t after : times) printf("%d ", decisions(after));
+    fresh = true;
+    decisions(2500);
+    fresh = false;
+    printf("%d ", action[0] != 2);
+    decisions(100000);
+    printf("%d ", action[0] == 2);
+    for (int third = 0; third < 3; third++) decisions(1431622432u); /* 2^32 us after the measurement */
+    printf("%d\\n", action[0] == 2);
+}
+"""
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not on this machine")
+def test_a_sketch_keeps_its_period_and_forgets_a_late_measurement_when_its_clock_begins_anew(tmp_path: Path):
+    path, choices = (
+        network(tmp_path, plant().model_copy(update={"sampling_period": 0.0025})),
+        Choices(fallback=(2.0, 0.0)),
+    )
+    folder = tmp_path / "library"
+    folder.mkdir()
+    write_arduino(controller_of(path, choices=choices), folder)
+    sketch = (folder / "examples" / "control" / "control.ino").read_text()
+    sketch = sketch.replace("return false;", "return fresh;").replace("// Send action", "applied++; // Send action")
+    (tmp_path / "sketch.cpp").write_text(sketch)
+    (tmp_path / "main.cpp").write_text(SIMULATED)
+    sources = [tmp_path / "main.cpp", "-x", "c", folder / "src" / "arm_controller.c"]
+    subprocess.run(["g++", f"-I{folder / 'src'}", *sources, "-lm", "-o", tmp_path / "main"], check=True)
+    assert run(tmp_path / "main").split() == ["1", "0", "1", "1", "1", "1", "1"]
+
+
+def test_a_sketch_of_a_period_that_its_clock_can_not_count_is_refused(tmp_path: Path):
+    path = network(tmp_path, plant().model_copy(update={"sampling_period": 3e6}))
+    with pytest.raises(NotDeployable, match="up to 2,000,000 s, got 6e"):
+        write_arduino(controller_of(path), tmp_path)

@@ -254,7 +254,7 @@ def _require_small(decision: Decision) -> None:
             f"expected a network of at most {MOST_WEIGHTS:,} weights, got {size:,}, which need {8 * size // 10**6} MB: "
             "surrogym export-policy writes it for a larger machine"
         )
-    if not (decision.deviation > 0).all():
+    if not (decision.deviation >= 1 / LARGEST).all():  # smaller ones are 0 in float
         raise NotDeployable("expected a policy with positive standard deviations, got others")
     arrays = (decision.mean, decision.deviation, decision.centre, decision.reach, *layers)
     _require_in_float("a policy", *arrays)

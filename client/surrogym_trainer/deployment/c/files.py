@@ -13,6 +13,8 @@ from surrogym_trainer.deployment.c import source
 from surrogym_trainer.deployment.controller import Array, Controller, NotDeployable
 from surrogym_trainer.deployment.vectors import Vector, vectors_of
 
+LONGEST = 2_000_000  # s; a sketch counts to 2^31 milliseconds
+
 
 def prefix_of(controller: Controller) -> str:
     """Return the prefix of all names in C: the surrogate's name with letters that an identifier may have."""
@@ -58,7 +60,7 @@ def write_arduino(controller: Controller, folder: Path) -> None:
     (folder / "library.properties").write_text("\n".join([*lines, ""]), encoding="utf-8")
     sketch = folder / "examples" / "control"
     sketch.mkdir(parents=True)
-    content = _template("sketch.ino").substitute(_names(controller), period_ms=_milliseconds(controller))
+    content = _template("sketch.ino").substitute(_names(controller), **_clock(controller))
     (sketch / "control.ino").write_text(content, encoding="utf-8")
 
 
@@ -123,10 +125,16 @@ def _title(controller: Controller) -> str:
     return f"Controller of {controller.name}"
 
 
-def _milliseconds(controller: Controller) -> str:
+def _clock(controller: Controller) -> dict[str, str]:
+    """Return the sketch's clock of 32 bits: microseconds if they suffice for the period and the timeout."""
     if controller.period is None:
         raise NotDeployable("a sketch has a period: expected --period, or sampling_period in the specification")
-    return f"{max(1, round(1000 * controller.period))}"
+    longest = max(controller.period, controller.timeout)
+    if longest > LONGEST:
+        raise NotDeployable(f"expected a period and a timeout of a sketch up to {LONGEST:,} s, got {longest:g} s")
+    unit, clock, second = ("us", "micros", 1_000_000) if longest < LONGEST / 1000 else ("ms", "millis", 1000)
+    period = max(1, round(second * controller.period))
+    return {"period": str(period), "unit": unit, "clock": clock, "second": str(second)}
 
 
 def _in(unit: str) -> str:
