@@ -152,3 +152,19 @@ def test_a_surrogate_where_a_policy_is_meant_is_refused_with_how_policies_are_na
     ]:
         said = surrogym("deploy", *arguments, "--out", "c")
         assert (said.code, words in said.err.replace("\n", " ")) == (1, True), said.err
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_is_one_sentence_and_no_file_stays(surrogym, tmp_path, monkeypatch):
+    path, whole = policy_for(tmp_path, pendulum(), None), Path.open
+
+    def full(self: Path, mode: str = "r", *arguments, **options):
+        if mode == "xb":
+            whole(self, mode).close()
+            return whole(Path("/dev/full"), "r+b", buffering=0)
+        return whole(self, mode, *arguments, **options)
+
+    monkeypatch.setattr(Path, "open", full)
+    said = surrogym("deploy", str(path), "--target", "c", "--out", "c")
+    assert (said.code, "a file can't be written: No space left on device" in said.err) == (1, True), said.err
+    assert list((tmp_path / "c").iterdir()) == []

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 from typing import TYPE_CHECKING
 
 from surrogym_client.runtime.ways_out import GIVE_TOKEN, START_SERVER, missing
 
 if TYPE_CHECKING:
     from surrogym_client.errors import SurrogymClientError
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # from a file that is open: such an error does not have its name
 
 
 class CommandError(Exception):
@@ -39,6 +42,8 @@ def sentence(error: Exception) -> str | None:
             return invalid(error)
         case OSError(filename=str(path), strerror=str(reason)):
             return f"{path}: {reason}"
+        case OSError(errno=number, strerror=str(reason)) if number in FULL:
+            return f"a file can't be written: {reason}"
         case _:
             return None
 
