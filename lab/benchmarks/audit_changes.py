@@ -16,7 +16,6 @@ import json
 import shutil
 import sqlite3
 import sys
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -28,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 import numpy as np
 import torch
-from audit_power import PATIENCE_SECONDS, placed, sampling
+from audit_power import PATIENCE_SECONDS, placed, sampling, share_of
 
 from support.changing import Machine, Parameters
 from support.levitation import PLANTS, Plant, real_returns
@@ -36,7 +35,6 @@ from support.server import running_server
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_lab.reproduce.rows import read_records, write_records
-from surrogym_lab.reproduce.statistics import exact_interval
 from surrogym_shared.spec import Design
 from surrogym_trainer.policies import load_policy
 from surrogym_trainer.policies.evidence import Promise
@@ -196,8 +194,6 @@ def audited(machine: Machine, change: str, subject: Subject, returns: Returns) -
     number, seed = [*UNCHANGED, *machine.wrong].index(change), subject.seed
     plant = Plant(machine, changed(machine, change), np.random.default_rng([seed, 2, number]))
     with sampling(subject.api.url, subject.name, plant):
-        while not subject.api.surrogate(subject.name).samplers:
-            time.sleep(0.05)
         phase = subject.api.surrogate(subject.name).phase
         found = hand_over(subject, AuditSettings(seed=seed + 1_000 * number))
     audit, promise = found.audit, found.promise
@@ -228,8 +224,7 @@ def _line(plant: str, what: str, rows: Sequence[Row]) -> str:
         return f"| {plant} | {what} | 0 | - | - | - | - |"
     lost = sum(not row.trusted for row in rows)
     broken = sum(row.trusted and row.now < row.promised_low for row in rows)
-    low, high = exact_interval(lost, len(rows))
-    share = f"{100 * lost / len(rows):.0f} % ({100 * low:.0f} to {100 * high:.0f})"
+    share = share_of(lost, len(rows), digits=0)
     steps = np.mean([row.steps for row in rows])
     return f"| {plant} | {what} | {len(rows)} | {lost} | {share} | {broken} | {steps:.1f} |"
 

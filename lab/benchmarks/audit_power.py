@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -145,13 +146,15 @@ def placed(
 
 @contextmanager
 def sampling(url: str, name: str, environment: Environment) -> Iterator[None]:
-    """A sampler beside the environment in a thread, until the context ends or the surrogate is deleted."""
+    """A connected sampler beside the environment in a thread, until the context ends or the surrogate is deleted."""
     settings = SamplerSettings(name="beside", wait_seconds=0.5, time_limit=2 * PATIENCE_SECONDS)
     with Api(url) as own:
         sampler = Sampler(own, name, environment, settings)
         thread = threading.Thread(target=_until_deleted, args=(sampler,))
         thread.start()
         try:
+            while not own.surrogate(name).samplers:
+                time.sleep(0.05)
             yield
         finally:
             sampler.stop()
@@ -189,21 +192,21 @@ def table(rows: Sequence[Row]) -> str:
     apart = [row for row, off in found if row.mechanism == RIGHT and off >= OFF]
     lines.append(_line("of the machine as it is", f"{OFF:.0%} or more", apart))
     trusted = [row for row, _ in found if row.trusted]
-    share = _share(sum(row.kept for row in trusted), len(trusted))
+    share = share_of(sum(row.kept for row in trusted), len(trusted))
     return "\n".join(lines) + f"\n\nreal return above the 5 % quantile of the promise: {share} of all trusted"
 
 
 def _line(models: str, off: str, rows: Sequence[Row]) -> str:
     failed = sum(not row.passed for row in rows)
-    return f"| {models} | {off} | {len(rows)} | {failed} | {_share(failed, len(rows))} |"
+    return f"| {models} | {off} | {len(rows)} | {failed} | {share_of(failed, len(rows))} |"
 
 
-def _share(count: int, of: int) -> str:
-    """A share with its exact 95 % interval."""
+def share_of(count: int, of: int, digits: int = 1) -> str:
+    """A share in per cent with its exact 95 % interval."""
     if not of:
         return "-"
     low, high = exact_interval(count, of)
-    return f"{100 * count / of:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+    return f"{100 * count / of:.{digits}f} % ({100 * low:.{digits}f} to {100 * high:.{digits}f})"
 
 
 def _options() -> argparse.Namespace:

@@ -16,7 +16,6 @@ import argparse
 import json
 import shutil
 import sys
-import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -30,13 +29,12 @@ import gymnasium
 import numpy as np
 import torch
 from audit_changes import copy_surrogate
-from audit_power import OFF, PATIENCE_SECONDS, placed, sampling
+from audit_power import OFF, PATIENCE_SECONDS, placed, sampling, share_of
 
 from support.server import running_server
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_lab.reproduce.rows import read_records, write_records
-from surrogym_lab.reproduce.statistics import exact_interval
 from surrogym_sampler.original.episodes import RolloutEpisode
 from surrogym_sampler.original.gymnasium import wrapped
 from surrogym_sampler.original.loading import make
@@ -298,8 +296,6 @@ def handed_over(subject: Subject, kind: type[Machine], mass: float, seed: int) -
     """Audit a policy beside a sampler, and by whole episodes if that left states untested. Returns the last verdict,
     and the real steps of both."""
     with sampling(subject.api.url, subject.name, FromReset(kind(mass))):
-        while not subject.api.surrogate(subject.name).samplers:
-            time.sleep(0.05)
         found = hand_over(subject, AuditSettings(seed=seed))
     audit = found.audit
     assert audit is not None, found.reason
@@ -334,11 +330,8 @@ def _line(machine: str, policies: str, rows: Sequence[Row]) -> str:
     if not rows:
         return f"| {machine} | {policies} | 0 | - | - | - |"
     trusted = sum(row.trusted for row in rows)
-    low, high = exact_interval(trusted, len(rows))
-    share = f"{100 * trusted / len(rows):.0f} % ({100 * low:.0f} to {100 * high:.0f})"
-    return (
-        f"| {machine} | {policies} | {len(rows)} | {trusted} | {share} | {np.mean([row.steps for row in rows]):.0f} |"
-    )
+    share, steps = share_of(trusted, len(rows), digits=0), np.mean([row.steps for row in rows])
+    return f"| {machine} | {policies} | {len(rows)} | {trusted} | {share} | {steps:.0f} |"
 
 
 def _options() -> argparse.Namespace:

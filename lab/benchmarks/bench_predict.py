@@ -161,7 +161,7 @@ def steps(model: GaussianProcessModel, lanes: int, seconds: float) -> Row:
 
 
 def particles(model: GaussianProcessModel, count: int, seconds: float) -> Row:
-    stages = [stage.serving for stage in model._stages if stage is not None]
+    stages = [group.serving for group in model._predictor._groups if group]
     bare = [products(s, PARTICLE_LANES * count, list(s.processes)) for s in stages]
     subjects = {
         "AUR-P": timed(stepping(model, PARTICLE_LANES, particles=count, **AUR_P)),

@@ -35,7 +35,7 @@ WIDER = 1.5  # times the largest observed change
 
 @dataclass(frozen=True)
 class History:
-    """Earlier changes and actions that tell what happens next. Errors are shares of the standard deviation of a change.
+    """How many earlier changes and actions predict the next change. Errors are shares of a change's standard deviation.
 
     Attributes:
         steps: number of real steps.

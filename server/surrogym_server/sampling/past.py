@@ -70,8 +70,8 @@ def _state(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
 
 
 def _past(u: Tensor, change: Tensor, follows: Tensor, depth: int) -> tuple[Tensor, Tensor]:
-    """Change of state in the step before each of n samples, and ``depth`` earlier actions, (n, d); also whether the
-    sample has so many steps before it, (n,)."""
+    """Change of state in the step before each of n samples, and ``depth`` earlier actions, (n, d); also whether
+    ``depth`` steps come before the sample, (n,)."""
     place, known, columns = torch.arange(len(follows)), torch.ones(len(follows), dtype=torch.bool), [change[follows]]
     for _ in range(depth):
         place = follows[place]  # -1 for a row without a step before it

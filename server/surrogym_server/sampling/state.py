@@ -84,9 +84,9 @@ class Request:
         return sum(query.steps for query in self.pending)
 
     def is_mostly_refused(self, cost: float) -> bool:
-        """Whether the environment has refused so many steps that the design should end.
+        """Whether the design should end, because as many steps were refused as its budget and ``cost`` have together.
 
-        The limit is the budget plus ``cost``, the real steps that count. Without it, a design whose queries are all
-        refused would never end.
+        ``cost`` is the number of real steps that count. Without this limit, a design whose queries are all refused
+        would never end.
         """
         return sum(query.steps for query in self.refused) >= self.budget + cost
