@@ -18,9 +18,8 @@ from surrogym_server.errors import Damaged, NoModel, SurrogymError
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewSample, NewSurrogate
 from surrogym_server.storage.sql import open_storage
-from surrogym_server.storage.sql.checks import check_pages
 from surrogym_server.storage.sql.database import connect
-from surrogym_server.storage.sql.storage import SqlStorage
+from surrogym_server.storage.sql.storage import SqlStorage, check_pages
 from surrogym_server.storage.sql.tables import Checked, metadata, models
 
 NAME = "pendulum"

@@ -25,7 +25,7 @@ from surrogym_server.storage.records import NewSurrogate
 from surrogym_server.storage.sql import database, filelock, open_storage
 from surrogym_server.storage.sql.database import connect
 from surrogym_server.storage.sql.filelock import FileLock
-from surrogym_server.storage.sql.migrate import SCRIPTS
+from surrogym_server.storage.sql.storage import SCRIPTS
 from surrogym_server.storage.sql.tables import metadata
 
 WRITER = """

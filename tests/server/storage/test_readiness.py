@@ -14,7 +14,8 @@ import sqlalchemy as sa
 
 from surrogym_server.errors import Unavailable
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import checks, open_storage
+from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import storage as sql_storage
 from surrogym_server.storage.sql.database import BUSY_SECONDS
 
 Until = Callable[[Callable[[], bool]], None]
@@ -37,7 +38,7 @@ def refusal(storage: Storage) -> str | None:
 
 @pytest.fixture(autouse=True)
 def _always_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checks, "FRESH_SECONDS", 0.0)
+    monkeypatch.setattr(sql_storage, "FRESH_SECONDS", 0.0)
 
 
 def test_a_missing_table_is_not_ready_until_it_is_back(storage: Storage, url: str) -> None:
@@ -65,7 +66,7 @@ def test_a_file_that_another_program_keeps_is_not_ready_and_nobody_waits_long_fo
     tmp_path: Path, until: Until, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     storage = open_storage(f"sqlite:///{tmp_path}/surrogym.db")
-    monkeypatch.setattr(checks, "PATIENCE_SECONDS", 0.2)
+    monkeypatch.setattr(sql_storage, "PATIENCE_SECONDS", 0.2)
     with closing(sqlite3.connect(tmp_path / "surrogym.db", isolation_level=None)) as other:
         other.execute("BEGIN EXCLUSIVE")
         started = time.monotonic()
@@ -77,10 +78,10 @@ def test_a_file_that_another_program_keeps_is_not_ready_and_nobody_waits_long_fo
 
 
 def test_many_simultaneous_checks_cause_one_write(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checks, "FRESH_SECONDS", 3600.0)
+    monkeypatch.setattr(sql_storage, "FRESH_SECONDS", 3600.0)
     writes: list[None] = []
-    write = checks.Readiness._write
-    monkeypatch.setattr(checks.Readiness, "_write", lambda self: (writes.append(None), write(self)))
+    write = sql_storage.Readiness._write
+    monkeypatch.setattr(sql_storage.Readiness, "_write", lambda self: (writes.append(None), write(self)))
     callers = [threading.Thread(target=storage.ping) for _ in range(20)]
     for caller in callers:
         caller.start()

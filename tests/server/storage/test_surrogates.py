@@ -15,7 +15,8 @@ from support.queries import steps
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewSurrogate
-from surrogym_server.storage.sql import designs, initial, removal
+from surrogym_server.storage.sql import designs, queries
+from surrogym_server.storage.sql import surrogates as stored
 from surrogym_server.storage.sql.tables import metadata, surrogates
 
 NAME = "pendulum"
@@ -155,15 +156,15 @@ def test_every_operation_refuses_an_unknown_surrogate(storage: Storage, by_hand:
 def test_many_initial_queries_are_queued_in_bounded_transactions_and_after_a_crash(
     storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(initial, "BATCH", 10)
-    unbegun = sa.select(surrogates.c.name).where(designs.IS_UNBEGUN | initial.IS_INCOMPLETE)
+    monkeypatch.setattr(queries, "BATCH", 10)
+    unbegun = sa.select(surrogates.c.name).where(designs.IS_UNBEGUN | queries.IS_INCOMPLETE)
     monkeypatch.setattr(designs, "UNBEGUN", unbegun)  # without the minute in which the creating server may be alive
     planned = steps(np.arange(70.0).reshape(35, 2), np.full((35, 1), 0.5))
     with committed(storage) as commits:
         whole = make(queries=35, name="whole")
     assert len(commits) >= 4
     with monkeypatch.context() as patched:
-        crash_at(patched, initial, "insert_queries", call=3)
+        crash_at(patched, queries, "insert_queries", call=3)
         with pytest.raises(ZeroDivisionError):
             make(queries=35)
     assert storage.queries.counts(NAME).pending == 20
@@ -181,7 +182,7 @@ def test_many_initial_queries_are_queued_in_bounded_transactions_and_after_a_cra
 def test_a_surrogate_is_deleted_in_bounded_transactions_and_after_a_crash(
     storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(removal, "BATCH", 10)
+    monkeypatch.setattr(stored, "BATCH", 10)
     kept, whole = make(name="kept"), make(queries=35, name="whole")
     with committed(storage) as commits:
         storage.surrogates.delete(whole)
@@ -189,7 +190,7 @@ def test_a_surrogate_is_deleted_in_bounded_transactions_and_after_a_crash(
     old = storage.surrogates.get(make(queries=35)).id
     answer_all(NAME)
     with monkeypatch.context() as patched:
-        crash_at(patched, removal, "_remove_some", call=12)
+        crash_at(patched, stored, "_remove_some", call=12)
         with pytest.raises(ZeroDivisionError):
             storage.surrogates.delete(NAME)
     assert [one.name for one in storage.surrogates.summaries()] == [kept]

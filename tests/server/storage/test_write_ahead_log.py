@@ -16,8 +16,8 @@ import pytest
 from surrogym_server.errors import Unavailable
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSurrogate
-from surrogym_server.storage.sql import checks, open_storage
-from surrogym_server.storage.sql import write_ahead_log as log
+from surrogym_server.storage.sql import filelock, open_storage
+from surrogym_server.storage.sql import storage as sql_storage
 
 KILLED = """
 import os, sys
@@ -178,7 +178,7 @@ def test_an_older_program_s_log_goes_with_an_older_program_s_database(tmp_path: 
         old.commit()
         for name, content in contents(file).items():
             (tmp_path / f"killed-{name}").write_bytes(content)
-    assert log.belongs(tmp_path / "killed-a.db-wal", (tmp_path / "killed-a.db").read_bytes()[:100])
+    assert filelock.belongs(tmp_path / "killed-a.db-wal", (tmp_path / "killed-a.db").read_bytes()[:100])
     assert served(tmp_path / "killed-a.db") == []
 
 
@@ -187,7 +187,7 @@ def test_a_database_overwritten_under_the_server_is_used_no_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, copied: str
 ) -> None:
     """What was written over it stays as it is, byte for byte, and is what a server finds when the log is put away."""
-    monkeypatch.setattr(checks, "FRESH_SECONDS", 0.0)
+    monkeypatch.setattr(sql_storage, "FRESH_SECONDS", 0.0)
     file, other = tmp_path / "a.db", tmp_path / "b.db"
     register(other, "other")
     storage = opened(file)

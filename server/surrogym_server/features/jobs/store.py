@@ -21,9 +21,17 @@ from surrogym_server.features.jobs.records import (
     NewJob,
 )
 from surrogym_server.storage.records import fingerprint
-from surrogym_server.storage.sql import expiry
 from surrogym_server.storage.sql.database import NOW, Database
-from surrogym_server.storage.sql.rows import append_event, find, hold, recall, remember
+from surrogym_server.storage.sql.rows import (
+    append_event,
+    find,
+    has_ended,
+    hold,
+    is_too_long,
+    recall,
+    remember,
+    shorten,
+)
 from surrogym_server.storage.sql.tables import Id, Json, Word, checked, metadata, owner, row_id, surrogates
 from surrogym_shared.states import JobKind, JobStatus
 
@@ -116,7 +124,7 @@ class Jobs:
         """
         with self._database.read() as connection:  # waiting workers don't block writers
             own = jobs.c.surrogate_id == find(connection, name)
-            waiting = (jobs.c.status == "queued") | expiry.has_ended(jobs, RUNNING)
+            waiting = (jobs.c.status == "queued") | has_ended(jobs, RUNNING)
             if not connection.execute(sa.select(sa.exists().where(own, waiting))).scalar():
                 return None
         with self._database.write() as connection:
@@ -203,14 +211,14 @@ class Jobs:
         A lease with more time left than it was given, because the clock was set back, gets that time from now.
         """
         with self._database.read() as connection:
-            owners = sa.select(jobs.c.surrogate_id).where(expiry.has_ended(jobs, RUNNING)).distinct()
+            owners = sa.select(jobs.c.surrogate_id).where(has_ended(jobs, RUNNING)).distinct()
             wanted = sa.select(surrogates.c.name).where(surrogates.c.id.in_(owners))
             names = [*connection.execute(wanted).scalars()]
-            too_long = expiry.is_too_long(jobs, RUNNING)
+            too_long = is_too_long(jobs, RUNNING)
             set_back = connection.execute(sa.select(sa.exists().where(too_long))).scalar()
         if set_back:
             with self._database.write() as connection:
-                expiry.shorten(connection, jobs, RUNNING)
+                shorten(connection, jobs, RUNNING)
         return sum(self._sweep(name) for name in names)
 
     def _sweep(self, name: str) -> int:

@@ -22,7 +22,7 @@ from surrogym_server.features.policies.records import (
 )
 from surrogym_server.storage.records import JSON
 from surrogym_server.storage.sql.database import Database, conflict_insert
-from surrogym_server.storage.sql.policy_names import require_version, resolve, unknown_policy
+from surrogym_server.storage.sql.models import require_version, resolve, unknown_policy
 from surrogym_server.storage.sql.rows import append_event, find, hold
 from surrogym_server.storage.sql.tables import (
     Id,

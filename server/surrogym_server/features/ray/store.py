@@ -16,9 +16,8 @@ from surrogym_server.features.ray.records import (
     TakenSession,
 )
 from surrogym_server.storage.sql.database import NOW, Database, conflict_insert
-from surrogym_server.storage.sql.expiry import has_ended, shorten
-from surrogym_server.storage.sql.removal import AT_ONCE, IS_THERE
-from surrogym_server.storage.sql.tables import checked, metadata, owner, surrogates
+from surrogym_server.storage.sql.rows import IS_THERE, has_ended, shorten
+from surrogym_server.storage.sql.tables import AT_ONCE, checked, metadata, owner, surrogates
 
 live = checked(  # each is in the memory of its owner, and here as at its last checkpoint
     sa.Table(

@@ -7,7 +7,9 @@ surrogate's row first. Claims, which skip locked rows, and renewals lock less.
 from __future__ import annotations
 
 import contextlib
+import re
 import shlex
+import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -24,9 +26,32 @@ from sqlalchemy.sql.functions import FunctionElement
 
 from surrogym_server.errors import Damaged, InvalidInput, Unavailable
 from surrogym_server.storage.records import Synchronous
-from surrogym_server.storage.sql.damage import are_broken_pages, damaged, means_damage
-from surrogym_server.storage.sql.filelock import FileLock
-from surrogym_server.storage.sql.write_ahead_log import marks
+from surrogym_server.storage.sql.filelock import FileLock, marks
+
+SQLITE_CODES = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+SQLSTATES = ("XX001", "XX002", "42P01", "42703")  # data and index corrupted, undefined table and column
+OTHER_SCHEMA = re.compile(r"no such (table|column)|has no column|already exists")  # SQLite has no code for these
+UNDECODABLE = "Could not decode to UTF-8"  # Python's driver has no error class for this
+
+
+def damaged(reason: object) -> Damaged:
+    """The error for stored data that this program can't have written."""
+    return Damaged(f"the database is damaged: {reason}")
+
+
+def means_damage(error: sa.exc.DBAPIError) -> bool:
+    """Whether an error of the driver means that stored data can't be read, or that the tables differ."""
+    if getattr(error.orig, "sqlstate", None) in SQLSTATES:
+        return True
+    message = str(error.orig)
+    return are_broken_pages(error) or UNDECODABLE in message or OTHER_SCHEMA.search(message) is not None
+
+
+def are_broken_pages(error: sa.exc.DBAPIError) -> bool:
+    """Whether an error of the driver means that a file's structure is broken, which can't be repaired while
+    it is open."""
+    return getattr(error.orig, "sqlite_errorcode", 0) & 0xFF in SQLITE_CODES
+
 
 BUSY_SECONDS = 5  # wait of a statement for locks of other programs or threads
 STALLED_SECONDS = 10  # PostgreSQL ends a transaction whose process has stopped, and its locks with it

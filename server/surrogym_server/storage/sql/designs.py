@@ -20,12 +20,12 @@ from surrogym_server.storage.records import (
     SurrogateRecord,
     fingerprint,
 )
-from surrogym_server.storage.sql import initial
 from surrogym_server.storage.sql import surrogates as stored
 from surrogym_server.storage.sql.database import NOW, Database, constant
 from surrogym_server.storage.sql.models import insert_model
-from surrogym_server.storage.sql.removal import NO_RIGHT
+from surrogym_server.storage.sql.queries import IS_INCOMPLETE, begin_initial, queue_initial
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, recall, remember, touch
+from surrogym_server.storage.sql.surrogates import NO_RIGHT
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
 from surrogym_shared.nouns import Query
 from surrogym_shared.states import Phase
@@ -47,7 +47,7 @@ IS_DUE = sa.and_(  # what the docstring of ``Designs.due`` says
     _EXPIRES.is_(None) | (_EXPIRES <= NOW) | _SET_BACK,
     sa.exists(OWN_SAMPLES),
     ~OPEN_QUERY | (surrogates.c.logged_revision > surrogates.c.fitted_revision),
-    ~initial.IS_INCOMPLETE,
+    ~IS_INCOMPLETE,
 )
 DUE = sa.select(surrogates.c.name).where(IS_DUE).order_by(surrogates.c.id)
 IS_HOPELESS = sa.and_(
@@ -56,7 +56,7 @@ IS_HOPELESS = sa.and_(
     sa.exists(OWN_QUERIES.where(queries.c.status.in_([constant(status) for status in ("set_aside", "refused")]))),
     ~OPEN_QUERY,
     ~sa.exists(OWN_SAMPLES),
-    ~initial.IS_INCOMPLETE,
+    ~IS_INCOMPLETE,
 )
 IS_UNBEGUN = sa.and_(
     surrogates.c.phase == constant("collecting"),
@@ -64,9 +64,9 @@ IS_UNBEGUN = sa.and_(
     surrogates.c.budget > 0,
     ~sa.exists(OWN_QUERIES),
     ~sa.exists(OWN_SAMPLES),
-    ~initial.IS_INCOMPLETE,
+    ~IS_INCOMPLETE,
 )
-INTERRUPTED = initial.IS_INCOMPLETE & (surrogates.c.created_at < NOW - INTERRUPTED_SECONDS)
+INTERRUPTED = IS_INCOMPLETE & (surrogates.c.created_at < NOW - INTERRUPTED_SECONDS)
 UNBEGUN = sa.select(surrogates.c.name).where(IS_UNBEGUN | INTERRUPTED).order_by(surrogates.c.id)
 HOPELESS = sa.select(surrogates.c.name).where(IS_HOPELESS).order_by(surrogates.c.id)
 
@@ -118,8 +118,8 @@ class SqlDesigns(port.Designs):
             if connection.execute(
                 sa.select(surrogates.c.id).where(surrogates.c.id == surrogate.id, IS_UNBEGUN)
             ).first():
-                initial.begin(connection, surrogate, queries)
-        initial.ask(self._database, name, queries)
+                begin_initial(connection, surrogate, queries)
+        queue_initial(self._database, name, queries)
 
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
         with self._database.write() as connection:

@@ -1,16 +1,28 @@
-"""One server for each SQLite file: a lock on the file itself, which ends with its process, however that ends."""
+"""One server for each SQLite file: a lock on the file itself, which ends with its process, however that ends.
+
+A write-ahead log beside the file may belong to another database. The lock finds out for which database it was written,
+from the first bytes of the database and the frames of the log (formats: sqlite.org/fileformat2.html,
+sqlite.org/walformat.html).
+
+SQLite itself would merge any log into any database of that name. So the first transaction of each log writes a mark of
+its database into the header of page 1: the checksum of that database's header, and a random number that makes the next
+header different from any before it.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
 import os
+import secrets
 import struct
 import threading
+import zlib
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from surrogym_server.errors import Unavailable
-from surrogym_server.storage.sql import write_ahead_log
 
 LOCKED_BYTE = 2**62  # beyond any database, and far from the bytes at 2**30 that SQLite locks
 WHOLE_DESCRIPTION = getattr(fcntl, "F_OFD_SETLK", None)  # Linux has it; other systems may not
@@ -62,13 +74,13 @@ class FileLock:
 
     def header(self) -> bytes:
         """The first bytes of the file on the disk, without data that are only in its log."""
-        return os.pread(self._descriptors[-1], write_ahead_log.HEADER_BYTES, 0)
+        return os.pread(self._descriptors[-1], HEADER_BYTES, 0)
 
     def log_is_merged(self) -> bool:
         """Whether the next transaction may begin a new log. Only a caller with the right to write may ask."""
         if self._index_descriptor is None:
             self._index_descriptor = os.open(self._index, os.O_RDONLY | os.O_CLOEXEC)  # SQLite has created it
-        return write_ahead_log.is_merged(os.pread(self._index_descriptor, write_ahead_log.INDEX_BYTES, 0))
+        return is_merged(os.pread(self._index_descriptor, INDEX_BYTES, 0))
 
     def watch(self) -> None:
         """Remember the file's first bytes, its write-ahead log and the log's index, to notice changes by others."""
@@ -106,7 +118,7 @@ class FileLock:
         if self.is_as_noted():
             return
         header = self.header()
-        if not write_ahead_log.belongs(self._log, header):
+        if not belongs(self._log, header):
             self._overwritten = True
             self._forbid_merging()
             raise self._foreign()
@@ -121,7 +133,7 @@ class FileLock:
         self._descriptors, self._index_descriptor = [], None
 
     def _require_own_log(self, header: bytes) -> None:
-        if not write_ahead_log.belongs(self._log, header):
+        if not belongs(self._log, header):
             raise Unavailable(
                 f"expected a write-ahead log of {self._path}, got {self._log}, which was written for another database "
                 f"or another state of it; nothing was changed: to keep {self._path} as it is, for example after "
@@ -197,3 +209,116 @@ def _displaced(path: Path, way_out: str) -> Unavailable:
 def _unavailable(path: Path, error: OSError | None = None) -> Unavailable:
     why = "another server has it open" if error is None or isinstance(error, BUSY) else f"no lock: {error.strerror}"
     return Unavailable(f"expected to be the only server on the database {path}, but {why}")
+
+
+HEADER_BYTES = 100  # size of the header of a SQLite database
+USER_VERSION, APPLICATION_ID = slice(60, 64), slice(68, 72)  # in the header; SQLite leaves both to applications
+LOG_HEADER, FRAME_HEADER = struct.Struct(">8I"), struct.Struct(">6I")
+BIG_ENDIAN = 1  # bit of the log's magic number: byte order of the words in its checksums
+INDEX_BYTES = 136  # bytes to read of the log's index: two headers, then the position up to which the log was merged
+INDEX_VERSION = 3_007_000
+WORD = 0xFFFF_FFFF
+
+
+def marks(header: bytes) -> tuple[str, ...]:
+    """Return the statements by which the first transaction of a log marks it as belonging to this header's database."""
+    number = 1 + secrets.randbelow(2**31 - 1)
+    return f"PRAGMA user_version={number}", f"PRAGMA application_id={_signed(zlib.crc32(header))}"
+
+
+def belongs(log: Path, header: bytes) -> bool:
+    """Whether SQLite may merge the file ``log`` into the database that begins with ``header``.
+
+    It may if there is nothing to merge, if the log begins with the mark of this database, or if the header comes from
+    the log because merging has begun. A log without a mark is from an older program, and may belong to a database
+    without a mark.
+    """
+    try:
+        file = log.open("rb")
+    except FileNotFoundError:
+        return True
+    with file:
+        first = None
+        for page in _first_pages(file):
+            if page == header:
+                return True
+            first = page if first is None else first
+        if first is not None and first[APPLICATION_ID] == struct.pack(">I", zlib.crc32(header)):
+            return True
+        if len(header) == HEADER_BYTES and not _is_marked(header) and not _is_marked(first):
+            return True
+        return not _has_a_whole_transaction(file)
+
+
+def is_merged(index: bytes) -> bool:
+    """Whether all of a log is in the database, so that the next transaction may begin a new log.
+
+    ``index`` is the beginning of the log's index, read by a caller with the right to write.
+    """
+    if len(index) < INDEX_BYTES or struct.unpack_from("=I", index)[0] != INDEX_VERSION:
+        return True  # an unnecessary mark does no harm
+    frames, merged = struct.unpack_from("=I", index, 16)[0], struct.unpack_from("=I", index, 96)[0]
+    return bool(frames == merged)
+
+
+def _is_marked(header: bytes | None) -> bool:
+    return header is not None and any(header[USER_VERSION] + header[APPLICATION_ID])
+
+
+def _signed(number: int) -> int:
+    return number - 2**32 if number >= 2**31 else number
+
+
+def _frames(file: BinaryIO) -> Iterator[tuple[tuple[int, ...], int]]:
+    """The headers of the frames of the log's present generation, and the positions of their pages."""
+    file.seek(0)
+    begin = file.read(LOG_HEADER.size)
+    if len(begin) < LOG_HEADER.size:
+        return
+    _, _, page_size, _, *salts, _, _ = LOG_HEADER.unpack(begin)
+    place = LOG_HEADER.size
+    while len(head := file.read(FRAME_HEADER.size)) == FRAME_HEADER.size:
+        frame = FRAME_HEADER.unpack(head)
+        if list(frame[2:4]) != salts:
+            return
+        place += FRAME_HEADER.size
+        yield frame, place
+        place += page_size
+        file.seek(place)
+
+
+def _first_pages(file: BinaryIO) -> Iterator[bytes]:
+    """Yield each version of the database's header that the log contains."""
+    for (page, *_), place in _frames(file):
+        if page == 1:
+            file.seek(place)
+            yield file.read(HEADER_BYTES)
+
+
+def _has_a_whole_transaction(file: BinaryIO) -> bool:
+    """Whether the log contains a transaction that SQLite would merge. After a power loss its checksums may be wrong."""
+    file.seek(0)
+    begin = file.read(LOG_HEADER.size)
+    if len(begin) < LOG_HEADER.size:
+        return False
+    magic, _, page_size, *_ = LOG_HEADER.unpack(begin)
+    order = ">" if magic & BIG_ENDIAN else "<"
+    sums = _checksum(begin[:24], order, (0, 0))
+    if sums != LOG_HEADER.unpack(begin)[6:]:
+        return False
+    for (page, size, *_, first, second), place in _frames(file):
+        file.seek(place)
+        sums = _checksum(struct.pack(">2I", page, size) + file.read(page_size), order, sums)
+        if sums != (first, second):
+            return False
+        if size:  # the last frame of a transaction has the database's size, others have 0
+            return True
+    return False
+
+
+def _checksum(data: bytes, order: str, sums: tuple[int, int]) -> tuple[int, int]:
+    first, second = sums
+    for left, right in struct.iter_unpack(f"{order}2I", data[: len(data) // 8 * 8]):
+        first = (first + left + second) & WORD
+        second = (second + right + first) & WORD
+    return first, second

@@ -1,21 +1,27 @@
-"""Leases of queries: how they begin and end. The caller holds the surrogate unless a docstring says otherwise."""
+"""Leases of queries: how they begin, how they end, and which of them a reported sample answers.
+
+The caller holds the surrogate unless a docstring says otherwise. A lease has one answer: one sample, or the first
+samples of a rollout. It comes whole, in one batch.
+"""
 
 from __future__ import annotations
 
 import secrets
-from collections.abc import Sequence
-from typing import Any, Literal
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
-from surrogym_server.errors import ForeignLease, UnknownQuery
+from surrogym_server.errors import ForeignLease, IdempotencyConflict, InvalidInput, UnknownQuery
 from surrogym_server.storage.port import MAX_ATTEMPTS
-from surrogym_server.storage.records import LeasedQuery
-from surrogym_server.storage.sql import expiry
+from surrogym_server.storage.records import LeasedQuery, NewSample
 from surrogym_server.storage.sql.database import NOW, constant
-from surrogym_server.storage.sql.rows import NAMED, append_event, hold, query_in, touch, unknown_surrogate
-from surrogym_server.storage.sql.tables import leases, queries, surrogates
+from surrogym_server.storage.sql.rows import NAMED, append_event, has_ended, hold, query_in, touch, unknown_surrogate
+from surrogym_server.storage.sql.tables import leases, queries, samples, surrogates
+from surrogym_shared.states import Purpose
 
 Returned = Literal["failed", "expired", "unbegun", "refused"]  # outcome of a lease that ended without an answer
 BEFORE_A_STEP = ("unbegun", "refused")
@@ -31,7 +37,7 @@ SET_OUTCOME = (
 )
 # The value is a constant in the statement: with a parameter, PostgreSQL would not use the index of open leases.
 IS_OPEN = leases.c.outcome == constant("open")
-ENDED = sa.exists().where(leases.c.surrogate_id == surrogates.c.id, expiry.has_ended(leases, IS_OPEN))
+ENDED = sa.exists().where(leases.c.surrogate_id == surrogates.c.id, has_ended(leases, IS_OPEN))
 SHARE = (
     sa.select(surrogates.c.id, surrogates.c.paused, NOW.label("now"), ENDED.label("has_ended"))
     .where(NAMED)
@@ -178,3 +184,139 @@ def requeue_set_aside(connection: Connection, surrogate: Row[Any]) -> int:
     number."""
     set_aside = (queries.c.surrogate_id == surrogate.id) & queries.c.status.in_(("set_aside", "refused"))
     return connection.execute(sa.update(queries).where(set_aside).values(status="pending")).rowcount
+
+
+NAMED_QUERIES: sa.Select[Any] = (
+    sa.select(queries.c.id, queries.c.purpose, queries.c.steps)
+    .where(queries.c.surrogate_id == sa.bindparam("owner"), queries.c.id.in_(sa.bindparam("named", expanding=True)))
+    .order_by(queries.c.id)
+    .with_for_update()
+)
+LIVE = (leases.c.outcome == "open") & (leases.c.expires > sa.bindparam("now", type_=sa.Double()))
+LEASES = sa.select(leases.c.id, leases.c.query_id, leases.c.token, leases.c.attempt, LIVE.label("live")).where(
+    leases.c.query_id.in_(sa.bindparam("asked", expanding=True))
+)
+REPORTED = sa.select(samples.c.lease_id, samples.c.step, samples.c.id, samples.c.fingerprint).where(
+    samples.c.lease_id.in_(sa.bindparam("reported", expanding=True))
+)
+ANSWER = (
+    sa.update(queries)
+    .where(queries.c.id.in_(sa.bindparam("done", expanding=True)))
+    .values(status="answered", error=None)
+)
+
+
+class Reported(NamedTuple):
+    """A stored sample, to compare with one that is reported again."""
+
+    sample_id: int
+    fingerprint: str
+
+
+@dataclass(frozen=True)
+class Answered:
+    """A lease under which samples were reported, with its query."""
+
+    lease_id: int
+    query_id: int
+    purpose: Purpose
+    steps: int  # most real steps that the query may take
+    attempt: int
+    live: bool
+    contested: bool  # another lease of the query is live
+    reported: dict[int, Reported]  # samples that are stored under this lease already, by step
+
+
+def read_answered(connection: Connection, surrogate: Row[Any], batch: Sequence[NewSample]) -> list[Answered | None]:
+    """Find the lease under which each sample was reported, or None. Locks their queries.
+
+    Raises:
+        UnknownQuery, ForeignLease, InvalidInput, IdempotencyConflict: as ``Samples.add`` says.
+    """
+    named = {sample.query_id for sample in batch if sample.query_id is not None}
+    by_id = _lock_queries(connection, surrogate, named)
+    by_token = _leases(connection, surrogate, by_id)
+    answered = [_lease_of(sample, by_id, by_token) for sample in batch]
+    steps: dict[int, set[int]] = defaultdict(set)
+    for sample, lease in zip(batch, answered, strict=True):
+        if lease is not None:
+            steps[lease.lease_id].add(sample.step)
+    for lease in {lease.lease_id: lease for lease in answered if lease}.values():
+        _check_steps(lease, steps[lease.lease_id])
+    return answered
+
+
+def settle(connection: Connection, answered: Iterable[Answered]) -> None:
+    """Mark leases as answered, and their queries too, except a query of which another lease is live."""
+    leases_done = {one.lease_id: one for one in answered}
+    if not leases_done:
+        return
+    set_outcome(connection, list(leases_done), "answered")
+    query_ids = [one.query_id for one in leases_done.values() if one.live or not one.contested]
+    if query_ids:
+        connection.execute(ANSWER, {"done": query_ids})
+
+
+def _check_steps(lease: Answered, steps: set[int]) -> None:
+    """Raise an error if a lease's answer lacks a step, has too many, or has more steps than when first reported."""
+    if lease.reported:
+        if more := steps - lease.reported.keys():
+            raise IdempotencyConflict(
+                f"expected the {len(lease.reported)} samples first reported for query {lease.query_id}, "
+                f"got step {min(more)} in addition"
+            )
+    elif steps != set(range(len(steps))) or len(steps) > lease.steps:
+        raise InvalidInput(
+            f"expected steps 0, 1, ... of query {lease.query_id}, at most {lease.steps}, got {sorted(steps)}"
+        )
+
+
+def _lock_queries(connection: Connection, surrogate: Row[Any], named: set[int]) -> dict[int, Row[Any]]:
+    if not named:
+        return {}
+    return {row.id: row for row in connection.execute(NAMED_QUERIES, {"owner": surrogate.id, "named": list(named)})}
+
+
+def _leases(connection: Connection, surrogate: Row[Any], by_id: dict[int, Row[Any]]) -> dict[tuple[int, str], Answered]:
+    """Read all leases of these queries, by query id and token."""
+    if not by_id:
+        return {}
+    rows = connection.execute(LEASES, {"asked": list(by_id), "now": surrogate.now}).all()
+    reported = _reported(connection, [row.id for row in rows])
+    live_ids = {row.query_id: row.id for row in rows if row.live}
+    return {
+        (row.query_id, row.token): Answered(
+            lease_id=row.id,
+            query_id=row.query_id,
+            purpose=by_id[row.query_id].purpose,
+            steps=by_id[row.query_id].steps,
+            attempt=row.attempt,
+            live=bool(row.live),
+            contested=live_ids.get(row.query_id, row.id) != row.id,
+            reported=reported[row.id],
+        )
+        for row in rows
+    }
+
+
+def _reported(connection: Connection, lease_ids: Sequence[int]) -> dict[int, dict[int, Reported]]:
+    """Return the samples stored under each of these leases, by step."""
+    reported: dict[int, dict[int, Reported]] = defaultdict(dict)
+    for lease_id, step, *stored in connection.execute(REPORTED, {"reported": lease_ids}):
+        reported[lease_id][step] = Reported(*stored)
+    return reported
+
+
+def _lease_of(
+    sample: NewSample, by_id: dict[int, Row[Any]], by_token: dict[tuple[int, str], Answered]
+) -> Answered | None:
+    if sample.query_id is None:
+        if sample.lease_token is not None:
+            raise InvalidInput("expected a query_id beside lease_token, got none")
+        return None
+    if sample.query_id not in by_id:
+        raise unknown_query(sample.query_id)
+    lease = by_token.get((sample.query_id, sample.lease_token or ""))
+    if lease is None:
+        raise foreign_lease(sample.query_id)
+    return lease

@@ -1,4 +1,4 @@
-"""Adapter of ``Models``: models by version."""
+"""Adapters of ``Models`` and ``PolicyNames``: models by version, versions and aliases of policies."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ import msgspec
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
-from surrogym_server.errors import NoModel, UnknownModel
+from surrogym_server.errors import NoModel, UnknownModel, UnknownPolicy
 from surrogym_server.storage import port
+from surrogym_server.storage.port import LATEST
 from surrogym_server.storage.records import ModelRecord, NewModel
-from surrogym_server.storage.sql.damage import damaged
-from surrogym_server.storage.sql.database import Database
-from surrogym_server.storage.sql.removal import NAMELESS
-from surrogym_server.storage.sql.rows import Span, append_event, find, hold, touch, within
-from surrogym_server.storage.sql.tables import models
+from surrogym_server.storage.sql.database import Database, damaged
+from surrogym_server.storage.sql.rows import NAMELESS, Span, append_event, find, hold, touch, within
+from surrogym_server.storage.sql.tables import models, policies, policy_aliases, policy_evaluations
 
 COLUMNS = [
     getattr(models.c, name)
@@ -132,3 +131,47 @@ def _one(connection: Connection, name: str, version: int | None, *columns: sa.Co
     if version is None:
         raise NoModel(f"expected a model of {name!r}, but no model has been fitted yet: start surrogym sample")
     raise UnknownModel(f"expected a version of {name!r}'s models, got {version}, which does not exist")
+
+
+class SqlPolicyNames(port.PolicyNames):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def version(self, name: str, which: str) -> int:
+        with self._database.read() as connection:
+            return resolve(connection, find(connection, name), name, which)
+
+    def has_evaluation(self, name: str, version: int, id: int) -> bool:
+        table = policy_evaluations
+        with self._database.read() as connection:
+            surrogate = find(connection, name)
+            require_version(connection, surrogate, name, version)
+            own = sa.select(table.c.id).where(table.c.surrogate_id == surrogate, table.c.version == version)
+            return connection.execute(own.where(table.c.id == id)).scalar() is not None
+
+
+def resolve(connection: Connection, surrogate: int, name: str, which: str) -> int:
+    """The version that a version, an alias or ``latest`` means. Raises ``UnknownPolicy``."""
+    if which.isascii() and which.isdecimal() and len(which) < 10:
+        require_version(connection, surrogate, name, int(which))
+        return int(which)
+    if which == LATEST:
+        statement = sa.select(sa.func.max(policies.c.version)).where(policies.c.surrogate_id == surrogate)
+    else:
+        aliases = policy_aliases.c
+        statement = sa.select(aliases.version).where(aliases.surrogate_id == surrogate, aliases.alias == which)
+    version = connection.execute(statement).scalar()
+    if version is None:
+        raise unknown_policy(name, which)
+    return int(version)
+
+
+def require_version(connection: Connection, surrogate: int, name: str, version: int) -> None:
+    """Raise ``UnknownPolicy`` if the surrogate has no policy of this version."""
+    own = (policies.c.surrogate_id == surrogate) & (policies.c.version == version)
+    if connection.execute(sa.select(policies.c.version).where(own)).scalar() is None:
+        raise unknown_policy(name, version)
+
+
+def unknown_policy(name: str, which: object) -> UnknownPolicy:
+    return UnknownPolicy(f"expected a version or an alias of {name!r}'s policies, got {which}, which does not exist")

@@ -1,4 +1,9 @@
-"""Adapter of ``Queries``: the queue of queries and their leases."""
+"""Adapters of ``Queries`` and ``Snapshots``: the queue of queries, and the snapshots that some of them begin at.
+
+The initial queries of a design are queued in transactions that block nobody for long. A row of ``requests`` holds how
+many are queued as long as some are missing. Until then no fit is due. If a crash interrupts the work, another call of
+``queue_initial`` with the same queries continues.
+"""
 
 from __future__ import annotations
 
@@ -18,23 +23,26 @@ from surrogym_server.storage.records import (
     QueryRecord,
     fingerprint,
 )
-from surrogym_server.storage.sql import expiry
 from surrogym_server.storage.sql import leases as leasing
-from surrogym_server.storage.sql.database import NOW, Database
+from surrogym_server.storage.sql.database import BATCH, NOW, Database, conflict_insert
 from surrogym_server.storage.sql.rows import (
+    NAMED,
     Span,
     append_event,
     find,
+    has_ended,
     hold,
     insert_queries,
+    is_too_long,
     query_in,
     recall,
     remember,
+    shorten,
+    touch,
     within,
 )
-from surrogym_server.storage.sql.snapshots import give_up_lost
-from surrogym_server.storage.sql.tables import leases, queries, surrogates
-from surrogym_shared.nouns import Query
+from surrogym_server.storage.sql.tables import leases, queries, requests, snapshots, surrogates
+from surrogym_shared.nouns import Query, Vector
 from surrogym_shared.states import Purpose, QueryStatus
 
 CONTENT = [getattr(queries.c, name) for name in ("coordinates", "action", "steps", "snapshot")]
@@ -147,15 +155,15 @@ class SqlQueries(port.Queries):
 
     def sweep_expired(self) -> int:
         with self._database.read() as connection:
-            ended = expiry.has_ended(leases, leasing.IS_OPEN)
+            ended = has_ended(leases, leasing.IS_OPEN)
             owners = sa.select(leases.c.surrogate_id).where(ended).distinct()
             statement = sa.select(surrogates.c.name).where(surrogates.c.id.in_(owners))
             names = list(connection.execute(statement).scalars())
-            too_long = expiry.is_too_long(leases, leasing.IS_OPEN)
+            too_long = is_too_long(leases, leasing.IS_OPEN)
             set_back = connection.execute(sa.select(sa.exists().where(too_long))).scalar()
         if set_back:
             with self._database.write() as connection:
-                expiry.shorten(connection, leases, leasing.IS_OPEN)
+                shorten(connection, leases, leasing.IS_OPEN)
         return sum(self._sweep(name) for name in names)
 
     def _sweep(self, name: str) -> int:
@@ -213,3 +221,112 @@ def _read(connection: Connection, surrogate_id: int, query_id: int) -> QueryReco
 def _record(row: Row[Any]) -> QueryRecord:
     state = {column.name: row._mapping[column.name] for column in STATE}
     return QueryRecord(**query_in(row), **state, lease_seconds_left=row.lease_seconds_left)
+
+
+GONE = "its snapshot is gone"
+
+
+class SqlSnapshots(port.Snapshots):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def all(self, name: str) -> dict[str, Vector]:
+        with self._database.read() as connection:
+            own = snapshots.c.surrogate_id == find(connection, name)
+            statement = sa.select(snapshots.c.name, snapshots.c.coordinates).where(own).order_by(snapshots.c.id)
+            return {row.name: row.coordinates for row in connection.execute(statement)}
+
+    def drop(self, name: str, snapshots: Sequence[str]) -> int:
+        with self._database.write() as connection:
+            surrogate = hold(connection, name)
+            gone = _forget(connection, surrogate, snapshots)
+            _give_up_queries(connection, surrogate, snapshots)
+            return gone
+
+
+def insert_snapshots(connection: Connection, surrogate: Row[Any], new: dict[str, Vector]) -> None:
+    """Store snapshots by name with their coordinates (C,). A name that is stored already does not change."""
+    if new:
+        rows = [{"surrogate_id": surrogate.id, "name": name, "coordinates": at} for name, at in new.items()]
+        insert = conflict_insert(connection, snapshots).on_conflict_do_nothing()
+        connection.execute(insert, rows)
+
+
+def give_up_lost(connection: Connection, surrogate: Row[Any], given_back: QueryRecord) -> None:
+    """Give up a query that was leased while its snapshot was reported as gone. Otherwise samplers would claim it again
+    and again."""
+    if given_back.snapshot is None or given_back.status != "pending":
+        return
+    own = (snapshots.c.surrogate_id == surrogate.id) & (snapshots.c.name == given_back.snapshot)
+    if not connection.execute(sa.select(sa.exists().where(own))).scalar():
+        _give_up_queries(connection, surrogate, [given_back.snapshot])
+
+
+def _forget(connection: Connection, surrogate: Row[Any], names: Sequence[str]) -> int:
+    own = (snapshots.c.surrogate_id == surrogate.id) & snapshots.c.name.in_(names)
+    return len(connection.execute(sa.delete(snapshots).where(own).returning(snapshots.c.id)).all())
+
+
+def _give_up_queries(connection: Connection, surrogate: Row[Any], names: Sequence[str]) -> None:
+    """Remove the pending queries that begin at dropped snapshots; set aside those of which steps may have been taken.
+
+    Steps of removed queries that ``improve`` had requested are requested again.
+    """
+    from_there = queries.c.snapshot.in_(names)
+    unbegun = leasing.is_unbegun(surrogate.id) & from_there
+    removed = connection.execute(sa.delete(queries).where(unbegun).returning(queries.c.steps, queries.c.extra)).all()
+    waiting = (queries.c.surrogate_id == surrogate.id) & (queries.c.status == "pending") & from_there
+    aside = sa.update(queries).where(waiting).values(status="set_aside", error=GONE).returning(queries.c.id)
+    begun = sorted(connection.execute(aside).scalars())
+    if removed:
+        append_event(connection, surrogate, "queries", withdrawn=len(removed), round=surrogate.round)
+    for query_id in begun:
+        append_event(connection, surrogate, "set_aside", query_id=query_id, error=GONE)
+    if removed or begun:
+        again = sum(row.steps for row in removed if row.extra)
+        touch(connection, surrogate, extra_queries=surrogates.c.extra_queries + again)
+
+
+INITIAL, NO_KEY = "initial", ""  # no request of a client has an empty key
+_OF_DESIGN = (requests.c.operation == INITIAL) & (requests.c.key == NO_KEY)
+IS_INCOMPLETE = sa.exists(  # condition on a surrogate's row: initial queries are missing
+    sa.select(requests.c.key).where(requests.c.surrogate_id == surrogates.c.id, _OF_DESIGN)
+)
+
+
+def begin_initial(connection: Connection, surrogate: Row[Any], queries: Sequence[Query]) -> None:
+    """Queue as many initial queries as one transaction may, and note in the table whether others are missing."""
+    remember(connection, surrogate, INITIAL, NO_KEY, "", 0)
+    _ask_some(connection, surrogate, queries)
+
+
+def end_initial(connection: Connection, surrogate: Row[Any]) -> None:
+    """Note that no initial query is missing any more: those in the queue are all."""
+    connection.execute(sa.delete(requests).where(requests.c.surrogate_id == surrogate.id, _OF_DESIGN))
+
+
+def queue_initial(database: Database, name: str, queries: Sequence[Query]) -> None:
+    """Queue the initial queries that are missing. If none are, nothing changes. Raises ``UnknownSurrogate``."""
+
+    def batch(connection: Connection) -> int:
+        return _ask_some(connection, hold(connection, name), queries)
+
+    with database.read() as connection:
+        missing = connection.execute(sa.select(surrogates.c.id).where(NAMED, IS_INCOMPLETE), {"named": name}).first()
+    if missing:
+        database.write_in_batches(batch)
+
+
+def _ask_some(connection: Connection, surrogate: Row[Any], queries: Sequence[Query]) -> int:
+    """Queue a batch of the missing initial queries. Returns how many; 0 if none were missing."""
+    own = (requests.c.surrogate_id == surrogate.id) & _OF_DESIGN
+    queued = connection.execute(sa.select(requests.c.result).where(own)).scalar()
+    if queued is None:
+        return 0
+    first, last = int(queued), int(queued) + BATCH
+    ids = insert_queries(connection, surrogate, queries[first:last], "initial", 0)
+    if last >= len(queries):
+        end_initial(connection, surrogate)
+    else:
+        connection.execute(sa.update(requests).where(own).values(result=last))
+    return len(ids)

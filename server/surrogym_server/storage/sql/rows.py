@@ -1,4 +1,4 @@
-"""Statements that several stores share: find a surrogate, append an event, remember an idempotency key."""
+"""Statements that several stores share: find a surrogate, append an event, remember an idempotency key, end leases."""
 
 from __future__ import annotations
 
@@ -27,6 +27,11 @@ TOUCH = (
     sa.update(surrogates).where(surrogates.c.id == sa.bindparam("touched")).values(revision=surrogates.c.revision + 1)
 )
 NEW_EVENT, NEW_REQUEST = sa.insert(events), sa.insert(requests)
+
+# A surrogate whose rows are being removed has no name any more; the column holds this word and its id.
+REMOVED = "/removed/"  # no name has a slash; the id follows
+IS_THERE = surrogates.c.name.not_like(f"{REMOVED}%")
+NAMELESS = sa.select(surrogates.c.id).where(~IS_THERE)
 
 
 def find(connection: Connection, name: str) -> int:
@@ -134,3 +139,24 @@ def query_in(row: Row[Any]) -> dict[str, Any]:
     size = max(1, len(row.action) // row.steps)
     actions = tuple(row.action[first : first + size] for first in range(0, len(row.action), size))
     return {"coordinates": row.coordinates, "actions": actions, "snapshot": row.snapshot}
+
+
+# Leases expire by the database's clock alone. Their tables have columns ``expires`` and ``seconds``.
+
+Condition = sa.ColumnElement[bool]  # on a row of a table
+
+
+def has_ended(table: sa.Table, is_leased: Condition) -> sa.ColumnElement[bool]:
+    """Whether a lease has expired."""
+    return is_leased & (table.c.expires <= NOW)
+
+
+def is_too_long(table: sa.Table, is_leased: Condition) -> sa.ColumnElement[bool]:
+    """Whether a lease has more time left than it began with, because the database's clock was set back."""
+    return is_leased & (table.c.expires > NOW + table.c.seconds)
+
+
+def shorten(connection: Connection, table: sa.Table, is_leased: Condition) -> None:
+    """Shorten leases that are too long to their original duration from now, so that live callers keep their leases."""
+    too_long = sa.update(table).where(is_too_long(table, is_leased))
+    connection.execute(too_long.values(expires=NOW + table.c.seconds))

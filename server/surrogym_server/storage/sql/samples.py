@@ -1,16 +1,27 @@
-"""Samples, which are stored once, all or nothing, and never changed."""
+"""Adapter of ``Samples``: they are stored once, all or nothing, and never changed.
+
+Logged samples are identified by their place in their log, and used by the design when the log is complete.
+
+The digest of a log up to a sample is a hash of the digest before it and of the sample's numbers. The fingerprint of a
+logged sample holds both digests, so a sample is found by everything that came before it. A log that equals a stored one
+up to some place, and then differs from what follows there, is another log. It is stored whole, under other digests.
+
+``logged_revision`` is the revision of the surrogate that has all of the last log. While a log is incomplete it is one
+ahead of ``revision``, so that the call that completes it makes a fit due even if it brings no new sample.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, fields
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
-from surrogym_server.errors import IdempotencyConflict
+from surrogym_server.errors import IdempotencyConflict, InvalidInput
 from surrogym_server.storage import port
 from surrogym_server.storage.records import (
     AddedSamples,
@@ -20,13 +31,13 @@ from surrogym_server.storage.records import (
     SampleRecord,
     fingerprint,
 )
-from surrogym_server.storage.sql.answers import Answered, insert_samples, read_answered, row_of, settle
 from surrogym_server.storage.sql.database import Database
-from surrogym_server.storage.sql.logged import complete_log, store_logged
-from surrogym_server.storage.sql.rows import find, hold, recall, remember, touch
-from surrogym_server.storage.sql.snapshots import insert_snapshots
-from surrogym_server.storage.sql.tables import queries, samples
+from surrogym_server.storage.sql.leases import Answered, read_answered, settle
+from surrogym_server.storage.sql.queries import insert_snapshots
+from surrogym_server.storage.sql.rows import append_event, find, hold, recall, remember, touch
+from surrogym_server.storage.sql.tables import queries, samples, surrogates
 from surrogym_shared.nouns import RealSteps, Vector
+from surrogym_shared.states import SamplePurpose
 
 _COMPUTED: dict[str, sa.ColumnElement[Any]] = {
     "requested_coordinates": sa.case((queries.c.kind == "step", queries.c.coordinates)).label("requested_coordinates"),
@@ -34,6 +45,8 @@ _COMPUTED: dict[str, sa.ColumnElement[Any]] = {
 }
 _NAMES = [field.name for field in fields(SampleRecord)]
 _FIELDS = [_COMPUTED[name] if name in _COMPUTED else samples.c[name] for name in _NAMES]
+
+NEW_SAMPLES = sa.insert(samples).returning(samples.c.id, sort_by_parameter_order=True)
 
 Identity = tuple[int | None, int]
 
@@ -155,3 +168,95 @@ def _raw_arrays(surrogate_id: int) -> sa.Select[Any]:
 def _matrix(rows: Sequence[bytes]) -> Array:
     """Convert n byte strings of k floats to a matrix (n, k)."""
     return np.frombuffer(b"".join(rows), dtype="<f8").reshape(len(rows), -1).astype(np.float64)
+
+
+def insert_samples(connection: Connection, surrogate: Row[Any], sampler: str, rows: list[dict[str, Any]]) -> list[int]:
+    """Insert rows of samples and append the event. Returns their ids in order."""
+    if not rows:
+        return []
+    ids = [int(id) for id in connection.execute(NEW_SAMPLES, rows).scalars()]
+    late = sum(row["late"] for row in rows)
+    append_event(connection, surrogate, "sample", sampler=sampler, ids=ids, late=late)
+    return ids
+
+
+def row_of(
+    surrogate: Row[Any], sampler: str, sample: NewSample, lease: Answered | None = None, *, logged: bool = False
+) -> dict[str, Any]:
+    """Convert a sample to a row of its table. It may be an answer under a lease, logged, or reported by hand."""
+    purpose: SamplePurpose = "logged" if logged else "manual"
+    return {
+        "surrogate_id": surrogate.id,
+        "query_id": lease.query_id if lease else None,
+        "lease_id": lease.lease_id if lease else None,
+        "purpose": lease.purpose if lease else purpose,
+        "sampler": sampler,
+        "attempt": lease.attempt if lease else 0,
+        "step": sample.step,
+        "late": lease is not None and not lease.live,
+        "coordinates": sample.coordinates,
+        "action": sample.action,
+        "next_coordinates": sample.next_coordinates,
+        "reward": sample.reward,
+        "terminated": sample.terminated,
+        "truncated": sample.truncated,
+        "observation": sample.observation,
+        "next_observation": sample.next_observation,
+        "fingerprint": fingerprint(asdict(sample)),
+        "created_at": surrogate.now,
+    }
+
+
+def store_logged(
+    connection: Connection, surrogate: Row[Any], sampler: str, batch: Sequence[NewSample], after: str | None
+) -> AddedSamples:
+    """Insert the new samples of one part of a log. ``after`` is the digest of the part before; None for the first.
+
+    Raises:
+        InvalidInput: a sample that names a query.
+    """
+    for index, sample in enumerate(batch):
+        if sample.query_id is not None:
+            raise InvalidInput(f"samples.{index}: expected a logged sample without a query_id, got {sample.query_id}")
+    rows = [row_of(surrogate, sampler, sample, logged=True) for sample in batch]
+    before = after or ""
+    while True:
+        chain = list(accumulate((row["fingerprint"] for row in rows), fingerprint, initial=before))
+        links = [f"{one}:{other}" for one, other in pairwise(chain)]
+        stored_ids = _stored_ids(connection, surrogate, links)
+        old = next((place for place, link in enumerate(links) if link not in stored_ids), len(links))
+        if old == len(links) or not _continued(connection, surrogate, chain[old]):
+            break
+        before = chain[old + 1]  # logs that continue in the same way from here share this digest
+        if after is not None:
+            return AddedSamples((), 0, restart=before)
+    new = [row | {"fingerprint": link} for row, link in zip(rows[old:], links[old:], strict=True)]
+    ids = [stored_ids[link] for link in links[:old]] + insert_samples(connection, surrogate, sampler, new)
+    if new:
+        _set(connection, surrogate, logged_revision=surrogates.c.revision + 1)
+    return AddedSamples(tuple(ids), old, digest=chain[-1])
+
+
+def complete_log(connection: Connection, surrogate: Row[Any]) -> None:
+    """Make a fit due for the samples of a complete log."""
+    ahead = sa.select(surrogates.c.logged_revision > surrogates.c.revision).where(surrogates.c.id == surrogate.id)
+    if connection.execute(ahead).scalar():
+        touch(connection, surrogate)
+
+
+def _stored_ids(connection: Connection, surrogate: Row[Any], fingerprints: Sequence[str]) -> dict[str, int]:
+    """Return the ids of stored logged samples with these fingerprints, by fingerprint."""
+    same = samples.c.fingerprint.in_(set(fingerprints))
+    statement = sa.select(samples.c.fingerprint, samples.c.id).where(samples.c.surrogate_id == surrogate.id, same)
+    return {row.fingerprint: row.id for row in connection.execute(statement.where(samples.c.purpose == "logged"))}
+
+
+def _continued(connection: Connection, surrogate: Row[Any], digest: str) -> bool:
+    """Whether a stored sample continues the log that has this digest."""
+    follows = samples.c.fingerprint.startswith(f"{digest}:")
+    statement = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogate.id, follows).limit(1)
+    return connection.execute(statement).first() is not None
+
+
+def _set(connection: Connection, surrogate: Row[Any], **changes: Any) -> None:
+    connection.execute(sa.update(surrogates).where(surrogates.c.id == surrogate.id).values(**changes))

@@ -1,29 +1,31 @@
-"""SqlStorage: the storage on one SQLite or PostgreSQL database."""
+"""SqlStorage: the storage on one SQLite or PostgreSQL database, its migration, and its checks."""
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from threading import Event, Lock, Timer
 
 import sqlalchemy as sa
+from sqlalchemy.engine import Connection
 
 from surrogym_server.errors import Damaged, Unavailable
 from surrogym_server.storage.announcements import Alone
 from surrogym_server.storage.port import Storage, T
 from surrogym_server.storage.records import Synchronous
 from surrogym_server.storage.sql.announcements import NotifiedAnnouncements
-from surrogym_server.storage.sql.checks import Readiness, check_pages, check_tables
-from surrogym_server.storage.sql.database import Database, connect, never_connected
+from surrogym_server.storage.sql.database import Database, connect, damaged, never_connected
 from surrogym_server.storage.sql.designs import SqlDesigns
-from surrogym_server.storage.sql.ledger import SqlLedger
+from surrogym_server.storage.sql.ledger import CountedSamples, SqlLedger
 from surrogym_server.storage.sql.memory import SqlEvents, SqlOccupancy, SqlSessions
-from surrogym_server.storage.sql.migrate import migrate
-from surrogym_server.storage.sql.models import SqlModels
-from surrogym_server.storage.sql.policy_names import SqlPolicyNames
-from surrogym_server.storage.sql.queries import SqlQueries
-from surrogym_server.storage.sql.sample_counts import CountedSamples
+from surrogym_server.storage.sql.models import SqlModels, SqlPolicyNames
+from surrogym_server.storage.sql.queries import SqlQueries, SqlSnapshots
 from surrogym_server.storage.sql.samples import SqlSamples
-from surrogym_server.storage.sql.snapshots import SqlSnapshots
 from surrogym_server.storage.sql.surrogates import SqlSurrogates
+from surrogym_server.storage.sql.tables import metadata
 
 
 class SqlStorage(Storage):
@@ -100,3 +102,166 @@ def _bring_up(database: Database) -> None:
         database.hold_open()
     except Damaged as error:
         raise Damaged(f"{error}; {database.way_out}") from error
+
+
+SCRIPTS = Path(__file__).parent / "migrations"
+VERSION = sa.table("alembic_version", sa.column("version_num", sa.Text))
+MIGRATION_LOCK = 0x5355_5252  # one server migrates at a time; any number will do
+
+
+def migrate(database: Database) -> None:
+    """Run the missing migrations.
+
+    Raises:
+        Unavailable: the database was written by a newer program, or by an unreleased one.
+        Damaged: no program has ever made its schema.
+    """
+    revisions = [script.name[1:5] for script in sorted(SCRIPTS.glob("versions/r*.py"))]
+    with database.write() as connection:
+        _take_turn(connection)
+        present = _present(connection)
+        _refuse_others(present, revisions)
+        if present != revisions[-1:]:
+            _upgrade(connection)
+
+
+def _present(connection: Connection) -> list[str]:
+    """Return the schema's revisions: one; none in a new database; several if somebody has changed the table."""
+    if not sa.inspect(connection).has_table(VERSION.name):
+        return []
+    return list(connection.execute(sa.select(VERSION.c.version_num)).scalars())
+
+
+def _upgrade(connection: Connection) -> None:
+    from alembic import command  # late: it takes a fifteenth of a server's start, and most schemas are up to date
+    from alembic.config import Config
+    from alembic.util import CommandError
+
+    config = Config(attributes={"connection": connection})
+    config.set_main_option("script_location", str(SCRIPTS).replace("%", "%%"))
+    config.set_main_option("path_separator", "os")
+    try:
+        command.upgrade(config, "head")
+    except CommandError as error:  # the database's record of its own schema is invalid
+        raise damaged(error) from error
+
+
+def _take_turn(connection: Connection) -> None:
+    if connection.dialect.name == "postgresql":
+        connection.execute(sa.text("SET LOCAL lock_timeout = 0"))  # another migration may take long
+        connection.execute(sa.text("SET LOCAL idle_in_transaction_session_timeout = 0"))  # it may pause to compute
+        connection.execute(sa.select(sa.func.pg_advisory_xact_lock(MIGRATION_LOCK)))
+
+
+def _refuse_others(present: list[str], revisions: list[str]) -> None:
+    unknown = sorted(map(str, set(present) - set(revisions)))
+    if unknown and max(unknown) < revisions[0]:
+        raise Unavailable(
+            f"the database was written by an unreleased Surrogym: its schema is {', '.join(unknown)}, "
+            f"the first released one is {revisions[0]}; export its samples with that version, or begin anew with "
+            "another --database"
+        )
+    if unknown:
+        raise Unavailable(
+            f"the database was written by a newer Surrogym: its schema is {', '.join(unknown)}, this program knows "
+            f"schemas up to {revisions[-1]}; start the newer program"
+        )
+
+
+logger = logging.getLogger(__name__)
+
+CHECK_SECONDS = 10.0  # enough for about 25 GB that are cached in memory
+INDEXES_BYTES = 128 * 2**20  # largest file whose indexes are checked too; for 100 MB this takes 1.5 s instead of 0.4 s
+FRESH_SECONDS = 1.0  # lifetime of a result, so that frequent checks cause one small write a second
+PATIENCE_SECONDS = 2.0  # longest wait of a caller for a new result
+
+schema = sa.table("alembic_version", sa.column("version_num"))
+
+
+def check_pages(connection: Connection, seconds: float = CHECK_SECONDS) -> None:
+    """Read a SQLite file once and check its structure, for at most ``seconds``. The indexes are checked too if the file
+    has at most ``INDEXES_BYTES``. PostgreSQL checks its own files.
+
+    Raises:
+        Damaged: names the place.
+    """
+    if connection.dialect.name != "sqlite":
+        return
+    driver, expired = connection.connection.driver_connection, Event()
+    assert driver is not None
+
+    def cut_short() -> None:
+        expired.set()
+        driver.interrupt()
+
+    timer = Timer(seconds, cut_short)
+    timer.start()
+    result = "ok"
+    try:
+        result = str(connection.exec_driver_sql(f"PRAGMA {_check(connection)}(1)").scalar())
+    except sa.exc.OperationalError:
+        if not expired.is_set():
+            raise
+    finally:
+        timer.cancel()
+        timer.join()  # otherwise it might interrupt a later statement
+    if expired.is_set():  # an interrupted check gives no reliable result
+        logger.warning("the database is large: its check stopped after %g s, and the rest was not checked", seconds)
+    elif result != "ok":
+        raise damaged(" ".join(result.split()))
+
+
+def _check(connection: Connection) -> str:
+    pages, size = (connection.exec_driver_sql(f"PRAGMA {name}").scalar_one() for name in ("page_count", "page_size"))
+    return "integrity_check" if pages * size <= INDEXES_BYTES else "quick_check"
+
+
+def check_tables(connection: Connection) -> None:
+    """Check that every table and column exists, without reading rows.
+
+    Raises:
+        Damaged: names what is missing.
+    """
+    for table in metadata.sorted_tables:
+        connection.execute(sa.select(table).limit(0))
+
+
+class Readiness:
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="readiness")
+        self._lock = Lock()
+        self._probe: Future[None] | None = None
+        self._begun = 0.0
+
+    def require(self) -> None:
+        """Raise ``Unavailable`` unless all tables exist, a write was recently made durable, and no broken page was ever
+        found: data written to such a file may be lost."""
+        self._database.require_sound()
+        probe = self._latest()
+        wait([probe], PATIENCE_SECONDS)
+        if not probe.done():
+            raise Unavailable(
+                f"the database can't be used now: no write succeeded within {PATIENCE_SECONDS:g} s; "
+                "see whether its disk is full or another program holds it"
+            )
+        if (error := probe.exception()) is not None:
+            raise Unavailable(str(error)) from error
+
+    def close(self) -> None:
+        self._thread.shutdown(wait=False)
+
+    def _latest(self) -> Future[None]:
+        """Return the last check of the database, or begin a new one if that is finished and old."""
+        with self._lock:
+            now = time.monotonic()
+            if self._probe is None or (self._probe.done() and now - self._begun >= FRESH_SECONDS):
+                self._probe, self._begun = self._thread.submit(self._write), now
+            return self._probe
+
+    def _write(self) -> None:
+        with self._database.write() as connection:
+            check_tables(connection)
+            version = connection.execute(sa.select(schema.c.version_num)).scalar()
+            for value in ("", version):  # two different values, because SQLite writes nothing if nothing changes
+                connection.execute(sa.update(schema).values(version_num=value))

@@ -1,22 +1,47 @@
-"""Adapter of ``Surrogates``: surrogates by name."""
+"""Adapter of ``Surrogates``: surrogates by name, entries of their list, and their removal.
+
+A removal takes the name away at once; the rows go in transactions that block nobody for long. A surrogate without a
+name is one that is being removed. A removal that a crash has interrupted is completed later.
+"""
 
 from __future__ import annotations
 
+import reprlib
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
+import msgspec
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage import port
-from surrogym_server.storage.records import FREE, NewSurrogate, Standing, SurrogateRecord, SurrogateSummary
-from surrogym_server.storage.sql import initial, removal
-from surrogym_server.storage.sql.database import NOW, Database, conflict_insert
+from surrogym_server.storage.records import (
+    FREE,
+    LedgerRecord,
+    NewSurrogate,
+    QueryCounts,
+    Standing,
+    SurrogateRecord,
+    SurrogateSummary,
+)
+from surrogym_server.storage.sql.database import BATCH, NOW, Database, conflict_insert, damaged
 from surrogym_server.storage.sql.leases import is_unbegun, requeue_set_aside
-from surrogym_server.storage.sql.rows import NAMED, append_event, hold, touch, unknown_surrogate
-from surrogym_server.storage.sql.sample_counts import CountedSamples
-from surrogym_server.storage.sql.summaries import Counted, read_summaries
-from surrogym_server.storage.sql.tables import queries, samples, surrogates
+from surrogym_server.storage.sql.ledger import MOST_KEPT, CountedSamples, SampleCounts, ledgers
+from surrogym_server.storage.sql.models import newest_of
+from surrogym_server.storage.sql.queries import begin_initial, end_initial, queue_initial
+from surrogym_server.storage.sql.rows import (
+    IS_THERE,
+    NAMED,
+    NAMELESS,
+    REMOVED,
+    append_event,
+    hold,
+    touch,
+    unknown_surrogate,
+)
+from surrogym_server.storage.sql.tables import metadata, models, policies, queries, samples, surrogates
 from surrogym_shared.states import Phase
 
 COLUMNS = [
@@ -41,8 +66,8 @@ class SqlSurrogates(port.Surrogates):
                 return read(connection, new.name), False
             surrogate = hold(connection, new.name)
             append_event(connection, surrogate, "created", name=new.name)
-            initial.begin(connection, surrogate, new.queries)
-        initial.ask(self._database, new.name, new.queries)
+            begin_initial(connection, surrogate, new.queries)
+        queue_initial(self._database, new.name, new.queries)
         return self.get(new.name), True
 
     def get(self, name: str) -> SurrogateRecord:
@@ -58,7 +83,7 @@ class SqlSurrogates(port.Surrogates):
 
     def name_of(self, id: int) -> str:
         with self._database.read() as connection:
-            named = sa.select(surrogates.c.name).where(surrogates.c.id == id, removal.IS_THERE)
+            named = sa.select(surrogates.c.name).where(surrogates.c.id == id, IS_THERE)
             name = connection.execute(named).scalar()
         if name is None:
             raise UnknownSurrogate("expected an existing surrogate, got one that was deleted")
@@ -73,7 +98,7 @@ class SqlSurrogates(port.Surrogates):
 
     def summaries(self, after: int = 0, limit: int | None = None) -> list[SurrogateSummary]:
         with self._database.read() as connection:
-            return read_summaries(connection, (surrogates.c.id > after) & removal.IS_THERE, limit, self._counted)
+            return read_summaries(connection, (surrogates.c.id > after) & IS_THERE, limit, self._counted)
 
     def change(
         self,
@@ -99,7 +124,7 @@ class SqlSurrogates(port.Surrogates):
                 return before
             smaller = budget if budget is not None and budget < before.budget else None
             if smaller is not None:
-                initial.end(connection, surrogate)
+                end_initial(connection, surrogate)
             if smaller is not None or changes.keys() & {"target", "tolerances"}:
                 changes |= _withdraw_unbegun(connection, surrogate, before, smaller)
             if changes:
@@ -115,14 +140,14 @@ class SqlSurrogates(port.Surrogates):
 
     def delete(self, name: str) -> None:
         with self._database.write() as connection:
-            id = removal.take_name(connection, name)
-        removal.remove(self._database, id)
+            id = _take_name(connection, name)
+        _remove(self._database, id)
 
     def complete_removals(self) -> int:
         with self._database.read() as connection:
-            ids = removal.interrupted(connection)
+            ids = _interrupted(connection)
         for id in ids:
-            removal.remove(self._database, id)
+            _remove(self._database, id)
         return len(ids)
 
 
@@ -186,7 +211,7 @@ def _withdraw_unbegun(
     unbegun = is_unbegun(surrogate.id)
     statement = sa.delete(queries).where(unbegun, queries.c.purpose == "adaptive")
     withdrawn = connection.execute(statement.returning(queries.c.steps, queries.c.extra)).all()
-    connection.execute(sa.update(surrogates).where(surrogates.c.id == surrogate.id).values(**removal.NO_RIGHT))
+    connection.execute(sa.update(surrogates).where(surrogates.c.id == surrogate.id).values(**NO_RIGHT))
     changes = {"phase": resting_phase(surrogate.round)} if surrogate.phase == "fitting" else {}
     if budget is None:
         again = sum(row.steps for row in withdrawn if row.extra)
@@ -221,3 +246,141 @@ def _apply(connection: Connection, surrogate: Row[Any], changes: dict[str, Any])
         touch(connection, surrogate, **changes)
     else:
         connection.execute(sa.update(surrogates).where(surrogates.c.id == surrogate.id).values(**changes))
+
+
+SUMMARY_FIELDS = (
+    "id",
+    "name",
+    "budget",
+    "target",
+    "phase",
+    "paused",
+    "round",
+    "error",
+    "created_at",
+)  # read as they are
+SUMMARY_COLUMNS = [getattr(surrogates.c, name) for name in SUMMARY_FIELDS]
+
+
+ANSWERED = (
+    sa.select(queries.c.surrogate_id, sa.func.count())
+    .where(queries.c.surrogate_id.in_(sa.bindparam("owners", expanding=True)), queries.c.status == "answered")
+    .group_by(queries.c.surrogate_id)
+)
+
+
+class _Named(msgspec.Struct):
+    """The only part of a specification that a list needs; parsing all of it takes ten times as long."""
+
+    environment: str = ""
+
+
+_NAMED = msgspec.json.Decoder(_Named)
+
+
+UNANSWERED = ("pending", "leased", "set_aside", "refused")  # statuses that an index counts
+OPEN_COUNTS = [
+    sa.select(sa.func.count())
+    .where(queries.c.surrogate_id == surrogates.c.id, queries.c.status == status)
+    .scalar_subquery()
+    .label(status)
+    for status in UNANSWERED
+]
+NEWEST = sa.select(sa.func.max(samples.c.id)).where(samples.c.surrogate_id == surrogates.c.id).scalar_subquery()
+AT_ONCE = 1_000  # most surrogates that one statement reads
+
+
+class Counted:
+    """Numbers of samples and answered queries, kept in memory.
+
+    They change only in a transaction that adds a sample. So the number of answered queries holds as long as the newest
+    sample is the same.
+    """
+
+    def __init__(self, samples: CountedSamples) -> None:
+        self._samples = samples
+        self._answered: dict[int, tuple[int | None, int]] = {}  # by surrogate: its newest sample's id, and the number
+
+    def read(self, connection: Connection, newest: Mapping[int, int | None]) -> dict[int, tuple[SampleCounts, int]]:
+        """The numbers of each surrogate, given the id of its newest sample, which was read before."""
+        counted = self._samples.of_many(connection, newest)
+        stale = [id for id in newest if self._answered.get(id, (-1, 0))[0] != newest[id]]
+        for first in range(0, len(stale), AT_ONCE):
+            self._count(connection, {id: newest[id] for id in stale[first : first + AT_ONCE]})
+        return {id: (counted[id], self._answered[id][1]) for id in newest}
+
+    def _count(self, connection: Connection, newest: Mapping[int, int | None]) -> None:
+        rows = connection.execute(ANSWERED, {"owners": list(newest)}).all()
+        answered = {int(id): int(count) for id, count in rows}
+        if len(self._answered) > MOST_KEPT:
+            self._answered = {}
+        self._answered |= {id: (last, answered.get(id, 0)) for id, last in newest.items()}
+
+
+def read_summaries(
+    connection: Connection, condition: sa.ColumnElement[bool], limit: int | None, counted: Counted
+) -> list[SurrogateSummary]:
+    """Up to ``limit`` surrogates that meet a condition, oldest first. The condition must choose a range of ids."""
+    statement = (
+        sa.select(*SUMMARY_COLUMNS, sa.type_coerce(surrogates.c.spec, sa.Text), NEWEST, *OPEN_COUNTS)
+        .where(condition)
+        .order_by(surrogates.c.id)
+        .limit(limit)
+    )
+    rows = connection.execute(statement).all()
+    if not rows:
+        return []
+    span = (rows[0].id, rows[-1].id)
+    answers = counted.read(connection, {row.id: row[len(SUMMARY_COLUMNS) + 1] for row in rows})
+    spent = ledgers(connection, span, {id: counts.by_purpose for id, (counts, _) in answers.items()})
+    newest, none_spent = newest_of(connection, span), LedgerRecord()
+    summaries = []
+    for row in rows:
+        id, *values, spec, _ = row[: len(SUMMARY_COLUMNS) + 2]
+        queue = QueryCounts(answered=answers[id][1], **{status: row._mapping[status] for status in UNANSWERED})
+        numbers = (spent.get(id, none_spent), queue, *newest.get(id, (None, None)))
+        fields: tuple[Any, ...] = (id, *values, _environment(spec), *numbers)
+        summaries.append(SurrogateSummary(*fields))
+    return summaries
+
+
+def _environment(spec: str) -> str:
+    try:
+        return _NAMED.decode(spec).environment
+    except msgspec.DecodeError as error:
+        raise damaged(f"expected JSON in surrogates.spec, got {reprlib.repr(spec)}: {error}") from error
+
+
+LARGE = {models: 8, policies: 8}  # tables whose rows have many bytes, or further rows
+NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None, "fit_seconds": None}
+
+
+def _take_name(connection: Connection, name: str) -> int:
+    """Take the name from a surrogate, so that nobody finds it, and return its id. Raises ``UnknownSurrogate``."""
+    id = int(hold(connection, name).id)
+    for table in metadata.tables.values():
+        if AT_ONCE in table.info:
+            connection.execute(sa.delete(table).where(table.c.surrogate_id == id))
+    gone = {"name": f"{REMOVED}{id}", "paused": True, **NO_RIGHT}
+    connection.execute(sa.update(surrogates).where(surrogates.c.id == id).values(**gone))
+    return id
+
+
+def _interrupted(connection: Connection) -> list[int]:
+    """Ids of the surrogates whose removal is not complete: they have no name any more."""
+    return [*connection.execute(NAMELESS).scalars()]
+
+
+def _remove(database: Database, id: int) -> None:
+    """Remove a surrogate that has no name any more, with its rows. A repeat is harmless."""
+    for table in reversed(metadata.sorted_tables):  # rows before those that they refer to
+        if "surrogate_id" in table.c:
+            database.write_in_batches(partial(_remove_some, table, id))
+    with database.write() as connection:
+        connection.execute(sa.delete(surrogates).where(surrogates.c.id == id, ~IS_THERE))
+
+
+def _remove_some(table: sa.Table, id: int, connection: Connection) -> int:
+    key = sa.tuple_(*table.primary_key.columns)
+    some = sa.select(*table.primary_key.columns).where(table.c.surrogate_id == id).limit(LARGE.get(table, BATCH))
+    return connection.execute(sa.delete(table).where(key.in_(some))).rowcount

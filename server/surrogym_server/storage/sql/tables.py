@@ -16,7 +16,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Dialect
 
 from surrogym_server.storage.records import Array
-from surrogym_server.storage.sql.damage import damaged
+from surrogym_server.storage.sql.database import damaged
 from surrogym_shared.nouns import Vector
 from surrogym_shared.states import EventKind, Phase, Purpose, QueryKind, QueryStatus, SamplePurpose
 
@@ -28,6 +28,8 @@ metadata = sa.MetaData(
         "pk": "pk_%(table_name)s",
     }
 )
+
+AT_ONCE = "at once"  # mark in the ``info`` of tables whose rows are removed together with the surrogate's name
 
 Id = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
 
