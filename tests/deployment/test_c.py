@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import shutil
@@ -155,10 +156,48 @@ def test_the_source_has_no_heap_no_recursion_and_a_bounded_stack(tmp_path: Path,
     assert f" and {sum(map(int, constants)):,} constants." in (folder / "arm_controller.h").read_text()
 
 
+TWO = """
+#include "arm_controller.h"
+#include <cstdio>
+int main() {
+    arm_controller one, other;
+    arm_real measured[2][3] = {{1, 0.5, 0.2}, {-2, 1.5, 0.9}}, actions[2][ARM_ACTIONS];
+    arm_reset(&one);
+    arm_reset(&other);
+    for (int step = 0; step < 5; step++) {
+        arm_step(&one, measured[0], 0, actions[0]);
+        arm_step(&other, measured[1], 0, actions[1]);
+        measured[0][0] += 0.1;
+        measured[1][0] -= 0.2;
+    }
+    std::printf("%s %.17g %.17g\\n", ARM_POLICY_SHA256, actions[0][0], actions[1][0]);
+}
+"""
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not on this machine")
+def test_a_program_in_cpp_runs_two_controllers_and_names_the_policy(tmp_path: Path):
+    path = network(tmp_path, plant(**HISTORY))
+    controller = controller_of(path)
+    (tmp_path / "c").mkdir()
+    write(controller, tmp_path / "c")
+    (tmp_path / "two.cpp").write_text(TWO)
+    sources = [tmp_path / "two.cpp", "-x", "c", tmp_path / "c" / "arm_controller.c"]
+    subprocess.run(["g++", f"-I{tmp_path / 'c'}", *sources, "-lm", "-o", tmp_path / "two"], check=True)
+    digest, *actions = run(tmp_path / "two").split()
+    assert digest == hashlib.sha256(path.read_bytes()).hexdigest()
+    for action, read, turn in zip(actions, ([1, 0.5, 0.2], [-2, 1.5, 0.9]), (0.1, -0.2), strict=True):
+        memory = begin(controller)
+        for step in range(5):
+            decided = decide(controller, memory, np.array([[read[0] + step * turn, *read[1:]]]))
+            memory = decided.memory
+        assert float(action) == pytest.approx(decided.action[0, 0], abs=1e-6)
+
+
 def test_names_that_would_end_a_comment_do_no_harm(tmp_path: Path):
     spec = plant()
     text = spec.model_dump_json().replace('"slide"', r'"*/ int x; /* ??/\n\\"')
-    path = network(tmp_path, type(spec).model_validate_json(text))
+    path = network(tmp_path, type(spec).model_validate_json(text), model='*/ " ??/\n\\"')
     (tmp_path / "c").mkdir()
     write(controller_of(path), tmp_path / "c")
     run(compile_c("cc", sorted((tmp_path / "c").glob("*.c")), tmp_path / "vectors"))

@@ -73,7 +73,7 @@ def test_names_with_the_end_of_a_comment_stay_in_it(tmp_path: Path):
     spec = plant()
     first, *others = spec.coordinates
     named = spec.model_copy(update={"coordinates": (first.model_copy(update={"unit": "*) x"}), *others)})
-    text = source_of(controller_of(network(tmp_path, named, (3,))), "LREAL", "arm")
+    text = source_of(controller_of(network(tmp_path, named, (3,), model="*) x")), "LREAL", "arm")
     assert text.count("(*") == text.count("*)")
 
 

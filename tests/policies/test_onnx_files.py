@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import onnx.inliner
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
@@ -99,8 +100,8 @@ def looping() -> onnx.ModelProto:
     [
         (inflated, "expected at most 67108864 numbers in the arrays of 1024 observations, got 40000"),
         (multiplied, "expected at most 67108864 numbers in the arrays of 1024 observations, got "),
-        (of_unknown_shape, "expected a shape that follows from the file for 'zeros', got none"),
-        (claiming, "expected a shape that follows from the file for 'zeros', got none"),
+        (of_unknown_shape, "expected sizes of the array 'zeros' that follow from those of the input, got"),
+        (claiming, "expected sizes of the array 'zeros' that follow from those of the input, got"),
         (of_another_file, "expected all arrays inside the file, got 'bias' in another one"),
         (hidden_in_a_constant, "expected all arrays inside the file, got 'bias' in another one"),
         (sparse, "expected dense arrays, got a sparse one"),
@@ -116,6 +117,18 @@ def test_a_file_without_bounds_is_refused_before_it_runs(
     with pytest.raises(UnusableOnnx, match=r"expected a policy in ONNX, got \d+ bytes") as refused:
         from_onnx(made().SerializeToString())
     assert said in str(refused.value)
+
+
+def test_a_file_with_functions_is_read_once_they_are_inlined_as_the_refusal_says():
+    opset = [helper.make_opsetid("", 18)]
+    own = helper.make_function("own", "Shift", ["x", "b"], ["y"], [helper.make_node("Add", ["x", "b"], ["y"])], opset)
+    made = model([helper.make_node("Shift", ["observation", "bias"], ["action"], domain="own")], [BIAS])
+    made.functions.append(own)
+    made.opset_import.append(helper.make_opsetid("own", 1))
+    with pytest.raises(UnusableOnnx, match=r"got the function 'Shift'.*onnx\.inliner\.inline_local_functions"):
+        from_onnx(made.SerializeToString())
+    policy = from_onnx(onnx.inliner.inline_local_functions(made).SerializeToString())
+    np.testing.assert_array_equal(policy(np.zeros((1, 3), np.float32)), np.ones((1, 3), np.float32))
 
 
 def test_a_file_of_too_many_bytes_is_refused_and_not_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -38,7 +38,8 @@ class Faults:
     fallback: Annotated[
         list[float] | None,
         typer.Option(
-            help="Action on a fault, one option for each entry. [default: the continuous action nearest to 0]"
+            help="Action on a fault, one option for each entry. A discrete action needs it. "
+            "[default: the continuous action nearest to 0]"
         ),
     ] = None
     timeout: Annotated[
@@ -81,7 +82,12 @@ class Checking:
         ),
     ] = False
     env: Annotated[str | None, typer.Option(help=f"Original environment of --check: {NAMES}.")] = None
-    episodes: Annotated[int, typer.Option(min=1, help="Number of episodes of --check.")] = 10
+    episodes: Annotated[
+        int,
+        typer.Option(
+            min=1, help="Number of starts of --check: from each, one episode of the policy and one of the controller."
+        ),
+    ] = 10
 
     @contextmanager
     def comparison(self, target: Target, controller: Controller, policy: LocalPolicy) -> Iterator[Comparison | None]:
@@ -213,7 +219,7 @@ def command(
         ),
     ],
     target: Annotated[str, typer.Option(help="What to write: c, arduino, fmu, onnx, st.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write, new or empty.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write: new, empty, or with the same files.")],
     spec: SpecFile = None,
     period: Annotated[
         float | None,

@@ -61,6 +61,8 @@ def description(controller: Controller) -> dict[str, Any]:
                 controller.low, controller.high, choices, controller.fallback, strict=True
             )
         ],
+        "reading": "a reading outside of sensor is a fault, and the action is the fallback; an angle is wrapped to "
+        "[-pi, pi); another measurement is clipped to low and high; lags follow from earlier steps",
         "scaling": "inside: give observations in their units; actions come in theirs, within low and high",
         "sampling_period": controller.period,
         "timeout": _finite(controller.timeout),

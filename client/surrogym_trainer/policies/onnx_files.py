@@ -78,7 +78,10 @@ def _check_self_contained(model: Any) -> None:
     import onnx
 
     if model.functions:
-        raise ValueError("expected only operators of ONNX, got a function that the file defines")
+        raise ValueError(
+            f"expected only operators of ONNX, got the function {model.functions[0].name!r}, which the file defines: "
+            "write the file again with its functions inlined, by onnx.inliner.inline_local_functions(model)"
+        )
     for message in _messages(model):
         match message:
             case onnx.TensorProto(data_location=onnx.TensorProto.EXTERNAL):
@@ -120,5 +123,8 @@ def _numbers(graph: Any) -> int:
 
 def _size(name: str, tensor: Any) -> int:
     if tensor is None or not tensor.HasField("shape") or not all(d.HasField("dim_value") for d in tensor.shape.dim):
-        raise ValueError(f"expected a shape that follows from the file for {name!r}, got none")
+        raise ValueError(
+            f"expected sizes of the array {name!r} that follow from those of the input, got an array of unknown size: "
+            "export the policy again so that only the number of observations is dynamic"
+        )
     return math.prod(int(d.dim_value) for d in tensor.shape.dim)

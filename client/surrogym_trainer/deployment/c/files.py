@@ -95,12 +95,12 @@ def _header(controller: Controller) -> dict[str, Any]:
     ]
     choices = controller.counts or (0,) * len(controller.low)
     acted = [
-        f"action[{i}]  from {low:.6g} to {high:.6g}{f', one of {n} values' if n else ''}"
+        f"action[{i}]  from {low:.6g} to {high:.6g}{f', one of {n} evenly spaced values' if n else ''}"
         for i, (low, high, n) in enumerate(zip(controller.low, controller.high, choices, strict=True))
     ]
     observed = [f"observation[{i}]  {o.name}{_in(o.unit)}" for i, o in enumerate(controller.observation)]
     return {
-        "digests": "\n".join(f" *   {value}  {name}" for name, value in sorted(controller.digests.items())),
+        "digests": "\n".join(_digest(controller, name, value) for name, value in sorted(controller.digests.items())),
         "measured": _comment(measured),
         "acted": _comment(acted),
         "observed": _comment(observed),
@@ -114,6 +114,11 @@ def _header(controller: Controller) -> dict[str, Any]:
         "D": len(controller.observation),
         "C": len(controller.coordinates),
     }
+
+
+def _digest(controller: Controller, name: str, value: str) -> str:
+    """Return a digest as a text that a program can print, so that a running machine can name its controller."""
+    return f"#define {prefix_of(controller).upper()}_{name.replace(' ', '_').upper()}_SHA256 {source.text(value)}"
 
 
 def _names(controller: Controller) -> dict[str, str]:

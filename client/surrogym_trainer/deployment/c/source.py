@@ -5,6 +5,7 @@ Shapes: R measurements, D observation entries, A outputs, F action entries.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Iterable
@@ -63,6 +64,11 @@ def plain(text: str) -> str:
     """Return a text that can't end a comment in C: names are free text."""
     printable = "".join(c if c.isprintable() else " " for c in text)
     return re.sub(r"\?\?", "? ?", printable.replace("*/", "* /").replace("/*", "/ *").rstrip("\\"))
+
+
+def text(value: str) -> str:
+    """Return a text as a constant in C."""
+    return json.dumps(plain(value))
 
 
 def stack_of(controller: Controller) -> int:

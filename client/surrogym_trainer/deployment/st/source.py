@@ -274,12 +274,12 @@ def _comments(controller: Controller) -> dict[str, str]:
     ]
     choices = controller.counts or (0,) * len(controller.low)
     acted = [
-        f"command[{i}]  from {low:.6g} to {high:.6g}{f', one of {n} values' if n else ''}"
+        f"command[{i}]  from {low:.6g} to {high:.6g}{f', one of {n} evenly spaced values' if n else ''}"
         for i, (low, high, n) in enumerate(zip(controller.low, controller.high, choices, strict=True))
     ]
     return {
         "title": plain(f"Controller of {controller.name}"),
-        "digests": "\n".join(f"     {value}  {name}" for name, value in sorted(controller.digests.items())),
+        "digests": "\n".join(f"     {plain(value)}  {name}" for name, value in sorted(controller.digests.items())),
         "measured": "\n".join(f"     {plain(line)}" for line in measured),
         "acted": "\n".join(f"     {line}" for line in acted),
         "observed": plain(", ".join(one.name for one in controller.observation)),
