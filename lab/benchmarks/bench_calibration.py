@@ -22,7 +22,7 @@ from common import parser, started, write
 from support.calibration import Calibration, Trajectories, mean, one_step, ten_steps, trajectories
 from surrogym_sampler.original import make
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
-from surrogym_server.sampling.tolerances import usual_tolerances
+from surrogym_server.sampling.tolerances import default_tolerances
 from surrogym_shared.spec import Design
 
 TASKS = {
@@ -55,8 +55,8 @@ def _calibration(model: GaussianProcessModel, way: str, ahead: str, real: Trajec
     noise = torch.Generator().manual_seed(seed)
     paths = draws.draw(torch.randn(DRAWS, draws.path_size, generator=noise, dtype=torch.float64))
     drawn, truth = AHEAD[ahead](model, draws, paths, real)
-    usual = np.array(usual_tolerances(model.definition, model.scales.tolist()))
-    return Calibration.of(drawn, truth, usual * (1 if ahead == "one step" else np.sqrt(10)))
+    defaults = np.array(default_tolerances(model.definition, model.scales.tolist()))
+    return Calibration.of(drawn, truth, defaults * (1 if ahead == "one step" else np.sqrt(10)))
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -31,7 +31,7 @@ from surrogym_server.sampling.design import advance, initial_queries
 from surrogym_server.sampling.rollouts import random_sequences
 from surrogym_server.sampling.serial import SensorNoise, sensor_noise
 from surrogym_server.sampling.state import DesignState, Request
-from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
+from surrogym_server.sampling.tolerances import DefaultTolerances, frozen_tolerances
 from surrogym_server.virtual import VirtualSettings, create, reset, step
 from surrogym_shared.spec import Design
 
@@ -81,8 +81,8 @@ def random_model(
         rows += play(machine, actions, noise, rng)
     samples = samples_of(rows)
     model = learn(definition, samples, {}).model
-    frozen = frozen_tolerances(definition, samples, Usual((), ())).tolerances
-    return model, sensor_noise(model, samples, definition.tolerances_over(frozen))
+    frozen = frozen_tolerances(definition, samples, DefaultTolerances()).values
+    return model, sensor_noise(model, samples, definition.tolerances_or(frozen))
 
 
 def tell(machine: Machine, given: argparse.Namespace) -> None:

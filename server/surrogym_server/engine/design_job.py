@@ -27,7 +27,7 @@ from surrogym_server.sampling.judging import judge_model
 from surrogym_server.sampling.limits import reached_limits
 from surrogym_server.sampling.prequential import LATEST, Predictions, latest, predicted
 from surrogym_server.sampling.state import DesignState, Request
-from surrogym_server.sampling.tolerances import usual_tolerances
+from surrogym_server.sampling.tolerances import default_tolerances
 from surrogym_shared.nouns import Query, RealSteps
 from surrogym_shared.states import Phase, SamplePurpose, Verdict
 
@@ -110,14 +110,18 @@ def judge_stored(job: DesignJob, stored: bytes) -> DesignResult:
     """
     started = time.perf_counter()
     model, samples = from_bytes(job.definition, stored), _samples(job)
-    usual = job.state.get("usual") or usual_tolerances(job.definition, model.scales.tolist())
     state = DesignState.from_json(job.state)
-    judgement = judge_model(model, samples, usual, _request(job), state)
+    defaults = state.defaults.values or default_tolerances(job.definition, model.scales.tolist())
+    judgement = judge_model(model, samples, job.definition.tolerances_or(defaults), _request(job), state)
     return DesignResult(
         model=stored,
         description=model.description,
         fidelity=fidelity_fields(
-            model, judgement.confidences, judgement.tolerances, job.target, reached_limits(job.definition, samples)
+            model,
+            judgement.confidences,
+            judgement.widened_tolerances,
+            job.target,
+            reached_limits(job.definition, samples),
         ),
         data_hash=model.digest,
         state=job.state,

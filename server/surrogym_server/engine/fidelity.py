@@ -11,7 +11,7 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
 from surrogym_server.sampling.judging import monte_carlo
 from surrogym_server.sampling.limits import Limit
-from surrogym_server.sampling.tolerances import usual_tolerances
+from surrogym_server.sampling.tolerances import default_tolerances
 
 
 def fidelity_fields(
@@ -38,17 +38,17 @@ def fidelity_fields(
     }
 
 
-def fidelity_of(model: DynamicsModel, usual: Sequence[float], target: float) -> dict[str, Any]:
+def fidelity_of(model: DynamicsModel, defaults: Sequence[float], target: float) -> dict[str, Any]:
     """Judge a model of a surrogate, and return the fields of ``wire.Fidelity``.
 
     Args:
         model: the model to judge.
-        usual: (O,) tolerances frozen by the design, for outputs without a declared one; empty before its first round,
-            when they are computed from the model's own scales.
+        defaults: (O,) default tolerances of the design, for outputs without a declared one. They are empty before its
+            first round, and then computed from the model's own scales.
         target: confidence index that the design aims at.
     """
-    usual = usual or usual_tolerances(model.definition, model.scales.tolist())
-    tolerances = model.definition.tolerances_over(usual)
+    defaults = defaults or default_tolerances(model.definition, model.scales.tolist())
+    tolerances = model.definition.tolerances_or(defaults)
     points = Points(*monte_carlo(model.definition))
     confidences = confidences_of(model, points, deviations(model, points.q, points.u), tolerances)
     return fidelity_fields(model, confidences, tolerances, target)

@@ -166,10 +166,10 @@ class EnvironmentDefinition:
         """The same definition for states on another device."""
         return self if device == self.device else to_device(self, device)
 
-    def tolerances_over(self, usual: Sequence[float]) -> tuple[float, ...]:
-        """Tolerance of each output: the declared one, or else the one in ``usual`` (O,)."""
+    def tolerances_or(self, defaults: Sequence[float]) -> tuple[float, ...]:
+        """Tolerance of each output (O,): the declared one, or else the one in ``defaults`` (O,)."""
         declared = dict(self.tolerances)
-        return tuple(declared.get(name, value) for name, value in zip(self.outputs, usual, strict=True))
+        return tuple(declared.get(name, value) for name, value in zip(self.outputs, defaults, strict=True))
 
     def with_tolerances(self, tolerances: Mapping[str, float]) -> EnvironmentDefinition:
         """The same definition with these tolerances, by output."""

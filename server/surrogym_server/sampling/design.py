@@ -1,6 +1,23 @@
-"""Algorithm 1, a round at a time: fit the model, judge it, choose the next queries.
+"""Algorithm 1 of the paper: one call for its start, and one call for each round.
 
-Pure: samples and state in, decision and state out.
+The real steps of the algorithm are taken elsewhere and take long, so the algorithm is cut where it waits for them:
+
+=========  ============================================================  ==============================================
+line       of Algorithm 1                                                where
+=========  ============================================================  ==============================================
+1          Latin hypercube of initial points                             ``initial_queries``
+2, 11      run single steps in the original environment                  a sampler, ``surrogym_sampler.queries``
+3, 4, 12   fit all processes to all data                                 ``advance``
+5, 6, 13   confidence index (CI) of each process over Monte Carlo data   ``advance``
+7          repeat                                                        ``services.designer``: one ``advance`` when the
+                                                                         queries of the last round have their samples
+8, 9, 10   for each process below the target, select a point by U        ``advance``
+14         until CI >= target                                            ``advance``, by its verdict
+15         step function of the virtual environment                      ``virtual``
+=========  ============================================================  ==============================================
+
+A policy is trained in the virtual environment, by ``surrogym_trainer``. All functions here are pure: samples and state
+in, decision and state out.
 """
 
 from __future__ import annotations
@@ -14,14 +31,14 @@ from surrogym_server.models.guard import learn
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.confidence import OutputConfidence
-from surrogym_server.sampling.judging import judge_model, outcome_of
+from surrogym_server.sampling.judging import below_target, judge_model, verdict_with_history
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube
 from surrogym_server.sampling.rollouts import first_rollouts
 from surrogym_server.sampling.round import Round
 from surrogym_server.sampling.rules import ROLLOUT_RULES, STEP_RULES
 from surrogym_server.sampling.seeds import generator_for
-from surrogym_server.sampling.state import DesignState, Request
-from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
+from surrogym_server.sampling.state import Conditions, DesignState, Request
+from surrogym_server.sampling.tolerances import frozen_tolerances
 from surrogym_shared.nouns import Query
 from surrogym_shared.states import Verdict
 
@@ -34,8 +51,8 @@ class Decision:
 
     model: DynamicsModel
     confidences: tuple[OutputConfidence, ...]  # (O,) one for each output
-    tolerances: tuple[float, ...]  # (O,) that the verdict is based on
-    state: DesignState
+    tolerances: tuple[float, ...]  # (O,) of the confidences: declared or default ones, widened by confirmed noise
+    state: DesignState  # for the next round
     verdict: Verdict
     queries: tuple[Query, ...]  # the next queries
 
@@ -57,69 +74,82 @@ def initial_queries(definition: EnvironmentDefinition, budget: int) -> tuple[Que
 
 
 def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignState, request: Request) -> Decision:
-    """Do one round of Algorithm 1.
+    """Do one round of Algorithm 1, lines 3 to 6 and 8 to 14; the module's docstring has the other lines.
+
+    The paper fits again after every real step (line 12). Here the queries of a round are chosen together, each as if
+    those before it were answered, and the next round fits once they all are.
+
+    Args:
+        definition: the environment, with the settings of its design.
+        samples: results of all real steps so far.
+        state: result of the round before; ``DesignState()`` before the first round.
+        request: budget and target of the design, and its queries without an answer.
 
     Raises:
         InvalidInput, NumericalFailure: from ``Learner.learn``.
         PluginFailed: the family of models raised another error, or its model can't be used.
         ChoiceFailed: the acquisition returned values of a wrong shape, or that are not finite.
     """
-    # Fit the model to all samples.
+    # Lines 3, 4 and 12: fit the processes of all outputs, transitions and reward, to all samples.
     fit = learn(definition, samples, state.warm)
-    default = frozen_tolerances(definition, samples, Usual(state.usual, state.ranges))
 
-    # Judge it: may the design end?
-    judgement = judge_model(fit.model, samples, default.tolerances, request, state)
-    tolerances = definition.tolerances_over(default.tolerances)
-    now = (float(len(samples) - request.free), float(request.budget), request.target, *tolerances)
-    outcome = outcome_of(judgement, state, request, now)
-    testing = outcome == "ready" and _is_untested(definition, samples, state)
+    # CI needs a tolerance for each output, (O,): the declared one, or else 5 % of the output's standard deviation.
+    defaults = frozen_tolerances(definition, samples, state.defaults)
+    tolerances = definition.tolerances_or(defaults.values)
 
-    # Choose the next queries.
-    continues = outcome == "continue" or testing
-    round = Round(state.round, fit.model, samples, request, judgement, default.tolerances, continues, testing)
-    queries = _choose(round)
-    verdict = _verdict(round, outcome, queries)
+    # Lines 5, 6 and 13: the CI of each output over the Monte Carlo set, whose points are also candidates below.
+    judgement = judge_model(fit.model, samples, tolerances, request, state)
 
+    # Line 14, "until CI >= target": the verdict is "continue", or why the design may end, such as a spent budget.
+    conditions = Conditions(request.cost(len(samples)), request.budget, request.target, tolerances)
+    verdict = verdict_with_history(judgement, state, request, conditions)
+
+    # Not in the paper: a ready design that begins at snapshots continues for an excursion, a test of its model.
+    testing = verdict == "ready" and _lacks_excursion(definition, samples, state)
+    if testing:
+        tested_at = len(samples)
+    else:
+        tested_at = state.tested_at if verdict == "ready" else 0
+    continues = verdict == "continue" or testing
+
+    # Line 8, "for each process with CI < target": the numbers of these outputs, the least confident first.
+    outputs = below_target(judgement.confidences, request.target)
+
+    # Lines 9 and 10: for each of these outputs the candidate with the largest uncertainty index. The last rule does
+    # that. The rules before it choose queries that the paper does not have, such as repeats, which show what is noise;
+    # a rule that does not apply returns None.
+    round = Round(state.round, fit.model, samples, request, judgement, tolerances, outputs, continues, testing)
+    rules = STEP_RULES if definition.max_rollout is None else ROLLOUT_RULES
+    queries = next(choice for rule in rules if (choice := rule(round)) is not None)
+    if continues:
+        verdict = _verdict_with(queries, round)
+
+    # Store what the next round needs. A design that has ended may begin again, if the conditions change.
     ended = verdict != "continue" and not queries
-    tested_at = len(samples) if testing else state.tested_at
     following = DesignState(
         round=state.round + 1,
-        usual=default.tolerances,
-        ranges=default.ranges,
+        defaults=defaults,
         warm=fit.warm,
-        ended_with=now if ended else (),
+        ended_under=conditions if ended else None,
         ended_as=verdict if ended else "",
         predictions=state.predictions,
-        tested_at=tested_at if outcome == "ready" else 0,
+        tested_at=tested_at,
     )
-    return Decision(fit.model, judgement.confidences, judgement.tolerances, following, verdict, queries)
+    return Decision(fit.model, judgement.confidences, judgement.widened_tolerances, following, verdict, queries)
 
 
-def _choose(round: Round) -> tuple[Query, ...]:
-    """Return the queries of the first rule that applies. The last rule always applies."""
-    rules = STEP_RULES if round.definition.max_rollout is None else ROLLOUT_RULES
-    return next(queries for rule in rules if (queries := rule(round)) is not None)
+def _verdict_with(queries: tuple[Query, ...], round: Round) -> Verdict:
+    """Return the verdict on a design that would continue: it ends if no query was chosen and none is open.
 
-
-def _verdict(round: Round, outcome: Verdict, queries: tuple[Query, ...]) -> Verdict:
-    """Decide the verdict of a round.
-
-    It is the outcome of the judgement. But a design that could continue ends, if no query was chosen and none is
-    open: no distinct query is left, or the budget has no real steps left for one.
+    Then no distinct query is left, or the budget has no real steps left for one.
     """
-    if not round.continues:
-        return outcome
     if queries or round.request.open:
         return "continue"
     return "unsure" if round.cost < round.request.budget else "over_budget"
 
 
-def _is_untested(definition: EnvironmentDefinition, samples: Samples, state: DesignState) -> bool:
-    """Whether a design with snapshots, which would be ready, has to take an excursion first.
-
-    It has to unless a step was taken since an excursion was planned.
-    """
+def _lacks_excursion(definition: EnvironmentDefinition, samples: Samples, state: DesignState) -> bool:
+    """Whether a ready design has snapshots, and no sample has come since its last excursion was planned."""
     if not definition.snapshots or definition.design.stopping != "tested_confidence":
         return False
     return not state.tested_at or len(samples) <= state.tested_at

@@ -18,13 +18,13 @@ from surrogym_server.sampling.candidates import Candidates, candidates_of, with_
 from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
 from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, random_points
-from surrogym_server.sampling.noise import SLACK, established_noise, widened
+from surrogym_server.sampling.noise import SLACK, established_noise, widened_by
 from surrogym_server.sampling.past import owed_to_past
 from surrogym_server.sampling.peaks import highest
 from surrogym_server.sampling.prequential import scores_of
 from surrogym_server.sampling.seeds import generator_for
 from surrogym_server.sampling.serial import noise_of_sensors, sensor_noise
-from surrogym_server.sampling.state import DesignState, Request
+from surrogym_server.sampling.state import Conditions, DesignState, Request
 from surrogym_shared.states import Verdict
 
 
@@ -33,44 +33,44 @@ class Judgement:
     """Judgement of a model: confidences, tolerances, verdict, and candidates for the next queries."""
 
     confidences: tuple[OutputConfidence, ...]  # (O,) one for each output
-    tolerances: tuple[float, ...]  # (O,) that the confidences refer to
-    verdict: Verdict
+    widened_tolerances: tuple[float, ...]  # (O,) of the confidences: the tolerances, widened by confirmed noise
+    verdict: Verdict  # on this model, whatever the verdicts of earlier rounds
     candidates: Candidates  # m points, for the next queries
 
 
 def judge_model(
     model: DynamicsModel,
     samples: Samples,
-    usual: Sequence[float],
+    tolerances: Sequence[float],
     request: Request,
     state: DesignState,
 ) -> Judgement:
-    """Judge a model. An output without a declared tolerance has its ``usual`` one (O,).
+    """Judge a model by the tolerances (O,) of its outputs, in their units.
 
     Raises:
         PluginFailed: code of the model's family failed.
     """
     definition = model.definition
     with plugin_calls(definition):
-        limits = definition.tolerances_over(usual)
-        past = owed_to_past(model, samples, limits)
-        sensors = tuple(None if any(past) else one for one in sensor_noise(model, samples, limits))
-        noise = established_noise(model, samples, limits).maximum(noise_of_sensors(model, samples, sensors, limits))
+        past = owed_to_past(model, samples, tolerances)
+        sensors = tuple(None if any(past) else one for one in sensor_noise(model, samples, tolerances))
+        of_sensors = noise_of_sensors(model, samples, sensors, tolerances)
+        noise = established_noise(model, samples, tolerances).maximum(of_sensors)
         if any(past):  # a hidden state may influence every output, so no noise is confirmed
             noise = torch.zeros_like(noise)
-    tolerances = widened(definition.tolerances_over(usual), noise)
+    widened = widened_by(noise, tolerances)
     points = Points(*monte_carlo(definition))
     with plugin_calls(definition):
         deviation = deviations(model, points.q, points.u)
         require_deviations(model, deviation)
-        without_noise = confidences_of(model, points, deviation, tolerances)
+        without_noise = confidences_of(model, points, deviation, widened)
     confidences = tuple(
         replace(
             c,
             noise=float(w),
             sensor_noise=0.0 if one is None else one.deviation,
             past=past[i],
-            prequential=scores_of(state.predictions[i], tolerances[i]) if state.predictions else None,
+            prequential=scores_of(state.predictions[i], widened[i]) if state.predictions else None,
         )
         for i, (c, w, one) in enumerate(zip(without_noise, noise, sensors, strict=True))
     )
@@ -79,15 +79,14 @@ def judge_model(
     settled = candidates.reserved is None or not definition.learns_termination
     peak = None
     if definition.design.stopping == "tested_confidence":
-        peak = highest(
-            model, samples, candidates.points, tolerances[-1], generator_for(definition, f"peak {state.round}")
-        )
+        rng = generator_for(definition, f"peak {state.round}")
+        peak = highest(model, samples, candidates.points, widened[-1], rng)
     if peak is not None:
         settled = False
         if candidates.reserved is None or state.round % 2:  # endings and peaks take turns
             candidates = with_reserved(candidates, peak)
-    verdict = judge(definition, confidences, tolerances, len(samples), request, settled)
-    return Judgement(confidences, tolerances, verdict, candidates)
+    verdict = judge(definition, confidences, widened, len(samples), request, settled)
+    return Judgement(confidences, widened, verdict, candidates)
 
 
 def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
@@ -111,7 +110,7 @@ def judge(
     half as many as initial ones. Logged samples count as initial ones, not as adaptive ones, because nobody chose them
     to disprove the model.
     """
-    initial, cost = definition.design.initial, samples - request.free
+    initial, cost = definition.design.initial, request.cost(samples)
     sure = all(c.confidence_index >= request.target for c in confidences)
     if definition.design.stopping == "tested_confidence":
         sure = sure and all(agrees(c, t) for c, t in zip(confidences, tolerances, strict=True))
@@ -130,7 +129,14 @@ def agrees(confidence: OutputConfidence, tolerance: float) -> bool:
     return confidence.leave_one_out_error is not None and confidence.leave_one_out_error <= limit
 
 
-def outcome_of(judgement: Judgement, state: DesignState, request: Request, now: tuple[float, ...]) -> Verdict:
+def below_target(confidences: Sequence[OutputConfidence], target: float) -> list[int]:
+    """Numbers of the outputs below the target, the least confident first; without any, the least confident one."""
+    index = [confidence.confidence_index for confidence in confidences]
+    order = sorted(range(len(index)), key=index.__getitem__)
+    return [i for i in order if index[i] < target] or order[:1]
+
+
+def verdict_with_history(judgement: Judgement, state: DesignState, request: Request, conditions: Conditions) -> Verdict:
     """Correct the verdict on a model by how the design ended before, if it did.
 
     A design that was ready stays ready, unless a person has asked for more or later steps contradict the model: a fit
@@ -139,17 +145,20 @@ def outcome_of(judgement: Judgement, state: DesignState, request: Request, now: 
     """
     if judgement.verdict in ("ready", "from_log"):
         return judgement.verdict
-    if state.ended_as == "ready" and not _asks_more(now, state.ended_with) and not _contradicted(judgement, request):
+    before = state.ended_under
+    if state.ended_as == "ready" and not _asks_more(conditions, before) and not _contradicted(judgement, request):
         return "ready"
-    if judgement.verdict == "continue" and (now == state.ended_with or request.is_mostly_refused(now[0])):
+    if judgement.verdict == "continue" and (conditions == before or request.is_mostly_refused(conditions.cost)):
         return "unsure"
     return judgement.verdict
 
 
-def _asks_more(now: tuple[float, ...], before: tuple[float, ...]) -> bool:
+def _asks_more(now: Conditions, before: Conditions | None) -> bool:
     """Whether a person has changed the budget or the target, or reduced a tolerance, since the design ended."""
-    smaller = any(new < old for new, old in zip(now[3:], before[3:], strict=True))
-    return now[1:3] != before[1:3] or smaller
+    if before is None:
+        return True
+    smaller = any(new < old for new, old in zip(now.tolerances, before.tolerances, strict=True))
+    return (now.budget, now.target) != (before.budget, before.target) or smaller
 
 
 def _contradicted(judgement: Judgement, request: Request) -> bool:
@@ -158,7 +167,7 @@ def _contradicted(judgement: Judgement, request: Request) -> bool:
     They are the errors of the predictions of the latest steps, or the leave-one-out errors if there are none.
     """
     surprises = request.surprises
-    for i, (confidence, tolerance) in enumerate(zip(judgement.confidences, judgement.tolerances, strict=True)):
+    for i, (confidence, tolerance) in enumerate(zip(judgement.confidences, judgement.widened_tolerances, strict=True)):
         latest = surprises[i] if surprises else ()
         error = confidence.leave_one_out_error or 0.0
         if latest:

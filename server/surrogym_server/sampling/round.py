@@ -23,7 +23,8 @@ class Round:
     samples: Samples
     request: Request
     judgement: Judgement
-    default_tolerances: tuple[float, ...]  # (O,) for outputs without a declared tolerance
+    tolerances: tuple[float, ...]  # (O,) declared or default ones, not widened by noise
+    outputs: list[int]  # numbers of the outputs to query for, the least confident first; at least one
     continues: bool  # the round may spend what the budget has left; otherwise it may take ``request.extra`` steps
     testing: bool  # the model is sure, and an excursion is to test it
 
@@ -34,7 +35,7 @@ class Round:
     @property
     def cost(self) -> int:
         """Real steps that count towards the budget."""
-        return len(self.samples) - self.request.free
+        return self.request.cost(len(self.samples))
 
     @property
     def room(self) -> int:
@@ -51,13 +52,6 @@ class Round:
         design = self.definition.design
         enough = self.cost >= max(self.request.budget / 2, 1.5 * design.initial)
         return self.continues and design.stopping == "tested_confidence" and enough
-
-    @property
-    def below_target(self) -> list[int]:
-        """Numbers of the outputs below the target, the least confident first; without any, the least confident one."""
-        index = [confidence.confidence_index for confidence in self.judgement.confidences]
-        order = sorted(range(len(index)), key=index.__getitem__)
-        return [i for i in order if index[i] < self.request.target] or order[:1]
 
     def generator(self) -> np.random.Generator:
         """Return a new random generator for this round's rollouts; each call returns the same numbers."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +11,27 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from surrogym_server.sampling.prequential import Predictions, from_pairs, pairs_of
+from surrogym_server.sampling.tolerances import DefaultTolerances
 from surrogym_shared.nouns import Query, Vector
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions under which a design has ended. If they change, it may begin again. O outputs."""
+
+    cost: float  # real steps that count towards the budget
+    budget: float  # limit of these real steps
+    target: float  # confidence index to reach
+    tolerances: tuple[float, ...]  # (O,) declared or default ones
+
+    def to_list(self) -> list[float]:
+        """Return the conditions as JSON has them, in one list."""
+        return [float(self.cost), float(self.budget), self.target, *self.tolerances]
+
+    @classmethod
+    def from_list(cls, numbers: Sequence[float]) -> Conditions:
+        cost, budget, target, *tolerances = numbers
+        return cls(cost, budget, target, tuple(tolerances))
 
 
 @dataclass(frozen=True)
@@ -19,28 +39,35 @@ class DesignState:
     """State that one round passes to the next. It can be stored as JSON."""
 
     round: int = 0
-    usual: tuple[float, ...] = ()  # (O,) default tolerances; see ``sampling.tolerances``
+    defaults: DefaultTolerances = field(default_factory=DefaultTolerances)  # for outputs without a declared one
     warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # what a fit passes to the next one
-    ended_with: tuple[float, ...] = ()  # real steps that count, budget, target and tolerances when the design ended
+    ended_under: Conditions | None = None  # conditions when the design ended; None while it continues
     ended_as: str = ""  # the verdict with which the design ended; "" while it continues
-    ranges: tuple[float, ...] = ()  # (O,) ranges of the targets that the default tolerances were computed from
     predictions: Predictions = ()  # last predictions of each output before the model learned from the sample
     tested_at: int = 0  # number of samples when the model became sure and an excursion was planned; 0: it is not sure
 
     def to_json(self) -> dict[str, Any]:
         warm = {key: array.tolist() for key, array in self.warm.items()}
-        ended, ranges = list(self.ended_with), list(self.ranges)
-        fields = {"round": self.round, "usual": list(self.usual), "ranges": ranges, "warm": warm, "ended_with": ended}
+        usual, ranges = list(self.defaults.values), list(self.defaults.ranges)
+        ended = [] if self.ended_under is None else self.ended_under.to_list()
+        fields = {"round": self.round, "usual": usual, "ranges": ranges, "warm": warm, "ended_with": ended}
         fields["ended_as"] = self.ended_as
         return fields | {"predictions": pairs_of(self.predictions), "tested_at": self.tested_at}
 
     @classmethod
     def from_json(cls, state: dict[str, Any]) -> DesignState:
         warm = {key: np.array(array) for key, array in state.get("warm", {}).items()}
-        usual, ended, ranges = (tuple(state.get(name, ())) for name in ("usual", "ended_with", "ranges"))
-        predictions, tested_at = from_pairs(state.get("predictions", [])), state.get("tested_at", 0)
-        ended_as = state.get("ended_as", "")
-        return cls(state.get("round", 0), usual, warm, ended, ended_as, ranges, predictions, tested_at)
+        defaults = DefaultTolerances(tuple(state.get("usual", ())), tuple(state.get("ranges", ())))
+        ended = state.get("ended_with")
+        return cls(
+            round=state.get("round", 0),
+            defaults=defaults,
+            warm=warm,
+            ended_under=Conditions.from_list(ended) if ended else None,
+            ended_as=state.get("ended_as", ""),
+            predictions=from_pairs(state.get("predictions", [])),
+            tested_at=state.get("tested_at", 0),
+        )
 
 
 @dataclass(frozen=True)
@@ -65,13 +92,12 @@ class Request:
     open: int = 0  # real steps of the pending queries that may still be answered
     surprises: Predictions = ()  # predictions, by the last model, of the samples that are new in this round
 
-    @property
-    def free(self) -> int:
-        """Number of samples less that of the real steps that count towards the budget.
+    def cost(self, samples: int) -> int:
+        """Number of real steps that count towards the budget, of a design that has this number of samples.
 
-        Samples of logs and audits don't count; steps from which nothing is learned do, and are no samples.
+        Samples of logs and audits don't count. Steps from which nothing is learned do, although they are no samples.
         """
-        return self.logged + self.audited - self.unlearned
+        return samples - self.logged - self.audited + self.unlearned
 
     @property
     def unanswered(self) -> tuple[Query, ...]:

@@ -30,7 +30,7 @@ def sizes_of(definition: EnvironmentDefinition, samples: Samples) -> list[float]
     return torch.where(spread > 0, spread, torch.where(mean > 0, mean, 1.0)).tolist()
 
 
-def usual_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]) -> tuple[float, ...]:
+def default_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]) -> tuple[float, ...]:
     """Default tolerance (O,) of outputs of these sizes (O,): 5 % of the size, or 1 in the unit, as in the paper."""
     if definition.design.tolerance == "raw":
         return (1.0,) * len(sizes)
@@ -39,14 +39,16 @@ def usual_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]) 
 
 
 @dataclass(frozen=True)
-class Usual:
-    """Default tolerances (O,) of a design, and the ranges (O,) of the targets that they were computed from."""
+class DefaultTolerances:
+    """Default tolerances of a design: of all O outputs, also of those that have a declared one, which replaces it."""
 
-    tolerances: tuple[float, ...] = ()
-    ranges: tuple[float, ...] = ()
+    values: tuple[float, ...] = ()  # (O,) in each output's unit; empty before the first round
+    ranges: tuple[float, ...] = ()  # (O,) ranges of the targets that the values were computed from
 
 
-def frozen_tolerances(definition: EnvironmentDefinition, samples: Samples, before: Usual) -> Usual:
+def frozen_tolerances(
+    definition: EnvironmentDefinition, samples: Samples, before: DefaultTolerances
+) -> DefaultTolerances:
     """Return the default tolerances of a round: those of the round before, unless they have to change.
 
     They are computed from the samples in the first round, and again for an output whose range of targets has grown by
@@ -55,14 +57,14 @@ def frozen_tolerances(definition: EnvironmentDefinition, samples: Samples, befor
     the reward's process does not model them. A pure function, so that a repeated round gives the same result.
     """
     sizes, ranges = sizes_of(definition, samples), _ranges(definition, samples)
-    current = usual_tolerances(definition, sizes)
-    if not before.tolerances:
-        return Usual(current, ranges)
+    current = default_tolerances(definition, sizes)
+    if not before.values:
+        return DefaultTolerances(current, ranges)
     if not before.ranges or definition.design.tolerance == "raw":
         return before
-    old, now = zip(before.tolerances, before.ranges, strict=True), zip(current, ranges, strict=True)
+    old, now = zip(before.values, before.ranges, strict=True), zip(current, ranges, strict=True)
     pairs = [_later(last, new, grows=definition.snapshots) for last, new in zip(old, now, strict=True)]
-    return Usual(tuple(tolerance for tolerance, _ in pairs), tuple(width for _, width in pairs))
+    return DefaultTolerances(tuple(tolerance for tolerance, _ in pairs), tuple(width for _, width in pairs))
 
 
 def _later(last: tuple[float, float], new: tuple[float, float], *, grows: bool) -> tuple[float, float]:

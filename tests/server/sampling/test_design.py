@@ -21,10 +21,10 @@ from surrogym_server.sampling.design import Decision, advance, initial_queries
 from surrogym_server.sampling.judging import judge, monte_carlo
 from surrogym_server.sampling.prequential import Prediction
 from surrogym_server.sampling.state import DesignState, Request
-from surrogym_server.sampling.tolerances import sizes_of, usual_tolerances
+from surrogym_server.sampling.tolerances import DefaultTolerances, default_tolerances, sizes_of
 from surrogym_shared.spec import Design, EnvironmentSpec
 
-NEVER = DesignState(1, (1e-12,) * 3)  # tolerances that no model reaches
+NEVER = DesignState(1, DefaultTolerances((1e-12,) * 3))  # tolerances that no model reaches
 
 
 def designed(**design: object) -> EnvironmentSpec:
@@ -35,8 +35,8 @@ def request(budget: int = 20, pending: Samples | None = None, **options: object)
     return Request(budget, 0.999, () if pending is None else Points(pending.q, pending.u).queries, **options)
 
 
-def usual_of(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
-    return usual_tolerances(definition, sizes_of(definition, samples))
+def defaults_of(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
+    return default_tolerances(definition, sizes_of(definition, samples))
 
 
 def first(samples: Samples, count: int) -> Samples:
@@ -88,9 +88,9 @@ def test_a_real_pendulum_is_known_within_twenty_steps(seed, unseen):
 def test_tolerances_are_frozen_after_the_first_round_and_rounds_are_counted(definition, few):
     one = advance(definition, first(few, 4), DesignState(), request()).state
     spread = torch.tensor([float(few.reward[:4].std(correction=0))])
-    assert one.usual[2] == pytest.approx(0.05 * float(spread))
+    assert one.defaults.values[2] == pytest.approx(0.05 * float(spread))
     two = advance(definition, random_steps(pendulum(), 8, seed=2), one, request()).state
-    assert two.usual == one.usual
+    assert two.defaults == one.defaults
     assert (one.round, two.round) == (1, 2)
     assert set(one.warm) <= set(two.warm)
 
@@ -98,7 +98,7 @@ def test_tolerances_are_frozen_after_the_first_round_and_rounds_are_counted(defi
 def test_a_state_survives_json(definition, few):
     state = advance(definition, few, DesignState(), request()).state
     again = DesignState.from_json(json.loads(json.dumps(state.to_json())))
-    assert (again.round, again.usual) == (state.round, state.usual)
+    assert (again.round, again.defaults) == (state.round, state.defaults)
     assert all(np.array_equal(again.warm[key], state.warm[key]) for key in state.warm)
     assert DesignState.from_json({}) == DesignState()
 
@@ -136,7 +136,7 @@ def test_one_round_asks_once_for_each_unsure_output_and_never_twice_the_same(def
 
 
 def test_certain_outputs_get_no_queries(definition, few):
-    generous = DesignState(1, (1e3, 1e3, 1e-12))
+    generous = DesignState(1, DefaultTolerances((1e3, 1e3, 1e-12)))
     assert len(advance(definition, few, generous, request()).queries) == 1
 
 
@@ -151,7 +151,7 @@ def test_where_nothing_distinct_is_left_to_ask_the_design_ends():
 
 @pytest.mark.parametrize(("budget", "verdict"), [(20, "ready"), (4, "ready")])
 def test_extra_queries_are_chosen_whatever_the_verdict(definition, few, unseen, budget, verdict):
-    generous = DesignState(1, (1e3,) * 3)
+    generous = DesignState(1, DefaultTolerances((1e3,) * 3))
     made = advance(definition, join(few, first(unseen, 4)), generous, request(budget, extra=5))
     assert made.verdict == verdict
     assert len(made.queries) == 5
@@ -162,7 +162,7 @@ def test_the_reward_of_an_ending_is_queried_first():
     definition = definition_from_spec(spec)
     steps = random_steps(spec, 60, seed=0)
     going = Samples(*(getattr(steps, n)[~steps.terminated][:8] for n in steps.__dataclass_fields__))
-    state = DesignState(1, (1e-12,) * 5)
+    state = DesignState(1, DefaultTolerances((1e-12,) * 5))
     made = advance(definition, going, state, Request(50, 0.999))
     q, u = arrays(made.queries)
     assert bool(definition.terminated(made.model.transition(q, u).q_next)[0])
@@ -185,7 +185,7 @@ def test_the_paper_starts_with_ten_points_a_dimension_and_tolerance_one():
     q, u = arrays(initial_queries(definition, 125))
     assert len(q) == len(u) == 10 * (3 + 1)
     samples = answer(pendulum(), q, u)
-    assert usual_of(definition, samples) == (1.0,) * 4
+    assert defaults_of(definition, samples) == (1.0,) * 4
     made = advance(definition, samples, DesignState(), request(125))
     assert [c.confidence_index for c in made.confidences] == [c.confidence_index_paper for c in made.confidences]
 
@@ -195,9 +195,9 @@ def test_the_papers_tolerance_can_be_relative_to_what_its_outputs_do():
     samples = random_steps(pendulum(), 40, seed=0)
     change = definition.observe(samples.q_next) - definition.observe(samples.q)
     spread = torch.cat([change, samples.reward[:, None]], -1).std(0, correction=0)
-    assert usual_of(definition, samples) == pytest.approx((0.05 * spread).tolist())
+    assert defaults_of(definition, samples) == pytest.approx((0.05 * spread).tolist())
     default = definition_from_spec(designed(tolerance="raw"))
-    assert usual_of(default, samples) == (1.0,) * 3
+    assert defaults_of(default, samples) == (1.0,) * 3
 
 
 def test_a_latin_hypercube_design_asks_for_its_whole_budget_at_once():
@@ -229,19 +229,19 @@ def test_more_extra_queries_than_there_are_distinct_points_end_soon(definition, 
 
 def test_declared_tolerances_hold(few):
     definition = definition_from_spec(pendulum().model_copy(update={"tolerances": {"speed": 0.5}}))
-    usual = usual_of(definition, few)
-    assert definition.tolerances_over(usual) == (usual[0], 0.5, usual[2])
-    assert usual[1] != 0.5
-    assert advance(definition, few, DesignState(), request()).tolerances == definition.tolerances_over(usual)
+    defaults = defaults_of(definition, few)
+    assert definition.tolerances_or(defaults) == (defaults[0], 0.5, defaults[2])
+    assert defaults[1] != 0.5
+    assert advance(definition, few, DesignState(), request()).tolerances == definition.tolerances_or(defaults)
 
 
 def test_an_output_that_never_varied_has_the_size_of_its_mean(definition, few):
     still = replace(few, reward=torch.ones_like(few.reward))
-    assert usual_of(definition, still)[2] == pytest.approx(0.05)
+    assert defaults_of(definition, still)[2] == pytest.approx(0.05)
 
 
 def test_a_tolerance_set_later_takes_the_place_of_the_frozen_one_until_it_is_taken_back(definition, few):
-    frozen = DesignState(1, (0.5, 0.5, 0.5))
+    frozen = DesignState(1, DefaultTolerances((0.5, 0.5, 0.5)))
     made = advance(definition.with_tolerances({"speed": 1e-12}), few, frozen, request())
     assert made.tolerances == (0.5, 1e-12, 0.5)
     assert made.confidences[1].confidence_index < 0.999
@@ -255,7 +255,7 @@ def test_a_tolerance_is_declared_for_what_the_preset_learns():
     design = Design(preset="paper", initial=10)
     spec = EnvironmentSpec.model_validate(pendulum().model_dump() | {"tolerances": {"cos": 0.02}, "design": design})
     definition = definition_from_spec(spec)
-    assert definition.tolerances_over(usual_of(definition, random_steps(spec, 10, seed=0))) == (0.02, 1.0, 1.0, 1.0)
+    assert definition.tolerances_or(defaults_of(definition, random_steps(spec, 10, seed=0))) == (0.02, 1.0, 1.0, 1.0)
     with pytest.raises(ValueError, match=r"'theta'.*\['cos', 'sin', 'speed', 'reward'\]"):
         EnvironmentSpec.model_validate(pendulum().model_dump() | {"tolerances": {"theta": 0.02}, "design": design})
 
@@ -338,7 +338,7 @@ def test_an_ended_design_adds_no_queries_after_an_audit(definition, few):
     same = replace(request(budget=len(few)), audited=4)
     after = advance(definition, more, state, same)
     assert (after.verdict, len(after.queries)) == ("over_budget", 0)
-    open_again = advance(definition, more, replace(state, ended_with=()), replace(same, budget=len(few) + 8))
+    open_again = advance(definition, more, replace(state, ended_under=None), replace(same, budget=len(few) + 8))
     assert open_again.queries
 
 
@@ -350,7 +350,7 @@ LEARNED, AUDITED = 8, 4  # samples
 def ready() -> Decision:
     """A design that ended as ready, long before its budget was spent."""
     definition, samples = definition_from_spec(designed(initial=4)), random_steps(pendulum(), LEARNED, seed=0)
-    made = advance(definition, samples, DesignState(1, (GENEROUS,) * 3), request(budget=100))
+    made = advance(definition, samples, DesignState(1, DefaultTolerances((GENEROUS,) * 3)), request(budget=100))
     assert made.verdict == "ready"
     return made
 
@@ -361,7 +361,8 @@ def after_audit(before: Decision, errors: float, budget: int = 100) -> Decision:
     ``errors``: of each prediction by the last model, in tolerances.
     """
     state = DesignState.from_json(json.loads(json.dumps(before.state.to_json())))
-    state = replace(state, ended_with=(*state.ended_with[:2], BEYOND, *state.ended_with[3:]))
+    assert state.ended_under is not None
+    state = replace(state, ended_under=replace(state.ended_under, target=BEYOND))
     surprises = ((Prediction(errors * GENEROUS, 0.1),) * AUDITED,) * 3
     asked = replace(request(budget, surprises=surprises, audited=AUDITED), target=BEYOND)
     after = advance(before.model.definition, random_steps(pendulum(), LEARNED + AUDITED, seed=0), state, asked)

@@ -22,7 +22,7 @@ from surrogym_server.sampling.noise import (
     established_noise,
     repeats,
     to_repeat,
-    widened,
+    widened_by,
 )
 from surrogym_server.sampling.state import DesignState, Request
 
@@ -128,7 +128,7 @@ def test_a_family_that_learns_no_noise_repeats_nothing(model: ClaimsNoise):
 
 
 def test_tolerances_without_noise_stay_to_the_last_bit():
-    assert widened((0.1, 0.3), torch.tensor([0.0, 0.4], dtype=torch.float64)) == (0.1, 0.5)
+    assert widened_by(torch.tensor([0.0, 0.4], dtype=torch.float64), (0.1, 0.3)) == (0.1, 0.5)
 
 
 def test_a_noisy_design_repeats_steps_and_comes_to_be_ready(model: ClaimsNoise):

@@ -18,7 +18,7 @@ from surrogym_server.sampling.noise import repeats
 from surrogym_server.sampling.past import EXPLAINED, pairs_lacking
 from surrogym_server.sampling.rules.past import LENGTH as LONGER
 from surrogym_server.sampling.state import DesignState, Request
-from surrogym_server.sampling.tolerances import usual_tolerances
+from surrogym_server.sampling.tolerances import default_tolerances
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 COUNT, LENGTH = 60, 12
@@ -75,8 +75,8 @@ def judged(follow: Next, seed: int = 0) -> Judgement:
     q, u, q_next = (torch.tensor(column, dtype=torch.float64)[:, None] for column in np.array(rows).T)
     taken = Samples(q, u, q_next, -(q[:, 0] ** 2), torch.zeros(len(rows), dtype=torch.bool))
     model = learn(DEFINITION, taken, {}).model
-    usual = usual_tolerances(DEFINITION, model.scales.tolist())
-    return judge_model(model, taken, usual, Request(COUNT, 0.9), DesignState())
+    defaults = default_tolerances(DEFINITION, model.scales.tolist())
+    return judge_model(model, taken, defaults, Request(COUNT, 0.9), DesignState())
 
 
 def longer_dead_time(s: np.ndarray, u: float, before: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:

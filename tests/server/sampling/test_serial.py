@@ -13,7 +13,7 @@ from surrogym_server.models.guard import learn
 from surrogym_server.sampling.judging import judge_model
 from surrogym_server.sampling.serial import CRITICAL, MAINLY, best_share, sensor_noise, sensor_pattern
 from surrogym_server.sampling.state import DesignState, Request
-from surrogym_server.sampling.tolerances import usual_tolerances
+from surrogym_server.sampling.tolerances import default_tolerances
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 SLOPE, COUNT, LENGTH = 0.9, 60, 10
@@ -88,9 +88,9 @@ def test_a_step_continues_the_one_that_ended_where_it_starts() -> None:
 def test_a_learned_model_tells_the_sensors_noise_and_allows_for_it(seed: int) -> None:
     taken = steps(0.0, 0.04, seed)
     model = learn(DEFINITION, taken, {}).model
-    usual = usual_tolerances(DEFINITION, model.scales.tolist())
+    defaults = default_tolerances(DEFINITION, model.scales.tolist())
     request = Request(budget=COUNT, target=0.9)
-    position, _ = judge_model(model, taken, usual, request, DesignState()).confidences
+    position, _ = judge_model(model, taken, defaults, request, DesignState()).confidences
     assert position.sensor_noise == pytest.approx(0.04, rel=0.35)
     assert position.noise == pytest.approx(0.04 * np.hypot(1, SLOPE), rel=0.35)
 
@@ -99,10 +99,10 @@ def test_a_learned_model_tells_the_sensors_noise_and_allows_for_it(seed: int) ->
 def test_other_steps_have_no_noise_of_sensors(process: float, sensor: float) -> None:
     taken = steps(process, sensor, seed=1)
     model = learn(DEFINITION, taken, {}).model
-    assert sensor_noise(model, taken, usual_tolerances(DEFINITION, model.scales.tolist())) == (None, None)
+    assert sensor_noise(model, taken, default_tolerances(DEFINITION, model.scales.tolist())) == (None, None)
 
 
 def test_single_steps_cannot_tell() -> None:
     taken = steps(0.0, 0.04, seed=0).at(torch.arange(0, COUNT, 2))
     model = learn(DEFINITION, taken, {}).model
-    assert sensor_noise(model, taken, usual_tolerances(DEFINITION, model.scales.tolist())) == (None, None)
+    assert sensor_noise(model, taken, default_tolerances(DEFINITION, model.scales.tolist())) == (None, None)

@@ -9,7 +9,14 @@ import torch
 
 from support.plane import drifting, plane
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.sampling.tolerances import FLOOR, TOLERANCE, Usual, frozen_tolerances, sizes_of, usual_tolerances
+from surrogym_server.sampling.tolerances import (
+    FLOOR,
+    TOLERANCE,
+    DefaultTolerances,
+    default_tolerances,
+    frozen_tolerances,
+    sizes_of,
+)
 from surrogym_shared.spec import Design
 
 DEFINITION = definition_from_spec(plane())
@@ -18,15 +25,15 @@ PAID = drifting(lambda q, _: (-q.square().sum(-1)).exp(), 6)
 
 
 def frozen(samples, before=None):
-    return frozen_tolerances(DEFINITION, samples, before or Usual())
+    return frozen_tolerances(DEFINITION, samples, before or DefaultTolerances())
 
 
 def test_a_tolerance_without_rewards_is_recomputed_at_the_first_reward():
     first = frozen(NOTHING_MET)
-    assert first.tolerances[-1] < 1e-100
+    assert first.values[-1] < 1e-100
     second = frozen(PAID, first)
-    assert second.tolerances[-1] == pytest.approx(TOLERANCE * float(PAID.reward.std(correction=0)))
-    assert second.tolerances[:-1] == first.tolerances[:-1]
+    assert second.values[-1] == pytest.approx(TOLERANCE * float(PAID.reward.std(correction=0)))
+    assert second.values[:-1] == first.values[:-1]
 
 
 def test_tolerance_that_fits_is_frozen():
@@ -38,8 +45,8 @@ def test_tolerance_that_fits_is_frozen():
 def test_tolerance_of_a_constant_reward_is_taken_again_once_it_varies():
     constant = replace(PAID, reward=torch.ones(6, dtype=torch.float64))
     first = frozen(constant)
-    assert first.tolerances[-1] == TOLERANCE
-    assert frozen(replace(PAID, reward=1 + 1e-3 * PAID.reward), first).tolerances[-1] < 1e-4
+    assert first.values[-1] == TOLERANCE
+    assert frozen(replace(PAID, reward=1 + 1e-3 * PAID.reward), first).values[-1] < 1e-4
 
 
 def test_reward_of_an_ending_does_not_change_a_tolerance():
@@ -50,32 +57,30 @@ def test_reward_of_an_ending_does_not_change_a_tolerance():
 
 
 def test_state_without_ranges_keeps_its_tolerances():
-    assert frozen(PAID, Usual((1e-12,) * 3)) == Usual((1e-12,) * 3)
+    assert frozen(PAID, DefaultTolerances((1e-12,) * 3)) == DefaultTolerances((1e-12,) * 3)
 
 
 def test_increments_of_rounding_get_the_floor_of_their_range():
     still = replace(PAID, q_next=PAID.q * (1 + 3e-16))
-    tolerance = usual_tolerances(DEFINITION, sizes_of(DEFINITION, still))
+    tolerance = default_tolerances(DEFINITION, sizes_of(DEFINITION, still))
     assert min(tolerance[:2]) == pytest.approx(TOLERANCE * FLOOR / 3**0.5)
 
 
 def test_raw_tolerances_are_one_whatever_was_met():
     raw = definition_from_spec(plane().model_copy(update={"design": Design(tolerance="raw")}))
-    first = frozen_tolerances(raw, NOTHING_MET, Usual())
-    assert frozen_tolerances(raw, PAID, first).tolerances == (1.0, 1.0, 1.0)
+    first = frozen_tolerances(raw, NOTHING_MET, DefaultTolerances())
+    assert frozen_tolerances(raw, PAID, first).values == (1.0, 1.0, 1.0)
 
 
 def test_tolerance_of_a_design_with_snapshots_grows_with_the_samples_and_never_shrinks():
     """Its first samples lie near the resets, so their deviation is far below that over the sampling range."""
     definition = definition_from_spec(plane().model_copy(update={"query": "rollout", "snapshots": True}))
-    first = frozen_tolerances(definition, PAID, Usual())
+    first = frozen_tolerances(definition, PAID, DefaultTolerances())
     assert first == frozen(PAID)
     more = replace(PAID, reward=3 * PAID.reward, q_next=PAID.q + 2 * (PAID.q_next - PAID.q))
     grown = frozen_tolerances(definition, more, first)
-    assert grown.tolerances == pytest.approx(
-        [2 * first.tolerances[0], 2 * first.tolerances[1], 3 * first.tolerances[2]]
-    )
+    assert grown.values == pytest.approx([2 * first.values[0], 2 * first.values[1], 3 * first.values[2]])
     assert frozen_tolerances(definition, PAID, grown) == grown
     constant = replace(PAID, reward=torch.ones(6, dtype=torch.float64))
     varied = frozen_tolerances(definition, replace(PAID, reward=1 + 1e-3 * PAID.reward), frozen(constant))
-    assert varied.tolerances[-1] < 1e-4, "that of a constant reward is taken again, as without snapshots"
+    assert varied.values[-1] < 1e-4, "that of a constant reward is taken again, as without snapshots"

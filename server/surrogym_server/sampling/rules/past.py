@@ -19,7 +19,7 @@ def see_the_past(round: Round) -> tuple[Query, ...] | None:
     definition, judgement = round.definition, round.judgement
     if not round.may_examine or definition.snapshots or round.request.pending:
         return None
-    if all(agrees(c, t) for c, t in zip(judgement.confidences[:-1], judgement.tolerances, strict=False)):
+    if all(agrees(c, t) for c, t in zip(judgement.confidences[:-1], judgement.widened_tolerances, strict=False)):
         return None
     length = min(LENGTH, definition.max_rollout or 1)
     if length < 2:

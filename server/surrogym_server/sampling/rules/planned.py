@@ -13,8 +13,8 @@ def plan_rollouts(round: Round) -> tuple[Query, ...]:
     """Return planned rollouts for the outputs whose confidence is below the target."""
     request, judgement = round.request, round.judgement
     aim = Aim(
-        columns=round.below_target,
-        tolerances=judgement.tolerances,
+        columns=round.outputs,
+        tolerances=judgement.widened_tolerances,
         longest=round.definition.max_rollout or 1,
         snapshots=request.snapshots,
         states=request.states,
@@ -33,5 +33,5 @@ def steps_of_a_round(round: Round) -> int:
     """
     samples = len(round.samples)
     if round.definition.snapshots:
-        return max(len(round.below_target), samples // 8)
+        return max(len(round.outputs), samples // 8)
     return max(SHORTEST, samples // 4)

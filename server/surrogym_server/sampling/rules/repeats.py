@@ -13,8 +13,7 @@ def repeat_steps(round: Round) -> tuple[Query, ...] | None:
     if not round.may_examine:
         return None
     with plugin_calls(round.definition):
-        limits = round.definition.tolerances_over(round.default_tolerances)
-        again = to_repeat(round.model, round.samples, limits)
+        again = to_repeat(round.model, round.samples, round.tolerances)
     if again is None or not round.room:
         return None
     return again[: round.room].queries

@@ -9,17 +9,18 @@ from surrogym_shared.nouns import Query
 
 
 def ask_best_candidates(round: Round) -> tuple[Query, ...]:
-    """Return one query for each output below its target, the least confident output first.
+    """Return one query for each output below the target, the least confident output first, while the budget has room.
 
-    If candidates are reserved (see ``Candidates``), the first query is one of them.
+    If the design has ended, there are ``request.extra`` queries, and the outputs take turns. If candidates are reserved
+    (see ``Candidates``), the first query is one of them.
     """
-    below, judgement = round.below_target, round.judgement
+    judgement = round.judgement
     unanswered = Points.of(round.definition, round.request.unanswered)
     if round.continues:
-        outputs = below[: round.room]
+        outputs = round.outputs[: round.room]
     else:
-        outputs = [below[i % len(below)] for i in range(round.request.extra)]
+        outputs = [round.outputs[i % len(round.outputs)] for i in range(round.request.extra)]
     earlier = Points.joined([Points(round.samples.q, round.samples.u), unanswered])
     candidates = judgement.candidates
-    picks = choose(round.model, candidates, earlier, unanswered, outputs, judgement.tolerances)
+    picks = choose(round.model, candidates, earlier, unanswered, outputs, judgement.widened_tolerances)
     return candidates.points[picks].queries
