@@ -37,8 +37,10 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 SESSION_ID_BYTES = 16
-MAX_PARTICLES = 4_000_000  # of all lanes of a session together
-MAX_PATHWISE_LANES = 4_096  # each lane has a sampled function of some thousand numbers
+MAX_PARTICLES = 4_000_000  # most particles of all lanes of a session together
+MAX_PATHWISE_LANES = (
+    4_096  # most lanes of variant ``pathwise``, in which each has a sampled function of some thousand numbers
+)
 
 
 class Models(Protocol):
@@ -184,7 +186,9 @@ def carried_out(
         TooLarge: a rollout of too many steps in all lanes.
         PluginFailed: the code of the model's family failed.
     """
-    if isinstance(request, Step):  # first, and by a call that is cheaper than a pattern: most requests are steps
+    if isinstance(
+        request, Step
+    ):  # checked first and without a pattern, because most requests are steps, and this is faster
         u = policy_actions(session.definition.action, request.action, session.settings.num_envs)
         stepped, result = _stepped(session, u, request.mask, request.deviations, models, interrupts)
         return stepped, (result,)

@@ -125,7 +125,9 @@ class SessionInfo:
     model: WantedVersion
     versions: Versions  # (N,) model version of each lane's episode
     seq: int  # sequence number of the last answered request
-    behind: bool = False  # restored from a checkpoint, so its client has to repeat the requests since then
+    behind: bool = (
+        False  # the session was restored from a checkpoint, so its client has to repeat its requests since then
+    )
 
 
 @dataclass(frozen=True, eq=False)

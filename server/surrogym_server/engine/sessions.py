@@ -286,7 +286,9 @@ class LiveSessions:
         self._check_deadline(deadline, threads.wait + expected)
 
         def in_time(session: Session) -> tuple[Session, Outcome]:
-            self._check_deadline(deadline, expected)  # again: the wait may have been longer than predicted
+            self._check_deadline(
+                deadline, expected
+            )  # checked again, because the wait may have been longer than predicted
             return work(session)
 
         threads.queued.append(expected)

@@ -45,7 +45,7 @@ class CandidateView:
         Tensor  # (m,) latent standard deviation, in the output's unit, as if all pending queries had been answered
     )
     distance: Tensor  # (m,) distance to the nearest query so far, in standard deviations of the sampling range
-    log_probability: Tensor  # (m,) log P_i (eq. 11); 0 unless the acquisition reads it
+    log_probability: Tensor  # (m,) logarithm of the input probability P_i (eq. 11); 0 without ``reads_probability``
     _reduction: Callable[[], Tensor]
 
     @cached_property

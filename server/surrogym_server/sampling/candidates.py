@@ -17,7 +17,9 @@ from surrogym_server.sampling.occupancy import log_occupancy
 
 MAX_CANDIDATES = 4_096  # most candidates of each kind, because memory holds their covariances with the reference
 REFERENCE = 256  # reference points of each kind: from the Monte Carlo set, and visited
-OCCUPIED = 0.75  # share of the visited states in the reference; the rest is the whole sampling range
+OCCUPIED = (
+    0.75  # weight of the visited states among the reference points; those from the whole sampling range have the rest
+)
 
 
 @dataclass(frozen=True)
@@ -25,10 +27,10 @@ class Candidates:
     """Candidate points, their input probabilities, and the reference points whose variance should become small."""
 
     points: Points  # m candidates
-    log_p: Tensor  # (m,) log P_i; 0 unless the acquisition reads it
+    log_p: Tensor  # (m,) logarithm of the input probability P_i (eq. 11); 0 if the acquisition does not use it
     reference: Points  # r reference points
-    weights: Tensor  # (r,) of the reference points; they add up to 1
-    reserved: Tensor | None = None  # (m,) bool: candidates to query first; see ``endings`` and ``peaks``
+    weights: Tensor  # (r,) share of each reference point in their mean variance; they add up to 1
+    reserved: Tensor | None = None  # (m,) bool: candidates to query first, near an ending or a peak of the reward
 
 
 def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, rng: np.random.Generator) -> Candidates:

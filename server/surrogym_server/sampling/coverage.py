@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy  # its parts are loaded on first use
+import scipy  # scipy loads its parts on first use, so a server that needs none starts sooner
 from numpy.typing import NDArray
 
 from surrogym_server.environment.definition import EnvironmentDefinition

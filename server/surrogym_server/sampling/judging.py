@@ -32,10 +32,10 @@ from surrogym_shared.states import Verdict
 class Judgement:
     """Judgement of a model: confidences, tolerances, verdict, and candidates for the next queries."""
 
-    confidences: tuple[OutputConfidence, ...]  # (O,) one for each output
+    confidences: tuple[OutputConfidence, ...]  # (O,)
     widened_tolerances: tuple[float, ...]  # (O,) of the confidences: the tolerances, widened by confirmed noise
     verdict: Verdict  # on this model, whatever the verdicts of earlier rounds
-    candidates: Candidates  # m points, for the next queries
+    candidates: Candidates  # points from which the next queries are chosen
 
 
 def judge_model(
@@ -83,7 +83,9 @@ def judge_model(
         peak = highest(model, samples, candidates.points, widened[-1], rng)
     if peak is not None:
         settled = False
-        if candidates.reserved is None or state.round % 2:  # endings and peaks take turns
+        if (
+            candidates.reserved is None or state.round % 2
+        ):  # if there are both, endings and peaks are queried in alternate rounds
             candidates = with_reserved(candidates, peak)
     verdict = judge(definition, confidences, widened, len(samples), request, settled)
     return Judgement(confidences, widened, verdict, candidates)

@@ -21,7 +21,7 @@ class Limit:
     coordinate: str
     side: Side
     value: float
-    share: float  # of the samples that end there
+    share: float  # share of the samples that end at the limit
 
 
 def reached_limits(definition: EnvironmentDefinition, samples: Samples) -> tuple[Limit, ...]:

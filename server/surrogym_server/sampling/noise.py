@@ -1,4 +1,4 @@
-"""Tell noise of the original environment from misfit of the model, by steps that are taken twice.
+"""Distinguish noise of the original environment from misfit of the model, by steps that are taken twice.
 
 A process that does not fit its samples explains the rest as noise. Only a repeat of the same step shows which it is: a
 deterministic environment gives the same result. Repeats are few, so each conclusion is a chi-squared test, at the level
@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import scipy  # its parts are loaded on first use
+import scipy  # scipy loads its parts on first use, so a server that needs none starts sooner
 import torch
 from torch import Tensor
 
@@ -34,7 +34,7 @@ SLACK = 1.25  # factor by which few samples may raise a leave-one-out error abov
 class Repeats:
     """Pooled differences between results of the same step."""
 
-    degrees: int  # degrees of freedom
+    degrees: int  # degrees of freedom: samples less distinct steps
     deviation: Tensor  # (O,) standard deviation of one result, in each output's unit
 
 

@@ -29,7 +29,7 @@ from surrogym_server.models.port import DynamicsModel
 EXPLAINED = 0.5  # least explained share of the squared error that counts
 PAIRS = 3  # least number of consecutive steps for each coefficient of a regression
 DEPTHS = (1, 3)  # numbers of earlier actions to try; a longer dead time is not found
-MOST = 400  # samples in a test, because its time grows with their third power
+MOST = 400  # most samples in a test, because its time grows with their third power
 RIDGE = 1e-6  # ridge of the regressions, relative to the variance of the inputs
 
 

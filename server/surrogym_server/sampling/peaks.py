@@ -21,7 +21,9 @@ from surrogym_server.models.port import DynamicsModel
 CLIMBERS, TRIES, CLIMBS = 16, 16, 24  # points that climb, random steps of each in one iteration, and iterations
 WIDEST = 0.25  # standard deviation of the first iteration's random steps, as a share of the sampling range
 SHRINK = 0.75  # factor of the random steps' length from one iteration to the next
-NOTHING = torch.finfo(torch.float32).tiny  # trainers compute in float32, in which a smaller reward is 0
+NOTHING = torch.finfo(
+    torch.float32
+).tiny  # smallest reward that counts: trainers compute in float32, in which a smaller one is 0
 UNMET = 0.1  # share of the range of rewards by which a prediction above all samples is clearly above them
 NEW = 0.01  # share of the sampling range: a point nearer to a sample than this counts as queried
 

@@ -27,7 +27,7 @@ class Region:
     input: str  # name of the coordinate, or of the action entry
     low: float | None
     high: float | None
-    outside: bool  # whether the doubt is outside of the range, which then has both ends
+    outside: bool  # the region is what lies outside of low to high; then neither is None
     share: float  # share of all doubt that lies in the region
 
 

@@ -29,27 +29,29 @@ from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.outlook import as_if_answered, path_outlook
 from surrogym_shared.nouns import Query, Vector
 
-STARTS = 6  # start states drawn for each plan
+STARTS = 6  # number of start states, drawn at random, from which each sequence is predicted
 POPULATION = 48  # action sequences compared at once
-ELITE = 12  # best sequences, which the next generation varies
-GENERATIONS = 3
+ELITE = 12  # number of the best sequences, of which the next generation has variations
+GENERATIONS = 3  # populations of a search, the random first one included
 DOUBTFUL = 0.25  # least chance of an ending for which a rollout is planned
 
 Sequences = NDArray[np.float64]  # k sequences of T actions, (k, T, F)
-Worth = Callable[[Tensor, Sequences], tuple[Tensor, Tensor]]  # rates sequences from states, as ``_worth`` does
+Worth = Callable[
+    [Tensor, Sequences], tuple[Tensor, Tensor]
+]  # from states (k, s, C) and k sequences: value and best length of each sequence, (k,)
 
 
 @dataclass(frozen=True)
 class Aim:
-    """Objective and limits of a plan."""
+    """Objective and limits of a planned action sequence: which outputs to learn about, and where it may lead."""
 
-    columns: Sequence[int]  # numbers of the outputs about which to learn
-    tolerances: Sequence[float]  # (O,) tolerance of every output
-    longest: int  # actions in a sequence
+    columns: Sequence[int]  # numbers of the model's outputs about which the sequence should give information
+    tolerances: Sequence[float]  # (O,) tolerance of every output, in its unit
+    longest: int  # most actions in the sequence
     snapshots: Mapping[str, Vector] = field(default_factory=dict)  # states at which a sequence may begin, by name
     states: Tensor | None = None  # (v, C) states that policies visited; their density weights the information
-    ending: bool = False  # look first for an end of the episode, or an edge of the reward, if one is within reach
-    ended: bool = False  # a sample has ended an episode, so plans need not look for a declared end
+    ending: bool = False  # a sequence that meets an unknown ending, or an edge of the reward, has priority
+    ended: bool = False  # some sample has ended an episode, so that a declared ending counts as known
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ class Round:
     tolerances: tuple[float, ...]  # (O,) declared or default ones, not widened by noise
     outputs: list[int]  # numbers of the outputs to query for, the least confident first; at least one
     continues: bool  # the round may spend what the budget has left; otherwise it may take ``request.extra`` steps
-    testing: bool  # the model is sure, and an excursion is to test it
+    testing: bool  # the design is ready, but an excursion tests its model first
 
     @property
     def definition(self) -> EnvironmentDefinition:

@@ -27,8 +27,8 @@ from surrogym_server.environment.samples import Samples, preceding
 from surrogym_server.models.abilities import AtSamples, LearnedNoise, SampledFunctions, offers
 from surrogym_server.models.port import DynamicsModel
 
-FEWEST = 12  # pairs of consecutive steps for a test
-MOST = 256  # samples in a test, because its time grows with their third power
+FEWEST = 12  # fewest pairs of consecutive steps for a test
+MOST = 256  # most samples in a test, because its time grows with their third power
 CRITICAL = 5.41  # upper 2 % point of chi-squared with one degree of freedom: the one-sided test has level 1 %
 MAINLY = 0.5  # noise counts as the sensor's if at least this share of it comes from the sensor
 SHARES = torch.linspace(0, 1, 21, dtype=torch.float64)

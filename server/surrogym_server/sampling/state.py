@@ -40,11 +40,13 @@ class DesignState:
 
     round: int = 0
     defaults: DefaultTolerances = field(default_factory=DefaultTolerances)  # for outputs without a declared one
-    warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # what a fit passes to the next one
+    warm: dict[str, NDArray[np.float64]] = field(
+        default_factory=dict
+    )  # arrays of the last fit, from which the next one starts
     ended_under: Conditions | None = None  # conditions when the design ended; None while it continues
     ended_as: str = ""  # the verdict with which the design ended; "" while it continues
-    predictions: Predictions = ()  # last predictions of each output before the model learned from the sample
-    tested_at: int = 0  # number of samples when the model became sure and an excursion was planned; 0: it is not sure
+    predictions: Predictions = ()  # of the latest samples, by the models that had not learned from them
+    tested_at: int = 0  # number of samples when an excursion was planned to test a ready model; 0 without one
 
     def to_json(self) -> dict[str, Any]:
         warm = {key: array.tolist() for key, array in self.warm.items()}

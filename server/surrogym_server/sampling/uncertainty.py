@@ -21,7 +21,9 @@ Array = NDArray[np.float64]
 class UncertaintyResult:
     """Prediction and uncertainty at n points, arrays (n, O) with the outputs in the order of ``definition.outputs``."""
 
-    mean: Array  # increments of the moving outputs, then the reward
+    mean: (
+        Array  # predicted change of each coordinate, or of each observation entry that the model moves; then the reward
+    )
     deviation: Array
     model_uncertainty: Array
     input_probability: Array

@@ -5,7 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
-Hear = Callable[[str | None], None]  # called with a surrogate's name; None: announcements may be lost
+Hear = Callable[
+    [str | None], None
+]  # takes the name of a surrogate that changed, or None after announcements may have been lost
 
 
 class Announcements(ABC):

@@ -267,7 +267,7 @@ class Queries(ABC):
 
         ``begun`` says that a real step may have been taken, so that the ledger counts it as unresolved. ``refused``
         says that the original environment refused the query before a real step, whatever ``begun`` says. A query that
-        begins at a snapshot which was dropped meanwhile then goes the way of the pending ones that begin there.
+        begins at a snapshot which was dropped meanwhile is then removed, or set aside if a step may have been taken.
 
         Raises:
             UnknownQuery: there is no such query.

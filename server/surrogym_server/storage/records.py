@@ -139,7 +139,9 @@ class QueryRecord(Query):
     attempts: int  # number of leases so far
     sampler: str | None  # name of the sampler that claimed the query last
     error: str | None  # error of the last failed attempt
-    lease_seconds_left: float | None = None  # of the open lease, by the database's clock; negative if it has expired
+    lease_seconds_left: float | None = (
+        None  # of the open lease, by the database's clock; negative once it has expired, None without a lease
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,10 +200,17 @@ class LogPart:
 
 @dataclass(frozen=True)
 class AddedSamples:
-    """Result of adding a batch of samples: their ``ids`` in order, of which ``duplicates`` existed already.
+    """Result of adding a batch of samples.
 
-    Of logged samples, ``digest`` identifies the log up to the end of the batch. With a ``restart`` nothing was stored:
-    the log differs here from a stored one that begins in the same way, and has to come again after ``restart``.
+    A log comes in several batches, and a log that begins like a stored one shares its samples with it. If the two
+    differ within a batch, the batch has to be sent again from the sample at which they differ. Then nothing was stored,
+    and ``restart`` is set.
+
+    Attributes:
+        ids: ids of the samples, in order.
+        duplicates: number of them that had been stored before.
+        digest: hash of the log up to the end of the batch; None if the samples are not logged.
+        restart: hash of the log up to the sample from which it has to be sent again; None if the batch was stored.
     """
 
     ids: tuple[int, ...]

@@ -63,12 +63,14 @@ class NotifiedAnnouncements(Announcements):
                 names, self._waiting = list(self._waiting), {}
             try:
                 self._database.notify(CHANNEL, [f"{self._origin} {name}" for name in names])
-            except Unavailable as error:  # no harm: the other servers also look from time to time
+            except (
+                Unavailable
+            ) as error:  # a lost announcement does no harm: the other servers also look from time to time
                 logger.debug("other servers were not told of %s: %s", names, error)
             self._ended.wait(GAP_SECONDS)
 
     def _listen(self, hear: Hear) -> None:
-        import psycopg  # where it is needed: a server on SQLite starts without it
+        import psycopg  # not at the top, because a server on SQLite does not need it
 
         delay, missed = FIRST_DELAY, False
         while not self._ended.is_set():

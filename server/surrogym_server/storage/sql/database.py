@@ -30,8 +30,10 @@ from surrogym_server.storage.sql.filelock import FileLock, marks
 
 SQLITE_CODES = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 SQLSTATES = ("XX001", "XX002", "42P01", "42703")  # data and index corrupted, undefined table and column
-OTHER_SCHEMA = re.compile(r"no such (table|column)|has no column|already exists")  # SQLite has no code for these
-UNDECODABLE = "Could not decode to UTF-8"  # Python's driver has no error class for this
+OTHER_SCHEMA = re.compile(
+    r"no such (table|column)|has no column|already exists"
+)  # SQLite's messages about a wrong schema, which have no code
+UNDECODABLE = "Could not decode to UTF-8"  # in the message of SQLite's driver, which has no error class for this
 
 
 def damaged(reason: object) -> Damaged:
@@ -161,7 +163,8 @@ class Database:
             return
         self._lock.require_in_place()
         if not self._lock.is_as_noted():
-            with self._take_turn():  # a program that merged the log has ended by then
+            # Having the turn excludes a program that is still merging the log into the file.
+            with self._take_turn():
                 self._lock.require_own_content()
 
     def _mark_log(self, connection: Connection) -> None:

@@ -31,7 +31,7 @@ from surrogym_shared.nouns import Query
 from surrogym_shared.states import Phase
 
 INTERRUPTED_SECONDS = 60.0  # the server that queues initial queries has died if they stay incomplete for so long
-# Conditions on a row of the table of surrogates.
+# Conditions on a row of the table of surrogates, and parts of them.
 OWN_QUERIES = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogates.c.id)
 OWN_SAMPLES = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogates.c.id)
 # The statuses are constants in the statement: with parameters, PostgreSQL would read all queries, not use an index.
@@ -41,7 +41,9 @@ OPEN_QUERY = sa.exists(OWN_QUERIES.where(queries.c.status.in_(OPEN)))
 
 _EXPIRES = surrogates.c.fit_expires
 _SET_BACK = NOW + surrogates.c.fit_seconds < _EXPIRES  # the clock was set back: the right lasts too long
-IS_DUE = sa.and_(  # what the docstring of ``Designs.due`` says
+# Whether a surrogate is to be fitted now: something has changed since the last fit, nobody fits it, and it waits for
+# no query. A new log is fitted without waiting.
+IS_DUE = sa.and_(
     surrogates.c.paused.is_(False),
     surrogates.c.revision > surrogates.c.fitted_revision,
     _EXPIRES.is_(None) | (_EXPIRES <= NOW) | _SET_BACK,

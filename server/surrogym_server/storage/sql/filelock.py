@@ -25,9 +25,14 @@ from typing import BinaryIO
 from surrogym_server.errors import Unavailable
 
 LOCKED_BYTE = 2**62  # beyond any database, and far from the bytes at 2**30 that SQLite locks
-WHOLE_DESCRIPTION = getattr(fcntl, "F_OFD_SETLK", None)  # Linux has it; other systems may not
-SQLITE_SHARED = (2**30 + 2, 510)  # bytes that SQLite's readers share a lock on; who merges the log locks them alone
-BUSY = (BlockingIOError, PermissionError)  # what fcntl raises if another process holds a lock
+WHOLE_DESCRIPTION = getattr(
+    fcntl, "F_OFD_SETLK", None
+)  # command for a lock of one open file; None on systems without it
+SQLITE_SHARED = (
+    2**30 + 2,
+    510,
+)  # bytes on which SQLite's readers share a lock; a program that merges the log locks them exclusively
+BUSY = (BlockingIOError, PermissionError)  # errors that fcntl raises if another process holds a lock
 
 BESIDE = ("-wal", "-shm")  # suffixes of SQLite's files beside a database: its write-ahead log, and the log's index
 
@@ -58,7 +63,7 @@ class FileLock:
         with _turn:
             if not path.exists():
                 self._require_own_log(b"")
-            if _identity(path) in _locked_files:  # before opening it: closing a descriptor would drop its locks
+            if _identity(path) in _locked_files:  # must not be opened: closing it again would drop its locks
                 raise _unavailable(path)
             self._descriptors = [_lock_byte(path)] if WHOLE_DESCRIPTION else [_lock_beside(path), _open(path)]
             self._index_descriptor: int | None = None
@@ -79,7 +84,9 @@ class FileLock:
     def log_is_merged(self) -> bool:
         """Whether the next transaction may begin a new log. Only a caller with the right to write may ask."""
         if self._index_descriptor is None:
-            self._index_descriptor = os.open(self._index, os.O_RDONLY | os.O_CLOEXEC)  # SQLite has created it
+            self._index_descriptor = os.open(
+                self._index, os.O_RDONLY | os.O_CLOEXEC
+            )  # SQLite has created the file by now
         return is_merged(os.pread(self._index_descriptor, INDEX_BYTES, 0))
 
     def watch(self) -> None:
@@ -256,7 +263,7 @@ def is_merged(index: bytes) -> bool:
     ``index`` is the beginning of the log's index, read by a caller with the right to write.
     """
     if len(index) < INDEX_BYTES or struct.unpack_from("=I", index)[0] != INDEX_VERSION:
-        return True  # an unnecessary mark does no harm
+        return True  # the log is then marked again, which does no harm
     frames, merged = struct.unpack_from("=I", index, 16)[0], struct.unpack_from("=I", index, 96)[0]
     return bool(frames == merged)
 

@@ -20,7 +20,7 @@ from surrogym_server.storage.sql.rows import Span, append_event, find, hold, rec
 from surrogym_server.storage.sql.tables import evaluations, leases, queries, samples, surrogates
 
 COUNTED = ("initial", "adaptive", "manual", "audit", "logged", "evaluation", "failed", "expired")
-MOST_KEPT = 100_000  # surrogates whose counts are kept
+MOST_KEPT = 100_000  # most surrogates whose counts are kept in memory
 
 PURPOSE = sa.type_coerce(samples.c.purpose, sa.Text)  # the column's own type would refuse unknown words
 BY_PURPOSE: sa.Select[Any] = sa.select(

@@ -1,4 +1,4 @@
-"""Adapters of ``Occupancy``, ``Sessions`` and ``Events``."""
+"""Store the states that policies visited, the sessions that a stopping server saves, and events of surrogates."""
 
 from __future__ import annotations
 

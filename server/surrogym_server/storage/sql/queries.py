@@ -170,7 +170,7 @@ class SqlQueries(port.Queries):
         try:
             with self._database.write() as connection:
                 return leasing.sweep(connection, hold(connection, name))
-        except UnknownSurrogate:  # deleted meanwhile
+        except UnknownSurrogate:  # the surrogate was deleted meanwhile
             return 0
 
 

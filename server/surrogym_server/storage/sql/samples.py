@@ -64,7 +64,9 @@ class SqlSamples(port.Samples):
         key: str | None = None,
         log: LogPart | None = None,
     ) -> AddedSamples:
-        body = fingerprint(sampler, [asdict(sample) for sample in samples] if key else [])  # compared if there is a key
+        body = fingerprint(
+            sampler, [asdict(sample) for sample in samples] if key else []
+        )  # compared with the earlier request if the idempotency key was used before
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             if log is not None:  # a sample of a log is identified by the log before it

@@ -133,7 +133,7 @@ def _present(connection: Connection) -> list[str]:
 
 
 def _upgrade(connection: Connection) -> None:
-    from alembic import command  # late: it takes a fifteenth of a server's start, and most schemas are up to date
+    from alembic import command  # not at the top: importing takes a fifteenth of a server's start
     from alembic.config import Config
     from alembic.util import CommandError
 
@@ -149,7 +149,9 @@ def _upgrade(connection: Connection) -> None:
 def _take_turn(connection: Connection) -> None:
     if connection.dialect.name == "postgresql":
         connection.execute(sa.text("SET LOCAL lock_timeout = 0"))  # another migration may take long
-        connection.execute(sa.text("SET LOCAL idle_in_transaction_session_timeout = 0"))  # it may pause to compute
+        connection.execute(
+            sa.text("SET LOCAL idle_in_transaction_session_timeout = 0")
+        )  # a migration may pause to compute
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(MIGRATION_LOCK)))
 
 

@@ -258,7 +258,7 @@ SUMMARY_FIELDS = (
     "round",
     "error",
     "created_at",
-)  # read as they are
+)  # columns that a summary has unchanged
 SUMMARY_COLUMNS = [getattr(surrogates.c, name) for name in SUMMARY_FIELDS]
 
 
@@ -373,7 +373,7 @@ def _interrupted(connection: Connection) -> list[int]:
 
 def _remove(database: Database, id: int) -> None:
     """Remove a surrogate that has no name any more, with its rows. A repeat is harmless."""
-    for table in reversed(metadata.sorted_tables):  # rows before those that they refer to
+    for table in reversed(metadata.sorted_tables):  # referring rows are removed before the rows that they refer to
         if "surrogate_id" in table.c:
             database.write_in_batches(partial(_remove_some, table, id))
     with database.write() as connection:

@@ -159,7 +159,7 @@ surrogates = sa.Table(
     sa.Column("fitted_revision", sa.BigInteger, nullable=False),  # revision at the last fit
     sa.Column(
         "logged_revision", sa.BigInteger, nullable=False, server_default="0"
-    ),  # revision that has all of the last log; see ``sql.logged``
+    ),  # revision from which on the last log is complete
     sa.Column("fit_token", sa.Text),
     sa.Column("fit_owner", sa.Text),
     sa.Column("fit_expires", sa.Double),
