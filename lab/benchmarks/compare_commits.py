@@ -2,7 +2,9 @@
 
 Run by ``make compare ARGS="BEFORE AFTER"``. Each commit is unpacked into a folder of its own. There it runs the demo of
 each task and seed, with a short training. Then its server serves that run and is asked for what it holds and does:
-queries, samples, models, predictions, trajectories. All of it has to be the same to the last bit.
+queries, samples, models, predictions, trajectories. All of it has to be the same to the last bit. With ``--design`` the
+design runs without a training, for commits whose policies differ on purpose: in a demo the states that a policy visits
+lead to further queries.
 
 Nothing but commands and requests is used, so a commit may move its modules. Steps, predictions and fits are timed on
 the runs of the first seed; the two servers take turns.
@@ -21,7 +23,7 @@ import sys
 import tempfile
 import time
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
@@ -38,10 +40,11 @@ from pydantic import TypeAdapter
 from safetensors.torch import load
 
 from support.server import running_server
+from surrogym.demo.tasks import TASKS
 from surrogym_client.environments.spaces import space
 from surrogym_shared.wire import ActionSpace
 
-TASKS = ("pendulum", "cartpole", "swingup", "mountaincar", "acrobot", "invertedpendulum")
+COMPARED = ("pendulum", "cartpole", "swingup", "mountaincar", "acrobot", "invertedpendulum")
 SEEDS = (0, 1)
 TRAINING_STEPS, EPISODES = 8_192, 2
 POINTS, LANES, STEPS = 64, 4, 200  # of a comparison
@@ -86,24 +89,23 @@ class Commit:
         """Package that is the command: older commits have it in the client."""
         return "surrogym" if (self.folder / "client/surrogym/__main__.py").exists() else "surrogym_client"
 
-    def demo(self, task: str, seed: int, out: Path) -> None:
+    def demo(self, task: str, seed: int, run: Path) -> None:
         """Run the demo of a task with a short training."""
         sizes = ["--steps", str(TRAINING_STEPS), "--episodes", str(EPISODES), "--no-pictures", "--quiet"]
-        command = [
-            sys.executable,
-            "-m",
-            self.program,
-            "demo",
-            task,
-            "--seed",
-            str(seed),
-            "--out",
-            str(out),
-            *sizes,
-        ]
-        subprocess.run(
-            command, cwd=self.folder, env=os.environ | {"PYTHONPATH": self.path}, check=True, stdout=subprocess.DEVNULL
-        )
+        self._run("demo", task, "--seed", str(seed), "--out", str(run), *sizes)
+
+    def design(self, task: str, seed: int, run: Path) -> None:
+        """Run the design of a task alone: a server in the folder ``run``, and a sampler."""
+        run.mkdir(parents=True)
+        environment, budget = TASKS[task].environment, TASKS[task].budget
+        with running_server(run, PYTHONPATH=self.path) as server:
+            about = ["--name", task, "--budget", str(budget), "--seed", str(seed)]
+            self._run("register", environment, *about, "--server", server.url, "--quiet")
+            self._run("sample", task, "--env", environment, "--until-done", "--server", server.url, "--quiet")
+
+    def _run(self, *arguments: str) -> None:
+        command, environment = [sys.executable, "-m", self.program, *arguments], os.environ | {"PYTHONPATH": self.path}
+        subprocess.run(command, cwd=self.folder, env=environment, check=True, stdout=subprocess.DEVNULL)
 
 
 def unpacked(revision: str, folder: Path) -> Commit:
@@ -175,12 +177,18 @@ def facts(server: Server, run: Path) -> Facts:
     found: Facts = {
         **{room: server.get(f"{server.surrogate}/{room}") for room in ("queries", "samples", "models")},
         "arrays": {name: _digest(array.numpy()) for name, array in arrays.items()},
-        "metrics": json.loads((run / "metrics.json").read_text()),
-        "policy": _policy(run / "policy.zip"),
+        **_trained(run),
         **{route: server.post(f"{server.surrogate}/{route}", server.points()) for route in POINT_ROUTES},
         **{f"trajectory, {name}": Session(server, LANES, **o).rollout(STEPS) for name, o in VARIANTS.items()},
     }
     return {what: _without(value) for what, value in found.items()}
+
+
+def _trained(run: Path) -> Facts:
+    """Metrics and policy of a demo; none of a design without a training."""
+    if not (run / "policy.zip").exists():
+        return {}
+    return {"metrics": json.loads((run / "metrics.json").read_text()), "policy": _policy(run / "policy.zip")}
 
 
 def _without(value: Any) -> Any:
@@ -261,8 +269,9 @@ def main() -> None:
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("before", help="a commit")
     made.add_argument("after", nargs="?", default="HEAD", help="another one; default: HEAD")
-    made.add_argument("--tasks", nargs="+", default=TASKS, help="names of the demo's tasks")
+    made.add_argument("--tasks", nargs="+", default=COMPARED, help="names of the demo's tasks")
     made.add_argument("--seeds", nargs="+", type=int, default=SEEDS)
+    made.add_argument("--design", action="store_true", help="compare designs without a training")
     made.add_argument("--rounds", type=int, default=ROUNDS, help="turns of a timing; 0 leaves the timings out")
     made.add_argument("--out", type=Path, default=OUT, help="folder of the JSON file")
     options = made.parse_args()
@@ -282,7 +291,8 @@ def compared(options: argparse.Namespace, folder: Path) -> list[Facts]:
     for task in options.tasks:
         for seed in options.seeds:
             rounds = options.rounds if seed == options.seeds[0] else 0
-            row = compared_run(commits, task, seed, rounds, folder / f"{task}-{seed}")
+            make = partial(Commit.design if options.design else Commit.demo, task=task, seed=seed)
+            row = compared_run(commits, make, rounds, folder / f"{task}-{seed}")
             rows.append({"task": task, "seed": seed, **row})
             print(f"{task}, seed {seed}: {len(row['differences'])} differences")
             for line in row["differences"][:SHOWN]:
@@ -292,13 +302,16 @@ def compared(options: argparse.Namespace, folder: Path) -> list[Facts]:
     return rows
 
 
-def compared_run(commits: Mapping[str, Commit], task: str, seed: int, rounds: int, folder: Path) -> Facts:
-    """The differences of one run of both commits, and timings if there are rounds of them."""
+def compared_run(commits: Mapping[str, Commit], make: Callable[..., None], rounds: int, folder: Path) -> Facts:
+    """The differences of one run of both commits, and timings if there are rounds of them.
+
+    ``make`` makes the run of a commit in the folder ``run``.
+    """
     with ExitStack() as stack:
         servers, found = {}, {}
         for side, commit in commits.items():
             run = folder / side
-            commit.demo(task, seed, run)
+            make(commit, run=run)
             url = stack.enter_context(running_server(run, PYTHONPATH=commit.path)).url
             servers[side] = stack.enter_context(closing(Server(url)))
             found[side] = facts(servers[side], run)
