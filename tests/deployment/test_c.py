@@ -54,6 +54,17 @@ def test_vectors_pass_under_sanitizers_without_a_warning(tmp_path: Path, case: s
     assert re.fullmatch(r"(\d+) of \1 vectors passed\n", run(program))
 
 
+@pytest.mark.skipif(shutil.which("size") is None, reason="size is not on this machine")
+def test_the_program_of_the_vectors_fits_a_board(tmp_path: Path):
+    (tmp_path / "c").mkdir()
+    write(made(tmp_path, "history"), tmp_path / "c")
+    out = tmp_path / "main.o"
+    compile_c("cc", [tmp_path / "c" / "arm_main.c"], out, "-c")
+    said = subprocess.run(["size", out], capture_output=True, text=True, check=True).stdout
+    data, bss = map(int, said.splitlines()[1].split()[1:3])
+    assert data + bss <= 32_768, "a board of 64 kB has more to hold than the vectors"
+
+
 def test_a_wrong_weight_fails_the_vectors(tmp_path: Path):
     folder = tmp_path / "c"
     folder.mkdir()

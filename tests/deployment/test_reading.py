@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import stable_baselines3
+import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from support.controllers import LEARNERS, Idle, learner, network, plant
@@ -114,17 +115,20 @@ def test_policies_without_a_feed_forward_network_are_refused_with_what_can(tmp_p
     (tmp_path / "policy.onnx").write_bytes(b"x")
     with pytest.raises(NotDeployable, match="feed-forward network can"):
         controller_of(tmp_path / "policy.onnx", spec)
-    made = stable_baselines3.PPO("MlpPolicy", Idle(spec), device="cpu", policy_kwargs={"activation_fn": _elu()})
+    made = stable_baselines3.PPO("MlpPolicy", Idle(spec), device="cpu", policy_kwargs={"activation_fn": torch.nn.ELU})
     made.save(path)
     write_card(path, PolicyCard(algorithm="PPO", spec=spec))
     with pytest.raises(NotDeployable, match="got ELU; a deterministic feed-forward network can"):
         controller_of(path, trust=True)
-    with pytest.raises(UnusablePolicy, match="pickled objects"):
+    with pytest.raises(NotDeployable, match=r"pickled objects.*feed-forward network can"):
         controller_of(path)
-    with pytest.raises(UnusablePolicy, match="is not a policy of DQN: expected --algorithm PPO"):
+    with pytest.raises(NotDeployable, match="is not a policy of DQN: expected --algorithm PPO"):
         controller_of(path, algorithm="DQN", trust=True)
     with pytest.raises(NotDeployable, match=r"RECURRENTPPO.*feed-forward network can"):
         controller_of(path, algorithm="RECURRENTPPO", trust=True)
+    torch.save({"weight": torch.zeros(3)}, path)
+    with pytest.raises(NotDeployable, match=r"is not a policy of PPO.*feed-forward network can"):
+        controller_of(path)
 
 
 def test_a_controller_names_what_it_was_made_from(tmp_path: Path):
@@ -161,12 +165,6 @@ def test_a_policy_that_learned_in_a_vecnormalize_keeps_its_statistics_and_its_cl
     shown = declared(spec, np.stack([begun(spec, read) for read in reads])).astype(np.float32)
     decided = decide(controller, begin(controller, 20), reads)
     np.testing.assert_allclose(decided.action, decode_actions(spec, policy(shown), 20), atol=1e-5)
-
-
-def _elu():
-    import torch
-
-    return torch.nn.ELU
 
 
 def test_choices_that_do_not_fit_are_refused(tmp_path: Path):

@@ -211,7 +211,7 @@ def controller_from(
     if shape != expected or decision.counts != _counts(spec.action):
         raise NotDeployable(
             f"expected a network of {expected[0]} inputs and {expected[1]} outputs for this specification, got "
-            f"{shape[0]} and {shape[1]}"
+            f"{shape[0]} and {shape[1]}: give the specification that the policy was trained for, with --spec"
         )
     period = _period(spec, choices.period)
     made = Controller(
@@ -377,7 +377,10 @@ def _period(spec: EnvironmentSpec, chosen: float | None) -> float | None:
         return declared
     _require_seconds("period", chosen)
     if declared is not None and declared != chosen:
-        raise NotDeployable(f"expected the period that the specification declares, {declared:g} s, got {chosen:g}")
+        raise NotDeployable(
+            f"expected the period that the specification declares, {declared:g} s, got {chosen:g}: leave "
+            "--period out, or train a policy for the other period"
+        )
     return chosen
 
 

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 CHECKS = 1_000  # random observations on which the controller is compared with the policy
 TOLERANCE = 1e-4  # largest difference, as a share of an action's range; torch computes in float32
 CAN = (
-    "a deterministic feed-forward network can: a policy of surrogym train, or one of PPO, A2C, SAC, TD3, DDPG or DQN "
-    "with layers of tanh or ReLU"
+    "a deterministic feed-forward network can be deployed: a policy of surrogym train, or one of PPO, A2C, SAC, TD3, "
+    "DDPG or DQN with layers of tanh or ReLU"
 )
 
 
@@ -61,8 +61,9 @@ def controller_of(
         choices: fallback, timeout and ranges.
 
     Raises:
-        NotDeployable: the policy has another form, no specification is known, or a choice does not fit.
-        UnusablePolicy: the file is not a policy of the algorithm, or it needs ``trust``.
+        NotDeployable: the policy has another form or needs ``trust``, no specification is known, or a choice does not
+            fit.
+        UnusablePolicy: the file or its card is damaged.
         PolicyMisfit: the card has another specification.
     """
     require_policy(policy)
@@ -71,7 +72,10 @@ def controller_of(
     card = read_card(policy)
     meant = spec or card.spec
     if meant is None:
-        raise NotDeployable(f"expected --spec with the specification of {policy}: no card beside it has one")
+        raise NotDeployable(
+            f"expected --spec with the specification that {policy} was trained for, because no card beside it has one: "
+            "surrogym describe drafts it"
+        )
     if card.spec is not None:
         check_policy(card.spec, meant)
     chosen = algorithm or card.algorithm
@@ -95,9 +99,7 @@ def _network(policy: Path, algorithm: str, *, trust: bool) -> tuple[Decision, Pr
     try:
         predict = load_policy(policy, algorithm, trust=trust)
     except UnusablePolicy as error:
-        if "has no algorithm" in str(error):
-            raise NotDeployable(f"{error}; {CAN}") from error
-        raise
+        raise NotDeployable(f"{error}; {CAN}") from error
     return _of_learner(policy, algorithm, trust=trust), predict
 
 

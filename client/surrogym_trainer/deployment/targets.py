@@ -65,7 +65,10 @@ def deploy(controller: Controller, target: str, out: Path) -> list[Path]:
         target_of(target).write(controller, Path(made))
         names = sorted(path.relative_to(made) for path in Path(made).rglob("*") if path.is_file())
         if other := _other(out, Path(made), names):
-            raise NotDeployable(f"expected a new or an empty folder, got {out} with {other}: nothing was written")
+            raise NotDeployable(
+                f"expected a new or an empty folder, got {out} with {other}: nothing was written; choose another "
+                "folder, or empty this one"
+            )
         _copy(Path(made), out, names)
     return [out / name for name in names]
 
