@@ -95,7 +95,7 @@ def main() -> None:
         try:
             wait_for_episodes(browser, server.url)
             take(browser, server.url, "page-list", "#/", "light", 1100, 420)
-            take(browser, server.url, "page-light", "#/s/pendulum", "light", 1280, 900)
+            take(browser, server.url, "page-light", "#/s/pendulum", "light", 1280, 800)
             take(browser, server.url, "page-compare", "#/compare/pendulum/pendulum", "light", 1100, 600)
             take_policy(browser, server.url)
             take_registration(browser, server.url)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -65,6 +66,16 @@ def test_promise_and_real_return_stand_beside_each_other(url: str, open_page: Op
     part.get_by_role("button", name="Make it production").click()
     expect(part.locator("summary").first).to_contain_text("production")
     assert complaints == []
+
+
+def test_axis_of_returns_has_round_numbers(url: str, open_page: Open):
+    page = open_page(f"{url}/#/s/better")
+    expect(page.locator(".ranges")).to_be_visible()
+    ticks = [float(text.replace("−", "-")) for text in page.locator(".ranges line.axis ~ text").all_inner_texts()]
+    steps = {f"{after - before:.3g}" for before, after in itertools.pairwise(ticks)}
+    assert len(ticks) >= 2
+    assert len(steps) == 1
+    assert steps.pop().strip("0.") in {"1", "2", "5"}
 
 
 def test_a_file_is_downloaded_as_it_came(url: str, open_page: Open, tmp_path: Path):

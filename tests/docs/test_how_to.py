@@ -16,7 +16,7 @@ from support.server import ServerProcess
 PAGES = Path(__file__).parents[2] / "docs" / "how-to"
 PRINTED_URL = "http://127.0.0.1:8000"
 READERS_FUNCTIONS = (
-    "read_sensors, send = lambda: [1.0, 0.0, 0.0], lambda action: None\n"  # that files.md leaves to them
+    "read_sensors, send = lambda: [1.0, 0.0, 0.0], lambda action: None\n"  # that files-and-terminal.md leaves to them
 )
 
 
@@ -53,8 +53,8 @@ def test_a_surrogate_leaves_as_a_file_and_is_stepped_without_a_server(server: Se
     on_server = ["--server", server.url]
     run(tmp_path, "-m", "surrogym", "export", "pendulum", "--out", "pendulum.surrogate", *on_server)
     run(tmp_path, "-m", "surrogym", "import", "pendulum.surrogate", "--name", "pendulum-2", *on_server)
-    for program in programs("files.md")[:2]:
-        run(tmp_path, "-c", program.replace("10_000", "512"))
+    for program in programs("in-process.md")[2:]:
+        run(tmp_path, "-c", program.replace(PRINTED_URL, server.url).replace("10_000", "512"))
 
 
 def test_an_episode_is_filmed(server: ServerProcess, tmp_path: Path) -> None:
@@ -68,11 +68,11 @@ def test_the_lines_of_the_terminal_page_work(
     server: ServerProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SURROGYM_URL", server.url)
-    text = (PAGES / "terminal.md").read_text(encoding="utf-8")
+    text = (PAGES / "files-and-terminal.md").read_text(encoding="utf-8")
     lines = re.findall(r"^surrogym (.*)$", "".join(re.findall(r"```console\n(.*?)```", text, re.DOTALL)), re.MULTILINE)
     assert len(lines) > 6
     for line in lines:
-        if not {"--watch", "--install-completion"} & set(line.split()):  # tests/cli: test_status.py, test_completion.py
+        if not {"--watch", "train", "export-policy", "import"} & set(line.split()):  # other tests run them
             run(tmp_path, "-m", "surrogym", *line.split())
     assert (tmp_path / "report.html").exists()
 
@@ -83,8 +83,8 @@ def test_a_policy_leaves_for_other_programs(server: ServerProcess, tmp_path: Pat
     run(tmp_path, "-m", "surrogym", *train)
     for file in ("policy.onnx", "policy.pt2"):
         run(tmp_path, "-m", "surrogym", "export-policy", "policy.zip", "--out", file)
-    for program in programs("files.md")[2:]:
-        run(tmp_path, "-c", READERS_FUNCTIONS + program)
+    (program,) = programs("files-and-terminal.md")
+    run(tmp_path, "-c", READERS_FUNCTIONS + program)
     evaluate = ["evaluate", "policy.onnx", "--env", "Pendulum-v1", "--episodes", "2", "--json", "--server", server.url]
     assert json.loads(run(tmp_path, "-m", "surrogym", *evaluate))["episodes"] == 2
 

@@ -27,14 +27,13 @@ PRINTED_URL = "http://127.0.0.1:8000"
 PAGES = ["docs/tutorial.md"]
 ALL_PAGES = [
     "README.md",
-    "docs/how-to/files.md",
+    "docs/how-to/files-and-terminal.md",
     "docs/how-to/in-process.md",
     "docs/how-to/no-teleport.md",
     "docs/how-to/own-environment.md",
     "docs/how-to/page.md",
     "docs/how-to/policy-search.md",
     "docs/how-to/rewards-and-terminations.md",
-    "docs/how-to/terminal.md",
     "docs/how-to/trainers.md",
     "docs/how-to/variants.md",
 ]
@@ -47,7 +46,7 @@ SHORTER = {
 }
 IN_PROGRAMS = {"0_000": "00", "num_envs=16": "num_envs=2"}
 READERS_FUNCTIONS = (
-    "read_sensors, send = lambda: [1.0, 0.0, 0.0], lambda action: None\n"  # that files.md leaves to them
+    "read_sensors, send = lambda: [1.0, 0.0, 0.0], lambda action: None\n"  # that files-and-terminal.md leaves to them
 )
 ELSEWHERE = {
     "make": "tests/demo and the Makefile itself",

@@ -12,6 +12,7 @@ from surrogym_shared.wire import SurrogateView
 
 LOOK_SECONDS = 0.25
 MANY = 1_500  # samples from which on a fit by the default model takes about the same time
+USUAL_FIT = "such a fit takes about 15 s with noise, up to 100 s without, on two free cores"  # bench_noisy_log, bench_logs
 FIRST_LEASE_SECONDS = 5.0  # a running sampler begins queries within a second
 
 
@@ -33,7 +34,7 @@ def words_of_design(view: SurrogateView) -> str:
 def words_of_long_fit(view: SurrogateView, seconds: float) -> str:
     """Describe a fit that has been waited for: its steps, the time so far, and how long such a fit takes."""
     waited = f" for {seconds:.0f} s" if view.phase == "fitting" else ""
-    usual = "; fits of so many steps took 20 to 160 s on two free cores" if waited and view.samples >= MANY else ""
+    usual = f"; {USUAL_FIT}" if waited and view.samples >= MANY else ""
     return f"{words_of_design(view)}{waited}{usual}"
 
 
@@ -43,8 +44,7 @@ def words_of_audit(view: SurrogateView) -> str:
 
 
 def _words_of_fit(view: SurrogateView) -> str:
-    """Say that the server fits a model, which takes a minute or more for the steps of a long log; empty if it does
-    not."""
+    """Say that the server fits a model; empty if it does not."""
     return f"; a model is being fitted to {view.samples} steps" if view.phase == "fitting" else ""
 
 

@@ -8,6 +8,7 @@ const STEP = 11; // from a mark to the next in a row
 const MOST = 1e30; // beyond it, differences overflow
 const MARKS = 3; // that a row has room for, at least
 const LETTER = 7; // width of one
+const HALF_LABEL = 30; // pixels
 const PAD = { right: 8, top: 4, bottom: 22 };
 const KEY = {
   promise: "promised: 90 % interval", real: "real: mean with 95 % interval", without: "real, without the policy", reference: "real, reference controller",
@@ -46,7 +47,6 @@ export function ranges(rows, label, least = MARKS) {
   const x = (value) => left + ((width - left - PAD.right) * (value - from)) / (to - from);
   const height = PAD.top + row * rows.length + PAD.bottom;
   const said = rows.map(({ label: who, marks }) => `${who}: ${marks.map(({ kind, value, low, high }) => `${kind} ${number(value)}${low === null || low === undefined ? "" : ` between ${number(low)} and ${number(high)}`}`).join(", ") || "nothing known"}`);
-  const ticks = [from + 0.04 * span, (from + to) / 2, to - 0.04 * span];
   return h("svg", { class: "ranges", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${label}. ${said.join("; ")}` },
     rows.map(({ label: who, marks }, at) => {
       const top = PAD.top + row * at;
@@ -55,7 +55,16 @@ export function ranges(rows, label, least = MARKS) {
       return [label, ...marks.map((mark, which) => shape(mark, x, top + 8 + STEP * which))];
     }),
     h("line", { class: "axis", x1: left, x2: width - PAD.right, y1: height - PAD.bottom, y2: height - PAD.bottom }),
-    ticks.map((value, at) => text(x(value), height - 6, number(value), ["start", "middle", "end"][at])));
+    roundNumbers(from, to).map((value) => text(x(value), height - 6, number(value), x(value) > width - HALF_LABEL ? "end" : "middle")));
+}
+
+/** Two to six multiples of 1, 2 or 5 times a power of ten. */
+function roundNumbers(from, to) {
+  const least = (to - from) / 6;
+  const power = 10 ** Math.floor(Math.log10(least));
+  const step = power * [1, 2, 5, 10].find((times) => times * power >= least);
+  const first = Math.ceil(from / step);
+  return Array.from({ length: Math.floor(to / step) - first + 1 }, (_, at) => (first + at) * step);
 }
 
 /** What the shapes in these rows mean. */
