@@ -109,10 +109,15 @@ class _Search:
         self._spec, self._model, self._settings = surrogate.spec(), surrogate.model, settings
         if offers(self._model, Differentiable) is None:
             family = self._model.definition.learning.model.name
-            raise InvalidInput(f"expected a model that can be differentiated, got one of the family {family!r}")
+            raise InvalidInput(
+                f"expected a model that can be differentiated, got one of the family {family!r}: choose "
+                "another algorithm"
+            )
         action = self._spec.action
         if not isinstance(action, BoxAction) or action.bins is not None:
-            raise InvalidInput("expected continuous actions, got discrete ones, which have no gradient")
+            raise InvalidInput(
+                "expected continuous actions, got discrete ones, which have no gradient: choose another algorithm"
+            )
         self._limit = self._spec.time_limit or LONGEST_EPISODE
         third = min(max(self._limit // 3, SHORTEST_HORIZON), LONGEST_HORIZON)
         self._horizon = min(settings.horizon or third, self._limit)

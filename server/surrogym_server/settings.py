@@ -81,7 +81,9 @@ class Settings(BaseModel):
     def _closed_by_default(self) -> Self:
         short = [token for token in self.tokens if len(token) < MIN_TOKEN_LENGTH]
         if short:
-            raise ValueError(f"expected tokens of at least {MIN_TOKEN_LENGTH} characters, got {len(short[0])}")
+            raise ValueError(
+                f"expected tokens of at least {MIN_TOKEN_LENGTH} characters, got {len(short[0])}: choose longer ones"
+            )
         if not (self.tokens or self.insecure or self.loopback):
             raise ValueError(f"host {self.host} is not loopback: expected a token (or --insecure), got none")
         return self
@@ -90,7 +92,7 @@ class Settings(BaseModel):
     def _certificate_with_its_key(self) -> Self:
         if (self.tls_certificate is None) != (self.tls_key is None):
             came = "the key" if self.tls_certificate is None else "the certificate"
-            raise ValueError(f"TLS: expected a certificate and its key, got {came} alone")
+            raise ValueError(f"TLS: expected a certificate and its key, got {came} alone: give both")
         return self
 
     @property

@@ -134,7 +134,9 @@ class Network:
             head = _read_head(entries[HEAD])
             arrays = read_arrays(entries[ARRAYS], MAX_BYTES, partial(_require_chain, head))
         except (LookupError, TypeError, OSError, ValueError, RecursionError, MemoryError) as error:
-            raise ValueError(f"{path} is not a network of arrays: {error}") from error
+            raise ValueError(
+                f"{path} is not a network of arrays: {error}; save or download the policy again"
+            ) from error
         layers = tuple(Layer(*(arrays[name] for name in names)) for names in head.names)
         outside = {name: arrays[name] for name in OUTSIDE}
         return cls(**outside, layers=layers, counts=head.counts, activation=head.activation)

@@ -165,7 +165,8 @@ def _split(data: bytes) -> tuple[Header, bytes]:
     end = LENGTH_BYTES + length
     if len(data) < LENGTH_BYTES or end > len(data) or length > MAX_HEADER_BYTES:
         raise NotASurrogateFile(
-            f"expected a surrogate's file, got {len(data)} bytes that are not in safetensors format"
+            f"expected a surrogate's file, got {len(data)} bytes that are not in safetensors format: export "
+            "it again by surrogym export"
         )
     try:
         header = json.loads(data[LENGTH_BYTES:end])

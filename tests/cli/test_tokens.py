@@ -63,7 +63,7 @@ def test_a_typed_token_is_taken_with_a_warning(surrogym, server):
 def test_two_typed_tokens_are_one_too_many(surrogym, server, file):
     said = surrogym("status", "--server", server.url, "--token", "typed", "--token-file", "token")
     assert (said.code, server.received) == (1, [])
-    assert said.err == "error: expected --token or --token-file, got both\n"
+    assert said.err == "error: expected --token or --token-file, got both; give one of the two\n"
 
 
 def test_a_token_file_that_others_may_read_is_taken_with_a_warning(surrogym, server, file):

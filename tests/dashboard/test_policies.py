@@ -71,7 +71,7 @@ def test_promise_and_real_return_stand_beside_each_other(url: str, open_page: Op
 def test_axis_of_returns_has_round_numbers(url: str, open_page: Open):
     page = open_page(f"{url}/#/s/better")
     expect(page.locator(".ranges")).to_be_visible()
-    ticks = [float(text.replace("−", "-")) for text in page.locator(".ranges line.axis ~ text").all_inner_texts()]
+    ticks = [float(text.replace("−", "-")) for text in page.locator(".ranges line.axis ~ text").all_text_contents()]
     steps = {f"{after - before:.3g}" for before, after in itertools.pairwise(ticks)}
     assert len(ticks) >= 2
     assert len(steps) == 1

@@ -18,7 +18,7 @@ from support.noting import until
 from support.programs import HANGS, NOTES_ITSELF, UNTERMINABLE, left_behind, program
 from surrogym_sampler import original
 from surrogym_sampler.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
-from surrogym_sampler.original.executables.messages import decode
+from surrogym_sampler.original.executables.messages import CHECK, decode
 from surrogym_sampler.original.executables.program import Program
 from surrogym_sampler.original.loading import is_known
 
@@ -64,7 +64,7 @@ def test_a_shell_program_takes_exact_steps():
         ("print('hello', flush=True)", "one line of JSON from the program, got hello"),
         ("print(flush=True)", "one line of JSON from the program, got an empty line; let it print"),
         ("result = {'state': [0]}", "4 finite numbers"),
-        ("result = {}", "4 finite numbers for 'state' in the program's answer, got nothing$"),
+        ("result = {}", "4 finite numbers for 'state' in the program's answer, got nothing;"),
         ("result['state'][3] = float('-inf')", "expected finite numbers from the program, got -Infinity in"),
         ("os.close(1); time.sleep(60)", "the program closed its standard output and was ended during step$"),
     ],
@@ -107,7 +107,7 @@ def test_a_line_without_an_end_is_in_the_error_with_the_way_out():
         ("no\n\x1b[2Jlicence", "the program answered: no [2Jlicence"),
         ("E" * 10**6, f"the program answered: {'E' * 400}…"),
         ("", "the program answered: an error without words"),
-        (None, "expected 'result' or 'error' in the program's answer, got {\"id\": 1, \"error\": null}"),
+        (None, f"expected 'result' or 'error' in the program's answer, got {{\"id\": 1, \"error\": null}}; {CHECK}"),
     ],
 )
 def test_an_error_of_a_program_is_repeated_as_one_short_line(error, said):
@@ -209,7 +209,7 @@ def test_a_program_that_hangs_is_ended_after_its_client_was_killed(tmp_path):
     command = program(tmp_path, NOTES_ITSELF, UNTERMINABLE, hangs)
     client = f"""
 import time
-from surrogym_sampler.original.executables.messages import decode
+from surrogym_sampler.original.executables.messages import CHECK, decode
 from surrogym_sampler.original.executables.program import Program
 plant = Program({command!r}, grace=0.0)
 plant.start()

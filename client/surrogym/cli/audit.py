@@ -122,7 +122,7 @@ def _by_episodes(
 
     spec = subject.port.spec()
     if subject.api.surrogate(subject.name).fidelity is None:
-        raise CommandError(f"{subject.name!r} has no model yet, so there is nothing to compare with")
+        raise CommandError(f"{subject.name!r} has no model yet: wait until a sampler has answered its first queries")
     most = settings.episodes * (spec.time_limit or LONGEST_EPISODE)
     count = counted(settings.episodes, "whole episode")
     say(f"the audit takes {count} in {env}: at most {most} real steps", quiet=quiet)

@@ -97,7 +97,7 @@ def perform(
     if settings.algorithm is not None:
         require_known(settings.algorithm)
     if json_file is not None and not json_file.resolve().parent.is_dir():
-        raise CommandError(f"expected an existing folder for --json, got {json_file.parent}")
+        raise CommandError(f"expected an existing folder for --json, got {json_file.parent}: make it first")
     as_json = json_file == Path("-")
 
     def tell(metrics: dict[str, Any], folder: Path) -> None:

@@ -98,7 +98,7 @@ class Episodes:
         from surrogym_trainer.evaluation.evaluator import EvaluationSettings
 
         if self.wide and self.start_scale != 1:
-            raise CommandError("expected --wide or --start-scale, got both")
+            raise CommandError("expected --wide or --start-scale, got both; give one of the two")
         return EvaluationSettings(**vars(self))
 
 

@@ -116,9 +116,11 @@ def command(
     if name is not None:
         raise CommandError(f"{file} is a log: give --register NAME or --to NAME, not --name")
     if log.register and log.to:
-        raise CommandError("expected --register or --to, got both")
+        raise CommandError("expected --register or --to, got both; give one of the two")
     if log.to and log.spec:
-        raise CommandError("expected --spec without --to, whose surrogate has a specification, got both")
+        raise CommandError(
+            "expected --spec without --to, whose surrogate has a specification, got both; leave out --spec"
+        )
     if log.to and given_here(context, "budget"):
         raise CommandError(
             "expected --budget without --to, whose surrogate has a budget, got both: surrogym change "

@@ -128,7 +128,7 @@ def token_from(context: typer.Context, token: str | None, file: Path | None) -> 
     quiet, typed_file = bool(context.params.get("quiet")), given_here(context, "token_file")
     if given_here(context, "token"):
         if typed_file:
-            raise CommandError("expected --token or --token-file, got both")
+            raise CommandError("expected --token or --token-file, got both; give one of the two")
         say(SHOWN, quiet=quiet)
     if file is None or (token is not None and not typed_file):
         return token
@@ -225,7 +225,7 @@ def read_spec_file(path: Path) -> SpecContent:
 
     content = path.read_bytes()
     if not content.strip():
-        raise CommandError(f"{path} is not a specification: it is empty")
+        raise CommandError(f"{path} is not a specification: it is empty; surrogym describe ENVIRONMENT writes one")
     try:
         read = json.loads(content)
         described = isinstance(read, dict) and "specification" in read
@@ -244,7 +244,9 @@ def read_spec_file(path: Path) -> SpecContent:
             f"{path} is not a specification: no JSON from line {error.lineno}, column {error.colno} on ({error.msg})"
         ) from error
     except UnicodeDecodeError as error:
-        raise CommandError(f"{path} is not a specification: expected JSON as text in UTF-8") from error
+        raise CommandError(
+            f"{path} is not a specification: expected JSON as text in UTF-8; write it again in UTF-8"
+        ) from error
     except (ValueError, RecursionError) as error:
         raise CommandError(f"{path} is not a specification: {error}") from error
     steps = read.get("real_steps") if isinstance(read, dict) else None

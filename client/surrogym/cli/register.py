@@ -176,7 +176,7 @@ def _sorted_out(
     if file is None and env is None:
         return environment, name, spec
     if environment is not None and name is not None:
-        raise CommandError(f"expected one name, got {environment!r} and --name {name!r}")
+        raise CommandError(f"expected one name, got {environment!r} and --name {name!r}; leave one out")
     return env, environment or name, spec
 
 
@@ -251,7 +251,7 @@ def _specification(environment: str | None, spec: EnvironmentSpec | None, **choi
             return with_choices(spec, given, **others)  # type: ignore[arg-type]
     except ValueError as error:
         raise CommandError(invalid(error)) from error
-    raise CommandError("expected an environment or --spec FILE, got neither")
+    raise CommandError("expected an environment or --spec FILE, got neither: for example surrogym register Pendulum-v1")
 
 
 def _with_tolerances(spec: EnvironmentSpec, tolerances: dict[str, float]) -> EnvironmentSpec:

@@ -202,7 +202,7 @@ def _named(env: str | None, program: str | None) -> str | None:
     from surrogym_sampler.original.executables import name_of
 
     if env is not None and program is not None:
-        raise CommandError(f"expected --env or --exec, got both: {env!r} and {program!r}")
+        raise CommandError(f"expected --env or --exec, got both, {env!r} and {program!r}: give one of the two")
     return env if program is None else name_of(program)
 
 

@@ -136,7 +136,10 @@ def _with_reference(environment: Environment | None, reference: str | None) -> E
     if reference is None:
         return environment
     if environment is None:
-        raise CommandError("--reference: expected a worker that evaluates, got one that only trains")
+        raise CommandError(
+            "--reference: expected a worker that evaluates, got one that only trains: give --env and a --most-episodes "
+            "above 0, or leave --reference out"
+        )
     if (trained_for := spec_of_reference(reference)) is not None:
         check_policy(trained_for, environment.spec)
     load = partial(reference_of, reference, PolicyReading())

@@ -93,7 +93,7 @@ def _new_folder(settings: DemoSettings) -> Path:
 def _empty_folder(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
-        raise RunFailed(f"expected an empty run folder, got {folder}, which holds files already")
+        raise RunFailed(f"expected an empty run folder, got {folder}, which holds files already: name another by --out")
     return folder.resolve()
 
 

@@ -12,7 +12,7 @@ from surrogym_shared.wire import SurrogateView
 
 LOOK_SECONDS = 0.25
 MANY = 1_500  # samples from which on a fit by the default model takes about the same time
-USUAL_FIT = "such a fit takes about 15 s with noise, up to 100 s without, on two free cores"  # bench_noisy_log, bench_logs
+USUAL_FIT = "such a fit takes about 15 s with noise, and up to 100 s without, on two free cores"
 FIRST_LEASE_SECONDS = 5.0  # a running sampler begins queries within a second
 
 

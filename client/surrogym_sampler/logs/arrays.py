@@ -43,7 +43,10 @@ def table_of_arrays(path: Path, arrays: dict[str, Any], names: Sequence[str] = (
     ignored = {name: _shape(array) for name, array in arrays.items() if array.ndim not in (1, 2)}
     columns = {name: _columns(name, array, names) for name, array in arrays.items() if name not in ignored}
     if not columns:
-        raise UnusableLog(f"expected arrays of one row a step in {path}, got {ignored or 'none'}")
+        raise UnusableLog(
+            f"expected arrays of one row a step in {path}, got {ignored or 'none'}: name them states, actions "
+            "and rewards"
+        )
     rows = _rows(columns)
     marked = any(name in STATES or STATE.match(name) for name in columns)
     for name in list(columns):
@@ -54,7 +57,7 @@ def table_of_arrays(path: Path, arrays: dict[str, Any], names: Sequence[str] = (
     flat = _flat(path, columns)
     lengths = {name: len(arrays[name]) for name in columns}
     if len(set(lengths.values())) > 1:
-        raise UnusableLog(f"expected columns of one length in {path}, got {lengths}")
+        raise UnusableLog(f"expected columns of one length in {path}, got {lengths}: cut them to the same steps")
     return Table(flat, np.arange(1, 1 + rows), unnamed=tuple(filter(is_unnamed, flat)), ignored=ignored)
 
 
@@ -70,7 +73,7 @@ def require_shapes(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> None:
 def _require_names(path: Path, arrays: Mapping[str, Cells], names: Sequence[str]) -> None:
     """Raise ``UnusableLog`` unless the names of the coordinates are different, and as many as the states have."""
     if len(set(names)) < len(names):
-        raise UnusableLog(f"expected different names in coordinate_names in {path}, got {list(names)}")
+        raise UnusableLog(f"expected different names in coordinate_names in {path}, got {list(names)}: rename some")
     for name, array in arrays.items():
         if names and name in (*STATES, *NEXT) and array.ndim == 2 and array.shape[1] != len(names):
             raise UnusableLog(

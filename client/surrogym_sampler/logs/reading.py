@@ -68,7 +68,10 @@ def read(path: Path) -> Table:
     readers = {"csv": read_csv, "npz": read_npz, "parquet": read_parquet, "hdf5": read_hdf5, "minari": read_minari}
     table = readers[kind](path)
     if not len(table):
-        raise UnusableLog(f"expected a surrogate's file, or a log with a heading and rows, got neither in {path}")
+        raise UnusableLog(
+            f"expected a surrogate's file, or a log with a heading and rows, got neither in {path}: write a "
+            "heading and rows"
+        )
     return table
 
 
@@ -105,7 +108,9 @@ def _require_npz(path: Path) -> None:
     if name is not None:
         raise UnusableLog(f"expected a log as text, NPZ, Parquet or HDF5 in {path}, got {name}: save the table as CSV")
     if not is_zipfile(path):
-        raise UnusableLog(f"expected an NPZ file in {path}, as its first bytes show, got a damaged or incomplete zip")
+        raise UnusableLog(
+            f"expected an NPZ file in {path}, as its first bytes show, got a damaged or incomplete zip: save it again"
+        )
 
 
 def read_hdf5(path: Path) -> Table:
@@ -124,12 +129,17 @@ def read_hdf5(path: Path) -> Table:
             groups = {name: "it is a group" for name in file if name not in found}
             require_shapes(path, {name: one.shape for name, one in found.items()})
             if not found:
-                raise UnusableLog(f"expected data sets of one row a step in {path}, got the groups {listed(groups)}")
+                raise UnusableLog(
+                    f"expected data sets of one row a step at the top of {path}, got only the groups {listed(groups)}: "
+                    "move the data sets to the top, or save them as CSV or NPZ"
+                )
             table = table_of_arrays(path, {name: _cells(one[()]) for name, one in found.items()})
     except (OSError, KeyError, ValueError, RuntimeError) as error:
         if isinstance(error, UnusableLog):
             raise
-        raise UnusableLog(f"expected an HDF5 file in {path}, got one that can't be read: {_line(error)}") from error
+        raise UnusableLog(
+            f"expected an HDF5 file in {path}, got one that can't be read: {_line(error)}; save it again, or as CSV"
+        ) from error
     return replace(table, ignored={**table.ignored, **groups})
 
 
@@ -158,7 +168,9 @@ def read_parquet(path: Path) -> Table:
     except UnusableLog:
         raise
     except (ArrowException, OSError, ValueError) as error:
-        raise UnusableLog(f"expected a Parquet file in {path}, got one that can't be read: {_line(error)}") from error
+        raise UnusableLog(
+            f"expected a Parquet file in {path}, got one that can't be read: {_line(error)}; save it again, or as CSV"
+        ) from error
     table = table_of_arrays(path, arrays)
     return replace(table, ignored={**table.ignored, **ignored})
 

@@ -179,7 +179,9 @@ class OwnEpisode(Episode):
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
         del rng, sigma
-        raise NotPerturbable("only environments with a built-in adapter can be perturbed")
+        raise NotPerturbable(
+            "only environments with a built-in adapter can be perturbed: write a changed class, and name it by --env"
+        )
 
     def _started(self, coordinates: Array) -> Moment:
         return Moment(self._shown(coordinates), 0.0, False, coordinates)

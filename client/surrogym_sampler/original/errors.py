@@ -24,6 +24,7 @@ from __future__ import annotations
 import os
 import traceback
 
+MORE_TIME = "a larger --step-limit gives it more time"
 RAISED = (Exception, SystemExit)  # what the code of somebody's environment raises; Ctrl-C is not its own
 
 

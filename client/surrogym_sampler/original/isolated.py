@@ -15,6 +15,7 @@ from types import FrameType, TracebackType
 from typing import Any, Self
 
 from surrogym_sampler.original.errors import (
+    MORE_TIME,
     RAISED,
     EnvironmentDied,
     StepFailed,
@@ -105,7 +106,7 @@ class IsolatedEnvironment:
             raise EnvironmentDied(f"the environment's process ended with exit code {code} during {method}") from error
         if answer is None:
             self._kill()
-            raise StepTimedOut(f"{method} took longer than {limit:g} s and was killed")
+            raise StepTimedOut(f"{method} took longer than {limit:g} s and was killed; {MORE_TIME}")
         ok, value = answer
         if isinstance(value, StepRefused):
             raise value
@@ -113,7 +114,9 @@ class IsolatedEnvironment:
             assert self._process is not None
             self._process.join(self._step_limit + CLOSE_LIMIT)  # it closes the environment
             self._kill()
-            raise EnvironmentDied(f"the environment ended its process during {method}: {value}")
+            raise EnvironmentDied(
+                f"the environment ended its process during {method}: {value}; let it raise an exception"
+            )
         if not ok:
             raise StepFailed(value)
         return value
@@ -138,7 +141,7 @@ class IsolatedEnvironment:
         try:
             if not pipe.poll(START_LIMIT):
                 self._kill()
-                raise StepTimedOut(f"the environment took longer than {START_LIMIT:g} s to start")
+                raise StepTimedOut(f"the environment took longer than {START_LIMIT:g} s to start: make it start faster")
             ok, value = pipe.recv()
         except EOFError as error:
             raise EnvironmentDied(f"the environment's process ended with exit code {self._kill()}") from error

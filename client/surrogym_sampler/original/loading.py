@@ -191,7 +191,7 @@ def with_choices(
     fields["design"].update(design)
     if bins is not None:
         if not isinstance(spec.action, BoxAction):
-            raise ValueError(f"bins need a continuous action, got a {spec.action.kind} one")
+            raise ValueError(f"bins need a continuous action, got a {spec.action.kind} one: leave bins out")
         fields["action"]["bins"] = (bins,) * spec.action.size
     if access is not None:
         fields |= ACCESS[access]

@@ -149,7 +149,7 @@ def answering(environment: object) -> Environment:
     )
     if not isinstance(environment, needed):
         raise UnknownEnvironment(
-            f"its specification declares query={query!r}, which needs {methods}: some of them are missing"
+            f"its specification declares query={query!r}, which needs {methods}: add those that are missing"
         )
     return environment
 
@@ -166,5 +166,5 @@ def _check_snapshots(environment: object) -> None:
     declared = callable(getattr(environment, "spec", None)) and environment.spec().snapshots  # type: ignore[attr-defined]
     if declared and not isinstance(environment, SnapshotEnvironment):
         raise UnknownEnvironment(
-            "its specification declares snapshots, which need the methods save and restore: some of them are missing"
+            "its specification declares snapshots, which need the methods save and restore: add those that are missing"
         )

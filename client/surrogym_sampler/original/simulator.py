@@ -133,7 +133,8 @@ class Simulator(ABC):
         """
         del rng, sigma
         raise NotPerturbable(
-            "only MuJoCo models, and classic control with its built-in specification, can be perturbed"
+            "only MuJoCo models, and classic control with its built-in specification, can be perturbed: write "
+            "a changed class, and name it by --env"
         )
 
     @abstractmethod

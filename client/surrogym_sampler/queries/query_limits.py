@@ -28,7 +28,7 @@ def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSp
     if is_other(asked.sampling_period, own.sampling_period):
         raise UnknownEnvironment(
             f"the environment does not fit surrogate {surrogate!r}: expected a step every {asked.sampling_period:g} s "
-            f"(sampling_period), got {own.sampling_period:g} s"
+            f"(sampling_period), got {own.sampling_period:g} s; register it anew"
         )
     _check_ranges("actions", action_ranges(asked), action_ranges(own))
     _check_ranges("coordinates", [sampled(c.sampling) for c in asked.coordinates], _coordinate_ranges(own))

@@ -25,6 +25,7 @@ from surrogym_sampler.queries.settings import SamplerSettings
 from surrogym_sampler.queries.snapshots import SnapshotFolder
 from surrogym_shared.spec import EnvironmentSpec, limits
 
+SKIPPED = "the design begins elsewhere, and surrogym doctor --env ENVIRONMENT checks save and restore"
 MOST_HANGS = 2  # of ``save`` in a row; one may be the machine's fault
 ELSEWHERE = 0.01  # share of a sampling range by which a return may miss the coordinates that were saved, unmentioned
 
@@ -130,7 +131,9 @@ class Returning:
         except Exception as error:  # an environment that is not isolated may raise anything
             raise SnapshotNotKept(sentence(error)) from error
         if not isinstance(state, bytes):
-            raise SnapshotNotKept(f"expected bytes from save, got a {type(state).__name__}")
+            raise SnapshotNotKept(
+                f"expected bytes from save, got a {type(state).__name__}: let it return the state as bytes"
+            )
         return state
 
     def _restore(self, name: str) -> None:
@@ -140,7 +143,7 @@ class Returning:
         except (StepTimedOut, EnvironmentDied):
             raise  # the fault may be the snapshot's or the machine's
         except Exception as error:  # an environment that is not isolated may raise anything
-            raise SnapshotGone(f"snapshot {name} can't be restored: {sentence(error)}") from error
+            raise SnapshotGone(f"snapshot {name} can't be restored: {sentence(error)}; {SKIPPED}") from error
         self._compare(name, np.array(saved), reached)
 
     def _restore_again(self, name: str) -> None:
@@ -148,7 +151,7 @@ class Returning:
         try:
             self._restore(name)
         except (StepTimedOut, EnvironmentDied) as error:
-            raise SnapshotGone(f"snapshot {name} can't be restored: {error}, twice") from error
+            raise SnapshotGone(f"snapshot {name} can't be restored: {error}, twice; {SKIPPED}") from error
 
     def _resets(self) -> bool:
         """Whether the environment, started anew, can be reset."""
@@ -167,7 +170,7 @@ class Returning:
         if at.shape != saved.shape or not np.isfinite(at).all():
             names = ", ".join(self._spec.coordinate_names)
             raise SnapshotGone(
-                f"snapshot {name} can't be restored: expected coordinates ({names}), got {reached!r:.200}"
+                f"snapshot {name} can't be restored: expected coordinates ({names}), got {reached!r:.200}; {SKIPPED}"
             )
         apart = np.abs(at - saved)
         for coordinate, number, now, before in zip(self._spec.coordinates, apart, at, saved, strict=True):

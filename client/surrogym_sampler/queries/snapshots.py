@@ -124,15 +124,21 @@ class SnapshotFolder:
             form, made_by = head["form"], head["environment"]
             coordinates, digest = head["coordinates"], head["digest"]
         except FileNotFoundError as error:
-            raise SnapshotGone(f"snapshot {name} is not in {self._folder}: it was dropped, or is another's") from error
+            raise SnapshotGone(
+                f"snapshot {name} is not in {self._folder}: it was dropped, or is another's; give all "
+                "samplers one --snapshots folder"
+            ) from error
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise SnapshotGone(f"snapshot {name} can't be read: {error}") from error
+            raise SnapshotGone(f"snapshot {name} can't be read: {error}; the design begins elsewhere") from error
         if (form, made_by, list(coordinates)) != (FORM, self._environment, self._names):
             raise SnapshotGone(
-                f"expected a snapshot of {self._environment!r} in form {FORM}, got {name} of {made_by!r} in form {form}"
+                f"expected a snapshot of {self._environment!r} in form {FORM}, got {name} of {made_by!r} in "
+                f"form {form}: give each environment a --snapshots folder of its own"
             )
         if hashlib.sha256(state).hexdigest() != digest:
-            raise SnapshotGone(f"snapshot {name} is damaged: its bytes are not those that were written")
+            raise SnapshotGone(
+                f"snapshot {name} is damaged: its bytes are not those that were written; the design begins elsewhere"
+            )
         return tuple(map(float, coordinates.values())), state
 
     def drop(self, name: str) -> None:
@@ -152,7 +158,9 @@ class SnapshotFolder:
                 raise
         except OSError as error:
             raise SnapshotNotKept(
-                f"expected to write a snapshot to {self._folder}: {error.strerror or error}"
+                f"expected to write a snapshot to {self._folder}: {error.strerror or error}; free space, or "
+                "name another folder "
+                "by --snapshots"
             ) from error
 
     def _require_room(self) -> None:
@@ -165,7 +173,9 @@ class SnapshotFolder:
             probe.unlink()
         except OSError as error:
             raise UnusableFolder(
-                f"expected a folder for snapshots that can be written to, got {self._folder}: {error.strerror or error}"
+                f"expected a folder for snapshots that can be written to, got {self._folder}: "
+                f"{error.strerror or error}; "
+                "name another by --snapshots"
             ) from error
         for path in self._folder.glob(f"*{UNFINISHED}"):
             with suppress(OSError):  # another sampler removed it

@@ -58,7 +58,10 @@ def read_check(folder: Path, policy: str) -> StoredCheck:
     """
     path = folder / FILE
     if not path.is_file():
-        raise UnusableCheck(f"expected {path}, which surrogym deploy --check writes, got no such file")
+        raise UnusableCheck(
+            f"expected {path}, which surrogym deploy --check writes, got no such file: deploy the policy with "
+            "--check first"
+        )
     with path.open("rb") as file:
         content = file.read(MOST_BYTES + 1)
     if len(content) > MOST_BYTES:

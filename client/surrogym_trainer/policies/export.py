@@ -176,7 +176,10 @@ def _difference(ours: Predict, theirs: Predict, size: int) -> float:
     observations = (3 * np.random.default_rng(0).standard_normal((CHECKS, size))).astype(np.float32)
     expected, got = ours(observations), theirs(observations)
     if expected.shape != got.shape:
-        raise NotExportable(f"expected the file to give actions of shape {expected.shape}, got {got.shape}")
+        raise NotExportable(
+            f"expected the file to give actions of shape {expected.shape}, got {got.shape}: use the policy's "
+            "zip file instead"
+        )
     largest = float(np.abs(expected.astype(np.float64) - got).max())
     bound = TOLERANCE * max(float(np.ptp(expected)), 1.0) if expected.dtype.kind == "f" else 0.0
     if not largest <= bound:

@@ -67,7 +67,9 @@ def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
     card, form = read_card(policy), _form(policy)
     name = surrogate or card.surrogate
     if name is None:
-        raise UnusablePolicy(f"expected the name of a surrogate, because no card beside {policy} names one")
+        raise UnusablePolicy(
+            f"expected the name of a surrogate, because no card beside {policy} names one: give --surrogate NAME"
+        )
     try:
         card_sent, curve = as_pushed(card), thinned(card.curve)
     except ValidationError as error:

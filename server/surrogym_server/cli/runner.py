@@ -139,7 +139,9 @@ def _listen(host: str, port: int) -> socket.socket:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(address)
     except OSError as error:
-        raise InvalidInput(f"can't listen on {host} port {port}: {error.strerror or error}") from error
+        raise InvalidInput(
+            f"can't listen on {host} port {port}: {error.strerror or error}; choose another by --host and --port"
+        ) from error
     return listener
 
 

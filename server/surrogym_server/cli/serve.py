@@ -162,5 +162,5 @@ def _refuse_workers() -> None:
     workers = os.environ.get(WORKERS_VARIABLE, "1")
     if workers != "1":
         raise InvalidInput(
-            f"expected one worker process, got {WORKERS_VARIABLE}={workers}: sessions live in one process"
+            f"expected one worker process, got {WORKERS_VARIABLE}={workers}: sessions live in one process, so unset it"
         )

@@ -71,7 +71,7 @@ def _table(body: wire.DraftLog | wire.AddLog) -> tuple[Table, Roles]:
         )
     table = table_of_text(body.text.removeprefix("\ufeff"), WHERE, MOST_ROWS)
     if not len(table):
-        raise UnusableLog(f"expected rows below the heading in {WHERE}, got none")
+        raise UnusableLog(f"expected rows below the heading in {WHERE}, got none: add the steps")
     return read_roles(table, body.mapping)
 
 

@@ -72,7 +72,10 @@ class SampleService:
         checked = [_checked(definition, index, sample) for index, sample in enumerate(samples)]
         check_trajectories(checked)
         if key is None and log is None and any(sample.query_id is None for sample in checked):
-            raise InvalidInput("samples without a query_id: expected an idempotency_key, got none")
+            raise InvalidInput(
+                "samples without a query_id: expected an idempotency_key, a text of your own that names this "
+                "request, got none"
+            )
         added = self._storage.samples.add(name, sampler, checked, key=key, log=log)
         if log is not None and log.complete and added.restart is None:
             self._withdraw_covered(name, definition)
@@ -167,7 +170,9 @@ def check_trajectories(samples: Sequence[NewSample]) -> None:
 def _checked(definition: EnvironmentDefinition, index: int, sample: NewSample) -> NewSample:
     where = f"samples.{index}"
     if (sample.query_id is None) != (sample.lease_token is None):
-        raise InvalidInput(f"{where}: expected query_id and lease_token together, got one of them")
+        raise InvalidInput(
+            f"{where}: expected query_id and lease_token together, got one of them: send both, as the claim gave them"
+        )
     check_coordinates(definition, f"{where}.coordinates", np.array([sample.coordinates]))
     check_coordinates(definition, f"{where}.next_coordinates", np.array([sample.next_coordinates]))
     for what in ("observation", "next_observation"):

@@ -187,7 +187,8 @@ def check_same(name: str, had: Any, got: Any) -> None:
     if had != got:
         where, old, new = difference(had, got)
         raise SpecConflict(
-            f"{name!r} exists with another specification: {where} was created as {short(old)}, got {short(new)}"
+            f"{name!r} exists with another specification: {where} was created as {short(old)}, got "
+            f"{short(new)}; register this one under another name"
         )
 
 

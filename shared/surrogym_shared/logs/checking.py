@@ -142,9 +142,15 @@ def _of_spec(roles: Roles, spec: EnvironmentSpec) -> Roles:
             f"{missing[0]!r} is missing; name the columns in a mapping file (--map)"
         )
     if len(roles.action) != spec.action.size:
-        raise UnusableLog(f"expected {spec.action.size} columns of the action, got {list(roles.action.values())}")
+        raise UnusableLog(
+            f"expected {spec.action.size} columns of the action, got {list(roles.action.values())}: name them "
+            "in a mapping file (--map)"
+        )
     if roles.reward is None and spec.reward.kind == "learned":
-        raise UnusableLog("expected a column of the reward, which the specification has learned, got none")
+        raise UnusableLog(
+            "expected a column of the reward, which the specification has learned, got none: name it in a "
+            "mapping file (--map)"
+        )
     return replace(
         roles,
         state={name: roles.state[name] for name in spec.coordinate_names},

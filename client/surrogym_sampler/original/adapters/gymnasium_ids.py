@@ -40,7 +40,8 @@ def open_simulator(name: str) -> Simulator:
     env = make(name)
     if type(env.observation_space).__name__ in SYMBOLS:
         raise UnknownEnvironment(
-            f"{name} shows {env.observation_space}, a symbol out of several: expected numbers that change gradually"
+            f"{name} shows {env.observation_space}, a symbol out of several: expected numbers that change gradually; "
+            "write a class that gives such numbers (docs/how-to/own-environment.md)"
         )
     limit = env.spec.max_episode_steps
     wrapped = getattr(env.spec, "additional_wrappers", ())  # these may change observations and rewards
@@ -165,7 +166,10 @@ class ResetOnly(_Gymnasium):
         return self._last
 
     def write(self, state: Array) -> None:
-        raise UnknownEnvironment(f"{self._name} can't be set to {state.tolist()}: its state can't be read")
+        raise UnknownEnvironment(
+            f"{self._name} can't be set to {state.tolist()}, because its state can't be read: register it "
+            "with --access reset"
+        )
 
     def observe(self) -> Array:
         return self._last

@@ -89,6 +89,6 @@ def flat(name: str, observation: Any) -> Array:
     if any(sum(size > 1 for size in a.shape) > 1 or a.dtype.kind not in "fiub" for a in arrays):
         raise UnknownEnvironment(
             f"{name} observes images, or values that are not numbers: expected a row of numbers, or a dictionary of "
-            "rows"
+            "rows; write a class that gives them (docs/how-to/own-environment.md)"
         )
     return np.concatenate([a.astype(np.float64).ravel() for a in arrays])

@@ -39,9 +39,14 @@ def require_few(name: str, variables: Sequence[Variable], moved: NDArray[np.bool
 def require_numbers(name: str, states: Sequence[Array], rewards: Array) -> None:
     """Raise ``UnknownEnvironment`` if states, each (n, V), or rewards (n,) are infinite or NaN."""
     if not all(np.isfinite(some).all() for some in states):
-        raise UnknownEnvironment(f"{name} reached states with infinite values or NaN: expected finite numbers")
+        raise UnknownEnvironment(
+            f"{name} reached states with infinite values or NaN: expected finite numbers; narrow its actions, "
+            "or correct it"
+        )
     if not np.isfinite(rewards).all():
-        raise UnknownEnvironment(f"{name} paid infinite rewards or NaN under random actions: expected numbers")
+        raise UnknownEnvironment(
+            f"{name} paid infinite rewards or NaN under random actions: expected finite numbers; correct its reward"
+        )
 
 
 def require_coordinates(name: str, count: int, steps: int) -> None:

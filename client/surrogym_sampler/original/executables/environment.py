@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from surrogym_sampler.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_sampler.original.errors import MORE_TIME, EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
 from surrogym_sampler.original.executables.messages import (
     PROTOCOL,
     Reply,
@@ -25,7 +25,6 @@ from surrogym_sampler.original.protocol import Array, RealStep
 from surrogym_shared.spec import EnvironmentSpec
 
 PREFIX = "exec:"
-MORE_TIME = "a larger --step-limit gives it more time"
 START_LIMIT = 120.0  # seconds until the specification is there; a simulator may start slowly
 
 

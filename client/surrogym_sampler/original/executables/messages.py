@@ -22,6 +22,7 @@ PROTOCOL = 1
 LONGEST_LINE = 1 << 24  # bytes, without the end of the line
 SHOWN = 80  # characters of a line that an error repeats
 SHOWN_ERROR = 400  # characters of a program's own error
+CHECK = "surrogym conformance --exec COMMAND checks the program"
 
 Reply = dict[str, Any]
 
@@ -52,22 +53,24 @@ def decode(line: bytes, number: int) -> Reply:
     try:
         answer = json.loads(line, parse_constant=_not_finite, object_pairs_hook=_once)
     except _NotFinite as error:
-        raise StepFailed(f"expected finite numbers from the program, got {error} in {short(line)}") from error
+        raise StepFailed(f"expected finite numbers from the program, got {error} in {short(line)}; {CHECK}") from error
     except _Twice as error:
-        raise StepFailed(f"expected each key once from the program, got {error} twice in {short(line)}") from error
+        raise StepFailed(
+            f"expected each key once from the program, got {error} twice in {short(line)}; {CHECK}"
+        ) from error
     except (ValueError, RecursionError) as error:
         raise StepFailed(
             f"expected one line of JSON from the program, got {short(line)}; let it print everything else to "
             "standard error"
         ) from error
     if not isinstance(answer, dict) or type(answer.get("id")) is not int or answer["id"] != number:
-        raise StepFailed(f"expected an answer with id {number} from the program, got {short(line)}")
+        raise StepFailed(f"expected an answer with id {number} from the program, got {short(line)}; {CHECK}")
     if answer.get("error") is not None:
         said, code = one_line(str(answer["error"]), SHOWN_ERROR), one_line(str(answer.get("code", "failed")), SHOWN)
         words = f"the program answered: {said or 'an error without words'}"
         raise StepRefused(words) if code == "refused" else RequestRefused(words, code)
     if not isinstance(answer.get("result"), dict):
-        raise StepFailed(f"expected 'result' or 'error' in the program's answer, got {short(line)}")
+        raise StepFailed(f"expected 'result' or 'error' in the program's answer, got {short(line)}; {CHECK}")
     result: Reply = answer["result"]
     return result
 
@@ -80,7 +83,7 @@ def numbers(reply: Reply, key: str, size: int) -> Array:
     """
     came = reply.get(key)
     if not isinstance(came, list) or len(came) != size or not all(map(_is_number, came)):
-        raise StepFailed(f"expected {size} finite numbers for {key!r} in the program's answer, got {_got(reply, key)}")
+        raise _wrong(f"{size} finite numbers", reply, key)
     return np.array(came, dtype=np.float64)
 
 
@@ -91,7 +94,7 @@ def number(reply: Reply, key: str) -> float:
         StepFailed: the reply has none under this key.
     """
     if not _is_number(reply.get(key)):
-        raise StepFailed(f"expected a finite number for {key!r} in the program's answer, got {_got(reply, key)}")
+        raise _wrong("a finite number", reply, key)
     return float(reply[key])
 
 
@@ -103,7 +106,7 @@ def truth(reply: Reply, key: str) -> bool:
     """
     came = reply.get(key)
     if not isinstance(came, bool):
-        raise StepFailed(f"expected true or false for {key!r} in the program's answer, got {_got(reply, key)}")
+        raise _wrong("true or false", reply, key)
     return came
 
 
@@ -115,7 +118,7 @@ def text(reply: Reply, key: str) -> str:
     """
     came = reply.get(key)
     if not isinstance(came, str):
-        raise StepFailed(f"expected a text for {key!r} in the program's answer, got {_got(reply, key)}")
+        raise _wrong("a text", reply, key)
     return came
 
 
@@ -141,7 +144,14 @@ def specification_in(reply: Reply) -> EnvironmentSpec:
     try:
         return EnvironmentSpec.model_validate_json(json.dumps(reply.get("spec")))
     except ValidationError as error:
-        raise UnknownEnvironment(f"expected a valid specification from the program: {first_fault(error)}") from error
+        raise UnknownEnvironment(
+            f"expected a valid specification from the program: {first_fault(error)}; {CHECK}"
+        ) from error
+
+
+def _wrong(expected: str, reply: Reply, key: str) -> StepFailed:
+    """The error for an entry of an answer that is not what was ``expected``."""
+    return StepFailed(f"expected {expected} for {key!r} in the program's answer, got {_got(reply, key)}; {CHECK}")
 
 
 def _is_number(value: object) -> bool:

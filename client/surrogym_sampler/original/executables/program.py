@@ -54,7 +54,10 @@ class Program:
         if not self._words:
             raise UnknownEnvironment("expected a command such as './plant --port 7', got an empty one")
         if os.name == "nt":
-            raise UnknownEnvironment("expected Linux or macOS to start a program, got Windows")
+            raise UnknownEnvironment(
+                "expected Linux or macOS to start a program, got Windows: run the sampler there; the server "
+                "may run elsewhere"
+            )
         self._process: subprocess.Popen[bytes] | None = None
         self._guard: Guard | None = None
         self._standard_error: StandardError | None = None

@@ -71,7 +71,7 @@ def read_choices(name: str) -> tuple[Path, Choices]:
             f"{path}: {wrong}; expected fmu, and optionally step, actions, coordinates and start"
         ) from error
     except ValueError as error:
-        raise UnknownEnvironment(f"{path} is not JSON: {error}") from error
+        raise UnknownEnvironment(f"{path} is not JSON: {error}; correct it there") from error
     return path.parent / given.fmu, _choices(path, given)
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from surrogym_sampler.original.errors import (
+    MORE_TIME,
     EnvironmentDied,
     OriginalError,
     RequestRefused,
@@ -24,7 +25,6 @@ from surrogym_sampler.original.errors import (
     StepTimedOut,
     UnknownEnvironment,
 )
-from surrogym_sampler.original.executables.environment import MORE_TIME
 from surrogym_sampler.original.executables.messages import Reply, numbers, truth
 from surrogym_sampler.original.executables.program import Program
 from surrogym_sampler.original.fmus.archive import Archive, Declared

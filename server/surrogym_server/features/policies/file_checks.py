@@ -25,7 +25,7 @@ def check_file(form: str, content: bytes, size: int, digest: str) -> None:
         raise InvalidInput(f"expected a file of {size} bytes, as announced, got {len(content)}: send the whole file")
     found = hashlib.sha256(content).hexdigest()
     if found != digest:
-        raise InvalidInput(f"expected a file with SHA-256 {digest}, as announced, got {found}")
+        raise InvalidInput(f"expected a file with SHA-256 {digest}, as announced, got {found}: send the file again")
     expected, looks_right = FORMS[form]
     if not looks_right(content):
         raise InvalidInput(f"expected {expected}, got content that begins with {content[:8]!r}")

@@ -188,7 +188,9 @@ class PolicyService:
         """Let an alias point to a version. Raises ``UnknownPolicy``, or ``InvalidInput`` for the reserved alias of the
         newest."""
         if alias == LATEST:
-            raise InvalidInput(f"expected another alias than {LATEST!r}, which is always the newest version")
+            raise InvalidInput(
+                f"expected another alias than {LATEST!r}, which is always the newest version: choose another word"
+            )
         self._policies.put_alias(name, alias, version)
         self._changed(name)
         return self._policies.get(name, alias)

@@ -166,7 +166,9 @@ class RecordedEngine(SessionEngine):
 
     async def _restored(self, id: str, taken: TakenSession) -> None:
         if taken.machine != self._leases.machine:
-            raise await self._lost(id, "no host of the same kind of machine is left, and another rounds differently")
+            raise await self._lost(
+                id, "no host of the same kind of machine is left, and another kind rounds numbers differently"
+            )
         if taken.checkpoint.data is None:
             raise await self._lost(id, "it was too large to be recorded")
         try:
@@ -194,7 +196,10 @@ class RecordedEngine(SessionEngine):
         """Raise if the lease was lost during a request, for example while a signal had stopped this process."""
         self._leases.require(id)
         if not self._leases.holds(id):
-            raise UnknownSession(f"session {id!r} was closed, or taken by another host, during this request")
+            raise UnknownSession(
+                f"session {id!r} was closed, or taken by another host, during this request: send the request "
+                "again, or open a new session"
+            )
 
     async def _settle(self) -> None:
         """Delete the records of sessions that the inner engine has ended."""

@@ -28,7 +28,7 @@ def read_parameters(path: Path) -> dict[str, Any]:
     try:
         given = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise UnknownEnvironment(f"{path} is not JSON: {error}") from error
+        raise UnknownEnvironment(f"{path} is not JSON: {error}; correct it there") from error
     if not isinstance(given, dict) or (lacking := [key for key in NEEDED if key not in given]):
         lacks = f"; it lacks {', '.join(lacking)}" if isinstance(given, dict) else ""
         raise UnknownEnvironment(f"{path}: expected an object with {', '.join(NEEDED)}{lacks}")
