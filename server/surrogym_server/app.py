@@ -116,8 +116,13 @@ class _Process:
     metrics: ProcessMetrics
 
 
-def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI:
+def create_app(settings: Settings, design: DesignPort = DesignPort(), fits: Fits | None = None) -> FastAPI:
     """The server as an ASGI app. Its database is open from here to the end of its lifespan.
+
+    Args:
+        settings: the server's settings.
+        design: choice of the first queries, and computation of a round.
+        fits: processes that compute rounds, if they have started already. The app closes them.
 
     Raises:
         InvalidInput: the address of the database can't be used, the device is not there, or the cluster is not, or is
@@ -135,7 +140,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         title="Surrogym",
         version=version("surrogym"),
         description=DESCRIPTION,
-        lifespan=lambda app: _lifespan(app, settings, storage, design, engine),
+        lifespan=lambda app: _lifespan(app, settings, storage, design, engine, fits),
         docs_url=None,
         redoc_url=None,
         openapi_url=None,
@@ -197,11 +202,16 @@ def say_goodbye(app: FastAPI) -> None:
 
 @asynccontextmanager
 async def _lifespan(
-    app: FastAPI, settings: Settings, storage: Storage, design: DesignPort, engine: SessionEngine | None
+    app: FastAPI,
+    settings: Settings,
+    storage: Storage,
+    design: DesignPort,
+    engine: SessionEngine | None,
+    fits: Fits | None,
 ) -> AsyncIterator[State]:
     torch.set_num_threads(settings.threads)
     threadpool_limits(settings.threads, user_api="blas")  # of NumPy, in which policies act
-    process = _build_process(settings, design, storage, app.state.metrics, engine)
+    process = _build_process(settings, design, storage, app.state.metrics, engine, fits)
     app.state.notices = process.notices
     services = _build_services(settings, design, process)
     core = Core(settings, storage, process.notices, process.metrics, _complete)
@@ -234,7 +244,12 @@ async def _lifespan(
 
 
 def _build_process(
-    settings: Settings, design: DesignPort, storage: Storage, metrics: ProcessMetrics, engine: SessionEngine | None
+    settings: Settings,
+    design: DesignPort,
+    storage: Storage,
+    metrics: ProcessMetrics,
+    engine: SessionEngine | None,
+    fits: Fits | None,
 ) -> _Process:
     definitions = Definitions(storage, _stored_definition)
     models = ModelCache(
@@ -250,8 +265,9 @@ def _build_process(
         device=torch.device(settings.device),
     )
     cluster = _cluster(settings.engine)
-    fits = (cluster and cluster.fits(settings, design.run)) or Fits(design.run, settings.fit_workers)
-    return _Process(storage, definitions, models, engine, fits, Notices(storage.announcements), metrics)
+    compute = cluster and cluster.fits(settings, design.run)
+    compute = compute or fits or Fits(design.run, settings.fit_workers)
+    return _Process(storage, definitions, models, engine, compute, Notices(storage.announcements), metrics)
 
 
 def _build_services(settings: Settings, design: DesignPort, process: _Process) -> Services:

@@ -2,6 +2,8 @@
 
 import itertools
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -314,3 +316,15 @@ def test_as_many_threads_as_no_machine_has_are_refused(threads: Any):
     """Torch would start them, and the process end."""
     with pytest.raises(ValueError, match="threads: expected a whole number from 1 to 1024, got"):
         TrainSettings(threads=threads)
+
+
+def test_the_default_search_loads_neither_torch_nor_stable_baselines():
+    """They take some three seconds of a core to import, at the start of every training."""
+    program = """
+import sys
+import surrogym_trainer.training.audited
+import surrogym_trainer.training.fast_ppo.search
+print(*sorted({"torch", "stable_baselines3"} & {*sys.modules}))
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert ended.stdout.split() == []

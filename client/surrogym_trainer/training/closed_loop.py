@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
-from surrogym_client.sb3 import SurrogateVecEnv
+from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.transport.api import Api
 from surrogym_shared.port import SurrogatePort
@@ -207,16 +206,16 @@ def visit(
     """
     spec = port.spec()
     act = search_for(settings).explorer(learned.path, learned.algorithm, VISIT_LANES)
-    options = {**settings.session, "occupancy": True}
-    env = SurrogateVecEnv.from_port(port, VISIT_LANES, seed=settings.seed, **options)
+    options = {**settings.session, "occupancy": True, "seed": settings.seed}
+    lanes = Lanes(port, session_request(VISIT_LANES, "same_step", options))
     steps = min(spec.time_limit or VISIT_STEPS, VISIT_STEPS)
     try:
-        observation: Any = env.reset()
+        observation = lanes.reset().observation
         for _ in range(steps):
-            observation, _, _, _ = env.step(act(observation))
-        submitted = env.submit_occupancy(checkpoint)
+            observation = lanes.step(act(observation)).result.observation
+        submitted = port.submit_occupancy(lanes.view.id, checkpoint)
     finally:
-        env.close()
+        lanes.close()
     return steps * VISIT_LANES, submitted.confidence_index
 
 

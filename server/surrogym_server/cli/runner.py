@@ -10,7 +10,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
 
@@ -21,6 +21,7 @@ from surrogym_server import logs
 from surrogym_server.api.stepping.messages import prompt
 from surrogym_server.app import create_app, say_goodbye
 from surrogym_server.cli.connections import connections_within, patient
+from surrogym_server.engine.fits import Fits
 from surrogym_server.errors import InvalidInput
 from surrogym_server.settings import Settings
 
@@ -102,11 +103,22 @@ def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool, tel
         Unavailable: the database is in use by another server, or does not answer.
     """
     logs.configure(settings.log_level, settings.log_format)
-    with _listen(settings.host, settings.port) as listener:
-        runner = Runner(create_app(settings), settings, _url(listener, settings), ready_file, tell)
+    with _fits(settings) as fits, _listen(settings.host, settings.port) as listener:
+        runner = Runner(create_app(settings, fits=fits), settings, _url(listener, settings), ready_file, tell)
         if exit_with_parent:
             threading.Thread(target=_end_with_parent, args=(runner, os.getppid()), daemon=True).start()
         runner.run(sockets=[listener])
+
+
+@contextmanager
+def _fits(settings: Settings) -> Iterator[Fits | None]:
+    """Start the process of the fits, while this one is small enough to fork. None if fits may run in a cluster."""
+    if settings.engine != "local":
+        yield None
+        return
+    with closing(Fits(idle=settings.fit_workers, forks=True)) as fits:
+        fits.start()
+        yield fits
 
 
 @contextmanager

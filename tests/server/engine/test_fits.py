@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -48,6 +51,35 @@ def test_a_job_is_done_in_another_process(started: Started):
     fits = started(jobs.answer)
     assert run(fits).data_hash not in ("", str(os.getpid()))
     assert run(fits).data_hash == run(fits).data_hash, "one process does them all"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems don't allow a fork")
+def test_the_first_process_may_be_a_fork_which_ends_with_its_parent_too():
+    """In a program of its own, because this one has threads."""
+    program = """
+import asyncio, os, signal, sys
+from support import jobs
+from surrogym_server.engine.fits import Fits
+
+class Job:
+    state = {"answer": True}
+
+fits = Fits(jobs.answer, forks=True)
+fits.start()
+process = asyncio.run(fits.run(Job())).data_hash
+assert process != str(os.getpid())
+print(process, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
+    ended = subprocess.run(
+        [sys.executable, "-c", program], env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True
+    )
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
+    deadline = time.monotonic() + 30
+    while _alive(int(ended.stdout)):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def test_it_yields_to_whoever_steps(started: Started):
