@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from surrogym_server.cli import optimise, serve
+from surrogym_server.cli import serve
 
 
 def main() -> None:
@@ -12,7 +12,6 @@ def main() -> None:
     app = typer.Typer(name="surrogym-server", no_args_is_help=True, add_completion=False)
     app.callback()(_keep_names)
     serve.register(app)
-    optimise.register(app)
     app()
 
 

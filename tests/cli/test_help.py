@@ -20,7 +20,7 @@ def test_help_has_an_example(surrogym, command):
 def test_the_command_alone_lists_all_commands(surrogym):
     said = surrogym("--help")
     assert said.code == 0
-    assert all(f"  {command} " in said.out for command in (*COMMANDS, "serve", "optimise"))
+    assert all(f"  {command} " in said.out for command in (*COMMANDS, "serve"))
     listed = said.out.partition("Start:")[2]
     assert "..." not in listed  # each says what it does in a line that is whole
     assert [line for line in listed.splitlines() if line.endswith(":")] == ["Loop:", "After:", "Operate:"]

@@ -20,7 +20,6 @@ ELSEWHERE = {
     "describe": "test_describe.py",
     "evaluate": "test_commands.py",
     "export-policy": "tests/policies/test_export.py",
-    "optimise": "tests/server/cli/test_optimise.py",
     "policy alias": "test_commands.py",
     "policy delete": "test_commands.py",
     "policy get": "test_commands.py",

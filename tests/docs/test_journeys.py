@@ -42,7 +42,6 @@ SHORTER = {
     "register": ["--budget", "12"],
     "train": ["--steps", "512", "--num-envs", "16"],
     "evaluate": ["--episodes", "1"],
-    "optimise": ["--updates", "1"],
 }
 IN_PROGRAMS = {"0_000": "00", "num_envs=16": "num_envs=2"}
 READERS_FUNCTIONS = (

@@ -57,7 +57,6 @@ def test_it_brings_the_commands(wheel: ZipFile) -> None:
     (entry_points,) = (name for name in wheel.namelist() if name.endswith("entry_points.txt"))
     text = wheel.read(entry_points).decode()
     assert "surrogym = surrogym.cli:main" in text
-    assert "gradients = surrogym_server.gradients" in text
     assert "serve = surrogym_server.cli.serve:register" in text
 
 

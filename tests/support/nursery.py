@@ -30,7 +30,6 @@ import torch
 from threadpoolctl import threadpool_limits
 
 MODULES = (
-    "surrogym_server.cli.optimise",
     "surrogym_server.cli.runner",
     "surrogym_server.cli.serve",
     "surrogym_server.models.gaussian_process.prediction.compiled.regions",

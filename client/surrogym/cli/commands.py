@@ -15,7 +15,6 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     "Loop": ("describe", "register", "sample", "train", "audit", "evaluate", "status"),
     "After": (
         *("report", "policies", "policy", "improve", "change", "export", "import", "export-policy", "deploy", "delete"),
-        "optimise",
     ),
     "Operate": ("work", "jobs", "conformance"),
 }

@@ -28,7 +28,7 @@ class SearchOptions:
         str | None,
         typer.Option(
             help="Policy search: fastppo (PPO in compiled code), ppo, a2c, sac, td3, ddpg, dqn (Stable-Baselines3), "
-            "cmaes, gradient, or one from an installed package. [default: fastppo; ppo if --log, --set or --start-from "
+            "cmaes, or one from an installed package. [default: fastppo; ppo if --log, --set or --start-from "
             "needs it, or if the specification has the paper's preset]",
             show_default=False,
         ),
@@ -168,7 +168,7 @@ class StartOptions:
             min=0,
             max=1,
             help="Share of episodes that start at a state at which a real step was taken, between 0 and 1. Then no "
-            "episode starts anywhere in the sampling range unless --start-box is given. Not with cmaes or gradient. "
+            "episode starts anywhere in the sampling range unless --start-box is given. Not with cmaes. "
             "[default: 0]",
         ),
     ] = None
@@ -177,7 +177,7 @@ class StartOptions:
         typer.Option(
             min=1,
             help="Longest episode of the training, in virtual steps. The critic values what would follow. Policies "
-            "are still compared over whole episodes. Not with cmaes or gradient. [default: the time limit]",
+            "are still compared over whole episodes. Not with cmaes. [default: the time limit]",
         ),
     ] = None
     start_from: Annotated[Path | None, typer.Option(help="Policy file to continue the training from.")] = None

@@ -105,7 +105,7 @@ class AuditedTraining:
     @property
     def _chosen(self) -> TrainSettings:
         settings = with_algorithm(self.settings, self.port.spec())
-        return chosen_for(self.api.surrogate(self.name), settings, by_mean=search_for(settings).by_mean)
+        return chosen_for(self.api.surrogate(self.name), settings)
 
     def _subject(self, result: TrainResult) -> Subject:
         predict, settings = load_policy(result.path, result.algorithm), self.settings

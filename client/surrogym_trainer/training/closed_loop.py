@@ -178,7 +178,7 @@ def _for_use(view: SurrogateView, settings: TrainSettings, *, region_known: bool
     with a new network and the variant of draws, because a network that has learned from wrong models keeps what they
     taught it.
     """
-    last = chosen_for(view, settings, by_mean=search_for(settings).by_mean)
+    last = chosen_for(view, settings)
     anew = last is not settings and settings.start_from is None and not region_known
     return replace(last, anew=anew)
 

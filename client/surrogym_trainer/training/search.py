@@ -95,7 +95,6 @@ class PolicySearch(ABC):
     prolongable: ClassVar[bool] = False  # supports ``task.prolong``
     whole_episodes: ClassVar[bool] = True  # knows no other starts than the declared ones, and no shorter episodes
     tracked: ClassVar[bool] = False  # logs its curves to ``settings.tracker``
-    by_mean: ClassVar[bool] = False  # moves by the mean without noise, whatever the session's variant
     resumable: ClassVar[bool] = True  # can start from a policy, and so learn in rounds
 
     @abstractmethod
@@ -115,7 +114,6 @@ SEARCHES = Registry[PolicySearch](
         **{name: f"surrogym_trainer.training.stable_baselines.algorithms:{name}" for name in ALGORITHMS},
         FAST: "surrogym_trainer.training.fast_ppo.search:FastPpo",
         "CMAES": "surrogym_trainer.training.cma_es:CmaEs",
-        "GRADIENT": "surrogym_trainer.training.gradients:Gradients",
     },
 )
 

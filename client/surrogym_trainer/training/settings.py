@@ -76,7 +76,7 @@ class TrainSettings:
         return self.session if self.judge is None else self.judge
 
 
-def chosen_for(view: SurrogateView, settings: TrainSettings, *, by_mean: bool = False) -> TrainSettings:
+def chosen_for(view: SurrogateView, settings: TrainSettings) -> TrainSettings:
     """Return settings adapted to the phase that the surrogate's design ended in.
 
     - If the design has confirmed noise, the learned noise is added to the state. Noise of the sensors is added to
@@ -91,13 +91,12 @@ def chosen_for(view: SurrogateView, settings: TrainSettings, *, by_mean: bool = 
     Args:
         view: the surrogate.
         settings: settings that the user chose.
-        by_mean: whether the search moves by the mean without noise, whatever the session's variant.
     """
     if not view.spec.preset.adapts_training:
         return settings
     if view.spec.outside_reward is not None and settings.start_box is None:
         settings = replace(settings, start_box=0.0)
-    if not by_mean and noise_of(view):
+    if noise_of(view):
         settings = replace(settings, session={**noise_of(view), **settings.session})
     if "variant" in settings.session or view.phase == "ready":
         return settings

@@ -20,7 +20,7 @@ from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.environment.samples import Samples, increments, saturated
 from surrogym_server.environment.step_rules import moved, paid, placed
 from surrogym_server.errors import InvalidInput
-from surrogym_server.models.abilities import Differentiable, FunctionDraws, LeaveOneOut, LeaveOneOutErrors
+from surrogym_server.models.abilities import FunctionDraws, LeaveOneOut, LeaveOneOutErrors
 from surrogym_server.models.port import DynamicsModel, Learned, Learner, ModelCodec, StoredModel, Transition, Warm
 from surrogym_server.tensors import in_rows
 
@@ -59,7 +59,7 @@ class Regression:
 
 
 @dataclass(frozen=True)
-class LinearModel(DynamicsModel, FunctionDraws, LeaveOneOut, Differentiable):
+class LinearModel(DynamicsModel, FunctionDraws, LeaveOneOut):
     """Three regressions: of the increments, of the reward, and of the labels of an end."""
 
     definition: EnvironmentDefinition

@@ -3,7 +3,7 @@
 import { h } from "/page/dom.js";
 import { count } from "/page/format.js";
 
-const ALGORITHMS = ["fastppo", "ppo", "a2c", "sac", "td3", "ddpg", "dqn", "cmaes", "gradient"];
+const ALGORITHMS = ["fastppo", "ppo", "a2c", "sac", "td3", "ddpg", "dqn", "cmaes"];
 const EPISODES = 20;
 
 

@@ -331,10 +331,3 @@ class WrittenInC(ABC):
     def step_source(self) -> StepSource | None:
         """Return the source; None if this installation lacks numba, which lays out the tables, or if the model is on
         another device. Its steps are those of ``transition``, except for the last bits."""
-
-
-class Differentiable:
-    """Mark of a model whose ``transition`` autograd can differentiate with respect to q and u. It has no methods.
-
-    For a model without this mark, the policy search ``gradient`` is refused with one sentence.
-    """

@@ -9,7 +9,6 @@ import torch
 
 from surrogym_server.environment.points import Points
 from surrogym_server.models.abilities import (
-    Differentiable,
     FunctionDraws,
     LearnedNoise,
     LeaveOneOut,
@@ -139,25 +138,6 @@ def doubts_about_edges_are_probabilities_of_error(case: ModelCase) -> None:
             assert 0 <= float(doubt.min()) <= float(doubt.max()) <= 0.5
 
 
-def gradients_are_those_of_differences(case: ModelCase) -> None:
-    if offers(case.model, Differentiable) is None or case.definition.action.nvec:
-        return
-    q, u = 0.5 * case.points.q[:3], case.points.u[:3].clone().requires_grad_()
-
-    def total(action: torch.Tensor) -> torch.Tensor:
-        made = case.model.transition(q, action)
-        return made.q_next[:, 1].sum() + made.reward.sum()
-
-    (gradient,) = torch.autograd.grad(total(u), u)
-    small = 1e-5
-    for row in range(3):
-        there = torch.zeros_like(u)
-        there[row] = small
-        with torch.no_grad():
-            difference = (total(u + there) - total(u - there)) / (2 * small)
-        assert math.isclose(float(gradient[row]), float(difference), rel_tol=1e-3, abs_tol=1e-5)
-
-
 def _paths(case: ModelCase, points: Points) -> PredictedSteps:
     """Three paths of four steps."""
     q_next = case.model.transition(points.q, points.u).q_next
@@ -175,5 +155,4 @@ LAWS_OF_ABILITIES: tuple[Callable[[ModelCase], None], ...] = (
     paths_tell_more_the_longer_they_are,
     steps_that_are_taken_lower_the_deviations,
     doubts_about_edges_are_probabilities_of_error,
-    gradients_are_those_of_differences,
 )

@@ -14,7 +14,7 @@ MAX_JOB_EPISODES = 1_000  # real episodes of an evaluation
 MAX_JOB_STEPS = 10_000_000  # virtual steps of a training
 MAX_JOB_POINTS = 200  # of a curve
 
-JobAlgorithm = Literal["ppo", "fastppo", "a2c", "sac", "td3", "ddpg", "dqn", "cmaes", "gradient"]
+JobAlgorithm = Literal["ppo", "fastppo", "a2c", "sac", "td3", "ddpg", "dqn", "cmaes"]
 JobPreset = Literal["default", "quick"]
 JobStage = Literal["preparing", "training", "auditing", "evaluating", "storing"]
 

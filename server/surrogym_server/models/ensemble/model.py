@@ -10,7 +10,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.step_rules import paid
-from surrogym_server.models.abilities import Differentiable, LearnedNoise
+from surrogym_server.models.abilities import LearnedNoise
 from surrogym_server.models.ensemble.networks import Networks, bounded
 from surrogym_server.models.ensemble.stepping import SteppedInBlocks, between, drawn_member
 from surrogym_server.tensors import cached
@@ -48,7 +48,7 @@ class Regression:
 
 
 @dataclass(frozen=True)
-class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise, Differentiable):
+class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
     """K members. The mean is the members' mean, and the standard deviation that between members. The noise of a
     transition depends on the state; the reward has none."""
 

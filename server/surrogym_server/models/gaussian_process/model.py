@@ -19,7 +19,6 @@ from surrogym_server.models.abilities import (
     ArraySteps,
     AtSamples,
     CompiledSteps,
-    Differentiable,
     FunctionDraws,
     LearnedNoise,
     LeaveOneOut,
@@ -65,7 +64,6 @@ class GaussianProcessModel(
     Lookahead,
     RewardEdges,
     RewardPeaks,
-    Differentiable,
     CompiledSteps,
     WrittenInC,
 ):
