@@ -22,7 +22,7 @@ MAX_PARAMETERS = 262_144  # most parameters of all layers together
 MAX_ROLLOUT = 100_000  # most steps of one request
 MAX_LANE_STEPS = 1_000_000  # most steps of all lanes together in one request
 MAX_ACTIVATIONS = 2**24  # most numbers of all lanes in the widest layer: 128 MiB
-MAX_LOG_DEVIATION = 80  # float32 holds its exponential
+MAX_LOG_DEVIATION = 80  # largest log standard deviation whose exponential is finite in float32
 
 Array = NDArray[np.floating[Any]]
 
@@ -57,7 +57,7 @@ class KeyedGenerator:
             "bit_generator": "Philox",
             "state": {"counter": _words(0, 0, key.step // key.hold, 0), "key": _words(key.seed, 0)},
             "buffer": _words(0, 0, 0, 0),
-            "buffer_pos": 4,  # discards buffered numbers of earlier draws
+            "buffer_pos": 4,  # random numbers that were buffered for another key are discarded
             "has_uint32": 0,
             "uinteger": 0,
         }
@@ -77,18 +77,18 @@ class ActingPolicy:
     mean: Array  # (D,) subtracted from an observation
     deviation: Array  # (D,) which divides the difference
     layers: tuple[Layer, ...]
-    activation: Activation = "tanh"  # of the hidden layers
-    log_deviations: Array | None = None  # (F,) of continuous actions with noise
+    activation: Activation = "tanh"  # activation function of the hidden layers
+    log_deviations: Array | None = None  # (F,) logarithms of the standard deviations of the noise; None without noise
 
     def __post_init__(self) -> None:
-        named = self._named()
+        arrays = self._named()
         if not 1 <= len(self.layers) <= MAX_LAYERS:
             raise ValueError(f"policy: expected 1 to {MAX_LAYERS} layers, got {len(self.layers)}")
-        for name, array in named.items():
+        for name, array in arrays.items():
             if array.dtype not in (np.float32, np.float64) or array.dtype != self.mean.dtype:
                 raise ValueError(f"policy: expected {name} as {_allowed(self.mean.dtype)}, got {array.dtype}")
         self._check_shapes()
-        for name, array in named.items():
+        for name, array in arrays.items():
             if not np.isfinite(array).all():
                 raise ValueError(f"policy: expected finite numbers in {name}, got NaN or infinity")
         if self.log_deviations is not None and np.abs(self.log_deviations).max() > MAX_LOG_DEVIATION:
@@ -117,10 +117,10 @@ class ActingPolicy:
         return np.concatenate([part.ravel() for layer in self.layers for part in layer])
 
     def _named(self) -> dict[str, Array]:
-        named = {"mean": self.mean, "deviation": self.deviation}
+        arrays = {"mean": self.mean, "deviation": self.deviation}
         for i, layer in enumerate(self.layers):
-            named |= {f"layers[{i}].weights": layer.weights, f"layers[{i}].bias": layer.bias}
-        return named if self.log_deviations is None else named | {"log_deviations": self.log_deviations}
+            arrays |= {f"layers[{i}].weights": layer.weights, f"layers[{i}].bias": layer.bias}
+        return arrays if self.log_deviations is None else arrays | {"log_deviations": self.log_deviations}
 
     def _check_shapes(self) -> None:
         size = self.mean.size
@@ -151,14 +151,14 @@ class PolicyRun:
     policy: ActingPolicy
     steps: int
     noise: NoiseKey | None = None
-    until: NDArray[np.bool_] | None = None  # (N,)
+    until: NDArray[np.bool_] | None = None  # (N,) lanes: stop once the episode of each has ended; None: take T steps
 
     def __post_init__(self) -> None:
         if not 1 <= self.steps <= MAX_ROLLOUT:
             raise ValueError(f"steps: expected 1 to {MAX_ROLLOUT}, got {self.steps}")
         if self.noise is not None and not (all(0 <= word < 2**63 for word in self.noise) and self.noise.hold):
-            shown = tuple(self.noise)
-            raise ValueError(f"noise: expected a seed and a step of 0 to 2^63 - 1 and a hold of 1 or more, got {shown}")
+            noise = tuple(self.noise)
+            raise ValueError(f"noise: expected a seed and a step of 0 to 2^63 - 1 and a hold of 1 or more, got {noise}")
 
 
 class Acted(NamedTuple):

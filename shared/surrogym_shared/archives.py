@@ -123,9 +123,9 @@ def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> Head
             raise ValueError(
                 f"expected an array {name!r} with a header of NumPy, got one that can't be read"
             ) from error
-        named, came = math.prod(shape) * dtype.itemsize, entry.file_size - file.tell()
-    if dtype.hasobject or min(shape, default=0) < 0 or named != came:
-        raise ValueError(f"expected an array {name!r} of numbers in {named} bytes, got {dtype} in {came} bytes")
+        declared, came = math.prod(shape) * dtype.itemsize, entry.file_size - file.tell()
+    if dtype.hasobject or min(shape, default=0) < 0 or declared != came:
+        raise ValueError(f"expected an array {name!r} of numbers in {declared} bytes, got {dtype} in {came} bytes")
     return Header(shape, dtype)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 COMPILERS = ("cc", "gcc", "clang")
-SECONDS = 600  # for a compilation
+SECONDS = 600  # longest time of a compilation
 SHOWN = 2_000  # characters of a compiler's errors
 
 
@@ -28,7 +28,7 @@ def c_compiler() -> tuple[str, ...] | None:
     if named := os.environ.get("CC", "").strip():
         try:
             command = tuple(shlex.split(named))
-        except ValueError:  # an open quote
+        except ValueError:  # a quotation mark is not closed
             command = ()
         if not command or shutil.which(command[0]) is None:
             raise CannotCompile(f"expected the variable CC to name a C compiler on the search path, got {named!r}")

@@ -11,9 +11,9 @@ from pydantic_core import ErrorDetails
 
 from surrogym_shared.entries import of_unknown
 
-LARGEST, NARROWEST = 1e12, 1e-12  # so that squares, products and float32 observations stay finite
+LARGEST, NARROWEST = 1e12, 1e-12  # bounds of numbers, so that squares, products and float32 observations stay finite
 SHOWN = 40  # characters of a wrong value in a message
-RESOLUTION = 1e-9  # narrowest range relative to the size of its numbers; rounding errors dominate below
+RESOLUTION = 1e-9  # narrowest range relative to the size of its numbers; in a narrower one rounding errors dominate
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False, strict=True)]
 Width = Annotated[float, Field(ge=NARROWEST, le=LARGEST, allow_inf_nan=False, strict=True)]
@@ -34,15 +34,15 @@ def require_range(what: str, low: float, high: float) -> None:
 
 
 def require_unique(what: str, names: Iterable[str]) -> None:
-    seen: set[str] = set()
+    earlier: set[str] = set()
     for name in names:
-        require(name not in seen, f"{what} {name!r} is given twice")
-        seen.add(name)
+        require(name not in earlier, f"{what} {name!r} is given twice")
+        earlier.add(name)
 
 
-def require_known(where: str, given: Iterable[str], known: Iterable[str]) -> None:
+def require_known(where: str, names: Iterable[str], known: Iterable[str]) -> None:
     known = list(known)
-    unknown = [name for name in given if name not in known]
+    unknown = [name for name in names if name not in known]
     require(not unknown, f"{where} names unknown {unknown}: expected some of {known}")
 
 

@@ -76,17 +76,16 @@ class Choices:
         return sum(self.counts)
 
     def sample(self, outputs: Array, further: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        with np.errstate(divide="ignore"):  # one draw in millions is 0, and its choice wins correctly
+        with np.errstate(divide="ignore"):  # a random number may be 0; its choice then wins with the score inf
             gumbel = -np.log(rng.standard_exponential(outputs.shape, dtype=_kind(outputs)))
-        chosen = [
-            part.argmax(1) for part in self.parts(outputs + gumbel)
-        ]  # the maximum with Gumbel noise is a draw from the softmax
-        actions = np.stack(chosen, 1).astype(np.float32)
+        # The largest output with Gumbel noise is a random choice with the probabilities of the softmax.
+        choices = [part.argmax(1) for part in self.parts(outputs + gumbel)]
+        actions = np.stack(choices, 1).astype(np.float32)
         return actions, self.log_probability(outputs, further, actions)
 
     def sent(self, actions: Array) -> NDArray[Any]:
-        chosen = actions.astype(np.int64)
-        return chosen[:, 0] if len(self.counts) == 1 else chosen
+        choices = actions.astype(np.int64)
+        return choices[:, 0] if len(self.counts) == 1 else choices
 
     def log_probability(self, outputs: Array, further: Array, actions: Array) -> Array:  # noqa: ARG002
         logs = [log_softmax(part) for part in self.parts(outputs)]

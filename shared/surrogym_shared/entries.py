@@ -17,25 +17,25 @@ def of_unknown(model: type[BaseModel], place: Sequence[int | str]) -> str:
         place: place of the entry, as pydantic gives it.
     """
     *above, name = place
-    allowed = list(dict.fromkeys(field for found in _models_at(model, above) for field in found.model_fields))
-    close = get_close_matches(str(name), allowed, n=1)
+    fields = list(dict.fromkeys(field for model in _models_at(model, above) for field in model.model_fields))
+    close = get_close_matches(str(name), fields, n=1)
     meant = f"; did you mean {close[0]!r}?" if close else ""
-    return f"unknown entry; expected some of {', '.join(allowed)}{meant}" if allowed else "unknown entry"
+    return f"unknown entry; expected some of {', '.join(fields)}{meant}" if fields else "unknown entry"
 
 
 def _models_at(model: type[BaseModel], place: Sequence[int | str]) -> list[type[BaseModel]]:
     """Return the models that the input at a place may be of. A place also has the tags of unions."""
-    found = [model]
+    models = [model]
     inner: list[Any] = [model]
     for part in place:
-        fields = [one.model_fields[part].annotation for one in found if part in one.model_fields]
+        fields = [one.model_fields[part].annotation for one in models if part in one.model_fields]
         if fields:
             inner = fields
-        found = [one for annotation in inner for one in _models_in(annotation)]
-        if not fields and (tagged := [one for one in found if _has_tag(one, str(part))]):
-            found = tagged
-        inner = list(found)
-    return found
+        models = [one for annotation in inner for one in _models_in(annotation)]
+        if not fields and (tagged := [one for one in models if _has_tag(one, str(part))]):
+            models = tagged
+        inner = list(models)
+    return models
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:

@@ -279,10 +279,10 @@ def action_of(request: StepRequest, shape: Shape) -> NDArray[np.float64]:
 
 def actions_of(request: RolloutRequest, shape: Shape) -> NDArray[np.float64]:
     """Return the actions (T, N, F) of a request, as a view of the frame. Raises ``FrameError``."""
-    lanes, size, got = shape.lanes, shape.action, request.actions.nbytes
-    steps, rest = divmod(got, lanes * size * FLOAT64.itemsize)
+    lanes, size, nbytes = shape.lanes, shape.action, request.actions.nbytes
+    steps, rest = divmod(nbytes, lanes * size * FLOAT64.itemsize)
     if rest or not 1 <= steps <= MAX_ROLLOUT:
-        raise FrameError(f"actions: expected 1 to {MAX_ROLLOUT} steps of {lanes} x {size} float64, got {got} bytes")
+        raise FrameError(f"actions: expected 1 to {MAX_ROLLOUT} steps of {lanes} x {size} float64, got {nbytes} bytes")
     return _array("actions", request.actions, FLOAT64, (steps, lanes, size))
 
 
@@ -348,7 +348,7 @@ def policy_reply(seq: int, result: PolicyRollout) -> PolicyReply:
         terminated=_flat(result.terminated, BOOL),
         truncated=_flat(result.truncated, BOOL),
         model_version=_flat(versions[0] if (versions == versions[0]).all() else versions, INT64),
-        reward_mean=None if mean.tobytes() == reward.tobytes() else mean,  # by bits: 0.0 equals -0.0
+        reward_mean=None if mean.tobytes() == reward.tobytes() else mean,  # compared by bytes, because 0.0 == -0.0
         final_steps=_flat(result.final_steps, INT64) if ended else None,
         final_lanes=_flat(result.final_lanes, INT64) if ended else None,
         final_observation=_flat(result.final_observation, FLOAT32) if ended else None,
@@ -500,7 +500,7 @@ def _require_size(name: str, view: memoryview, dtype: np.dtype[Any], shape: tupl
 
 
 def _checked(name: str, view: memoryview) -> memoryview:
-    if bytes(view).strip(b"\x00\x01"):  # any remaining byte is neither 0 nor 1
+    if bytes(view).strip(b"\x00\x01"):  # what remains without bytes 0 and 1
         raise FrameError(f"{name}: expected bytes 0 and 1, got others")
     return view
 

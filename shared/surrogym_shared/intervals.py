@@ -25,12 +25,12 @@ def of_mean(values: Sequence[float]) -> Interval | None:
     """
     if len(values) < 2:
         return None
-    given = np.asarray(values, dtype=np.float64)
-    rows = max(1, 2**20 // len(given))  # resamples at once: 8 MB
+    array = np.asarray(values, dtype=np.float64)
+    rows = max(1, 2**20 // len(array))  # resamples at once: 8 MB
     rng = np.random.default_rng(0)
     means = np.concatenate(
         [
-            given[rng.integers(len(given), size=(min(rows, RESAMPLES - begun), len(given)))].mean(1)
+            array[rng.integers(len(array), size=(min(rows, RESAMPLES - begun), len(array)))].mean(1)
             for begun in range(0, RESAMPLES, rows)
         ]
     )

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 try:
     from websockets.speedups import apply_mask
-except ImportError:  # a platform without the compiled extension
+except ImportError:  # websockets has no compiled extension on this platform
     from websockets.utils import apply_mask
 
 __all__ = ["KEY_BYTES", "MASKED", "WHOLE_BINARY", "Extent", "FrameSplitter", "apply_mask", "extent_of", "header"]
@@ -70,32 +70,32 @@ class FrameSplitter:
     def __init__(self, max_bytes: float = float("inf"), max_frames: float = float("inf")) -> None:
         self._max_bytes = max_bytes
         self._max_frames = max_frames
-        self._held = bytearray()
+        self._rest = bytearray()
         self._due = 0  # number of bytes needed before the next frame can be complete
 
     @property
-    def held(self) -> int:
+    def rest_bytes(self) -> int:
         """Bytes of the frame that is not complete yet."""
-        return len(self._held)
+        return len(self._rest)
 
     def split(self, chunk: bytes) -> list[tuple[bytes, Extent | None]]:
         """Return the frames that this chunk completes, in order, each with its extent. None marks one that is too
         long."""
-        if self._held:
-            self._held += chunk
-            if len(self._held) < self._due:
+        if self._rest:
+            self._rest += chunk
+            if len(self._rest) < self._due:
                 return []
-            chunk = bytes(self._held)
-            self._held.clear()
-        found: list[tuple[bytes, Extent | None]] = []
-        while chunk and len(found) <= self._max_frames:
+            chunk = bytes(self._rest)
+            self._rest.clear()
+        frames: list[tuple[bytes, Extent | None]] = []
+        while chunk and len(frames) <= self._max_frames:
             extent = extent_of(chunk)
             if extent is not None and extent.end - extent.payload > self._max_bytes:
-                return [*found, (chunk, None)]
+                return [*frames, (chunk, None)]
             if extent is None or extent.end > len(chunk):
-                self._held += chunk
+                self._rest += chunk
                 self._due = 0 if extent is None else extent.end
                 break
-            found.append((chunk[: extent.end], extent))  # slicing a whole chunk does not copy it
+            frames.append((chunk[: extent.end], extent))  # slicing a whole chunk does not copy it
             chunk = chunk[extent.end :]
-        return found
+        return frames

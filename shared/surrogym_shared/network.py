@@ -127,7 +127,7 @@ class Network:
         Raises:
             ValueError: the file has another form, or more than ``MAX_BYTES``.
         """
-        from surrogym_shared.archives import read_arrays, read_entries  # only who reads a file needs it
+        from surrogym_shared.archives import read_arrays, read_entries  # only reading a file needs this import
 
         try:
             entries = read_entries(path, MAX_BYTES)
@@ -167,8 +167,8 @@ def most_probable(y: NDArray[np.floating[Any]], low: Array, high: Array, counts:
         centre, reach = (low + high) / 2, (high - low) / 2
         return np.asarray(centre + reach * np.tanh(y), dtype=np.float32)
     groups = np.split(y, np.cumsum(counts)[:-1], axis=-1)
-    chosen = [group.argmax(-1) for group in groups]
-    return chosen[0] if len(chosen) == 1 else np.stack(chosen, -1)
+    choices = [group.argmax(-1) for group in groups]
+    return choices[0] if len(choices) == 1 else np.stack(choices, -1)
 
 
 def counts_of(spec: EnvironmentSpec) -> tuple[int, ...]:

@@ -26,12 +26,12 @@ class Preset:
     # What is learned.
     moves: Moves  # what the model of the transition predicts
     takes_declared_rewards: bool
-    penalty: float  # k of eq. 14
-    limits_rewards: bool  # by those of the samples
-    gaussian_process: Mapping[str, float | bool | str]  # settings of the family
+    penalty: float  # k of eq. 14: standard deviations that are subtracted from a predicted reward
+    limits_rewards: bool  # whether virtual rewards are limited by the samples' rewards
+    gaussian_process: Mapping[str, float | bool | str]  # settings of the Gaussian processes, by name
 
     # How queries are chosen.
-    takes_rollouts: bool  # or single steps alone
+    takes_rollouts: bool  # whether a query may be a rollout, not only a single step
     hypercube_tries: int
     acquisition: str
     tolerance: Tolerance

@@ -32,8 +32,8 @@ REMOVED: Mapping[str, Mapping[str, str]] = {
 
 def instead_of(kind: str, name: str) -> str | None:
     """Return what takes the place of a removed name of a kind, such as "model"; None if it was never known."""
-    named = (instead for removed, instead in REMOVED.get(kind, {}).items() if removed.casefold() == name.casefold())
-    return next(named, None)
+    matches = (instead for removed, instead in REMOVED.get(kind, {}).items() if removed.casefold() == name.casefold())
+    return next(matches, None)
 
 
 def remark(kind: str, name: str) -> str:

@@ -15,11 +15,11 @@ OTHERS = stat.S_IRGRP | stat.S_IROTH
 def open_to_others(path: Path) -> str | None:
     """Return a warning, with its remedy, if other users of this machine can read a file; else None."""
     try:
-        found = path.stat().st_mode
+        status = path.stat().st_mode
     except OSError:
         return None
-    mode = stat.S_IMODE(found)
-    if stat.S_ISDIR(found):
+    mode = stat.S_IMODE(status)
+    if stat.S_ISDIR(status):
         return None  # reading it raises the error
     if os.name != "posix" or not mode & OTHERS:
         return None

@@ -88,8 +88,8 @@ class SurrogateFile:
             NotASurrogateFile: ``model`` is not a safetensors file.
         """
         header, body = _split(self.model)
-        given = {name: getattr(self.samples, name) for name in RealSamples.__dataclass_fields__}
-        arrays = {SAMPLES + name: array for name, array in given.items() if array is not None}
+        samples = {name: getattr(self.samples, name) for name in RealSamples.__dataclass_fields__}
+        arrays = {SAMPLES + name: array for name, array in samples.items() if array is not None}
         parts = [body]
         for name, array in arrays.items():
             kind = "BOOL" if array.dtype == np.bool_ else "F64"
@@ -194,26 +194,26 @@ def _array(entry: Any, body: bytes) -> NDArray[Any]:
     return raw.astype(np.bool_ if dtype == np.bool_ else np.float64)
 
 
-def _pair(given: Any) -> list[float]:
+def _pair(pair: Any) -> list[float]:
     """Return the error and the standard deviation of a prediction. Raises one of ``UNREADABLE`` if they are invalid."""
-    error, deviation = (float(one) for one in given)
+    error, deviation = (float(one) for one in pair)
     if not math.isfinite(error) or not 0 <= deviation < math.inf:
         raise ValueError(f"a prediction with the error {error} and the standard deviation {deviation}")
     return [error, deviation]
 
 
-def _name(given: object) -> str:
-    if not isinstance(given, str) or not re.fullmatch(NAME_PATTERN, given):
-        raise NotASurrogateFile(f"its name: expected {NAME_IN_WORDS}, got {given!r}")
-    return given
+def _name(name: object) -> str:
+    if not isinstance(name, str) or not re.fullmatch(NAME_PATTERN, name):
+        raise NotASurrogateFile(f"its name: expected {NAME_IN_WORDS}, got {name!r}")
+    return name
 
 
 def _require_shapes(spec: EnvironmentSpec, samples: RealSamples) -> None:
     n, c, f = len(samples.coordinates), len(spec.coordinates), spec.action.size
-    wanted = {"coordinates": (n, c), "action": (n, f), "next_coordinates": (n, c)}
+    shapes = {"coordinates": (n, c), "action": (n, f), "next_coordinates": (n, c)}
     for name in RealSamples.__dataclass_fields__:
         if (array := getattr(samples, name)) is None:
             continue
-        expected, got = wanted.get(name, (n,)), array.shape
+        expected, got = shapes.get(name, (n,)), array.shape
         if got != expected:
             raise NotASurrogateFile(f"{SAMPLES}{name}: expected shape {expected}, got {got}")

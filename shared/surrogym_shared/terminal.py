@@ -48,11 +48,11 @@ def watch(look: Callable[[], str], seconds: float = WATCH_SECONDS) -> None:
 @contextmanager
 def _screen() -> Iterator[Callable[[str], None]]:
     if not sys.stdout.isatty():
-        shown: list[str] = []
+        last: list[str] = []
 
         def show(text: str) -> None:
-            if shown[-1:] != [text]:
-                shown[:] = [text]
+            if last[-1:] != [text]:
+                last[:] = [text]
                 typer.echo(visible(text))
 
         yield show

@@ -148,8 +148,8 @@ def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
     with suppress(InvalidInput), plugin_calls(job.definition):
         model = from_bytes(job.definition, job.previous)
         if model.digest == samples.at(torch.arange(min(model.samples, len(samples)))).digest:
-            chosen = torch.tensor([purpose not in UNCHOSEN for purpose in job.samples.purpose])
-            new = chosen[_known(job)].index_fill(0, torch.arange(model.samples), value=False).nonzero()[-LATEST:, 0]
+            is_chosen = torch.tensor([purpose not in UNCHOSEN for purpose in job.samples.purpose])
+            new = is_chosen[_known(job)].index_fill(0, torch.arange(model.samples), value=False).nonzero()[-LATEST:, 0]
             return predicted(model, samples.at(new))
     return ()
 

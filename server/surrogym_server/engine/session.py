@@ -131,10 +131,10 @@ def answered(session: Session, request: Fingerprint, outcome: Outcome) -> tuple[
 def reset_session(session: Session, seed: Seeds, mask: Bools | None, latest: int) -> tuple[Session, ResetResult]:
     """Start new episodes in the lanes of the mask, under version ``latest``."""
     lanes, observation = reset(session.definition, session.settings, session.lanes, seed, mask)
-    chosen = np.ones(session.settings.num_envs, dtype=bool) if mask is None else mask
-    versions = np.where(chosen, latest, session.versions)
+    lanes_reset = np.ones(session.settings.num_envs, dtype=bool) if mask is None else mask
+    versions = np.where(lanes_reset, latest, session.versions)
     session = replace(session, lanes=lanes, versions=versions)
-    return _visited(session, chosen), ResetResult(observation, versions)
+    return _visited(session, lanes_reset), ResetResult(observation, versions)
 
 
 def step_session(
@@ -224,11 +224,11 @@ def _result(transition: LaneTransition, versions: Versions) -> StepResult:
     )
 
 
-def _visited(session: Session, chosen: Bools | None) -> Session:
+def _visited(session: Session, mask: Bools | None) -> Session:
     if session.visited is None:
         return session
     states = session.lanes.q.cpu().numpy()
-    return replace(session, visited=session.visited.visit(states if chosen is None else states[chosen]))
+    return replace(session, visited=session.visited.visit(states if mask is None else states[mask]))
 
 
 def _check_mask(mask: Bools, num_envs: int) -> None:

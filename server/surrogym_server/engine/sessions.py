@@ -41,7 +41,7 @@ Work = Callable[[Session], tuple[Session, Outcome]]
 @dataclass
 class _Live:
     session: Session
-    used: float
+    last_use: float
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     reserved: int = 0  # bytes that the session may grow to
     seconds_per_step: float = float("inf")  # moving average of measurements; infinite before the first step
@@ -160,7 +160,7 @@ class LiveSessions:
     ) -> Answer:
         """Do ``advance`` at once, in the caller's thread. Allowed only if ``prompt`` has returned True."""
         live = self._get(id)
-        live.used = self.clock()
+        live.last_use = self.clock()
         if repeat := replay(live.session, seq, request):
             return repeat
         if steps > 1:
@@ -196,7 +196,7 @@ class LiveSessions:
         live.requests += 1
         try:
             async with live.lock:
-                self._get(id).used = self.clock()
+                self._get(id).last_use = self.clock()
                 if repeat := replay(live.session, seq, request):
                     return repeat
                 if steps > 1:
@@ -235,7 +235,9 @@ class LiveSessions:
     def sweep(self) -> list[str]:
         """End the sessions that were idle for too long, and return their ids."""
         now = self.clock()
-        idle = [id for id, live in self._live.items() if now - live.used > self.idle_seconds and not live.lock.locked()]
+        idle = [
+            id for id, live in self._live.items() if now - live.last_use > self.idle_seconds and not live.lock.locked()
+        ]
         for id in idle:
             del self._live[id]
             self._expired[id] = None
@@ -252,18 +254,18 @@ class LiveSessions:
         raise UnknownSession(f"no session {id!r}: open a new one")
 
     def _check_memory(self, nbytes: int) -> None:
-        most, used = self._limits.nbytes, sum(live.nbytes for live in self._live.values())
+        most, total = self._limits.nbytes, sum(live.nbytes for live in self._live.values())
         if nbytes > most:
             raise TooLarge(f"expected lanes and answers of at most {_mebibytes(most)}, got {_mebibytes(nbytes)}")
-        if used + nbytes > most:
+        if total + nbytes > most:
             raise Overloaded(
-                f"expected all sessions to take at most {_mebibytes(most)}, got {_mebibytes(used)} "
+                f"expected all sessions to take at most {_mebibytes(most)}, got {_mebibytes(total)} "
                 f"and {_mebibytes(nbytes)} more: close some, or try later"
             )
 
     def _keep(self, live: _Live, request: Fingerprint, result: tuple[Session, Outcome]) -> Answer:
         live.session, answer = answered(result[0], request, result[1])
-        live.used = self.clock()
+        live.last_use = self.clock()
         return answer
 
     async def _do(self, live: _Live, work: Work, steps: int, deadline: float | None) -> tuple[Session, Outcome]:

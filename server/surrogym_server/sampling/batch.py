@@ -49,19 +49,19 @@ def choose(
     distance = nearest(definition, points, earlier)
     picks: list[int] = []
     for column in outputs:
-        output, allowed = outlook[column], distance >= NEAR
-        if not bool(allowed.any()):
+        output, eligible = outlook[column], distance >= NEAR
+        if not bool(eligible.any()):
             break
         value = distance
         if output is not None:
             view = candidate_view(model, candidates, column, output, tolerances[column], distance)
             value = value_of(acquisition, view)
-        if candidates.reserved is not None and not picks and bool((allowed & candidates.reserved).any()):
-            allowed &= candidates.reserved
+        if candidates.reserved is not None and not picks and bool((eligible & candidates.reserved).any()):
+            eligible &= candidates.reserved
         elif output is not None:
-            allowed &= output.learns
-        pick = int(torch.where(allowed, value, -torch.inf).argmax())
-        if allowed[pick]:
+            eligible &= output.learns
+        pick = int(torch.where(eligible, value, -torch.inf).argmax())
+        if eligible[pick]:
             picks.append(pick)
             outlook = tuple(None if output is None else output.observe(pick) for output in outlook)
             distance = torch.minimum(distance, nearest(definition, points, points[pick : pick + 1]))

@@ -59,8 +59,8 @@ def owed_to_past(model: DynamicsModel, samples: Samples, limits: Sequence[float]
 def pairs_lacking(definition: EnvironmentDefinition, samples: Samples) -> int:
     """Number of consecutive steps that ``owed_to_past`` needs in addition."""
     state, size, changes = _state(definition, samples.q[:1]).shape[1], samples.u.shape[1], len(definition.moving)
-    needed = PAIRS * (state + size + changes + DEPTHS[0] * size + 1)
-    return max(0, needed - int((preceding(definition, samples) >= 0).sum()))
+    enough = PAIRS * (state + size + changes + DEPTHS[0] * size + 1)
+    return max(0, enough - int((preceding(definition, samples) >= 0).sum()))
 
 
 def _state(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
@@ -72,24 +72,24 @@ def _state(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
 def _past(u: Tensor, change: Tensor, follows: Tensor, depth: int) -> tuple[Tensor, Tensor]:
     """Change of state in the step before each of n samples, and ``depth`` earlier actions, (n, d); also whether
     ``depth`` steps come before the sample, (n,)."""
-    place, known, columns = torch.arange(len(follows)), torch.ones(len(follows), dtype=torch.bool), [change[follows]]
+    place, complete, columns = torch.arange(len(follows)), torch.ones(len(follows), dtype=torch.bool), [change[follows]]
     for _ in range(depth):
         place = follows[place]  # -1 for a row without a step before it
-        known &= place >= 0
+        complete &= place >= 0
         columns.append(u[place])
-    return torch.cat(columns, -1), known
+    return torch.cat(columns, -1), complete
 
 
-def _explained(at: AtSamples, now: Tensor, past: Tensor, known: Tensor) -> float:
+def _explained(at: AtSamples, now: Tensor, past: Tensor, complete: Tensor) -> float:
     """Share of an output's squared error at n samples that their past explains in addition to state and action.
 
     Args:
         at: the model's residuals of the output.
         now: (n, e) state and action.
         past: (n, d) earlier change and actions.
-        known: (n,) whether the past of a sample is known; the other samples are left out.
+        complete: (n,) whether the past of a sample is known; the other samples are left out.
     """
-    some = known[at.rows]
+    some = complete[at.rows]
     x, y, r = now[at.rows][some], at.targets[some], _residuals(at)[some]
     whole = torch.cat([x, past[at.rows][some]], -1)
     if len(y) < PAIRS * (whole.shape[1] + 1):

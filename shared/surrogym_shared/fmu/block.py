@@ -127,9 +127,9 @@ class Names:
 
     def free(self, name: str, kind: str) -> str:
         """Return a name that no variable has yet, and take it."""
-        chosen = f"{kind}.{name}" if name in self._taken else name
-        self._taken.add(chosen)
-        return chosen
+        name_of_variable = f"{kind}.{name}" if name in self._taken else name
+        self._taken.add(name_of_variable)
+        return name_of_variable
 
 
 def _string(text: str) -> str:

@@ -25,8 +25,8 @@ from surrogym_shared.logs.writing import spreadsheet_cell
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 from surrogym_shared.terms import terminates
 
-SHOWN = 8  # values in a message
-HEADING = ("line", "reason")  # of a file of rejected rows, before the columns of its log
+SHOWN = 8  # most values in a message
+HEADING = ("line", "reason")  # first columns of a file of rejected rows; those of its log follow
 OURS = ",".join(HEADING).encode() + b","
 
 
@@ -173,13 +173,13 @@ def _require_choices(spec: EnvironmentSpec, roles: Roles, values: Floats) -> Non
             if len(declared) != count:
                 raise UnusableLog(f"action {name}: expected {count} choices in discrete, got {list(declared)}")
             continue
-        used = set(np.unique(column[np.isfinite(column)]).tolist())
-        missing = set(range(count)) - used
-        if used and not roles.discrete and (0 in missing or (missing and not used <= set(range(count)))):
+        present = set(np.unique(column[np.isfinite(column)]).tolist())
+        missing = set(range(count)) - present
+        if present and not roles.discrete and (0 in missing or (missing and not present <= set(range(count)))):
             some = [np.unique(one[np.isfinite(one)]) for one in values.T]
             raise UnusableLog(
                 f"action {name}: expected the numbers of its choices from 0 to {count - 1}, got "
-                f"{', '.join(f'{value:g}' for value in sorted(used)[:SHOWN])}: declare all codes in this order in a "
+                f"{', '.join(f'{value:g}' for value in sorted(present)[:SHOWN])}: declare all codes in this order in a "
                 f"mapping file (--map), such as {declared_choices(list(roles.action), some)}, or discrete = true if "
                 "these are the numbers"
             )
@@ -188,8 +188,8 @@ def _require_choices(spec: EnvironmentSpec, roles: Roles, values: Floats) -> Non
 def _shaped(spec: EnvironmentSpec, roles: Roles, steps: Transitions) -> Transitions:
     """Keep only the coordinates of a specification, in its order, and wrap angles to [-pi, pi)."""
     names = list(roles.state)
-    kept = [names.index(name) for name in spec.coordinate_names]
-    q, q_next = steps.q[:, kept].copy(), steps.q_next[:, kept].copy()
+    columns = [names.index(name) for name in spec.coordinate_names]
+    q, q_next = steps.q[:, columns].copy(), steps.q_next[:, columns].copy()
     for index, coordinate in enumerate(spec.coordinates):
         if coordinate.kind == "angle":
             q[:, index], q_next[:, index] = wrapped(q[:, index]), wrapped(q_next[:, index])
@@ -211,8 +211,8 @@ def _consistent(spec: EnvironmentSpec, steps: Transitions) -> Transitions:
         for place in np.flatnonzero(declared != steps.terminated).tolist():
             reasons.setdefault(place, _contradiction(bool(declared[place])))
     rejected = {int(steps.row[place]): reason for place, reason in reasons.items()}
-    kept = np.array([place not in reasons for place in range(len(steps))], dtype=np.bool_)
-    return _without(steps, kept, rejected) if reasons else steps
+    sound = np.array([place not in reasons for place in range(len(steps))], dtype=np.bool_)
+    return _without(steps, sound, rejected) if reasons else steps
 
 
 def _contradiction(declared: bool) -> str:
@@ -221,9 +221,9 @@ def _contradiction(declared: bool) -> str:
     return "terminated: expected 0, as no declared termination holds at the next state, got 1"
 
 
-def _without(steps: Transitions, kept: Bools, rejected: dict[int, str]) -> Transitions:
+def _without(steps: Transitions, sound: Bools, rejected: dict[int, str]) -> Transitions:
     fields: dict[str, Any] = {
-        name: getattr(steps, name)[kept] for name in ("row", "q", "u", "q_next", "terminated", "truncated", "first")
+        name: getattr(steps, name)[sound] for name in ("row", "q", "u", "q_next", "terminated", "truncated", "first")
     }
-    reward: Floats | None = None if steps.reward is None else steps.reward[kept]
+    reward: Floats | None = None if steps.reward is None else steps.reward[sound]
     return replace(steps, **fields, reward=reward, rejected=dict(sorted({**steps.rejected, **rejected}.items())))

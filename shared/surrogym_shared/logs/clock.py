@@ -17,9 +17,10 @@ from surrogym_shared.logs.table import Bools, Floats, Ints
 from surrogym_shared.words import counted
 
 SHARED = 0.1  # share of rows with the time of the row before, from which the clock may be coarser than the rows
-REPEATS, DIFFER = 0.02, 0.2  # of them: share that differ in other numbers, up to which they repeat rows; or don't
+# Shares of these rows that differ in other numbers: up to the first they are repeats, from the second on they are not.
+REPEATS, DIFFER = 0.02, 0.2
 IRREGULAR = 0.1  # share of ticks with another number of rows, above which such a clock does not order the rows
-GAP = 1.5  # times of a tick that are a gap
+GAP = 1.5  # number of ticks between two times from which on there is a gap
 
 
 @dataclass(frozen=True)
@@ -69,18 +70,18 @@ def episodes_of(rows: Rows) -> Episodes:
     return Episodes(number, frozenset(overlapping), tuple(notes))
 
 
-def _names(rows: Rows, named: Ints, notes: list[str]) -> Ints:
+def _names(rows: Rows, names: Ints, notes: list[str]) -> Ints:
     """Return a number for each name of an episode, (n,), and a new one where a name returns after others."""
     changes = np.zeros(len(rows), dtype=np.bool_)
-    changes[1:] = named[1:] != named[:-1]
+    changes[1:] = names[1:] != names[:-1]
     stretch = np.cumsum(changes, dtype=np.int64)
     alternate = bool(np.median(np.bincount(stretch)) < 2) if len(rows) else False
-    returned = int(stretch[-1]) + 1 - len(np.unique(named)) if len(rows) else 0
-    if rows.time is not None or alternate or not returned:  # a clock shows by itself what continues
-        return named
+    returned = int(stretch[-1]) + 1 - len(np.unique(names)) if len(rows) else 0
+    if rows.time is not None or alternate or not returned:  # a clock shows without names which rows continue an episode
+        return names
     first: dict[int, int] = {}
     back = next(
-        r for r in np.flatnonzero(changes) if first.setdefault(int(named[r]), int(r)) != r or named[r] == named[0]
+        r for r in np.flatnonzero(changes) if first.setdefault(int(names[r]), int(r)) != r or names[r] == names[0]
     )
     notes.append(
         f"{rows.roles.episode}: {counted(returned, 'name')} returned after other episodes, first in line "
@@ -114,18 +115,18 @@ def repeated(rows: Rows, episodes: Episodes, faults: Mapping[int, str], *, coars
         return {row: f"repeats line {rows.lines[row % copy]}" for row in range(copy, len(rows))}
     if rows.time is None or coarse:
         return {}
-    seen: dict[tuple[int, bytes], int] = {}
-    found = {}
+    first_rows: dict[tuple[int, bytes], int] = {}
+    reasons = {}
     for row in range(len(rows)):
         if row in faults:
             continue
         number, key = int(episodes.number[row]), whole[row].tobytes()
-        before = seen.setdefault((number, key), row)
+        before = first_rows.setdefault((number, key), row)
         if before == row and number in episodes.overlapping:
-            before = seen.get((number - 1, key), row)
+            before = first_rows.get((number - 1, key), row)
         if before != row:
-            found[row] = f"repeats line {rows.lines[before]}"
-    return found
+            reasons[row] = f"repeats line {rows.lines[before]}"
+    return reasons
 
 
 def _content(rows: Rows) -> Floats:
@@ -176,9 +177,9 @@ def ticks_of(rows: Rows, episode: Ints, left_out: Mapping[int, str]) -> Ticks | 
     """
     if rows.time is None:
         return None
-    used = np.ones(len(rows), dtype=np.bool_)
-    used[list(left_out)] = False
-    order = np.flatnonzero(used & np.isfinite(rows.time))
+    usable = np.ones(len(rows), dtype=np.bool_)
+    usable[list(left_out)] = False
+    order = np.flatnonzero(usable & np.isfinite(rows.time))
     order = order[np.argsort(episode[order], kind="stable")]
     time, number = rows.time[order], episode[order]
     same = (time[1:] == time[:-1]) & (number[1:] == number[:-1])

@@ -94,12 +94,12 @@ class Roles:
     @property
     def used(self) -> dict[str, str]:
         """Role of each used column in words, by the column's name."""
-        found = {column: f"state {name}" for name, column in self.state.items()}
-        found |= {column: f"action {name}" for name, column in self.action.items()}
-        found |= {column: f"next state {name}" for name, column in self.following.items()}
-        found |= {column: role for role in SINGLE if (column := getattr(self, role)) is not None}
+        roles = {column: f"state {name}" for name, column in self.state.items()}
+        roles |= {column: f"action {name}" for name, column in self.action.items()}
+        roles |= {column: f"next state {name}" for name, column in self.following.items()}
+        roles |= {column: role for role in SINGLE if (column := getattr(self, role)) is not None}
         return {
-            column: f"{role} ({self.units[column]})" if column in self.units else role for column, role in found.items()
+            column: f"{role} ({self.units[column]})" if column in self.units else role for column, role in roles.items()
         }
 
     @property
@@ -181,30 +181,30 @@ def roles_by_name(names: Sequence[str]) -> Roles:
 
 def _units(names: Iterable[str], used: Iterable[str | None]) -> dict[str, str]:
     """Return the unit of each used column whose heading has one."""
-    found = {name: _as_time(heading(name)) or heading(name) for name in names if name in set(used)}
-    return {name: one.unit for name, one in found.items() if one.unit}
+    headings = {name: _as_time(heading(name)) or heading(name) for name in names if name in set(used)}
+    return {name: one.unit for name, one in headings.items() if one.unit}
 
 
 def _as_time(one: Heading) -> Heading | None:
     """Return the heading of a column of times with its unit; None if it is no such column."""
-    for found in (one, timed(one)):
-        short = len(found.plain) == 1
-        known = SHORT_TIMES if short and found is not one else TIMES
-        if found.plain in SINGLE["time"] and (not found.unit or not short or found.unit in known):
-            return found
+    for quantity in (one, timed(one)):
+        short = len(quantity.plain) == 1
+        known = SHORT_TIMES if short and quantity is not one else TIMES
+        if quantity.plain in SINGLE["time"] and (not quantity.unit or not short or quantity.unit in known):
+            return quantity
     return None
 
 
-def mapping_of(given: Path | Mapping[str, Any] | LogMapping, where: str) -> LogMapping:
+def mapping_of(mapping: Path | Mapping[str, Any] | LogMapping, where: str) -> LogMapping:
     """Parse a mapping: a file in JSON or TOML, or what stands in one.
 
     Raises:
         OSError: the file can't be read.
         UnusableLog: it is not a mapping.
     """
-    if isinstance(given, LogMapping):
-        return given
-    return _mapped(_content(given) if isinstance(given, Path) else given, where)
+    if isinstance(mapping, LogMapping):
+        return mapping
+    return _mapped(_content(mapping) if isinstance(mapping, Path) else mapping, where)
 
 
 def _content(path: Path) -> Mapping[str, Any]:
@@ -245,8 +245,8 @@ def roles_by_mapping(mapped: LogMapping, names: Sequence[str], where: str = "the
     """
     fields: dict[str, Any] = {role: getattr(mapped, role) or None for role in SINGLE}
     state, action = _by_name(mapped.state), _by_name(mapped.action)
-    wanted = [*state.values(), *action.values(), *mapped.next.values(), *filter(None, fields.values())]
-    if missing := [column for column in wanted if column not in names]:
+    columns = [*state.values(), *action.values(), *mapped.next.values(), *filter(None, fields.values())]
+    if missing := [column for column in columns if column not in names]:
         raise UnusableLog(f"{where} names the column {missing[0]!r}: expected one of {listed(names)}")
     _require(names, state, action)
     _require_one_role(mapped, where)
@@ -262,8 +262,8 @@ def roles_by_mapping(mapped: LogMapping, names: Sequence[str], where: str = "the
             constants=frozenset(mapped.constants),
             discrete=mapped.discrete if not isinstance(mapped.discrete, dict) else True,
             choices=_choices(mapped, action, where),
-            ignored=tuple(name for name in names if name not in wanted),
-            units=_units(names, wanted),
+            ignored=tuple(name for name in names if name not in columns),
+            units=_units(names, columns),
         )
     )
 
@@ -282,10 +282,10 @@ def _choices(mapped: LogMapping, action: Mapping[str, str], where: str) -> dict[
     return {name: tuple(mapped.discrete[name]) for name in action}
 
 
-def _single(role: str, found: Iterable[tuple[str, str]]) -> dict[str, str]:
+def _single(role: str, pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
     """Return columns by the names of their states or actions. Raises ``UnusableLog`` if two have the same name."""
     columns: dict[str, str] = {}
-    for name, column in found:
+    for name, column in pairs:
         if name in columns:
             raise UnusableLog(
                 f"expected one column for the {role} {name!r}, got two: {columns[name]} and {column}: rename one, or "
@@ -298,14 +298,14 @@ def _single(role: str, found: Iterable[tuple[str, str]]) -> dict[str, str]:
 def _require_one_role(mapped: LogMapping, where: str) -> None:
     """Raise ``UnusableLog`` if a mapping names a column twice."""
     tables = {"state": mapped.state, "action": mapped.action, "next state": mapped.next}
-    named = [
+    pairs = [
         (f"{role} {name}", column)
-        for role, given in tables.items()
-        for name, column in (given.items() if isinstance(given, dict) else zip(given, given, strict=True))
+        for role, columns in tables.items()
+        for name, column in (columns.items() if isinstance(columns, dict) else zip(columns, columns, strict=True))
     ]
-    named += [(role, column) for role in SINGLE if (column := getattr(mapped, role))]
+    pairs += [(role, column) for role in SINGLE if (column := getattr(mapped, role))]
     roles: dict[str, str] = {}
-    for role, column in named:
+    for role, column in pairs:
         if column in roles:
             raise UnusableLog(f"{where}: expected one role for the column {column!r}, got {roles[column]} and {role}")
         roles[column] = role
@@ -314,12 +314,12 @@ def _require_one_role(mapped: LogMapping, where: str) -> None:
 def _require_declared(mapped: LogMapping, state: Iterable[str], action: Iterable[str], where: str) -> None:
     """Raise ``UnusableLog`` if limits, angles or constants of a mapping name nothing, or contradict each other."""
     states, actions = list(state), list(action)
-    for key, given, known in (
+    for key, entries, known in (
         ("limits", mapped.limits, [*states, *actions]),
         ("angles", mapped.angles or (), states),
         ("constants", mapped.constants, states),
     ):
-        if unknown := sorted(set(given) - set(known)):
+        if unknown := sorted(set(entries) - set(known)):
             what = "one of" if key == "limits" else "one of the states"
             raise UnusableLog(f"{where} names {unknown[0]!r} in {key}: expected {what} {known}")
     if both := sorted(set(mapped.angles or ()) & set(mapped.constants)):
@@ -343,7 +343,7 @@ def _mapped(content: Mapping[str, Any], where: str) -> LogMapping:
     try:
         return LogMapping.model_validate(content)
     except ValidationError as error:
-        keys = dict.fromkeys(str(found["loc"][0]) for found in error.errors())
+        keys = dict.fromkeys(str(fault["loc"][0]) for fault in error.errors())
         faults = "; ".join(_fault(key, content) for key in keys)
         raise UnusableLog(f"{where} is not a mapping of columns: {faults}") from error
 
@@ -367,9 +367,9 @@ def _short(value: object) -> str:
 def _checked(roles: Roles) -> Roles:
     """Return the roles if they are consistent: at most ``MAX_DIMENSIONS`` states and actions, and next states of all
     coordinates or of none. Otherwise raise ``UnusableLog``."""
-    for what, found in (("states", roles.state), ("actions", roles.action)):
-        if len(found) > MAX_DIMENSIONS:
-            raise UnusableLog(f"expected at most {MAX_DIMENSIONS} {what}, got {len(found)}: choose by --map")
+    for what, names in (("states", roles.state), ("actions", roles.action)):
+        if len(names) > MAX_DIMENSIONS:
+            raise UnusableLog(f"expected at most {MAX_DIMENSIONS} {what}, got {len(names)}: choose by --map")
     if long := [name for name in roles.state if not 1 <= len(name) <= LONGEST]:
         raise UnusableLog(f"expected names of states with 1 to {LONGEST} letters, got {long[0]!r}: rename it by --map")
     if roles.following and set(roles.following) != set(roles.state):
@@ -389,8 +389,8 @@ def _checked(roles: Roles) -> Roles:
 
 
 def _require(names: Iterable[str], state: Mapping[str, str], action: Mapping[str, str]) -> None:
-    for what, found, example in (("action", action, "action_valve"), ("state", state, "state_temperature")):
-        if not found:
+    for what, columns, example in (("action", action, "action_valve"), ("state", state, "state_temperature")):
+        if not columns:
             raise UnusableLog(
                 f"expected a column of the {what}, such as {example}, got {listed(names)}: rename it, or name the "
                 "columns in a mapping file (--map)"
@@ -403,15 +403,15 @@ def _only(role: str, headings: Iterable[Heading], known: Sequence[str]) -> str |
     Case only matters for single letters: t is a time, T a temperature. A letter with a physical unit is a quantity.
     """
     if role == "time":
-        found = [one.column for one in headings if _as_time(one) is not None]
+        columns = [one.column for one in headings if _as_time(one) is not None]
     else:
-        found = [one.column for one in headings if one.plain in known and not (len(one.plain) == 1 and one.unit)]
-    if len(found) > 1:
+        columns = [one.column for one in headings if one.plain in known and not (len(one.plain) == 1 and one.unit)]
+    if len(columns) > 1:
         raise UnusableLog(
-            f"expected one column for the role {role}, got {' and '.join(found)}: rename one, or name the "
+            f"expected one column for the role {role}, got {' and '.join(columns)}: rename one, or name the "
             "columns in a mapping file (--map)"
         )
-    return found[0] if found else None
+    return columns[0] if columns else None
 
 
 def _of_next(part: str, states: Mapping[str, str]) -> str:
@@ -425,5 +425,5 @@ def _part(match: re.Match[str] | None) -> str:
     return "" if match is None else next((part for part in match.groups() if part), "")
 
 
-def _by_name(given: dict[str, str] | list[str]) -> dict[str, str]:
-    return given if isinstance(given, dict) else {name: name for name in given}
+def _by_name(columns: dict[str, str] | list[str]) -> dict[str, str]:
+    return columns if isinstance(columns, dict) else {name: name for name in columns}

@@ -11,7 +11,7 @@ from surrogym_shared.logs.table import DATES, DURATIONS, Cells, Floats, flags, g
 
 Numbering = Literal["rows", "episodes", "gaps"]
 
-FEWEST = 4  # rows that show what a column is
+FEWEST = 4  # fewest rows that show what a column is
 MOST_TURNS = 0.5  # share of rows at which numbers of episodes change, or a clock restarts, at most
 EQUAL = 1e-6  # share of a step by which the steps of a clock may differ
 
@@ -31,7 +31,7 @@ def numbering(cells: Cells) -> Numbering | None:
     if values is None or cells.dtype.kind in (DATES, DURATIONS) or (values != np.floor(values)).any():
         return None
     plain, faults = numbers("", cells)
-    if faults or stamps(plain) is not None:  # a date is no number of a row
+    if faults or stamps(plain) is not None:  # dates don't number rows
         return None
     change = np.diff(values)
     if (change == 1).all():
@@ -88,12 +88,12 @@ def is_mark(cells: Cells) -> bool:
 
 def is_in_blocks(cells: Cells) -> bool:
     """Whether a column stays for several rows at a whole number or a text, as numbers of episodes do."""
-    found = groups(cells)
-    if len(found) < FEWEST or found[-1] == found[0]:
+    numbers = groups(cells)
+    if len(numbers) < FEWEST or numbers[-1] == numbers[0]:
         return False
     values = measured(cells)
     whole = values is None or bool((values == np.floor(values)).all())
-    return whole and bool((np.diff(found) != 0).mean() <= MOST_TURNS)
+    return whole and bool((np.diff(numbers) != 0).mean() <= MOST_TURNS)
 
 
 def episodes_by(name: str, cells: Cells) -> Cells:

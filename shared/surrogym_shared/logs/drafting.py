@@ -64,24 +64,24 @@ def draft(roles: Roles, steps: Transitions, name: str, budget: int = 0) -> Draft
     """
     notes: list[str] = []
     coordinates = [
-        found
+        coordinate
         for index, one in enumerate(roles.state)
-        if (found := _coordinate(roles, steps, one, index, notes)) is not None
+        if (coordinate := _coordinate(roles, steps, one, index, notes)) is not None
     ]
     if not any(c.kind != "constant" for c in coordinates):
         raise UnusableLog(
             f"expected at least one state that changes from row to row, got {list(roles.state)}, which never change: "
             "log a run in which a state moves, or name the states by --map"
         )
-    kept = [index for index, one in enumerate(roles.state) if one in {c.name for c in coordinates}]
-    starts = {c.name: _start(c, steps, index) for c, index in zip(coordinates, kept, strict=True)}
+    columns = [index for index, one in enumerate(roles.state) if one in {c.name for c in coordinates}]
+    starts = {c.name: _start(c, steps, index) for c, index in zip(coordinates, columns, strict=True)}
     spec = EnvironmentSpec(
         environment=name,
         coordinates=tuple(coordinates),
         observation=tuple(entry for c in coordinates for entry in _observed(c)),
         action=_action(roles, steps, notes),
         start=starts,
-        starts=_starts(steps, kept, coordinates),
+        starts=_starts(steps, columns, coordinates),
         termination="learned" if bool(steps.terminated.any()) else (),
         time_limit=_time_limit(steps, notes),
         outside_reward=_outside_reward(steps, budget, notes),
@@ -138,8 +138,8 @@ def _narrowest(low: float, high: float) -> float:
     return max(NARROWEST, RESOLUTION * max(abs(low), abs(high)))
 
 
-def _why(declared: bool, shown: str) -> str:
-    return "is declared" if declared else shown
+def _why(is_declared: bool, evidence: str) -> str:
+    return "is declared" if is_declared else evidence
 
 
 def _is_angle(roles: Roles, steps: Transitions, name: str, index: int, notes: list[str]) -> bool:
@@ -167,12 +167,12 @@ def _is_angle(roles: Roles, steps: Transitions, name: str, index: int, notes: li
 def _bounds(roles: Roles, name: str, after: Floats, ends: tuple[float, float], notes: list[str]) -> Bounds | None:
     """Return the limits of a coordinate: declared ones, or extreme values at which many steps end exactly."""
     low, high = roles.limits.get(name, (None, None))
-    shown = [end if _stays_at(after, end, ends) else None for end in ends]
-    for side, end, declared in (("low", shown[0], low), ("high", shown[1], high)):
+    limits = [end if _stays_at(after, end, ends) else None for end in ends]
+    for side, end, declared in (("low", limits[0], low), ("high", limits[1], high)):
         if end is not None and declared is None:
             rows = int((after == end).sum())
             notes.append(f"{name}: saturates at {end:g} ({side}), where {ending(rows)} exactly")
-    low, high = shown[0] if low is None else low, shown[1] if high is None else high
+    low, high = limits[0] if low is None else low, limits[1] if high is None else high
     return None if low is None and high is None else Bounds(low=low, high=high)
 
 
@@ -194,7 +194,7 @@ def _start(coordinate: Coordinate, steps: Transitions, index: int) -> Uniform | 
     return Fixed(value=low) if high - low < _narrowest(low, high) else Uniform(low=low, high=high)
 
 
-def _starts(steps: Transitions, kept: list[int], coordinates: list[Coordinate]) -> tuple[tuple[float, ...], ...]:
+def _starts(steps: Transitions, columns: list[int], coordinates: list[Coordinate]) -> tuple[tuple[float, ...], ...]:
     """Return the states that virtual episodes start at: those at which episodes of the log begin.
 
     If the log has few episodes, these are evenly spaced states of the whole log. A box around the states would not do,
@@ -204,7 +204,7 @@ def _starts(steps: Transitions, kept: list[int], coordinates: list[Coordinate]) 
     if len(rows) < FEW_STARTS:
         rows = np.arange(len(steps))
     spaced = rows[np.unique(np.linspace(0, len(rows) - 1, min(MOST_STARTS, len(rows))).round().astype(int))]
-    states = steps.q[spaced][:, kept].copy()
+    states = steps.q[spaced][:, columns].copy()
     for index, coordinate in enumerate(coordinates):
         if coordinate.kind == "angle":
             states[:, index] = wrapped(states[:, index])
@@ -312,14 +312,14 @@ def _discrete(counts: list[int]) -> DiscreteAction | MultiDiscreteAction:
 
 def _asked(names: list[str], codes: list[Floats], whole: list[bool]) -> Iterator[str]:
     """Ask about actions of few whole numbers, which are drafted as amounts."""
-    shown = ", ".join(
+    values = ", ".join(
         f"{name} of {', '.join(f'{value:g}' for value in one)}"
         for name, one, few in zip(names, codes, whole, strict=True)
         if few
     )
-    if not shown:
+    if not values:
         return
-    yield f"action {shown}: few whole numbers, drafted as amounts, which a policy may choose between"
+    yield f"action {values}: few whole numbers, drafted as amounts, which a policy may choose between"
     if all(whole):
         yield (
             f"action: for choices, declare {declared_choices(names, codes)} in a mapping file (--map); for amounts, "

@@ -46,16 +46,16 @@ def from_rlds(table: Table) -> Table:
         raise UnusableLog(f"expected steps of RLDS, got none: each row has {LAST}, or no row after it")
     columns = {name: cells for name, cells in table.columns.items() if name not in marks.values()}
     states = roles_by_name(list(columns)).state
-    kept = {name: cells[rows] for name, cells in columns.items()}
+    columns_of_steps = {name: cells[rows] for name, cells in columns.items()}
     if not any(NEXT.match(heading(name).name) for name in columns):
-        kept |= {f"next.{name}": columns[column][rows + 1] for name, column in states.items()}
-    kept |= {"terminated": terminal[rows + 1], "truncated": last[rows + 1] & ~terminal[rows + 1]}
-    if "episode" not in kept:
-        kept["episode"] = np.cumsum(first)[rows]
+        columns_of_steps |= {f"next.{name}": columns[column][rows + 1] for name, column in states.items()}
+    columns_of_steps |= {"terminated": terminal[rows + 1], "truncated": last[rows + 1] & ~terminal[rows + 1]}
+    if "episode" not in columns_of_steps:
+        columns_of_steps["episode"] = np.cumsum(first)[rows]
     without = len(table) - len(rows)
     return replace(
         table,
-        columns=kept,
+        columns=columns_of_steps,
         lines=table.lines[rows],
         cells=[table.cells[row] for row in rows.tolist()] if len(table.cells) else (),
         remarks=(*table.remarks, f"RLDS: {has(without, 'row')} only the last observation of an episode, and no step"),
@@ -63,8 +63,8 @@ def from_rlds(table: Table) -> Table:
 
 
 def _marks(table: Table, name: str) -> Bools:
-    found, faults = flags(name, table.columns[name])
+    marks, faults = flags(name, table.columns[name])
     if faults:
         row = next(iter(faults))
         raise UnusableLog(f"line {table.lines[row]}: {faults[row]}")
-    return found
+    return marks

@@ -175,8 +175,8 @@ def _ask(table: Table, roles: Roles, plain: Sequence[str]) -> None:
 
 def _likely(name: str, cells: Cells, roles: Roles) -> str | None:
     one = timed(heading(name))
-    for role, (words, names, shown) in LIKELY.items():
+    for role, (words, names, has_cells_of) in LIKELY.items():
         by_name = one.plain in names and getattr(roles, role, True) is None
-        if (by_name or words.intersection(one.words)) and shown(cells):
+        if (by_name or words.intersection(one.words)) and has_cells_of(cells):
             return role
     return None

@@ -58,28 +58,28 @@ def rows_of(table: Table, roles: Roles, spec: EnvironmentSpec | None = None) -> 
     u, action_faults = _matrix(table, roles.action, _action_limits(roles, spec), roles.choices)
     sound = whole.copy()
     sound[list(state_faults)] = False
-    found = [state_faults, action_faults]
+    of_columns = [state_faults, action_faults]
     following = reward = time = None
     if roles.following:
         columns = {name: roles.following[name] for name in roles.state}
         following, faulty = _matrix(table, columns, _state_limits(roles, spec))
-        found.append(faulty)
+        of_columns.append(faulty)
     if roles.reward is not None:
         reward, faulty = numbers(roles.reward, table.columns[roles.reward])
-        found.append(faulty)
+        of_columns.append(faulty)
     if roles.time is not None:
         time, faulty = times(roles.time, table.columns[roles.time])
-        found.append(faulty)
+        of_columns.append(faulty)
     terminated, truncated = (np.zeros(len(table), dtype=np.bool_) for _ in range(2))
     if roles.terminated is not None:
         terminated, faulty = flags(roles.terminated, table.columns[roles.terminated])
-        found.append(faulty)
+        of_columns.append(faulty)
     if roles.truncated is not None:
         truncated, faulty = flags(roles.truncated, table.columns[roles.truncated])
-        found.append(faulty)
+        of_columns.append(faulty)
         if heading(roles.terminated or "").plain in EITHER_END:
             terminated &= ~truncated
-    for one in found:
+    for one in of_columns:
         for row, reason in one.items():
             if whole[row]:
                 faults.setdefault(row, []).append(reason)

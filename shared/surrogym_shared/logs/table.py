@@ -24,9 +24,9 @@ NO_FINITE = ("nan", "+nan", "-nan", "inf", "+inf", "-inf", "infinity", "+infinit
 BOOLEANS = {"True": 1.0, "False": 0.0, "true": 1.0, "false": 0.0, "TRUE": 1.0, "FALSE": 0.0}
 DATES, DURATIONS = "M", "m"  # kinds of NumPy types
 NO_NUMBERS = {DATES: "dates", DURATIONS: "durations", "c": "complex numbers", "V": "records"}
-FEWEST_STAMPS = 3  # numbers that show that a column has time stamps
-MOST_STAMPS = 0.9  # share of them that are dates
-MAX_MEASURED = 1e30  # the server takes no larger number
+FEWEST_STAMPS = 3  # least number of dates that show that a column has time stamps
+MOST_STAMPS = 0.9  # least share of a column's numbers that are dates
+MAX_MEASURED = 1e30  # largest number, as in the server's requests
 
 
 @dataclass(frozen=True)
@@ -153,12 +153,12 @@ def flags(name: str, cells: Cells) -> tuple[Bools, dict[int, str]]:
 def groups(cells: Cells) -> Ints:
     """Number the different cells in the order of their first appearance, (n,). Each empty cell has its own number."""
     codes: dict[str, int] = {}
-    found = np.zeros(len(cells), dtype=np.int64)
+    numbers = np.zeros(len(cells), dtype=np.int64)
     for row, cell in enumerate(cells):
         text = str(cell).strip()
         alone = text in ("", "nan", "None")
-        found[row] = codes.setdefault(f"\0{row}" if alone else text, len(codes))
-    return found
+        numbers[row] = codes.setdefault(f"\0{row}" if alone else text, len(codes))
+    return numbers
 
 
 def _plain(cells: Cells) -> Floats:
@@ -181,7 +181,7 @@ def is_date(cell: str) -> bool:
 
 def _parsed(cells: Cells) -> Floats:
     text = "".join(map(str, cells))
-    if text.isascii() and "_" not in text:  # what NumPy takes beyond decimal numbers
+    if text.isascii() and "_" not in text:  # excludes what NumPy reads as a number beyond decimal ones
         try:
             return cells.astype(np.float64)
         except ValueError:

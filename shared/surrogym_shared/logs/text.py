@@ -20,7 +20,7 @@ from surrogym_shared.words import counted
 DELIMITERS = ",;\t|"
 BLANKS = " "
 COMMENTS = ("#", "%", "//", "sep=")  # Excel has sep=; as the first line
-LONGEST_NAME = 200  # letters
+LONGEST_NAME = 200  # most letters of a column's name
 JSON = re.compile(r"[{\[]\s*[{\[\"]")
 UNIT_APART = re.compile(r"\s+(?=[\[(])")  # time [s] is one name, also where blanks separate the columns
 UNNAMED = re.compile(r"^(?:unnamed column \d+|Unnamed: \d+|__index_level_\d+__)$")  # pandas has the last two
@@ -105,18 +105,18 @@ def _with_places(names: Sequence[str]) -> list[str]:
 
 def _head(text: str) -> _Head:
     """Return the beginning of a log. Its lines are empty if the text has none."""
-    comments, found, before = [], list[str](), 0
+    comments, lines, before = [], list[str](), 0
     for number, line in enumerate(io.StringIO(text, newline=None)):
         if not line.strip():
             continue
         if line.strip().strip('"').startswith(COMMENTS):
-            comments += [line.strip()] if not found else []
+            comments += [line.strip()] if not lines else []
             continue
-        before = before if found else number
-        found.append(line.rstrip("\n"))
-        if len(found) == 2:
+        before = before if lines else number
+        lines.append(line.rstrip("\n"))
+        if len(lines) == 2:
             break
-    line, row = [*found, "", ""][:2]
+    line, row = [*lines, "", ""][:2]
     return _Head(tuple(comments), line, row, before)
 
 

@@ -29,8 +29,8 @@ def require_steps(table: Table, steps: Transitions, least: int) -> None:
     """Raise ``TooFewSteps`` if the log has fewer than ``least`` usable steps. The message says what the log has."""
     if len(steps) >= least:
         return
-    wanted = "two usable steps" if least == 2 else "one usable step"
-    parts = [f"expected {wanted} at least, got {len(steps)} of {counted(len(table), 'row')}"]
+    minimum = "two usable steps" if least == 2 else "one usable step"
+    parts = [f"expected {minimum} at least, got {len(steps)} of {counted(len(table), 'row')}"]
     if steps.ends:
         parts.append(
             f"{has(steps.ends, 'row')} no next state, because an episode or the log ends there, or a gap follows"

@@ -84,7 +84,8 @@ def transitions_of(rows: Rows) -> Transitions:
     order = [row for row in np.argsort(episode, kind="stable").tolist() if rows.faults.get(row) or row not in rejected]
     out_of_order = _backwards(rows, episode, order, rejected, coarse=ticks is not None)
     _reject(rejected, out_of_order)
-    order = [row for row in order if row not in out_of_order]  # the row before continues with the one after
+    # Without the rows out of order, the row before them continues with the row after them.
+    order = [row for row in order if row not in out_of_order]
     follower = {a: b for a, b in pairwise(order) if episode[a] == episode[b]}
     if rows.episode is not None:
         _reject(rejected, _going_on(rows, follower, rejected))
@@ -112,8 +113,8 @@ def transitions_of(rows: Rows) -> Transitions:
     )
 
 
-def _reject(rejected: dict[int, str], found: dict[int, str]) -> None:
-    for row, reason in found.items():
+def _reject(rejected: dict[int, str], reasons: dict[int, str]) -> None:
+    for row, reason in reasons.items():
         rejected.setdefault(row, reason)
 
 
@@ -125,7 +126,7 @@ def _backwards(
     if rows.time is None:
         return {}
     latest: dict[int, int] = {}
-    found = {}
+    reasons = {}
     for row in order:
         if not np.isfinite(rows.time[row]):
             continue
@@ -135,11 +136,11 @@ def _backwards(
             if row not in rejected:
                 latest[int(episode[row])] = row
         elif row not in rejected:
-            found[row] = (
+            reasons[row] = (
                 f"{rows.roles.time}: expected a time after {rows.time[before]:g} of line {rows.lines[before]}, "
                 f"got {time:g}"
             )
-    return found
+    return reasons
 
 
 def _going_on(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) -> dict[int, str]:
@@ -187,8 +188,8 @@ def _paired(
 
 def _firsts(episode: Ints, order: list[int]) -> Iterable[tuple[int, bool]]:
     """Return the rows in the given order, each with whether it is the first of its episode."""
-    seen: set[int] = set()
+    earlier: set[int] = set()
     for row in order:
         number = int(episode[row])
-        yield row, number not in seen
-        seen.add(number)
+        yield row, number not in earlier
+        earlier.add(number)

@@ -19,14 +19,14 @@ FULL_TURN = 2 * math.pi
 KNOWN = {FULL_TURN: "radians", 360.0: "degrees", 400.0: "gon", 1.0: "turns", 24.0: "hours", 60.0: "minutes"} | {
     float(2**bits): "counts" for bits in range(8, 25)
 }
-FILLED = 0.8  # of a turn: least width of the values
-MOST_JUMPS = 1 / 3  # of the steps
-CONTINUES = 4.0  # deviations from the motion that a jump may have
-ROUGHLY = 0.1  # of a usual change: the same for a motion that is not linear
-OUTLIERS = 0.05  # share of jumps that may have more
+FILLED = 0.8  # least width of a column's values, as a share of a turn
+MOST_JUMPS = 1 / 3  # most steps that jump, as a share of all
+CONTINUES = 4.0  # standard deviations by which a jump may differ from the motion
+ROUGHLY = 0.1  # the same as a share of a usual change, for a motion that is not linear
+OUTLIERS = 0.05  # share of the jumps that may differ more
 BY_CHANCE = 1e-3  # probability that a column without turns looks as if it had
-NEAR = 1e-3  # of a turn: by how much the size of the jumps may differ from it
-FINEST = 1e-6  # of the width: least deviation of the motion
+NEAR = 1e-3  # share of a turn by which the size of the jumps may differ from it
+FINEST = 1e-6  # least standard deviation of the motion, as a share of the width of the values
 
 
 @dataclass(frozen=True)

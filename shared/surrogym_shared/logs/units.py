@@ -10,7 +10,7 @@ from surrogym_shared.logs.table import Floats
 from surrogym_shared.spec import EnvironmentSpec, limits
 
 BEYOND = 20.0  # distance outside a coordinate's range, in widths of the range, that no real plant reaches
-FEWEST = 8  # known rewards that show how large rewards are
+FEWEST = 8  # least number of known rewards that show how large rewards are
 
 
 def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:

@@ -19,8 +19,8 @@ def spreadsheet_cell(value: Any) -> Any:
     """Return a cell of CSV that no spreadsheet reads as a formula and no terminal as an order. Numbers stay numbers."""
     if not isinstance(value, str):
         return value
-    shown = visible(value)
-    return f"'{shown}" if shown.strip()[:1] in (*FORMULA,) and not is_number(shown) else shown
+    text = visible(value)
+    return f"'{text}" if text.strip()[:1] in (*FORMULA,) and not is_number(text) else text
 
 
 def npz_of_steps(coordinate_names: Sequence[str], arrays: Mapping[str, Any]) -> bytes:

@@ -51,7 +51,7 @@ def with_history(
     starts: dict[str, StartDistribution] = {lag.name: Fixed(value=_at_rest(lag)) for lag in lags}
     for name, most in at_start.items():
         starts |= {f"{name}.change{age}": Uniform(low=-most, high=most) for age in range(1, changes + 1)}
-    shown = tuple(ObservationEntry(name=lag.name, term=Term.linear(**{lag.name: 1.0})) for lag in lags)
+    entries = tuple(ObservationEntry(name=lag.name, term=Term.linear(**{lag.name: 1.0})) for lag in lags)
     if at_start:
         lags.append(_counter(changes))
         starts[COUNTER] = Fixed(value=float(changes))
@@ -60,7 +60,7 @@ def with_history(
         **own
         | {
             "coordinates": (*spec.coordinates, *lags),
-            "observation": (*spec.observation, *shown),
+            "observation": (*spec.observation, *entries),
             "start": {**spec.start, **starts},
             "starts": tuple((*start, *(_at_rest(lag) for lag in lags)) for start in spec.starts),
         }

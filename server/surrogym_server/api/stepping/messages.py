@@ -78,7 +78,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
             self._oversized = extent is None
             if len(whole) > 1 or extent is None or not self._answered(self._answer, frame, extent):
                 super().data_received(frame)
-        self._count(self._frames.held + sum(map(len, self.frames)))
+        self._count(self._frames.rest_bytes + sum(map(len, self.frames)))
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._count(0)

@@ -265,8 +265,8 @@ def connect(url: str, synchronous: Synchronous = "full") -> Database:
         case "postgresql":
             return _postgresql(parsed)
         case _:
-            shown = parsed.render_as_string()
-            raise InvalidInput(f"expected sqlite:///path or postgresql://user@host/name, got {shown}")
+            address = parsed.render_as_string()
+            raise InvalidInput(f"expected sqlite:///path or postgresql://user@host/name, got {address}")
 
 
 def _sqlite(path: Path, synchronous: Synchronous) -> Database:

@@ -188,7 +188,7 @@ def requeue_set_aside(connection: Connection, surrogate: Row[Any]) -> int:
 
 NAMED_QUERIES: sa.Select[Any] = (
     sa.select(queries.c.id, queries.c.purpose, queries.c.steps)
-    .where(queries.c.surrogate_id == sa.bindparam("owner"), queries.c.id.in_(sa.bindparam("named", expanding=True)))
+    .where(queries.c.surrogate_id == sa.bindparam("owner"), queries.c.id.in_(sa.bindparam("query_ids", expanding=True)))
     .order_by(queries.c.id)
     .with_for_update()
 )
@@ -233,8 +233,8 @@ def read_answered(connection: Connection, surrogate: Row[Any], batch: Sequence[N
     Raises:
         UnknownQuery, ForeignLease, InvalidInput, IdempotencyConflict: as ``Samples.add`` says.
     """
-    named = {sample.query_id for sample in batch if sample.query_id is not None}
-    by_id = _lock_queries(connection, surrogate, named)
+    query_ids = {sample.query_id for sample in batch if sample.query_id is not None}
+    by_id = _lock_queries(connection, surrogate, query_ids)
     by_token = _leases(connection, surrogate, by_id)
     answered = [_lease_of(sample, by_id, by_token) for sample in batch]
     steps: dict[int, set[int]] = defaultdict(set)
@@ -271,10 +271,12 @@ def _check_steps(lease: Answered, steps: set[int]) -> None:
         )
 
 
-def _lock_queries(connection: Connection, surrogate: Row[Any], named: set[int]) -> dict[int, Row[Any]]:
-    if not named:
+def _lock_queries(connection: Connection, surrogate: Row[Any], query_ids: set[int]) -> dict[int, Row[Any]]:
+    if not query_ids:
         return {}
-    return {row.id: row for row in connection.execute(NAMED_QUERIES, {"owner": surrogate.id, "named": list(named)})}
+    return {
+        row.id: row for row in connection.execute(NAMED_QUERIES, {"owner": surrogate.id, "query_ids": list(query_ids)})
+    }
 
 
 def _leases(connection: Connection, surrogate: Row[Any], by_id: dict[int, Row[Any]]) -> dict[tuple[int, str], Answered]:

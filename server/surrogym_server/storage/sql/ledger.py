@@ -124,9 +124,9 @@ OTHERS = sa.union_all(_evaluations(), _unresolved())
 
 
 class SqlLedger(port.Ledger):
-    def __init__(self, database: Database, counted: CountedSamples) -> None:
+    def __init__(self, database: Database, counts: CountedSamples) -> None:
         self._database = database
-        self._counted = counted
+        self._counted = counts
 
     def report(self, name: str, steps: int, *, key: str, episodes: int = 0, note: str = "") -> LedgerRecord:
         body = fingerprint(steps, episodes, note)
@@ -157,12 +157,12 @@ def ledgers(connection: Connection, span: Span, sampled: Mapping[int, Mapping[st
         sampled: number of samples by surrogate and purpose.
     """
     rows = connection.execute(OTHERS, {"first": span[0], "last": span[1]}).all()
-    counted: defaultdict[int, dict[str, int]] = defaultdict(dict)
+    of_surrogates: defaultdict[int, dict[str, int]] = defaultdict(dict)
     for surrogate, counts in sampled.items():
-        counted[surrogate].update(counts)
+        of_surrogates[surrogate].update(counts)
     for surrogate, what, steps in rows:
-        counted[surrogate][what] = int(steps)
-    return {surrogate: _record(**counts) for surrogate, counts in counted.items()}
+        of_surrogates[surrogate][what] = int(steps)
+    return {surrogate: _record(**counts) for surrogate, counts in of_surrogates.items()}
 
 
 def _record(*, failed: int = 0, expired: int = 0, **steps: int) -> LedgerRecord:

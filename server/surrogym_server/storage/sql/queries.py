@@ -130,8 +130,8 @@ class SqlQueries(port.Queries):
     def withdraw(self, name: str, query_ids: Sequence[int]) -> int:
         with self._database.write() as connection:
             surrogate = hold(connection, name)
-            chosen = queries.c.id.in_(query_ids) & leasing.is_unbegun(surrogate.id)
-            gone = len(connection.execute(sa.delete(queries).where(chosen).returning(queries.c.id)).all())
+            condition = queries.c.id.in_(query_ids) & leasing.is_unbegun(surrogate.id)
+            gone = len(connection.execute(sa.delete(queries).where(condition).returning(queries.c.id)).all())
             if gone:
                 append_event(connection, surrogate, "queries", withdrawn=gone, round=surrogate.round)
             return gone
@@ -191,12 +191,12 @@ def _require_room(connection: Connection, surrogate: Row[Any], steps: int) -> No
 
 def query_counts(connection: Connection, span: Span) -> dict[int, QueryCounts]:
     """Number of queries by status, for each surrogate of the span that has any."""
-    counted: defaultdict[int, dict[str, int]] = defaultdict(dict)
+    of_surrogates: defaultdict[int, dict[str, int]] = defaultdict(dict)
     statement = sa.select(queries.c.surrogate_id, queries.c.status, sa.func.count()).where(within(queries, span))
     rows = connection.execute(statement.group_by(queries.c.surrogate_id, queries.c.status)).all()
     for surrogate, status, count in rows:
-        counted[surrogate][status] = count
-    return {surrogate: QueryCounts(**counts) for surrogate, counts in counted.items()}
+        of_surrogates[surrogate][status] = count
+    return {surrogate: QueryCounts(**counts) for surrogate, counts in of_surrogates.items()}
 
 
 def _ended(query_id: int) -> LeaseExpired:

@@ -32,14 +32,14 @@ class SqlStorage(Storage):
     """The ``Storage`` port on a SQLite or PostgreSQL database."""
 
     def __init__(self, database: Database) -> None:
-        self._database, counted = database, CountedSamples()
+        self._database, counts = database, CountedSamples()
         self._readiness = Readiness(database)
-        self.surrogates = SqlSurrogates(database, counted)
+        self.surrogates = SqlSurrogates(database, counts)
         self.designs = SqlDesigns(database)
         self.queries = SqlQueries(database)
         self.samples = SqlSamples(database)
         self.snapshots = SqlSnapshots(database)
-        self.ledger = SqlLedger(database, counted)
+        self.ledger = SqlLedger(database, counts)
         self.models = SqlModels(database)
         self.occupancy = SqlOccupancy(database)
         self.sessions = SqlSessions(database)

@@ -56,9 +56,9 @@ STANDING = sa.select(surrogates.c.id, surrogates.c.phase, surrogates.c.paused).w
 
 
 class SqlSurrogates(port.Surrogates):
-    def __init__(self, database: Database, counted: CountedSamples) -> None:
+    def __init__(self, database: Database, counts: CountedSamples) -> None:
         self._database = database
-        self._counted = Counted(counted)
+        self._counted = Counted(counts)
 
     def create(self, new: NewSurrogate) -> tuple[SurrogateRecord, bool]:
         with self._database.write() as connection:
@@ -83,8 +83,8 @@ class SqlSurrogates(port.Surrogates):
 
     def name_of(self, id: int) -> str:
         with self._database.read() as connection:
-            named = sa.select(surrogates.c.name).where(surrogates.c.id == id, IS_THERE)
-            name = connection.execute(named).scalar()
+            statement = sa.select(surrogates.c.name).where(surrogates.c.id == id, IS_THERE)
+            name = connection.execute(statement).scalar()
         if name is None:
             raise UnknownSurrogate("expected an existing surrogate, got one that was deleted")
         return str(name)
@@ -303,11 +303,11 @@ class Counted:
 
     def read(self, connection: Connection, newest: Mapping[int, int | None]) -> dict[int, tuple[SampleCounts, int]]:
         """The numbers of each surrogate, given the id of its newest sample, which was read before."""
-        counted = self._samples.of_many(connection, newest)
+        counts = self._samples.of_many(connection, newest)
         stale = [id for id in newest if self._answered.get(id, (-1, 0))[0] != newest[id]]
         for first in range(0, len(stale), AT_ONCE):
             self._count(connection, {id: newest[id] for id in stale[first : first + AT_ONCE]})
-        return {id: (counted[id], self._answered[id][1]) for id in newest}
+        return {id: (counts[id], self._answered[id][1]) for id in newest}
 
     def _count(self, connection: Connection, newest: Mapping[int, int | None]) -> None:
         rows = connection.execute(ANSWERED, {"owners": list(newest)}).all()
@@ -318,7 +318,7 @@ class Counted:
 
 
 def read_summaries(
-    connection: Connection, condition: sa.ColumnElement[bool], limit: int | None, counted: Counted
+    connection: Connection, condition: sa.ColumnElement[bool], limit: int | None, counts: Counted
 ) -> list[SurrogateSummary]:
     """Up to ``limit`` surrogates that meet a condition, oldest first. The condition must choose a range of ids."""
     statement = (
@@ -331,7 +331,7 @@ def read_summaries(
     if not rows:
         return []
     span = (rows[0].id, rows[-1].id)
-    answers = counted.read(connection, {row.id: row[len(SUMMARY_COLUMNS) + 1] for row in rows})
+    answers = counts.read(connection, {row.id: row[len(SUMMARY_COLUMNS) + 1] for row in rows})
     spent = ledgers(connection, span, {id: counts.by_purpose for id, (counts, _) in answers.items()})
     newest, none_spent = newest_of(connection, span), LedgerRecord()
     summaries = []
