@@ -24,7 +24,7 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -39,7 +39,7 @@ from common import OUT, Call, Turns, ratio, take_turns, timed, write
 from pydantic import TypeAdapter
 from safetensors.torch import load
 
-from support.server import running_server
+from support.server import COLD, ServerProcess, start_server
 from surrogym.demo.tasks import TASKS
 from surrogym_client.environments.spaces import space
 from surrogym_shared.wire import ActionSpace
@@ -98,10 +98,19 @@ class Commit:
         """Run the design of a task alone: a server in the folder ``run``, and a sampler."""
         run.mkdir(parents=True)
         environment, budget = TASKS[task].environment, TASKS[task].budget
-        with running_server(run, PYTHONPATH=self.path) as server:
+        with self.server(run) as server:
             about = ["--name", task, "--budget", str(budget), "--seed", str(seed)]
             self._run("register", environment, *about, "--server", server.url, "--quiet")
             self._run("sample", task, "--env", environment, "--until-done", "--server", server.url, "--quiet")
+
+    @contextmanager
+    def server(self, run: Path) -> Iterator[ServerProcess]:
+        """The server of this commit on the run in a folder; a fork of this process would run other code."""
+        server = start_server(run, program=COLD, PYTHONPATH=self.path)
+        try:
+            yield server
+        finally:
+            server.stop()
 
     def _run(self, *arguments: str) -> None:
         command, environment = [sys.executable, "-m", self.program, *arguments], os.environ | {"PYTHONPATH": self.path}
@@ -312,7 +321,7 @@ def compared_run(commits: Mapping[str, Commit], make: Callable[..., None], round
         for side, commit in commits.items():
             run = folder / side
             make(commit, run=run)
-            url = stack.enter_context(running_server(run, PYTHONPATH=commit.path)).url
+            url = stack.enter_context(commit.server(run)).url
             servers[side] = stack.enter_context(closing(Server(url)))
             found[side] = facts(servers[side], run)
         told = list(differences(found["before"], found["after"]))
