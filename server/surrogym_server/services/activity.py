@@ -13,6 +13,7 @@ T = TypeVar("T")
 
 ALIVE_SECONDS = 75.0  # one that was silent for longer counts as gone; the longest claim waits for 60
 FORGET_AT = 256  # entries, those of the silent included; a search through all at each call would take longer with each
+MOST_NAMES = 1_000  # of a surrogate at once; a caller beyond them is served, but not shown
 
 
 class Alive(Generic[T]):
@@ -20,27 +21,47 @@ class Alive(Generic[T]):
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock = clock
-        self._heard: dict[tuple[str, str], tuple[float, T]] = {}
+        self._heard = defaultdict[str, dict[str, tuple[float, T]]](dict)  # by surrogate and name
         self._forget_at = FORGET_AT
         self._lock = threading.Lock()
 
     def note(self, surrogate: str, name: str, said: T) -> bool:
-        """Note a call. Returns whether the caller is new, or was silent for so long that it counted as gone."""
-        now, key = self._clock(), (surrogate, name)
+        """Note a call. Returns whether the caller is new, or was silent for so long that it counted as gone. A new
+        caller is not noted while ``MOST_NAMES`` others of the surrogate are active."""
+        now = self._clock()
         with self._lock:
-            before, _ = self._heard.get(key, (-ALIVE_SECONDS, said))
-            self._heard[key] = (now, said)
-            if len(self._heard) > self._forget_at:
-                self._heard = {key: one for key, one in self._heard.items() if now - one[0] < ALIVE_SECONDS}
-                self._forget_at = max(FORGET_AT, 2 * len(self._heard))
+            names = self._heard[surrogate]
+            if name not in names and len(names) >= MOST_NAMES:
+                names = self._heard[surrogate] = self._active(names, now)
+                if len(names) >= MOST_NAMES:
+                    return False
+            before, _ = names.get(name, (-ALIVE_SECONDS, said))
+            new = name not in names
+            names[name] = (now, said)
+            if new:
+                self._forget_silent(now)
         return now - before >= ALIVE_SECONDS
 
     def alive(self) -> list[tuple[str, str, T]]:
         """The surrogate, the name and the report of each."""
         now = self._clock()
         with self._lock:
-            heard = sorted(self._heard.items(), key=lambda one: one[0])
-        return [(*key, said) for key, (at, said) in heard if now - at < ALIVE_SECONDS]
+            heard = {surrogate: self._active(names, now) for surrogate, names in self._heard.items()}
+        return [
+            (surrogate, name, heard[surrogate][name][1])
+            for surrogate in sorted(heard)
+            for name in sorted(heard[surrogate])
+        ]
+
+    def _forget_silent(self, now: float) -> None:
+        if sum(map(len, self._heard.values())) > self._forget_at:
+            active = {surrogate: self._active(names, now) for surrogate, names in self._heard.items()}
+            self._heard = defaultdict(dict, {surrogate: names for surrogate, names in active.items() if names})
+            self._forget_at = max(FORGET_AT, 2 * sum(map(len, self._heard.values())))
+
+    @staticmethod
+    def _active(names: dict[str, tuple[float, T]], now: float) -> dict[str, tuple[float, T]]:
+        return {name: heard for name, heard in names.items() if now - heard[0] < ALIVE_SECONDS}
 
 
 class Samplers(Alive[None]):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from surrogym_server.services.activity import Samplers
+from surrogym_server.features.jobs.workers import Offer, Workers
+from surrogym_server.services.activity import ALIVE_SECONDS, MOST_NAMES, Samplers
 
 
 class Clock:
@@ -22,3 +23,25 @@ def test_a_sampler_that_falls_silent_is_gone():
     assert samplers.by_surrogate()["a"] == ["one", "two"]
     clock.now += 40
     assert samplers.by_surrogate()["a"] == ["two"]
+
+
+def test_flood_of_names_is_bounded_and_ends_with_its_silence():
+    clock = Clock()
+    samplers = Samplers(clock)
+    samplers.heard("a", "honest")
+    for i in range(3 * MOST_NAMES):
+        samplers.heard("a", f"made up {i}")
+    samplers.heard("b", "other")
+    heard = samplers.by_surrogate()
+    assert len(heard["a"]) == MOST_NAMES
+    assert "honest" in heard["a"]
+    assert heard["b"] == ["other"]
+    clock.now += ALIVE_SECONDS
+    samplers.heard("a", "late")
+    assert samplers.by_surrogate() == {"a": ["late"]}
+
+
+def test_worker_beyond_the_bound_is_not_new_at_each_call():
+    workers = Workers(Clock())
+    assert all(workers.heard("a", f"made up {i}", Offer()) for i in range(MOST_NAMES))
+    assert not workers.heard("a", "one more", Offer()), "each would wake all who wait"

@@ -20,7 +20,7 @@ class Workers(Alive[Offer]):
     def heard(self, surrogate: str, worker: str, offer: Offer | None = None) -> bool:
         """Note that a worker claimed or reported, and return whether it is new. None keeps its earlier offer."""
         if offer is None:
-            _, offer = self._heard.get((surrogate, worker), (0.0, Offer()))
+            _, offer = self._heard.get(surrogate, {}).get(worker, (0.0, Offer()))
         return self.note(surrogate, worker, offer)
 
     def of(self, surrogate: str) -> dict[str, Offer]:
