@@ -32,6 +32,9 @@ Algorithm = Annotated[
         show_default=False,
     ),
 ]
+Access = Annotated[
+    Literal["any", "snapshot", "reset"], typer.Option(help="Where a query may begin, as in surrogym register.")
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -50,6 +53,7 @@ def command(
     budget: Budget = None,
     steps: Steps = None,
     algorithm: Algorithm = None,
+    access: Access = "any",
     episodes: Annotated[int, typer.Option(min=1, help="Number of real episodes of the evaluation.")] = 100,
     pictures: Annotated[bool, typer.Option(help="Draw pictures of the run.")] = True,
     keep: Annotated[bool, typer.Option("--keep", help="Keep the server running until Ctrl-C.")] = False,
@@ -71,6 +75,7 @@ def command(
         budget=budget,
         steps=steps,
         algorithm=algorithm,
+        access=access,
         episodes=episodes,
         pictures=pictures,
         keep=keep,

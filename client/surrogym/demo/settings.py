@@ -10,7 +10,7 @@ from typing import Any
 from surrogym.demo.tasks import ROUNDS, TASKS, DemoTask, design_budget, queries_a_round
 from surrogym_sampler.original import make
 from surrogym_sampler.original.loading import with_choices
-from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.spec import Access, EnvironmentSpec
 from surrogym_trainer.training.search import FAST, REFERENCE, SEARCHES
 from surrogym_trainer.training.settings import TrainSettings, prolongs
 
@@ -27,11 +27,12 @@ class DemoSettings:
     pictures: bool = True
     keep: bool = False
     algorithm: str | None = None  # name of a policy search; None: the default of a training
+    access: Access = "any"  # where a query of the sampler may begin
 
     @property
     def run_name(self) -> str:
         """Name of the kind of run, for its folder and its table."""
-        return self.task
+        return self.task if self.access == "any" else f"{self.task}-{self.access}"
 
     @property
     def labels(self) -> dict[str, str]:
@@ -44,8 +45,13 @@ class DemoSettings:
 
     @property
     def real_steps(self) -> int:
-        """The budget."""
-        return self.budget or self.demo_task.budget
+        """The budget. A task whose states can't be set has the default budget of its specification."""
+        if self.budget is not None:
+            return self.budget
+        if self.access == "any":
+            return self.demo_task.budget
+        spec = self._usual()
+        return spec.preset.budget(0, len(spec.coordinates), spec.action.size, spec.query == "step")
 
     @property
     def virtual_steps(self) -> int | None:
@@ -86,8 +92,11 @@ class DemoSettings:
 
     def spec(self) -> EnvironmentSpec:
         """The environment's specification with the design of the demo."""
-        plain = make(self.demo_task.environment, preset="default", seed=self.seed).spec()
-        return with_choices(plain, {"preset": "default", "budget": design_budget(self.real_steps)})
+        return with_choices(self._usual(), {"preset": "default", "budget": design_budget(self.real_steps)})
+
+    def _usual(self) -> EnvironmentSpec:
+        """The specification with the design's default budget."""
+        return make(self.demo_task.environment, preset="default", seed=self.seed, access=self.access).spec()
 
     def judged_by(self) -> EnvironmentSpec:
         """The original environment as the policy is judged by it."""
