@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections import Counter, defaultdict, deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from typing import Any
 
 import sqlalchemy as sa
@@ -66,7 +67,7 @@ class Policies:
         """Store a policy before its ``file`` is sent. Returns its version, and whether that is new.
 
         A version never changes. The same main file, card and curve are the same version, whoever stores them. Beyond
-        ``MAX_POLICIES`` the oldest policy without an alias is removed.
+        ``MAX_POLICIES`` the oldest policy without an alias of whoever stored most is removed.
 
         Raises:
             TooLarge: there are ``MAX_POLICIES``, and all have aliases.
@@ -76,11 +77,11 @@ class Policies:
             known = _known(connection, held.id, card, curve, file.digest)
             if known is not None:
                 return known, False, ()
-            freed = _make_place(connection, held.id, name)
             version = _next_version(connection, held.id)
             place = {"surrogate_id": held.id, "version": version}
             connection.execute(sa.insert(policies).values(**place, created_at=held.now, card=card, curve=curve))
             connection.execute(sa.insert(policy_files).values(**place, **_of_file(file), main=True))
+            freed = _make_place(connection, held.id, version, name)
             append_event(connection, held, "policy", version=version, what="new")
             return version, True, freed
 
@@ -99,8 +100,8 @@ class Policies:
     def attach(self, name: str, version: int, file: PolicyFile, most: int) -> Freed:
         """Store a file of a policy. A file of this form that was stored or announced is the same one.
 
-        If the files of the surrogate's policies then exceed ``most`` bytes together, files of the oldest policies
-        without an alias are removed first. Their descriptions stay.
+        If the files of the surrogate's policies then exceed ``most`` bytes together, files of policies
+        without an alias are removed: the oldest of whoever stored most. Their descriptions stay.
 
         Raises:
             InvalidInput: the policy has another file of this form.
@@ -218,24 +219,29 @@ def _without_owner(card: JSON) -> JSON:
     return {name: value for name, value in card.items() if name != PUSHED_BY}
 
 
-def _make_place(connection: Connection, surrogate: int, name: str) -> Freed:
-    """Remove the oldest policies without an alias, until there is room for one more."""
-    versions = _unaliased(connection, surrogate)
-    own = sa.select(sa.func.count()).select_from(policies).where(policies.c.surrogate_id == surrogate)
-    beyond = connection.execute(own).scalar_one() + 1 - MAX_POLICIES
-    if beyond > len(versions):
+def _make_place(connection: Connection, surrogate: int, version: int, name: str) -> Freed:
+    """Remove policies without an alias, but for this version, until there are ``MAX_POLICIES``."""
+    own = sa.select(policies.c.version).where(policies.c.surrogate_id == surrogate)
+    counts = dict.fromkeys(connection.execute(own).scalars(), 1)
+    beyond = len(counts) - MAX_POLICIES
+    if beyond <= 0:
+        return ()
+    removed = [*islice(_in_order_of_removal(connection, surrogate, version, counts), beyond)]
+    if len(removed) < beyond:
         raise TooLarge(
             f"expected at most {MAX_POLICIES} policies of {name!r}, got one more, and all have aliases: remove an alias"
         )
-    return _delete(connection, surrogate, versions[: max(0, beyond)])
+    return _delete(connection, surrogate, removed)
 
 
 def _within(connection: Connection, surrogate: int, version: int, most: int, name: str) -> Freed:
-    """Remove files of the oldest policies without an alias, until all files have at most ``most`` bytes together."""
+    """Remove files of policies without an alias, but for this version, until all have at most ``most`` bytes."""
     sizes = _sizes(connection, surrogate)
     beyond = sum(sizes.values()) - most
+    if beyond <= 0:
+        return ()
     freed: list[str] = []
-    for oldest in [v for v in _unaliased(connection, surrogate) if v != version]:
+    for oldest in _in_order_of_removal(connection, surrogate, version, sizes):
         if beyond <= 0:
             break
         beyond -= sizes.get(oldest, 0)
@@ -256,6 +262,29 @@ def _sizes(connection: Connection, surrogate: int) -> dict[int, int]:
         for row in connection.execute(there.where(table.c.surrogate_id == surrogate, table.c.blob.is_not(None))):
             sizes[row.version] += row.bytes
     return sizes
+
+
+def _in_order_of_removal(connection: Connection, surrogate: int, kept: int, sizes: Mapping[int, int]) -> Iterator[int]:
+    """Versions without an alias, but for ``kept``: again and again the oldest of whoever holds most.
+
+    So a flood of policies removes those of its own sender, and none of others.
+    """
+    cards = sa.select(policies.c.version, policies.c.card).where(policies.c.surrogate_id == surrogate)
+    senders = {row.version: row.card.get(PUSHED_BY) for row in connection.execute(cards)}
+    held = Counter[str | None]()
+    for version, size in sizes.items():
+        held[senders[version]] += size
+    left = defaultdict[str | None, deque[int]](deque)
+    for version in _unaliased(connection, surrogate):
+        if version != kept:
+            left[senders[version]].append(version)
+    while left:
+        sender = max(left, key=held.__getitem__)
+        version = left[sender].popleft()
+        held[sender] -= sizes.get(version, 0)
+        if not left[sender]:
+            del left[sender]
+        yield version
 
 
 def _unaliased(connection: Connection, surrogate: int) -> list[int]:

@@ -12,7 +12,7 @@ import pytest
 
 from surrogym_server.errors import Damaged, InvalidInput, TooLarge, UnknownPolicy, UnknownSurrogate
 from surrogym_server.features.policies.blobs import open_blobs
-from surrogym_server.features.policies.records import Blobs, NewEvaluation, PolicyFile
+from surrogym_server.features.policies.records import PUSHED_BY, Blobs, NewEvaluation, PolicyFile
 from surrogym_server.features.policies.store import Policies
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
@@ -156,6 +156,28 @@ def test_beyond_the_count_the_oldest_without_an_alias_goes(
     stored.policies.put_alias(name, "spare", 3)
     with pytest.raises(TooLarge, match="all have aliases"):
         pushed(stored, name, b"four")
+
+
+def test_flood_of_one_sender_leaves_the_policies_of_others(
+    stored: Stored, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("surrogym_server.features.policies.store.MAX_POLICIES", 4)
+    name = make()
+    for number in range(2):
+        stored.policies.add(name, CARD | {PUSHED_BY: "honest"}, [], file_of(b"%d" % number))
+    for number in range(20):
+        stored.policies.add(name, CARD | {PUSHED_BY: "flood"}, [], file_of(b"flood %d" % number))
+    assert [policy.version for policy in stored.policies.list(name)] == [22, 21, 2, 1]
+
+
+def test_files_of_one_sender_do_not_displace_those_of_others(stored: Stored, make: Make) -> None:
+    name = make()
+    for number, sender in enumerate(["honest", *["flood"] * 5]):
+        content = bytes([number]) * 100
+        version, _, _ = stored.policies.add(name, CARD | {PUSHED_BY: sender}, [], file_of(content))
+        stored.policies.attach(name, version, file_of(content, blob=stored.blobs.put(content)), 350)
+    policies = stored.policies.list(name)
+    assert [policy.version for policy in policies if policy.files[0].blob is not None] == [6, 5, 1]
 
 
 def test_files_of_a_deleted_surrogate_are_orphans(storage: Storage, stored: Stored, make: Make) -> None:
