@@ -38,6 +38,7 @@ FREQUENT = frozenset(  # routes that only read or make short-lived changes, and 
         "/v1/surrogates/{name}/imagine",
     }
 )
+MOST_PATH = 256  # characters of a path in the log: anybody may send long ones, without a token
 FAILED = 500  # a request that ended before its reply began
 
 _GIVEN = re.compile(r"[A-Za-z0-9._-]{1,64}")
@@ -90,8 +91,9 @@ class Observed:
         told = status >= 400 or (method in CHANGING and route not in FREQUENT)
         level = logging.WARNING if status >= FAILED else logging.INFO if told else logging.DEBUG
         if logger.isEnabledFor(level):
-            who = caller(scope)
-            logger.log(level, "%s %s -> %d in %.1f ms, by %s", method, scope["path"], status, 1e3 * seconds, who)
+            path, who = scope["path"], caller(scope)
+            path = path if len(path) <= MOST_PATH else f"{path[:MOST_PATH]}... ({len(path)} characters)"
+            logger.log(level, "%s %s -> %d in %.1f ms, by %s", method, path, status, 1e3 * seconds, who)
 
 
 def _id_of(scope: Scope) -> str:

@@ -70,6 +70,14 @@ def test_a_fingerprint_is_found_in_the_list_of_the_start_and_is_no_part_of_the_t
     assert len({fingerprint(token) for token in TOKENS.values()}) == len(TOKENS)
 
 
+def test_long_path_of_a_stranger_does_not_fill_the_log(guarded: ServerProcess, send: Send) -> None:
+    assert send("DELETE", "/v1/surrogates/" + "x" * 30_000, "a-stranger", "long-path").status_code == 401
+    assert until(lambda: lines(guarded, "long-path"))
+    (line,) = lines(guarded, "long-path")
+    assert len(line) < 500
+    assert "(30015 characters)" in line
+
+
 def test_a_token_that_is_refused_is_not_fingerprinted(guarded: ServerProcess, send: Send) -> None:
     """Who mistypes a password into the header has not published its hash."""
     assert send("DELETE", "/v1/surrogates/x", "a-mistyped-secret", "stranger").status_code == 401
