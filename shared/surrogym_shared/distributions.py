@@ -17,7 +17,8 @@ Array = NDArray[np.floating[Any]]  # float32 in a training
 
 
 class Sampled(Protocol):
-    """Distribution of actions (B, F), given the outputs of an actor (B, A) and further parameters (K,)."""
+    """Distribution of actions (B, F), given the outputs of an actor (B, A) and further parameters (K,), such as
+    logarithms of standard deviations."""
 
     @property
     def outputs(self) -> int:

@@ -136,7 +136,9 @@ class SurrogateFile:
         except NotASurrogateFile:
             raise
         except ValidationError as error:
-            raise NotASurrogateFile(f"its specification contradicts itself: {first_fault(error)}") from error
+            raise NotASurrogateFile(
+                f"expected a specification without faults, got {first_fault(error)}; export the surrogate again"
+            ) from error
         except UNREADABLE as error:
             raise NotASurrogateFile(f"expected a surrogate's file, got {len(data)} bytes: {error!r}") from error
         _require_shapes(spec, samples)

@@ -141,7 +141,7 @@ def test_an_own_page_and_a_program_may(server: ServerProcess):
         assert sent(server.url, sec_fetch_site=site) == 403
 
 
-def test_behind_a_proxy_the_public_address_is_its_own(tmp_path: Path):
+def test_behind_a_proxy_pages_of_the_public_url_are_own_and_others_foreign(tmp_path: Path):
     token = "the-token-behind-a-proxy"
     with running_server(tmp_path, "--public-url", "https://Plant.example", SURROGYM_TOKEN=token) as server:
         bearer = {"authorization": f"Bearer {token}"}

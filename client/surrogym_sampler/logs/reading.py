@@ -89,7 +89,7 @@ def read_npz(path: Path) -> Table:
     except UnusableLog:
         raise
     except ValueError as error:
-        raise UnusableLog(f"{path}: {error}") from error
+        raise UnusableLog(f"{path}: {error}; write the file again, for example by numpy.savez") from error
     named = [str(name) for name in np.atleast_1d(arrays.pop("coordinate_names", ()))]
     evaluated = arrays.pop(EVALUATED, np.array(False))
     return replace(table_of_arrays(path, arrays, named), evaluated=evaluated.shape == () and bool(evaluated))

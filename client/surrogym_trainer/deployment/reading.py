@@ -262,7 +262,9 @@ def _check(controller: Controller, spec: EnvironmentSpec, predict: Predict) -> N
     try:
         expected = decode_actions(spec, predict(observations), CHECKS)
     except ValueError as error:  # torch refuses a distribution of NaN
-        raise NotDeployable("expected a policy with finite actions, got another: its weights overflow") from error
+        raise NotDeployable(
+            "expected a policy with finite actions, got NaN or infinity, because its weights overflow: train it again"
+        ) from error
     shown = observations.astype(np.float64)
     got, _ = act(controller, shown)
     wrong = np.abs(got - expected) > TOLERANCE * (controller.high - controller.low)

@@ -89,7 +89,9 @@ def _check_self_contained(model: Any) -> None:
             case onnx.SparseTensorProto():
                 raise ValueError("expected dense arrays, got a sparse one")
             case onnx.GraphProto() if message is not model.graph:
-                raise ValueError("expected one graph, got a loop or a branch")
+                raise ValueError(
+                    "expected one graph, got a loop or a branch in it: export the policy without control flow"
+                )
 
 
 def _messages(message: Any) -> Iterator[Any]:

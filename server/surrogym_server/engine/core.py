@@ -122,7 +122,11 @@ def limits_rewards(definition: EnvironmentDefinition) -> bool:
 
 
 def _limited(settings: VirtualSettings, rewards: SampledRewards | None, model: DynamicsModel) -> VirtualSettings:
-    """Add the limits of virtual rewards to settings, unless an imported model has learned from further samples."""
+    """Limit virtual rewards to the range of the sampled ones.
+
+    They stay as they are if the reward is declared or unlimited by design, or if an imported model has learned from
+    samples that are not stored here.
+    """
     if rewards is None or not limits_rewards(model.definition) or model.samples > rewards.samples:
         return settings
     return replace(settings, reward_limits=reward_limits(rewards.low, rewards.high))
@@ -236,7 +240,9 @@ def _stepped(
         )
     except SurrogymError:
         raise
-    except BaseException as error:  # from a family's code; a ``plugin_calls`` block would slow each step
+    except (
+        BaseException
+    ) as error:  # raised by a family of models, maybe a plug-in's; a context manager here would slow each step
         if isinstance(error, KeyboardInterrupt) and not interrupts:
             raise
         raise failure_of(session.definition, error) from error

@@ -93,18 +93,24 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     # Lines 3, 4 and 12: fit the processes of all outputs, transitions and reward, to all samples.
     fit = learn(definition, samples, state.warm)
 
-    # CI needs a tolerance for each output, (O,): the declared one, or else 5 % of the output's standard deviation.
+    # CI needs a tolerance for each output, (O,): the declared one, or else 5 % of the output's standard deviation over
+    # the samples of the first round, which later rounds keep. With snapshots each round computes it again.
     defaults = frozen_tolerances(definition, samples, state.defaults)
     tolerances = definition.tolerances_or(defaults.values)
 
-    # Lines 5, 6 and 13: the CI of each output over the Monte Carlo set, whose points are also candidates below.
+    # Lines 5, 6, 13, and the test of line 14: the CI of each output over the Monte Carlo set, whose points are also
+    # candidates below, and a verdict: "continue", or why the design may end, such as a spent budget. Beyond the paper,
+    # leave-one-out errors have to be within the tolerances, and some adaptive queries have to be answered. The request
+    # says what budget and target are, and which states policies visited; the state has earlier predictions.
     judgement = judge_model(fit.model, samples, tolerances, request, state)
 
-    # Line 14, "until CI >= target": the verdict is "continue", or why the design may end, such as a spent budget.
+    # A design that has ended before stays ended, with its verdict, until a person asks for more or the model is
+    # contradicted. The cost is the number of real steps taken, without those of logs and audits.
     conditions = Conditions(request.cost(len(samples)), request.budget, request.target, tolerances)
     verdict = verdict_with_history(judgement, state, request, conditions)
 
-    # Not in the paper: a ready design that begins at snapshots continues for an excursion, a test of its model.
+    # Not in the paper: a ready design that begins at snapshots continues for an excursion, a rollout beyond the visited
+    # states that tests the model. If the budget has no room for it, the design ends as "over_budget".
     testing = verdict == "ready" and _lacks_excursion(definition, samples, state)
     if testing:
         tested_at = len(samples)
@@ -112,19 +118,23 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         tested_at = state.tested_at if verdict == "ready" else 0
     continues = verdict == "continue" or testing
 
-    # Line 8, "for each process with CI < target": the numbers of these outputs, the least confident first.
+    # Line 8, "for each process with CI < target": the numbers of these outputs, the least confident first; if there is
+    # none, the least confident output alone.
     outputs = below_target(judgement.confidences, request.target)
 
-    # Lines 9 and 10: for each of these outputs the candidate with the largest uncertainty index. The last rule does
-    # that. The rules before it choose queries that the paper does not have, such as repeats, which show what is noise;
-    # a rule that does not apply returns None.
+    # Lines 9 and 10: for each of these outputs the query that the acquisition values most; in preset "paper" that is
+    # the largest uncertainty index U. The last rule does that, by single steps or by planned rollouts, and always
+    # applies. The rules before it choose queries that the paper does not have, such as repeats, which show what is
+    # noise; a rule that does not apply returns None. A design that has ended chooses none, or the ``request.extra``
+    # steps that a person asked for.
     round = Round(state.round, fit.model, samples, request, judgement, tolerances, outputs, continues, testing)
     rules = STEP_RULES if definition.max_rollout is None else ROLLOUT_RULES
     queries = next(choice for rule in rules if (choice := rule(round)) is not None)
     if continues:
         verdict = _verdict_with(queries, round)
 
-    # Store what the next round needs. A design that has ended may begin again, if the conditions change.
+    # Store what the next round needs; its caller adds the predictions of the new samples. A design with extra queries
+    # has not ended here, whatever its verdict. One that has ended may begin again, if the conditions change.
     ended = verdict != "continue" and not queries
     following = DesignState(
         round=state.round + 1,

@@ -53,8 +53,8 @@ class NearbyAnswers(OutputOutlook):
     definition: EnvironmentDefinition
     candidates: Points  # m candidates
     reference: Points  # r reference points
-    own: Tensor  # (m,) variance at each candidate after the answers so far
-    there: Tensor  # (r,) variance at each reference point after the answers so far
+    own: Tensor  # (m,) variance at each candidate, as if the queries before were answered
+    there: Tensor  # (r,) variance at each reference point, as if the same
     learns: Tensor  # (m,) bool: whether a model learns from a step at the candidate, because its lags are known
 
     @classmethod

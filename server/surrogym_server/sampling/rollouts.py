@@ -36,9 +36,8 @@ GENERATIONS = 3  # populations of a search, the random first one included
 DOUBTFUL = 0.25  # least chance of an ending for which a rollout is planned
 
 Sequences = NDArray[np.float64]  # k sequences of T actions, (k, T, F)
-Worth = Callable[
-    [Tensor, Sequences], tuple[Tensor, Tensor]
-]  # from states (k, s, C) and k sequences: value and best length of each sequence, (k,)
+# Rates k sequences, each from s equally likely start states (k, s, C): their values and best lengths, (k,) each.
+Worth = Callable[[Tensor, Sequences], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -270,7 +269,7 @@ def vary(definition: EnvironmentDefinition, sequences: Sequences, rng: np.random
         sequence[first : last + 1] = _random_actions(definition, 1, rng)
 
 
-def _random_actions(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> Sequences:
+def _random_actions(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Random actions (count, F). Half of the continuous entries are at a limit, because such actions reach farthest."""
     action = definition.action
     if action.nvec:

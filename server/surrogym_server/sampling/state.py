@@ -76,8 +76,9 @@ class DesignState:
 class Request:
     """Input of a round.
 
-    Pending queries, open or set aside, are treated as answered. They count towards the budget, so that a design whose
-    queries all fail comes to an end, and in the acquisition, so that the next queries go elsewhere. Queries that the
+    Pending queries, open or set aside, are treated as answered. Their steps are reserved (``Round.room`` subtracts
+    them, ``cost`` does not count them), so that a design whose queries all fail comes to an end. They count in the
+    acquisition, so that the next queries go elsewhere. Queries that the
     environment refused count in the acquisition alone, because no real step was taken.
     """
 

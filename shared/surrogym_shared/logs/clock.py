@@ -19,7 +19,8 @@ from surrogym_shared.words import counted
 SHARED = 0.1  # share of rows with the time of the row before, from which the clock may be coarser than the rows
 # Shares of these rows that differ in other numbers: up to the first they are repeats, from the second on they are not.
 REPEATS, DIFFER = 0.02, 0.2
-IRREGULAR = 0.1  # share of ticks with another number of rows, above which such a clock does not order the rows
+# Share of ticks whose number of rows differs by more than one from the usual, above which a coarse clock is refused.
+IRREGULAR = 0.1
 GAP = 1.5  # number of ticks between two times from which on there is a gap
 
 

@@ -325,7 +325,9 @@ def _require_declared(mapped: LogMapping, state: Iterable[str], action: Iterable
     if both := sorted(set(mapped.angles or ()) & set(mapped.constants)):
         raise UnusableLog(f"{where}: expected {both[0]!r} in angles or in constants, got it in both")
     if both := sorted(set(mapped.limits) & set(states) & set(actions)):
-        raise UnusableLog(f"{where}: expected limits of a state or of an action, got {both[0]!r}, which names both")
+        raise UnusableLog(
+            f"{where}: expected limits of a state or of an action, got {both[0]!r}, which is both: rename one of them"
+        )
     for name, (low, high) in mapped.limits.items():
         ends = [end for end in (low, high) if end is not None]
         if not all(abs(end) <= LARGEST for end in ends):

@@ -311,7 +311,8 @@ def _discrete(counts: list[int]) -> DiscreteAction | MultiDiscreteAction:
 
 
 def _asked(names: list[str], codes: list[Floats], whole: list[bool]) -> Iterator[str]:
-    """Ask about actions of few whole numbers, which are drafted as amounts."""
+    """Remark on actions that are few whole numbers (``whole``) and are drafted as amounts, and ask whether they are
+    choices."""
     values = ", ".join(
         f"{name} of {', '.join(f'{value:g}' for value in one)}"
         for name, one, few in zip(names, codes, whole, strict=True)

@@ -43,7 +43,7 @@ def test_a_float32_bound_may_round_to_just_outside_and_is_clipped():
 
 
 @pytest.mark.parametrize("count", [-1, 3])
-def test_numbers_out_of_range(count):
+def test_a_choice_out_of_range_is_refused_with_its_entry_and_row(count):
     with pytest.raises(InvalidInput, match=rf"entry 0 in 0\.\.2, got {count} in row 1"):
         policy_actions(DISCRETE, np.array([[0], [count]]), 2)
 

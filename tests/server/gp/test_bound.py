@@ -223,7 +223,7 @@ def test_noisy_points_go_through_few_of_them_and_predict_as_through_all(parity: 
 
 
 @pytest.mark.parametrize("what", ["a kink", "few points", "rough"])
-def test_points_of_which_some_do_not_say_as_much_as_all_keep_all_of_them(what: str):
+def test_no_sparse_fit_is_made_where_few_points_would_lose_accuracy(what: str):
     count = 300 if what == "few points" else 600
     x, y = points(count, 3, 0)
     if what == "a kink":

@@ -60,7 +60,7 @@ def test_state_without_ranges_keeps_its_tolerances():
     assert frozen(PAID, DefaultTolerances((1e-12,) * 3)) == DefaultTolerances((1e-12,) * 3)
 
 
-def test_increments_of_rounding_get_the_floor_of_their_range():
+def test_the_tolerance_of_increments_that_are_rounding_is_a_floor_of_the_range():
     still = replace(PAID, q_next=PAID.q * (1 + 3e-16))
     tolerance = default_tolerances(DEFINITION, sizes_of(DEFINITION, still))
     assert min(tolerance[:2]) == pytest.approx(TOLERANCE * FLOOR / 3**0.5)

@@ -37,7 +37,7 @@ def emptied(storage: Storage) -> Storage:
     return storage
 
 
-def test_what_is_there_comes_at_once(storage: Storage, definitions: Definitions):
+def test_a_claim_returns_at_once_if_queries_are_open(storage: Storage, definitions: Definitions):
     async def run() -> Claim:
         return await QueryService(storage, definitions, Notices()).claim(NAME, "tester", 2, 60, PATIENCE)
 

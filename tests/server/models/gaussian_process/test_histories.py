@@ -79,7 +79,7 @@ def test_a_reward_of_the_present_looks_at_the_present_alone(model):
     assert "history 0" in model.description["outputs"][-1]["inputs"]
 
 
-def test_each_history_is_compared_with_the_best_map(model):
+def test_every_history_length_is_scored_and_the_best_feature_map_is_kept(model):
     (moved,) = model.transitions
     histories = [name for name, _ in moved.scores if "history" in name]
     assert len(histories) == LONGEST
