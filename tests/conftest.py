@@ -6,8 +6,6 @@ import gc
 import os
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from functools import cache
 from multiprocessing import context
@@ -26,12 +24,12 @@ import typer.testing
 
 import surrogym.cli
 from support.long import TESTS, Long
-from support.nursery import CONTEXTS, contexts_of_forks, one_thread
+from support.nursery import CONTEXTS, FORKS, await_shared, contexts_of_forks, one_thread, share, use_shared
 from support.server import ServerProcess, running_server
 from support.teaching import teach
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import pendulum
-from surrogym_server.engine.compiling import PROGRAM, Compiling
+from surrogym_server.engine.compiling import Compiling
 
 # The same examples in every run, on machines of any speed, and none kept in the checkout.
 hypothesis.settings.register_profile(
@@ -59,7 +57,7 @@ for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHU
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, usual)
 
-COMPILING = pytest.StashKey[subprocess.Popen[bytes]]()
+ADDRESS = "address of the process that is forked"  # entry of what a worker is told
 WHOLE = pytest.StashKey[bool]()  # whether this run is one of all tests
 LASTING = ("slow", "e2e", "timeout")  # marks; a limit of its own is one of more time
 
@@ -97,17 +95,24 @@ def pytest_configure(config: pytest.Config) -> None:
     checkout has compiled is of no use to this one.
     """
     config.stash[WHOLE] = [Path(argument).resolve() for argument in config.args] == [TESTS]
-    if getattr(config.option, "numprocesses", None):
-        config.stash[COMPILING] = subprocess.Popen([sys.executable, "-c", PROGRAM])
-    elif not hasattr(config, "workerinput"):
+    if hasattr(config, "workerinput"):
+        if address := config.workerinput[ADDRESS]:
+            use_shared(address)
+    elif not (FORKS and getattr(config.option, "numprocesses", None)):
         ahead = Compiling()
         ahead.start()
         ahead.wait()
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_node_collection_finished(node: Any) -> None:
-    node.config.stash[COMPILING].wait()
+def pytest_configure_node(node: Any) -> None:
+    node.workerinput[ADDRESS] = share() if FORKS else None
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_node_collection_finished() -> None:
+    if FORKS:
+        await_shared()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,7 +1,8 @@
 """Start servers as forks of a process that has imported them already.
 
 A server imports torch, FastAPI and SQLAlchemy, and the process of its fits does so again: some nine seconds of a core
-for each of a hundred servers. Tests of what a start does start their server cold.
+for each of a hundred servers. Tests of what a start does start their server cold. The process that is forked is one
+for all workers of a run.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
-from multiprocessing import context, forkserver
+from multiprocessing import context, forkserver, resource_tracker
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import IO, Any
@@ -54,6 +55,8 @@ LONGEST = 1 << 18  # bytes of a request
 
 forkserver.set_forkserver_preload([*MODULES, *SAMPLING])
 CONTEXTS: dict[str, Any] = context._concrete_contexts  # type: ignore[attr-defined]
+FORKS = sys.platform == "linux"  # elsewhere forks are not safe
+FORKSERVER: Any = forkserver._forkserver  # type: ignore[attr-defined]
 
 
 class Forked:
@@ -150,10 +153,31 @@ def one_thread() -> None:
     threadpool_limits(1)
 
 
+def share() -> str:
+    """Start the process that is forked, for all workers of this run. It compiles what is not compiled yet. Returns its
+    address."""
+    forkserver.ensure_running()
+    return str(FORKSERVER._forkserver_address)
+
+
+def await_shared() -> None:
+    """Wait until the process that is forked has imported everything."""
+    first = CONTEXTS["forkserver"].Process(target=os.getpid)
+    first.start()
+    first.join()
+
+
+def use_shared(address: str) -> None:
+    """Fork the process that the controller of this run has started, and that ends with it."""
+    FORKSERVER._forkserver_address = address
+    _, FORKSERVER._forkserver_alive_fd = os.pipe()  # forks inherit it; it keeps nothing alive here
+    FORKSERVER.ensure_running = resource_tracker.ensure_running
+
+
 @cache
 def nursery() -> Nursery | None:
     """The nursery of this process, None on a system where forks are not safe."""
-    return Nursery() if sys.platform == "linux" else None
+    return Nursery() if FORKS else None
 
 
 def main(asked: socket.socket, path: list[str]) -> None:
@@ -166,7 +190,7 @@ def main(asked: socket.socket, path: list[str]) -> None:
     from surrogym_server.storage.sql import open_storage  # here: a fork of this process has imported it already
 
     sys.path[:] = path
-    forkserver._forkserver.ensure_running = lambda: None  # type: ignore[attr-defined]  # the one this is a fork of
+    FORKSERVER.ensure_running = lambda: None  # the one this is a fork of
     context._concrete_contexts = CONTEXTS | {"spawn": CONTEXTS["forkserver"]}  # type: ignore[attr-defined]
     with TemporaryDirectory() as folder:
         open_storage(f"sqlite:///{folder}/surrogym.db").close()  # it imports, and compiles statements, at its first use
@@ -219,7 +243,7 @@ class _Forks(context.ForkServerContext):
 def contexts_of_forks() -> dict[str, Any]:
     """The ways of ``multiprocessing`` to start a process; "spawn" forks one that has imported what fits, environments
     and samplers need. That one starts with the first of its forks."""
-    return {**CONTEXTS, "spawn": _Forks()} if sys.platform == "linux" else CONTEXTS
+    return {**CONTEXTS, "spawn": _Forks()} if FORKS else CONTEXTS
 
 
 def _tell(end: int, pid: int, status: int) -> None:
