@@ -7,12 +7,18 @@ import torch
 
 from support.models import learn
 from support.real_steps import answer, arrays, random_steps
+from support.remembered import learn_once
 from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.sampling.design import initial_queries
+
+
+@pytest.fixture(autouse=True)
+def _equal_fits_are_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("surrogym_server.sampling.design.learn", learn_once)
 
 
 @pytest.fixture(scope="session")

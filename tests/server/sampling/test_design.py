@@ -14,6 +14,7 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition, wrap
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
+from surrogym_server.models.guard import learn
 from surrogym_server.sampling import batch
 from surrogym_server.sampling.batch import NEAR, nearest
 from surrogym_server.sampling.confidence import OutputConfidence
@@ -169,7 +170,8 @@ def test_the_reward_of_an_ending_is_queried_first():
     assert not bool(definition.terminated(q)[0])
 
 
-def test_the_same_round_asks_the_same(definition, few):
+def test_the_same_round_asks_the_same(definition, few, monkeypatch):
+    monkeypatch.setattr("surrogym_server.sampling.design.learn", learn)
     one, two = (advance(definition, few, DesignState(), request()) for _ in range(2))
     assert one.queries == two.queries
 

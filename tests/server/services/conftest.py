@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from support import pendulum
+from support.remembered import learn_once
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.sampling.design import initial_queries
@@ -23,6 +24,11 @@ NAME = "pendulum"
 
 def define(spec: dict) -> EnvironmentDefinition:
     return definition_from_spec(EnvironmentSpec.model_validate(spec))
+
+
+@pytest.fixture(autouse=True)
+def _equal_fits_are_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("surrogym_server.sampling.design.learn", learn_once)
 
 
 @pytest.fixture
