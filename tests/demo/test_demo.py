@@ -76,7 +76,7 @@ def demo(tmp_path):
 
 def test_a_small_demo_from_start_to_run_folder(demo, tmp_path):
     metrics_file = tmp_path / "metrics.json"
-    small = demo(*SMALL, "--steps", "8192", "--episodes", "3", "--seed", "1", "--json", str(metrics_file))
+    small = demo(*SMALL, "--steps", "2048", "--episodes", "3", "--seed", "1", "--json", str(metrics_file))
     out, err = small.process.communicate(timeout=SECONDS)
     assert small.process.returncode == 0, err
     assert small.family() == []
@@ -87,7 +87,7 @@ def test_a_small_demo_from_start_to_run_folder(demo, tmp_path):
     assert queries["initial"] + queries["adaptive"] == queries["total"] <= 8
     assert 0 < metrics["confidence_index"] <= 1
     assert metrics["fidelity"]["confidence_index"] == metrics["confidence_index"]
-    assert 0 < metrics["virtual_steps"] <= 8_192
+    assert 0 < metrics["virtual_steps"] <= 2_048
     assert set(metrics["seconds"]) == {"start", "design", "train", "evaluate", "report", "total"}
     assert metrics["seconds"]["total"] >= metrics["seconds"]["train"]
     assert metrics["real_return"]["episodes"] == len(metrics["returns"]) == 3

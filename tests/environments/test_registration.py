@@ -64,17 +64,20 @@ def test_registering_twice_is_harmless():
     assert gymnasium.spec(ENVIRONMENT_ID) is before
 
 
-@pytest.mark.parametrize(
-    "module",
-    [
+def test_client_sampler_and_trainer_load_without_torch():
+    """In one process, the thinnest first: which module brings it is on its line."""
+    modules = (
         "surrogym_client.transport",
         "surrogym_client.environments",
         "surrogym_client.environments.gym_factories",
         "surrogym_sampler.queries",
         "surrogym_trainer.policies",
         "surrogym_trainer.training",
-    ],
-)
-def test_the_thin_client_needs_no_torch(module: str):
-    code = f"import sys, {module}; print(*sys.modules)"
-    assert not {"torch", "stable_baselines3"} & set(run(code).split())
+    )
+    code = (
+        "import importlib, sys\n"
+        f"for module in {modules}:\n"
+        "    importlib.import_module(module)\n"
+        "    print(module, *{'torch', 'stable_baselines3'} & set(sys.modules))"
+    )
+    assert run(code).split() == list(modules)

@@ -83,17 +83,17 @@ def test_surrogates_come_in_pages(client: httpx.Client, taught: str, fresh: str)
 
 
 def test_improve_asks_more_and_raises_the_budget(client: httpx.Client, name: str):
-    before = pendulum.teach(client, name, budget=6)
+    before = pendulum.teach(client, name, budget=5)
     body = {"queries": 2, "idempotency_key": "once"}
     for _ in range(2):
         improved = client.post(f"/v1/surrogates/{name}/improve", json=body).raise_for_status().json()
-        assert (improved["budget"], improved["budget_raised_by"], improved["budget_left"]) == (8, 2, 0)
+        assert (improved["budget"], improved["budget_raised_by"], improved["budget_left"]) == (7, 2, 0)
     after = pendulum.finish(client, name)
-    assert (before["samples"], after["samples"], after["budget"]) == (6, 8, 8)
+    assert (before["samples"], after["samples"], after["budget"]) == (5, 7, 7)
 
 
 def test_improve_by_the_states_a_policy_visited(client: httpx.Client, name: str):
-    pendulum.teach(client, name, budget=6)
+    pendulum.teach(client, name, budget=5)
     opened = client.post(f"/v1/surrogates/{name}/sessions", json={"num_envs": 4, "occupancy": True}).json()
     for what, body in (("reset", {}), ("step", {"action": [[0.0]] * 4})):
         client.post(f"/v1/sessions/{opened['id']}/{what}", json=body).raise_for_status()
@@ -102,18 +102,18 @@ def test_improve_by_the_states_a_policy_visited(client: httpx.Client, name: str)
     assert 0.5 <= submitted["confidence_index"] <= 1
     body = {"queries": 1, "checkpoint": "first"}
     client.post(f"/v1/surrogates/{name}/improve", json=body).raise_for_status()
-    assert pendulum.finish(client, name)["samples"] == 7
+    assert pendulum.finish(client, name)["samples"] == 6
 
 
 def test_a_raised_budget_sets_a_finished_design_going(client: httpx.Client, name: str):
-    pendulum.teach(client, name, budget=6)
-    client.patch(f"/v1/surrogates/{name}", json={"budget": 8}).raise_for_status()
-    assert pendulum.finish(client, name)["samples"] == 8
+    pendulum.teach(client, name, budget=5)
+    client.patch(f"/v1/surrogates/{name}", json={"budget": 7}).raise_for_status()
+    assert pendulum.finish(client, name)["samples"] == 7
 
 
 def test_a_tolerance_has_a_finished_design_judged_anew(client: httpx.Client, name: str):
-    pendulum.teach(client, name, budget=6)
-    changed = client.patch(f"/v1/surrogates/{name}", json={"tolerances": {"theta_dot": 0.25}, "budget": 7})
+    pendulum.teach(client, name, budget=5)
+    changed = client.patch(f"/v1/surrogates/{name}", json={"tolerances": {"theta_dot": 0.25}, "budget": 6})
     assert changed.raise_for_status().json()["tolerances"] == {"theta_dot": 0.25}
     judged = pendulum.finish(client, name)["fidelity"]["outputs"]
     assert next(output for output in judged if output["name"] == "theta_dot")["tolerance"] == 0.25
