@@ -156,7 +156,16 @@ def one_thread() -> None:
 def share() -> str:
     """Start the process that is forked, for all workers of this run. It compiles what is not compiled yet. Returns its
     address."""
-    forkserver.ensure_running()
+    kept = [os.dup(stream) for stream in (1, 2)]
+    with open(os.devnull, "wb") as nowhere:
+        for stream in (1, 2):
+            os.dup2(nowhere.fileno(), stream)  # what forks print is no part of a run's report
+    try:
+        forkserver.ensure_running()
+    finally:
+        for stream, before in zip((1, 2), kept, strict=True):
+            os.dup2(before, stream)
+            os.close(before)
     return str(FORKSERVER._forkserver_address)
 
 
