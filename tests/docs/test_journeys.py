@@ -70,7 +70,6 @@ ELSEWHERE_WITH = {  # a word anywhere in the line
 OTHERWISE = {
     "docs/how-to/policies.md": "tests/cli/test_commands.py, as it needs three versions; test_how_to.py films",
     "docs/how-to/backup.md": "tests/server starts on databases and copies of them",
-    "docs/evidence.md": "lab/tests runs its studies, in short",
     "docs/http-api.md": "test_http_api.py sends its requests without curl",
     "docs/reference/stream.md": "test_http_api.py sends its requests without curl",
     "docs/how-to/containers.md": "tests/docker reads it; no container engine is needed",
