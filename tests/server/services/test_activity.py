@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from surrogym_server.features.jobs.workers import Offer, Workers
 from surrogym_server.services.activity import ALIVE_SECONDS, MOST_NAMES, Samplers
 
 
@@ -39,9 +38,3 @@ def test_flood_of_names_is_bounded_and_ends_with_its_silence():
     clock.now += ALIVE_SECONDS
     samplers.heard("a", "late")
     assert samplers.by_surrogate() == {"a": ["late"]}
-
-
-def test_worker_beyond_the_bound_is_not_new_at_each_call():
-    workers = Workers(Clock())
-    assert all(workers.heard("a", f"made up {i}", Offer()) for i in range(MOST_NAMES))
-    assert not workers.heard("a", "one more", Offer()), "each would wake all who wait"
