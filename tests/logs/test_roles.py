@@ -67,7 +67,7 @@ def test_letters_of_other_cases_are_other_columns():
         ({"limits": {"v": [float("-inf"), None]}}, "limits of 'v' to be at most 1e.12 in size"),
         (
             {"state": {"v": "x"}, "limits": {"v": [0, 1]}},
-            "limits of a state or of an action, got 'v', which names both",
+            "limits of a state or of an action, got 'v', which is both",
         ),
     ],
 )
