@@ -18,7 +18,8 @@ MAX_ROLLOUT_QUERY = 4_096  # most real steps of one query
 MAX_STARTS = 256
 REWARD = "reward"
 
-Name = Annotated[str, Field(min_length=1, max_length=64)]
+VISIBLE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"  # no control characters, because people see the text
+Name = Annotated[str, Field(min_length=1, max_length=64, pattern=VISIBLE)]
 
 
 class Frozen(FailFast):

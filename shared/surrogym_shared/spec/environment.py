@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field, StrictBool, StrictFloat, StrictInt,
 from surrogym_shared.checks import SHOWN, Number, Positive, require, require_known, require_unique
 from surrogym_shared.presets import PRESETS, Preset, PresetName, Tolerance
 from surrogym_shared.spec.actions import Action
-from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, MAX_STARTS, REWARD, Frozen, Name
+from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, MAX_STARTS, REWARD, VISIBLE, Frozen, Name
 from surrogym_shared.spec.coordinates import Coordinate, StartDistribution, limits
 from surrogym_shared.spec.rewards import AnyReward, DeclaredReward, Reward, Success
 from surrogym_shared.spec.terms import AllOf, ObservationEntry, Term, Termination
@@ -89,7 +89,9 @@ class EnvironmentSpec(Frozen):
     """Specification of one original environment: coordinates, observation, action, start, termination, and design of
     queries."""
 
-    environment: str = Field(default="", max_length=256, description="Gymnasium id, or free text for one's own")
+    environment: str = Field(
+        default="", max_length=256, pattern=VISIBLE, description="Gymnasium id, or free text for one's own"
+    )
     coordinates: tuple[Coordinate, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
     observation: tuple[ObservationEntry, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
     action: Action

@@ -11,6 +11,7 @@ from surrogym_shared.bounded import FailFast
 from surrogym_shared.kinds import AutoresetMode as AutoresetMode
 from surrogym_shared.kinds import Variant as Variant
 from surrogym_shared.spec import MAX_DIMENSIONS, NAME_PATTERN
+from surrogym_shared.spec.base import VISIBLE as VISIBLE
 from surrogym_shared.states import Phase as Phase
 from surrogym_shared.states import Purpose as Purpose
 from surrogym_shared.states import QueryKind as QueryKind
@@ -30,7 +31,6 @@ MAX_MEASURED = 1e30  # variances overflow beyond it, so one larger sample would 
 Role = Literal["read", "train", "sample", "admin"]
 
 SurrogateName = Annotated[str, Field(pattern=NAME_PATTERN)]
-VISIBLE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"  # no control characters, because people see the text
 Key = Annotated[str, Field(min_length=1, max_length=128, pattern=VISIBLE)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Seq = Annotated[int, Field(ge=1)]
