@@ -64,6 +64,7 @@ def test_a_missing_field_is_named_with_the_way_out(tmp_path: Path):
     said = failures(program(tmp_path, ('"truncated": False', '"time": 0')))["a step gives state reward and ends"]
     assert "expected true or false for 'truncated'" in said
     assert said.endswith("give all four fields in every answer to step")
+    assert "surrogym conformance" not in said, "the command does not advise to run itself"
 
 
 def test_numbers_and_missing_fields_are_named_without_words_of_python(tmp_path: Path):

@@ -8,6 +8,7 @@ from surrogym_sampler.diagnosis.executables import ends, requests, states
 from surrogym_sampler.diagnosis.executables.subject import LeftOut, Subject
 from surrogym_sampler.diagnosis.outcomes import Mismatch, Outcome
 from surrogym_sampler.original.errors import RequestRefused, StepFailed, UnknownEnvironment
+from surrogym_sampler.original.executables.messages import CHECK
 
 FIRST = "spec answers with protocol 1 and a valid specification"
 
@@ -26,7 +27,7 @@ def conformance(command: str, seconds: float) -> Iterator[Outcome]:
         try:
             subject.start()
         except (UnknownEnvironment, StepFailed) as error:
-            yield Outcome(FIRST, f"{error}; see docs/how-to/executables.md for a first program")
+            yield Outcome(FIRST, f"{_own(error)}; see docs/how-to/executables.md for a first program")
             return
         yield Outcome(FIRST, None)
         for check, way_out in (*requests.CHECKS, *states.CHECKS, *ends.CHECKS):
@@ -43,5 +44,10 @@ def _outcome(check: Callable[[Subject], None], way_out: str, subject: Subject) -
     except RequestRefused as error:
         return Outcome(name, f"expected a result, got an error: {error}; {way_out}")
     except (Mismatch, StepFailed, UnknownEnvironment) as error:
-        return Outcome(name, f"{error}; {way_out}")
+        return Outcome(name, f"{_own(error)}; {way_out}")
     return Outcome(name, None)
+
+
+def _own(error: Exception) -> str:
+    """Return the message without the advice to run this very command."""
+    return str(error).removesuffix(f"; {CHECK}")
