@@ -40,6 +40,8 @@ def test_a_stored_policy_is_deployed_by_its_name_and_checked_in_the_virtual_envi
     deploy = ["deploy", f"pendulum@{version}", "--target", "c", "--out", "c", *check]
     said = surrogym(*deploy, "--server", pendulum_server.url, "--json")
     assert said.code == 0, said.err
+    unchecked = surrogym(*deploy[:4], "--out", "unchecked", "--server", pendulum_server.url)
+    assert f"surrogym policy get pendulum@{version}" in unchecked.out
     names = [Path(file).name for file in said.json["files"]]
     assert names[:3] == ["pendulum_controller.c", "pendulum_controller.h", "pendulum_main.c"]
     if check:
@@ -64,6 +66,19 @@ def test_a_check_in_the_original_environment_enters_its_real_steps(surrogym, ser
         assert said.code == 0, said.err
         entered = api.surrogate(name).ledger.evaluation
     assert entered == 2 * said.json["check"]["steps"] > 0, "steps of the policy and of the controller"
+
+
+@pytest.mark.parametrize("trusted", [True, False, None])
+def test_a_policy_that_is_not_trusted_is_deployed_with_its_reason_and_the_next_step(surrogym, tmp_path, trusted):
+    reason = "the audit failed: speed is off" if trusted is not None else ""
+    path = network(tmp_path, pendulum(), (4,), trusted=trusted, reason=reason)
+    deploy = ["deploy", str(path), "--target", "c", "--out", "c"]
+    said = surrogym(*deploy)
+    assert said.code == 0, said.err
+    warned = [line for line in said.out.splitlines() if line.startswith("warning")]
+    assert len(warned) == (trusted is not True)
+    assert all(reason in line and f"surrogym audit {path}" in line for line in warned)
+    assert surrogym(*deploy, "--json").json["trusted"] is trusted
 
 
 def test_what_can_not_be_written_or_checked_is_refused_and_nothing_is_written(surrogym, tmp_path):

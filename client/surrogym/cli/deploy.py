@@ -269,7 +269,10 @@ def command(
         with checking.comparison(to, controller, local) as comparison:
             written = deploy(controller, target, out)
             result: dict[str, Any] = {"target": target, "files": [str(file) for file in written]}
+            result["trusted"] = local.card.trusted
             words = [f"{out}: {', '.join(str(file.relative_to(out)) for file in written)}"]
+            if not local.card.trusted:
+                words.append(_warning(policy, local.card))
             if not isfinite(controller.timeout):
                 words.append("no timeout, so a sensor that stops is no fault: --timeout or --period sets one")
             if comparison is not None:
@@ -318,6 +321,21 @@ def _local(
             path.write_bytes(api.policies.file(name, found.version, "zip"))
         write_card(path, card)
         yield LocalPolicy(path, card, spec, context, reading, service, output)
+
+
+def _warning(policy: str, card: PolicyCard) -> str:
+    """Say why the policy's promise is not trusted, and how to test it. An audit takes a file, not a stored policy."""
+    from shlex import quote
+
+    stored = "@" in policy and not Path(policy).is_file()
+    file = quote("policy.zip" if stored else policy)
+    get = f"surrogym policy get {quote(policy)} --out {file}, then " if stored else ""
+    named = "" if card.surrogate else " --surrogate NAME"
+    doubt = "not trusted" if card.trusted is False else "not judged"
+    return (
+        f"warning: the policy's promise is {doubt}: {card.reason or 'its card has no audit'}; before a machine obeys "
+        f"it: {get}surrogym audit {file}{named}"
+    )
 
 
 def _range(text: str) -> tuple[str, tuple[float, float]]:
