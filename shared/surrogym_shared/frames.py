@@ -40,14 +40,7 @@ from surrogym_shared.acting import MAX_PARAMETERS, MAX_UNITS, ActingPolicy, Nois
 from surrogym_shared.codes import Code
 from surrogym_shared.network import MAX_LAYERS, Activation
 from surrogym_shared.port import PolicyRollout, ResetResult, StepResult, quick
-from surrogym_shared.wire import (
-    MAX_ROLLOUT,
-    ActionSpace,
-    BoxSpace,
-    DiscreteSpace,
-    MultiDiscreteSpace,
-    SessionView,
-)
+from surrogym_shared.wire import MAX_ROLLOUT, ActionSpace, BoxSpace, DiscreteSpace, MultiDiscreteSpace, SessionView
 
 MEDIA_TYPE = "application/vnd.msgpack"
 

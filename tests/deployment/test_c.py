@@ -207,7 +207,7 @@ def test_a_program_in_cpp_runs_two_controllers_and_names_the_policy(tmp_path: Pa
 
 def test_names_that_would_end_a_comment_do_no_harm(tmp_path: Path):
     spec = plant()
-    text = spec.model_dump_json().replace('"slide"', r'"*/ int x; /* ??/\n\\"')
+    text = spec.model_dump_json().replace('"slide"', r'"*/ int x; /* ??/\\"')
     path = network(tmp_path, type(spec).model_validate_json(text), model='*/ " ??/\n\\"')
     (tmp_path / "c").mkdir()
     write(controller_of(path), tmp_path / "c")

@@ -280,7 +280,7 @@ def command(
                 stored = checking.stored(checked, target, controller, local.card)
                 result["check"] = stored.model_dump(mode="json")
                 result["files"].append(str(write_check(out, stored)))
-                words += _in_words(checked)
+                words += _in_words(checked, stored.environment)
     output.give(result, lambda: "\n".join(words))
 
 
@@ -350,11 +350,11 @@ def _range(text: str) -> tuple[str, tuple[float, float]]:
         raise CommandError(f"--range: expected NAME=LOW:HIGH, such as level=0:2, got {text!r}") from error
 
 
-def _in_words(checked: Checked) -> list[str]:
+def _in_words(checked: Checked, environment: str) -> list[str]:
     from surrogym_shared.words import counted
 
     lines = [
-        f"{counted(len(checked.returns), 'episode')}, {checked.steps} steps: mean return "
+        f"{counted(len(checked.returns), 'episode')} in {environment}, {checked.steps} steps: mean return "
         f"{checked.returns.mean():.6g}, of the policy {checked.policy_returns.mean():.6g}",
         f"actions differ by at most {checked.largest:.1g} of their range",
     ]

@@ -148,8 +148,9 @@ def answering(environment: object) -> Environment:
         else (OriginalEnvironment, "step_from")
     )
     if not isinstance(environment, needed):
+        other = '; for an environment that can only be reset, declare query="rollout"' if query == "step" else ""
         raise UnknownEnvironment(
-            f"its specification declares query={query!r}, which needs {methods}: add those that are missing"
+            f"its specification declares query={query!r}, which needs {methods}: add those that are missing{other}"
         )
     return environment
 

@@ -28,6 +28,7 @@ Plan = Callable[[EnvironmentDefinition, int], tuple[Query, ...]]
 Complete = Callable[[dict[str, Any]], dict[str, Any]]
 
 ABSENT = object()
+READS = 3  # most times that a status is read, while rounds are stored
 SHOWN = 120  # largest number of characters of a value in an error
 
 
@@ -165,21 +166,33 @@ class SurrogateService:
         self._notices.post(name)
 
     def _status(self, record: SurrogateRecord) -> SurrogateStatus:
-        name = record.name
-        summary = self._storage.surrogates.summary(name)  # before the model, which is then never older than the phase
-        try:
-            model = self._storage.models.get(name)
-        except NoModel:
-            model = None
+        summary, model, left = self._read(record.name)
         return SurrogateStatus(
             summary=summary,
             record=record,
             outputs=self._definitions.of(record).outputs,
             model=model,
-            budget_left=self._storage.designs.left(name),
-            samplers=tuple(self._samplers.by_surrogate().get(name, ())),
-            sessions=self._engine.counts().sessions.get(name, 0),
+            budget_left=left,
+            samplers=tuple(self._samplers.by_surrogate().get(record.name, ())),
+            sessions=self._engine.counts().sessions.get(record.name, 0),
         )
+
+    def _read(self, name: str) -> tuple[SurrogateSummary, ModelRecord | None, int]:
+        """Return the summary, the latest model, and the real steps that the budget has left, of the same moment.
+
+        They are three reads. If a round was stored in between, all are repeated, a few times.
+        """
+        for _ in range(READS):
+            left = self._storage.designs.left(name)
+            summary = self._storage.surrogates.summary(name)  # before the model, which is then never older
+            try:
+                model = self._storage.models.get(name)
+            except NoModel:
+                model = None
+            same_model = summary.model_version == (None if model is None else model.version)
+            if same_model and self._storage.designs.left(name) == left:
+                break
+        return summary, model, left
 
 
 def check_same(name: str, had: Any, got: Any) -> None:
@@ -188,7 +201,7 @@ def check_same(name: str, had: Any, got: Any) -> None:
         where, old, new = difference(had, got)
         raise SpecConflict(
             f"{name!r} exists with another specification: {where} was created as {short(old)}, got "
-            f"{short(new)}; register this one under another name"
+            f"{short(new)}; register this one under another name; surrogym change sets that one's budget and target"
         )
 
 

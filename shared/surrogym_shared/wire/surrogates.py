@@ -237,9 +237,7 @@ class CheckedSurrogate(Reply):
 class ImprovedSurrogate(SurrogateView):
     """Reply to a request for more queries: the surrogate, and by how much its budget was raised."""
 
-    budget_raised_by: int = Field(
-        description="real steps that the request added to the budget; 0: it already had enough"
-    )
+    budget_raised_by: int = Field(description="real steps that the request added to the budget; 0: it had enough left")
 
 
 class SurrogateList(Reply):

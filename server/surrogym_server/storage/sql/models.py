@@ -174,4 +174,7 @@ def require_version(connection: Connection, surrogate: int, name: str, version: 
 
 
 def unknown_policy(name: str, which: object) -> UnknownPolicy:
-    return UnknownPolicy(f"expected a version or an alias of {name!r}'s policies, got {which}, which does not exist")
+    return UnknownPolicy(
+        f"expected a version or an alias of the policies of {name!r}, got {which}, which does not exist: surrogym "
+        "policies lists them"
+    )
