@@ -43,7 +43,7 @@ SHORTER = {
     "train": ["--steps", "512", "--num-envs", "16"],
     "evaluate": ["--episodes", "1"],
 }
-IN_PROGRAMS = {"0_000": "00", "num_envs=16": "num_envs=2"}
+IN_PROGRAMS = {"0_000": "00", "5_000": "100", "num_envs=16": "num_envs=2"}
 READERS_FUNCTIONS = (
     "read_sensors, send = lambda: [1.0, 0.0, 0.0], lambda action: None\n"  # that files-and-terminal.md leaves to them
 )

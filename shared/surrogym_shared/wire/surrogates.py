@@ -149,7 +149,7 @@ class Ledger(Reply):
 
     ``total`` is the cost of the design: initial + adaptive + manual. It excludes evaluation, and ``logged`` steps,
     which were recorded before and don't count towards the budget. ``unresolved`` counts steps that may have been taken
-    under leases that ended without an answer, so the true number of real steps is between total and total + unresolved.
+    under leases that ended without an answer, so the design took between total and total + unresolved.
     ``failed`` of the unresolved ones were returned by a sampler with an error; the leases of the others expired.
     """
 
