@@ -49,6 +49,7 @@ SEEDS = (0, 1)
 TRAINING_STEPS, EPISODES = 8_192, 2
 POINTS, LANES, STEPS = 64, 4, 200  # of a comparison
 ROUNDS, CALLS, FITS = 20, 10, 5  # of a timing
+PATIENCE = 600.0  # seconds for a reply: a commit whose steps were never compiled here compiles them first
 SHOWN = 8  # differences of a run
 POINT_ROUTES = ("predict", "query_uncertainty")
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -129,7 +130,7 @@ class Server:
     """A server of either commit, spoken to without the client, whose older and newer replies need not fit."""
 
     def __init__(self, url: str) -> None:
-        self._http = httpx.Client(base_url=url, timeout=60)
+        self._http = httpx.Client(base_url=url, timeout=PATIENCE)
         [surrogate] = self.get("/v1/surrogates")["surrogates"]
         self.surrogate = f"/v1/surrogates/{surrogate['name']}"
 
