@@ -16,7 +16,7 @@ except ImportError:  # websockets has no compiled extension on this platform
 
 __all__ = ["KEY_BYTES", "MASKED", "WHOLE_BINARY", "Extent", "FrameSplitter", "apply_mask", "extent_of", "header"]
 
-WHOLE_BINARY = 0x82  # the last fragment, no extension, opcode 2
+WHOLE_BINARY = 0x82  # first byte of a WebSocket frame: last fragment, no extension, opcode 2 (binary)
 MASKED = 0x80
 _TWO_BYTES, _EIGHT_BYTES = 126, 127
 _SHORT, _LONG = struct.Struct("!H"), struct.Struct("!Q")

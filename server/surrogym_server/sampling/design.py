@@ -74,7 +74,7 @@ def initial_queries(definition: EnvironmentDefinition, budget: int) -> tuple[Que
 
 
 def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignState, request: Request) -> Decision:
-    """Do one round of Algorithm 1, lines 3 to 6 and 8 to 14; the module's docstring has the other lines.
+    """Do one round of Algorithm 1, lines 3 to 6, 8 to 10 and 12 to 14; the module's docstring has the other lines.
 
     The paper fits again after every real step (line 12). Here the queries of a round are chosen together, each as if
     those before it were answered, and the next round fits once they all are.
@@ -93,24 +93,25 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     # Lines 3, 4 and 12: fit the processes of all outputs, transitions and reward, to all samples.
     fit = learn(definition, samples, state.warm)
 
-    # CI needs a tolerance for each output, (O,): the declared one, or else 5 % of the output's standard deviation over
-    # the samples of the first round, which later rounds keep. With snapshots each round computes it again.
+    # CI needs a tolerance for each output, (O,): the declared one, or else the preset's, which is 1 in "paper" and else
+    # 5 % of the output's standard deviation. Later rounds keep it, unless the range of the samples grows far.
     defaults = frozen_tolerances(definition, samples, state.defaults)
     tolerances = definition.tolerances_or(defaults.values)
 
     # Lines 5, 6, 13, and the test of line 14: the CI of each output over the Monte Carlo set, whose points are also
-    # candidates below, and a verdict: "continue", or why the design may end, such as a spent budget. Beyond the paper,
-    # leave-one-out errors have to be within the tolerances, and some adaptive queries have to be answered. The request
-    # says what budget and target are, and which states policies visited; the state has earlier predictions.
+    # candidates below, and a verdict: "continue", or why the design may end, such as a spent budget. Tolerances are
+    # widened by confirmed noise here. Unless stopping is "confidence", as in the paper, leave-one-out errors have to be
+    # within them too, ends and peaks of the reward have to be known, and some adaptive queries have to be answered.
     judgement = judge_model(fit.model, samples, tolerances, request, state)
 
-    # A design that has ended before stays ended, with its verdict, until a person asks for more or the model is
-    # contradicted. The cost is the number of real steps taken, without those of logs and audits.
+    # A ready design stays ready until a person asks for more, or new samples contradict the model. Another ended design
+    # takes no further steps until its conditions change, and becomes ready if its model is. The cost is the number of
+    # real steps taken, without those of logs and audits.
     conditions = Conditions(request.cost(len(samples)), request.budget, request.target, tolerances)
     verdict = verdict_with_history(judgement, state, request, conditions)
 
-    # Not in the paper: a ready design that begins at snapshots continues for an excursion, a rollout beyond the visited
-    # states that tests the model. If the budget has no room for it, the design ends as "over_budget".
+    # Not in the paper: a ready design that begins at snapshots continues for an excursion, a rollout beyond the sampled
+    # states that tests the model. Without room for it in the budget, the design ends as not ready.
     testing = verdict == "ready" and _lacks_excursion(definition, samples, state)
     if testing:
         tested_at = len(samples)
@@ -122,11 +123,11 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     # none, the least confident output alone.
     outputs = below_target(judgement.confidences, request.target)
 
-    # Lines 9 and 10: for each of these outputs the query that the acquisition values most; in preset "paper" that is
-    # the largest uncertainty index U. The last rule does that, by single steps or by planned rollouts, and always
-    # applies. The rules before it choose queries that the paper does not have, such as repeats, which show what is
-    # noise; a rule that does not apply returns None. A design that has ended chooses none, or the ``request.extra``
-    # steps that a person asked for.
+    # Lines 9 and 10: for each of these outputs the candidate that the acquisition values most, in preset "paper" by the
+    # uncertainty index U; or rollouts of several steps in all. Candidates that may end an episode are reserved for the
+    # first such query. The last rule does all this, and always applies. The rules before it choose queries that the
+    # paper does not have, such as repeats, which show what is noise; a rule that does not apply returns None. A design
+    # that has ended chooses none, or the ``request.extra`` steps that a person asked for.
     round = Round(state.round, fit.model, samples, request, judgement, tolerances, outputs, continues, testing)
     rules = STEP_RULES if definition.max_rollout is None else ROLLOUT_RULES
     queries = next(choice for rule in rules if (choice := rule(round)) is not None)

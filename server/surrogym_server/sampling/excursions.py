@@ -28,7 +28,8 @@ LONGEST = 16  # most actions of an excursion
 def excursion(
     model: DynamicsModel, samples: Tensor, snapshots: Mapping[str, Vector], longest: int, rng: np.random.Generator
 ) -> Query:
-    """Plan the shortest sequence whose predicted state gets ``FAR`` from all sampled states (n, C).
+    """Plan the shortest sequence whose predicted state gets at least the distance ``FAR`` away from all ``samples``,
+    which are states (n, C).
 
     If none does, the sequence that leads farthest is planned. It begins at a reset or at one of the snapshots, which
     have coordinates (C,) by name."""

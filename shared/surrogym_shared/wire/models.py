@@ -1,4 +1,4 @@
-"""Wire models of models: predictions and history."""
+"""Messages about the fitted models of a surrogate: predictions and history."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 
 import pytest
 
@@ -15,14 +16,20 @@ NAME = "pendulum"
 PATIENCE = 60.0
 
 
+async def until(holds: Callable[[], bool]) -> None:
+    while not holds():
+        await asyncio.sleep(0.01)
+
+
 @pytest.mark.parametrize("streams", [1, 100])
 def test_waiting_streams_share_each_read(storage: Storage, monkeypatch: pytest.MonkeyPatch, streams: int):
     reads = []
     stored = storage.events.list
 
     def counted(*arguments: object) -> object:
-        reads.append(arguments)
-        return stored(*arguments)  # type: ignore[arg-type]
+        page = stored(*arguments)  # type: ignore[arg-type]
+        reads.append(arguments)  # once it has ended, so that what is reported afterwards needs another one
+        return page
 
     monkeypatch.setattr(storage.events, "list", counted)
 
@@ -37,6 +44,7 @@ def test_waiting_streams_share_each_read(storage: Storage, monkeypatch: pytest.M
             return None
 
         tasks = [asyncio.create_task(first()) for _ in range(streams)]
+        await asyncio.wait_for(until(lambda: len(reads) > 0), PATIENCE)
         await asyncio.sleep(0.3)
         assert len(reads) == 1
         storage.ledger.report(NAME, 5, key="k")

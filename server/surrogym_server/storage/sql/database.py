@@ -249,7 +249,7 @@ def connect(url: str, synchronous: Synchronous = "full") -> Database:
     Args:
         url: its address.
         synchronous: of a SQLite file; ``full`` waits for the disk at every commit, ``normal`` may lose the last
-            commits with the power, though not with the process. PostgreSQL has a setting of its own.
+            commits if the power fails, but not if the process dies. PostgreSQL has a setting of its own.
 
     Raises:
         InvalidInput: another kind of address.
