@@ -3,8 +3,8 @@
 # make help      the rest
 
 PYTHON ?= python3
-# Two more than cores: tests wait for processes half of their time.
-WORKERS ?= 4
+# One more than cores: tests wait for processes a quarter of their time.
+WORKERS ?= 3
 ARGS ?=
 
 BIN := .venv/bin
