@@ -57,7 +57,7 @@ for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHU
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, usual)
 
-ADDRESS = "address of the process that is forked"  # entry of what a worker is told
+ADDRESS = "address of the process that is forked"  # key under which a worker of pytest-xdist receives it
 WHOLE = pytest.StashKey[bool]()  # whether this run is one of all tests
 LASTING = ("slow", "e2e", "timeout")  # marks; a limit of its own is one of more time
 

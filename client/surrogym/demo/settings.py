@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from surrogym.demo.tasks import ROUNDS, TASKS, DemoTask, design_budget, queries_a_round
@@ -50,7 +51,7 @@ class DemoSettings:
             return self.budget
         if self.access == "any":
             return self.demo_task.budget
-        spec = self._usual()
+        spec = self._usual
         return spec.preset.budget(0, len(spec.coordinates), spec.action.size, spec.query == "step")
 
     @property
@@ -92,8 +93,9 @@ class DemoSettings:
 
     def spec(self) -> EnvironmentSpec:
         """The environment's specification with the design of the demo."""
-        return with_choices(self._usual(), {"preset": "default", "budget": design_budget(self.real_steps)})
+        return with_choices(self._usual, {"preset": "default", "budget": design_budget(self.real_steps)})
 
+    @cached_property
     def _usual(self) -> EnvironmentSpec:
         """The specification with the design's default budget."""
         return make(self.demo_task.environment, preset="default", seed=self.seed, access=self.access).spec()
