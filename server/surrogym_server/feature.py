@@ -6,11 +6,12 @@ does not import it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from fastapi import APIRouter, Depends, Request
+from prometheus_client import Metric
 
 from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.engine.port import Compute, SessionEngine
@@ -28,6 +29,9 @@ class Service(Protocol):
 
     async def sweep(self) -> None:
         """Called at every sweep, every ``sweep_seconds``."""
+
+    def metrics(self) -> Iterable[Metric]:
+        """Series of the feature for ``/metrics``."""
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ COMMANDS = (
     "jobs",
     "audit",
     "evaluate",
+    "watch",
     "policies",
     "policy",
     "status",

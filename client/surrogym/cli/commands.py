@@ -16,7 +16,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     "After": (
         *("report", "policies", "policy", "improve", "change", "export", "import", "export-policy", "deploy", "delete"),
     ),
-    "Operate": ("work", "jobs", "conformance"),
+    "Operate": ("watch", "work", "jobs", "conformance"),
 }
 REST = "More"  # heading of the commands of no group, such as those of other packages
 ADVANCED: Mapping[str, frozenset[str]] = {  # options that a first reader does not need, by command

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from surrogym_client.transport.api import Api
-    from surrogym_shared.wire import ModelView, OutputFidelity, SurrogateSummary, SurrogateView
+    from surrogym_shared.wire import ModelView, OutputFidelity, PolicyView, SurrogateSummary, SurrogateView
 
 Form = Literal["json", "short", "words"]
 
@@ -77,7 +77,15 @@ def _one(api: Api, name: str, form: Form) -> str:
         return json.dumps(view.model_dump(mode="json"))
     if form == "short":
         return _short(view)
-    return _detail(view, api.models(name) if view.phase in ("over_budget", "unsure") else ())
+    models = api.models(name) if view.phase in ("over_budget", "unsure") else ()
+    return "\n".join([_detail(view, models), *_untrusted(name, api.policies.list(name))])
+
+
+def _untrusted(name: str, policies: Sequence[PolicyView]) -> list[str]:
+    """Lines of the newest policy and of those with an alias, if their promise is not trusted."""
+    shown = [one for number, one in enumerate(policies) if one.trusted is False and (one.aliases or number == 0)]
+    named = [", ".join([f"{name}@{one.version}", *one.aliases]) for one in shown]
+    return [f"policy {words}: not trusted: {one.reason}" for words, one in zip(named, shown, strict=True)]
 
 
 def _patiently(look: Callable[[], str], as_json: bool) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import Protocol
 
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
@@ -42,16 +43,23 @@ def metrics(request: Request, use: Use) -> Response:
     and fidelity come from the database.
     """
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(_Reading(request.app.version, use, request.app.state.metrics))
+    registry.register(_Reading(request.app.version, use, request.app.state.metrics, request.state.parts.values()))
     text = generate_latest(registry) + exposition(use.storage.surrogates.summaries())
     return Response(text, media_type=CONTENT_TYPE_LATEST)
+
+
+class _Measured(Protocol):
+    """A feature's service."""
+
+    def metrics(self) -> Iterable[Metric]: ...
 
 
 class _Reading:
     """A collector for one request."""
 
-    def __init__(self, version: str, use: Services, metrics: ProcessMetrics) -> None:
+    def __init__(self, version: str, use: Services, metrics: ProcessMetrics, parts: Iterable[_Measured]) -> None:
         self._version = version
+        self._parts = parts
         self._use = use
         self._metrics = metrics
 
@@ -70,6 +78,8 @@ class _Reading:
         yield GaugeMetricFamily("surrogym_sessions", "Open sessions.", sum(engine.sessions.values()))
         yield GaugeMetricFamily("surrogym_lanes", "Lanes of all open sessions.", engine.lanes)
         yield GaugeMetricFamily("surrogym_session_requests", "Requests running or waiting.", engine.requests)
+        for part in self._parts:
+            yield from part.metrics()
 
 
 def _requests(metrics: ProcessMetrics) -> Metric:

@@ -44,6 +44,10 @@ class JobService:
         """End the leases of workers that fell silent."""
         self._metrics.expired_leases += await asyncio.to_thread(self._jobs.sweep_expired)
 
+    def metrics(self) -> tuple[()]:
+        """There are none."""
+        return ()
+
     def train(self, name: str, task: JSON, key: str | None) -> JobRecord:
         """Queue a training.
 

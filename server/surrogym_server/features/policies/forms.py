@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from typing import Any
 
 from surrogym_server.convert.stored import read_stored
-from surrogym_server.features.policies.records import PUSHED_BY, EvaluationRecord, PolicyFile, PolicyRecord
+from surrogym_server.features.policies.records import DRIFT, PUSHED_BY, EvaluationRecord, PolicyFile, PolicyRecord
 from surrogym_server.features.policies.service import Episodes
 from surrogym_server.storage.records import JSON
 from surrogym_shared import wire
+from surrogym_shared.wire.drifts import AddDrift
 
 OLDER: JSON = {
     "environment": "",
@@ -87,7 +89,7 @@ def _card(record: PolicyRecord) -> wire.PushedCard:
 def _fields(record: PolicyRecord, card: wire.PushedCard) -> dict[str, Any]:
     names = ("algorithm", "virtual_steps", "imagined_return", "promise", "audit")
     evaluations = [_evaluation(evaluation, card) for evaluation in record.evaluations]
-    trusted, reason = _trust(card, evaluations)
+    trusted, reason = _trust(card, evaluations, record.drifts)
     return {
         "version": record.version,
         "created_at": record.created_at,
@@ -105,11 +107,18 @@ def _fields(record: PolicyRecord, card: wire.PushedCard) -> dict[str, Any]:
     }
 
 
-def _trust(card: wire.PushedCard, evaluations: list[dict[str, Any]]) -> tuple[bool | None, str]:
-    """The verdict on a promise with its reason: that of the card, unless the latest evaluation that judges the promise
-    broke it."""
+def _trust(
+    card: wire.PushedCard, evaluations: list[dict[str, Any]], drifts: tuple[EvaluationRecord, ...]
+) -> tuple[bool | None, str]:
+    """The verdict on a promise with its reason: that of the card, unless what came last shows another: a drift, or an
+    evaluation that judges the promise and broke it."""
     judged = [one for one in evaluations if one["promise_kept"] is not None]
     latest = max(judged, key=lambda one: int(one["id"]), default=None)
+    drift = max(drifts, key=lambda one: one.id, default=None)
+    if drift is not None and (latest is None or drift.id > int(latest["id"])):
+        found = read_stored(AddDrift, "a drift", {**drift.summary[DRIFT], "idempotency_key": "-"})
+        since = datetime.fromtimestamp(drift.created_at, UTC)
+        return False, f"since {since:%Y-%m-%d %H:%M} UTC, drift: {found.words}"
     if latest is None or latest["promise_kept"] or card.promise is None:
         return card.trusted, card.reason
     return False, (

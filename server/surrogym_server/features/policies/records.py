@@ -15,6 +15,7 @@ from surrogym_server.storage.records import JSON
 MAX_POLICIES = 200  # of a surrogate
 MAX_EVALUATIONS = 100  # of a policy
 PUSHED_BY = "pushed_by"  # entry of a card: who stored it
+DRIFT = "drift"  # entry of the summary of a report that the plant has drifted; other summaries are of episodes
 
 
 @dataclass(frozen=True)
@@ -42,9 +43,9 @@ class EvaluationRecord:
 class NewEvaluation:
     key: str
     summary: JSON
-    bytes: int
-    digest: str
-    blob: str
+    bytes: int = 0
+    digest: str = ""
+    blob: str | None = None
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ class PolicyRecord:
     files: tuple[PolicyFile, ...] = ()
     aliases: tuple[str, ...] = ()
     evaluations: tuple[EvaluationRecord, ...] = ()
+    drifts: tuple[EvaluationRecord, ...] = ()  # without episodes
 
 
 Freed = tuple[str, ...]  # names of blobs that no row refers to any more

@@ -30,6 +30,7 @@ from surrogym_shared.wire import (
     PushedPolicy,
     PutAlias,
 )
+from surrogym_shared.wire.drifts import AddDrift
 
 router = APIRouter(prefix="/v1/surrogates/{name}/policies", tags=["policies"], route_class=DoorRoute)
 
@@ -57,6 +58,13 @@ EVALUATION_EXAMPLE = {
     "returns": [-141.5, -118.2],
     "lengths": [200, 200],
     "idempotency_key": "evaluation-1",
+}
+DRIFT_EXAMPLE = {
+    "output": "speed",
+    "error": 0.0131,
+    "words": "speed is +0.0131 off the prediction in the last 14 real steps",
+    "steps": 214,
+    "idempotency_key": "drift-1",
 }
 ALIAS_EXAMPLE = {"version": 1}
 
@@ -157,6 +165,22 @@ def evaluate(
 ) -> EvaluationView:
     """Report real episodes, once for each idempotency key. ``POST .../ledger`` counts their real steps separately."""
     return forms.evaluation_view(*policies.evaluate(name, version, forms.episodes(body), body.idempotency_key))
+
+
+@router.post(
+    "/{version}/drifts",
+    status_code=201,
+    summary="Report drift",
+    dependencies=[TRAIN],
+    responses=documented(*THERE),
+)
+def report_drift(
+    name: str, version: Version, body: Annotated[AddDrift, example(DRIFT_EXAMPLE)], policies: Policies
+) -> PolicyView:
+    """Report, once for each idempotency key, that real steps no longer agree with the model. The policy's promise is
+    not trusted from then on, until a later evaluation keeps it."""
+    drift = body.model_dump(mode="json", exclude={"idempotency_key"})
+    return forms.policy_view(policies.report_drift(name, version, drift, body.idempotency_key))
 
 
 @router.get("/{which}/evaluations/{id}", summary="One evaluation", dependencies=[READ], responses=documented(*THERE))

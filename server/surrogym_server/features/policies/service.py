@@ -13,11 +13,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Self
 
+from prometheus_client import Metric
+from prometheus_client.core import GaugeMetricFamily
+
 from surrogym_server.errors import Damaged, Forbidden, InvalidInput, NotThere, SpecConflict, UnknownPolicy
 from surrogym_server.feature import Core
 from surrogym_server.features.policies.blobs import open_blobs
 from surrogym_server.features.policies.file_checks import check_file
 from surrogym_server.features.policies.records import (
+    DRIFT,
     PUSHED_BY,
     Blobs,
     EvaluationRecord,
@@ -82,6 +86,14 @@ class PolicyService:
     async def sweep(self) -> None:
         """Once in ``ORPHAN_SECONDS``, remove the files whose policy or surrogate was deleted or never stored."""
         await asyncio.to_thread(self._sweep_files)
+
+    def metrics(self) -> Iterator[Metric]:
+        """When drift was last found, for each policy of which it was."""
+        words = "When real steps last disagreed with the model of a policy, in seconds since 1970."
+        family = GaugeMetricFamily("surrogym_policy_drift_time_seconds", words, labels=("surrogate", "version"))
+        for name, version, at in self._policies.drifts():
+            family.add_metric([name, str(version)], at)
+        yield family
 
     def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile, by: str) -> tuple[PolicyRecord, bool]:
         """Store a policy before its file is sent. Returns it, and whether it is new: a policy with the same file, card
@@ -163,6 +175,14 @@ class PolicyService:
             stored, created, freed = self._policies.evaluate(name, version, new, self._most_bytes)
         self._changed(name, freed if created else (blob,))
         return self._policies.get(name, str(version)), stored
+
+    def report_drift(self, name: str, version: int, drift: JSON, key: str) -> PolicyRecord:
+        """Store that the plant has drifted, once for each key, which withdraws the trust. Returns the policy."""
+        new = NewEvaluation(f"{DRIFT} {key}", {DRIFT: drift})
+        _, created, freed = self._policies.evaluate(name, version, new, self._most_bytes)
+        if created:
+            self._changed(name, freed)
+        return self._policies.get(name, str(version))
 
     def episodes(
         self, name: str, which: str, id: int

@@ -12,6 +12,7 @@ from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import InvalidInput, TooLarge
 from surrogym_server.features.policies.records import (
+    DRIFT,
     MAX_EVALUATIONS,
     MAX_POLICIES,
     PUSHED_BY,
@@ -144,9 +145,23 @@ class Policies:
             beyond = sa.delete(table).where(own, table.c.id.not_in(kept)).returning(table.c.blob)
             gone = tuple(blob for blob in connection.execute(beyond).scalars() if blob is not None)
             freed = _within(connection, held.id, version, most, name)
-            append_event(connection, held, "policy", version=version, what="evaluation")
+            what = DRIFT if DRIFT in new.summary else "evaluation"
+            append_event(connection, held, "policy", version=version, what=what)
             row = connection.execute(sa.select(table).where(own, table.c.key == new.key)).one()
             return _evaluation(row), True, (*gone, *freed)
+
+    def drifts(self) -> Sequence[tuple[str, int, float]]:
+        """Return the policies of which a drift was reported: surrogate, version, and when, in seconds since 1970."""
+        rows = policy_evaluations.c
+        statement = (
+            sa.select(surrogates.c.name, rows.version, sa.func.max(rows.created_at))
+            .join_from(policy_evaluations, surrogates, rows.surrogate_id == surrogates.c.id)
+            .where(rows.bytes == 0)  # episodes have bytes, drifts have none
+            .group_by(surrogates.c.name, rows.version)
+            .order_by(surrogates.c.name, rows.version)
+        )
+        with self._database.read() as connection:
+            return [(name, int(version), float(at)) for name, version, at in connection.execute(statement)]
 
     def put_alias(self, name: str, alias: str, version: int) -> None:
         """Let the alias point to this version, and no longer to another one."""
@@ -332,7 +347,7 @@ def _records(
             row.curve if curves else [],
             tuple(PolicyFile(f.form, f.bytes, f.digest, f.blob, f.main) for f in files[row.version]),
             tuple(a.alias for a in aliases[row.version]),
-            tuple(map(_evaluation, evaluations[row.version])),
+            *_told_apart(map(_evaluation, evaluations[row.version])),
         )
         for row in rows
     ]
@@ -343,6 +358,14 @@ def _by_version(rows: Iterable[Row[Any]]) -> defaultdict[int, list[Row[Any]]]:
     for row in rows:
         found[row.version].append(row)
     return found
+
+
+def _told_apart(rows: Iterable[EvaluationRecord]) -> tuple[tuple[EvaluationRecord, ...], tuple[EvaluationRecord, ...]]:
+    """Split rows into evaluations and reports of drift."""
+    both: tuple[list[EvaluationRecord], list[EvaluationRecord]] = ([], [])
+    for row in rows:
+        both[DRIFT in row.summary].append(row)
+    return tuple(both[0]), tuple(both[1])
 
 
 def _evaluation(row: Row[Any]) -> EvaluationRecord:

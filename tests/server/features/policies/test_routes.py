@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import pickle
 import sqlite3
 import zipfile
@@ -23,6 +24,7 @@ from surrogym_server.features.policies import routes
 from surrogym_shared import wire
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire.drifts import AddDrift
 
 PROMISE = wire.PolicyPromise(median=-150, low=-170, high=-130)
 
@@ -43,6 +45,7 @@ class Bomb:
         (routes.POLICY_EXAMPLE, wire.AddPolicy),
         (routes.EVALUATION_EXAMPLE, wire.AddEvaluation),
         (routes.ALIAS_EXAMPLE, wire.PutAlias),
+        (routes.DRIFT_EXAMPLE, AddDrift),
     ],
 )
 def test_every_example_is_accepted_by_its_model(example: dict[str, Any], model: type[wire.Request]):
@@ -172,6 +175,44 @@ def test_a_policy_whose_latest_evaluation_broke_its_promise_is_not_trusted(api: 
         "the latest evaluation broke the promise: a mean return of -180, where at least -170 was promised"
     )
     assert said[2].reason == "an audit passed"
+
+
+def test_drift_withdraws_the_trust_until_an_evaluation_keeps_the_promise(
+    api: Api, client: httpx.Client, surrogate: str, tmp_path: Path
+):
+    api.policies.push(surrogate, card(reason="an audit passed"), [], "zip", network_file(tmp_path))
+    many: dict[str, Any] = {"returns": [-150.0] * 30, "lengths": [200] * 30}
+    api.policies.evaluate(surrogate, 1, episodes("before", **many))
+    url, series = f"/v1/surrogates/{surrogate}/policies/1/drifts", f'{{surrogate="{surrogate}",version="1"}}'
+    assert series not in client.get("/metrics").text
+    first, again = (client.post(url, json=routes.DRIFT_EXAMPLE) for _ in range(2))
+    assert first.status_code == 201
+    assert first.json() == again.json()
+    (policy,) = api.policies.list(surrogate)
+    assert policy.trusted is False
+    assert policy.reason.startswith("since ")
+    assert policy.reason.endswith(f"drift: {routes.DRIFT_EXAMPLE['words']}")
+    assert len(policy.evaluations) == 1
+    assert f"surrogym_policy_drift_time_seconds{series}" in client.get("/metrics").text
+    broken = api.policies.evaluate(surrogate, 1, episodes("after", returns=[-180.0] * 30, lengths=[200] * 30))
+    assert (broken.promise_kept, api.policies.get(surrogate, 1).trusted) == (False, False)
+    api.policies.evaluate(surrogate, 1, episodes("later", **many))
+    kept = api.policies.get(surrogate, 1)
+    assert (kept.trusted, kept.reason) == (True, "an audit passed")
+
+
+@pytest.mark.parametrize(("field", "value"), [("error", float("inf")), ("words", "a\0b"), ("steps", -1), ("more", 1)])
+def test_an_impossible_drift_is_refused_and_changes_nothing(
+    api: Api, client: httpx.Client, surrogate: str, tmp_path: Path, field: str, value: object
+):
+    api.policies.push(surrogate, card(reason="an audit passed"), [], "zip", network_file(tmp_path))
+    body = json.dumps({**routes.DRIFT_EXAMPLE, field: value})
+    reply = client.post(
+        f"/v1/surrogates/{surrogate}/policies/1/drifts", content=body, headers={"content-type": "application/json"}
+    )
+    assert reply.status_code == 422
+    assert field in reply.json()["detail"]
+    assert api.policies.get(surrogate, 1).trusted is True
 
 
 def test_only_episodes_in_the_own_environment_judge_a_promise(api: Api, surrogate: str, tmp_path: Path):

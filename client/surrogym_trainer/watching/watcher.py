@@ -1,0 +1,216 @@
+"""Real steps that arrive, compared with one model of a surrogate, and a drift in words.
+
+Shapes: n steps, O outputs, C coordinates, F action entries.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.transport import routes
+from surrogym_client.transport.api import Api
+from surrogym_client.transport.replies import parse
+from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
+from surrogym_shared.wire import PolicyView, SurrogateView
+from surrogym_shared.wire.drifts import AddDrift
+from surrogym_trainer.evaluation.audit import Compared
+from surrogym_trainer.evaluation.comparing import StepOfEpisode, compared, steady
+from surrogym_trainer.watching.detector import FALSE_ALARM_STEPS, Detector
+
+BATCH = 500  # steps of one request
+KEPT = 2_000  # latest steps from which a drift is described
+QUARTERS = ("lowest", "second", "third", "highest")
+TELLING = 0.1  # nats by which an error's place has to differ from where the stream has been
+
+Array = NDArray[np.float64]
+
+
+class Region(NamedTuple):
+    """The quarter of an input's range that has most of an error."""
+
+    name: str
+    low: float
+    high: float
+    quarter: str
+    share: float  # of the sum of the squared errors
+
+    def words(self) -> str:
+        return (
+            f"{self.share:.0%} of it where {self.name} is between {self.low:.4g} and {self.high:.4g}, the "
+            f"{self.quarter} quarter of its range"
+        )
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """A drift that was found.
+
+    Attributes:
+        output: name of the output.
+        error: mean of real minus predicted values since the change, in the output's unit; their root mean square if
+            the errors have grown in both directions.
+        both: whether they have.
+        expected: root mean square error that the model claims at these steps.
+        latest: number of steps since the change.
+        compared: number of steps that were compared.
+        line: line of the step that gave the alarm, in its log.
+        region: where the error is; None if no input has a range.
+    """
+
+    output: str
+    error: float
+    both: bool
+    expected: float
+    latest: int
+    compared: int
+    line: int
+    region: Region | None
+
+    def words(self) -> str:
+        """Describe the error in a sentence."""
+        how = "in both directions, root mean square" if self.both else "on average"
+        size = f"{self.error:.3g}" if self.both else f"{self.error:+.3g}"
+        last = "the last real step" if self.latest == 1 else f"the last {self.latest} real steps"
+        where = "" if self.region is None else f"; {self.region.words()}"
+        return (
+            f"{self.output} is {size} off the prediction ({how}) in {last}, where the model expects errors of "
+            f"{self.expected:.3g}{where}"
+        )
+
+
+class Watcher:
+    """Compares real steps with the model that a surrogate serves now, and looks for drift. No model learns from
+    them."""
+
+    def __init__(self, api: Api, view: SurrogateView, false_alarm_steps: float = FALSE_ALARM_STEPS) -> None:
+        """Args:
+        api: the server.
+        view: the surrogate, which has a model.
+        false_alarm_steps: average number of real steps up to a false alarm, at least."""
+        self._api, self._view = api, view
+        self._false_alarm_steps = false_alarm_steps
+        self._detector: Detector | None = None
+        self._recent: deque[tuple[Array, Array, Array]] = deque(maxlen=KEPT)  # errors (O,), deviations (O,), inputs
+        self._inputs = _inputs_of(view.spec)
+        self._visits = np.zeros((len(self._inputs), len(QUARTERS)))
+        self.left_out = 0  # steps in which a constant changed
+
+    @property
+    def compared(self) -> int:
+        """Number of real steps that were compared."""
+        return 0 if self._detector is None else self._detector.steps
+
+    @property
+    def evidence(self) -> float:
+        """Evidence for a drift now; the alarm is at ``false_alarm_steps``."""
+        return 0.0 if self._detector is None else self._detector.evidence
+
+    def take(self, steps: Sequence[StepOfEpisode]) -> Alarm | None:
+        """Compare at most ``BATCH`` steps, up to an alarm. Their ``number`` is the line of the log.
+
+        Raises:
+            SurrogymClientError: as every request.
+        """
+        spec = self._view.spec
+        usable = steady(spec, [step for step in steps if spec.known(step.coordinates)])
+        self.left_out += len(steps) - len(usable)
+        if not usable:
+            return None
+        beside = compared(self._api, spec, self._view, usable)
+        if self._detector is None:
+            self._detector = Detector(beside.claimed_alone, self._tolerances(beside.names), self._false_alarm_steps)
+        errors = _without_terminal_rewards(beside, usable)
+        inputs = np.concatenate([beside.states, beside.actions], 1)
+        for i, step in enumerate(usable):
+            self._recent.append((errors[i], beside.deviations[i], inputs[i]))
+            self._visits[np.arange(len(self._inputs)), self._quarters(inputs[i : i + 1])[0]] += 1
+            if (drift := self._detector.step(errors[i], beside.deviations[i])) is not None:
+                return self._alarm(beside, drift.output, drift.shifted, drift.steps, step.number)
+        return None
+
+    def withdraw(self, version: int, alarm: Alarm) -> PolicyView:
+        """Report a drift for a policy, so that its promise is not trusted. Returns the policy."""
+        content = f"{self._view.model_version} {alarm!r}".encode()
+        body = AddDrift(
+            output=alarm.output,
+            error=alarm.error,
+            words=alarm.words(),
+            steps=alarm.compared,
+            idempotency_key=hashlib.sha256(content).hexdigest(),
+        )
+        route = f"{routes.policy(self._view.name, version)}/drifts"
+        return parse(PolicyView, self._api.connection.send("POST", route, body.model_dump_json().encode()), route)
+
+    def _tolerances(self, names: Sequence[str]) -> Array:
+        assert self._view.fidelity is not None
+        known = {output.name: output.tolerance for output in self._view.fidelity.outputs}
+        return np.array([known[name] for name in names])
+
+    def _alarm(self, beside: Compared, output: int, shifted: bool, latest: int, line: int) -> Alarm:
+        recent = [one for one in list(self._recent)[-latest:] if np.isfinite(one[0][output])]
+        errors = np.array([error[output] for error, _, _ in recent])
+        deviations = np.array([deviation[output] for _, deviation, _ in recent])
+        return Alarm(
+            output=beside.names[output],
+            error=float(errors.mean()) if shifted else sqrt(float((errors**2).mean())),
+            both=not shifted,
+            expected=sqrt(float((deviations**2).mean()) + float(beside.claimed_alone[output]) ** 2),
+            latest=len(errors),
+            compared=self.compared,
+            line=line,
+            region=self._region(errors, np.array([inputs for _, _, inputs in recent])),
+        )
+
+    def _region(self, errors: Array, inputs: Array) -> Region | None:
+        """Return the quarter that has more of the squared errors (n,) than of the stream's steps; without one, the
+        quarter in which most of them are."""
+        if not self._inputs:
+            return None
+        quarters, weight = self._quarters(inputs), errors**2 / max(float((errors**2).sum()), 1e-300)
+        shares = np.stack([weight @ (quarters == number) for number in range(len(QUARTERS))], 1)
+        usual = self._visits / self._visits.sum(1, keepdims=True)
+        telling = np.where(shares > 0, shares * np.log(shares.clip(1e-12) / usual.clip(1e-12)), 0.0)
+        chosen = telling if telling.max() > TELLING else shares
+        row, quarter = np.unravel_index(int(chosen.argmax()), shares.shape)
+        name, low, high = self._inputs[int(row)]
+        ends = np.linspace(low, high, len(QUARTERS) + 1)
+        return Region(
+            name, float(ends[quarter]), float(ends[quarter + 1]), QUARTERS[quarter], float(shares[row, quarter])
+        )
+
+    def _quarters(self, inputs: Array) -> NDArray[np.intp]:
+        """Quarters (n, K), from 0, of the ranged ones of inputs (n, C + F). Values outside count to the outer ones."""
+        names = [*self._view.spec.coordinate_names, *_actions(self._view.spec)]
+        columns = inputs[:, [names.index(name) for name, _, _ in self._inputs]]
+        low, high = (np.array([one[end] for one in self._inputs]) for end in (1, 2))
+        quarters = np.floor((columns - low) / (high - low) * len(QUARTERS))
+        whole: NDArray[np.intp] = quarters.clip(0, len(QUARTERS) - 1).astype(np.intp)
+        return whole
+
+
+def _inputs_of(spec: EnvironmentSpec) -> list[tuple[str, float, float]]:
+    """Name and ends of the range of each coordinate and action entry that has a range."""
+    ranged = [(one.name, *limits(one.sampling)) for one in spec.coordinates]
+    if isinstance(spec.action, BoxAction):
+        ranged += zip(_actions(spec), spec.action.low, spec.action.high, strict=True)
+    return [(name, low, high) for name, low, high in ranged if high > low]
+
+
+def _actions(spec: EnvironmentSpec) -> list[str]:
+    return [f"action {i}" for i in range(spec.action.size)]
+
+
+def _without_terminal_rewards(beside: Compared, steps: Sequence[StepOfEpisode]) -> Array:
+    """Errors (n, O), NaN for the reward of a step that ended its episode: it may contain a terminal reward."""
+    errors = beside.errors.copy()
+    if "reward" in beside.names:
+        errors[[step.terminated for step in steps], list(beside.names).index("reward")] = np.nan
+    return errors

@@ -1,0 +1,21 @@
+"""Wire model of drift. It is no part of what a thin client loads."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from surrogym_shared.wire.base import Key, Measured, Request
+from surrogym_shared.wire.policies import Count, Text
+
+
+class AddDrift(Request):
+    """Report that real steps no longer agree with the model, so that the policy's promise is not trusted."""
+
+    output: Text = Field(description="name of the output that differs most")
+    error: Measured = Field(
+        description="mean of real minus predicted values in its unit; or their root mean square, if the errors have "
+        "grown in both directions"
+    )
+    words: Text = Field(description="the error and the region in which it was found, for people")
+    steps: Count = Field(description="number of real steps that were compared, up to the alarm")
+    idempotency_key: Key = Field(description="a repeat with the same key adds nothing")

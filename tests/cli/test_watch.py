@@ -1,0 +1,155 @@
+"""``surrogym watch``: a plant that has changed costs the policy its trust; an unusable log changes nothing."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from support.saying import Said
+from support.server import ServerProcess
+from support.tank import HEADING, lines, watched_tank, write
+from surrogym_client.transport import Api
+
+Watch = Callable[..., Said]
+
+
+@pytest.fixture(scope="module")
+def tank(server_process: ServerProcess, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with watched_tank(server_process.url, tmp_path_factory.mktemp("tank")) as name:
+        yield name
+
+
+@pytest.fixture
+def watch(on_server: Watch, tank: str) -> Watch:
+    return lambda log, *options: on_server("watch", tank, str(log), "--policy", "production", *options)
+
+
+@pytest.fixture
+def policy(server_process: ServerProcess, tank: str) -> Callable[[], Any]:
+    def get() -> Any:
+        with Api(server_process.url) as api:
+            return api.policies.get(tank, "production"), api.surrogate(tank).ledger.model_dump()
+
+    return get
+
+
+def test_a_healthy_plant_keeps_the_trust(watch: Watch, policy: Callable[[], Any], tmp_path: Path):
+    before = policy()
+    said = watch(write(tmp_path / "log.csv", lines(1_500, seed=2)), "--json")
+    assert said.code == 0, said.err
+    result = json.loads(said.out)
+    assert (result["compared"], result["drift"], result["without_next_state"]) == (1_499, None, 1)
+    assert policy() == before
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "named"),
+    [
+        (lambda rows: [_with(row, 1, lambda level: 1_000 * level) for row in rows], ["level", "0.4504", "unit"]),
+        (lambda rows: [_with(row, 0, lambda t: 0.5 * t) for row in rows], ["every 1 s", "0.5"]),
+        (lambda rows: [row.rpartition(",")[0] for row in rows], ["columns"]),
+        (lambda rows: rows[:1], ["1 row"]),
+    ],
+    ids=["other units", "another period", "no reward", "one row"],
+)
+def test_a_log_that_cannot_be_compared_is_refused_and_changes_nothing(
+    watch: Watch, policy: Callable[[], Any], tmp_path: Path, spoiled: Callable[[list[str]], list[str]], named: list[str]
+):
+    before = policy()
+    log = write(tmp_path / "log.csv", spoiled(lines(300, seed=3)))
+    content = log.read_bytes()
+    said = watch(log)
+    assert said.code == 1
+    assert not [words for words in named if words not in said.err], said.err
+    assert "Traceback" not in said.err
+    assert policy() == before
+    assert log.read_bytes() == content
+    assert list(tmp_path.iterdir()) == [log]
+
+
+def test_gaps_and_rows_out_of_order_are_said_and_not_compared(watch: Watch, tmp_path: Path):
+    rows = lines(400, seed=4)
+    rows[200], rows[300] = rows[300], _with(rows[300], 1, lambda _: float("nan"))
+    said = watch(write(tmp_path / "log.csv", [*rows[:100], *rows[110:]]), "--json")
+    assert said.code == 0, said.err
+    result = json.loads(said.out)
+    assert result["without_next_state"] >= 2
+    assert {one["line"] for one in result["rejected"]} >= {292}
+    assert result["rows"] == 390
+    assert 380 < result["compared"] < 389
+
+
+def test_a_worn_pump_costs_the_trust_once_and_is_said_everywhere(
+    watch: Watch, on_server: Watch, policy: Callable[[], Any], tank: str, tmp_path: Path
+):
+    log = write(tmp_path / "log.csv", lines(400, seed=5, worn_from=200))
+    said = watch(log)
+    assert said.code == 1, said.err
+    shown, as_json = on_server("policy", f"{tank}@production"), watch(log, "--json")
+    found = json.loads(as_json.out)["drift"]
+    assert found["output"] == "level"
+    assert 200 < found["line"] <= 240
+    assert found["compared"] == found["line"] - 1
+    assert found["region"]["name"] in ("level", "action 0")
+    assert f"line {found['line']}" in said.out
+    now, ledger = policy()
+    assert (now.trusted, ledger["logged"]) == (False, 79)
+    for text in (now.reason, shown.out, on_server("status", tank).out):
+        assert "drift: level is" in text
+
+
+def test_a_log_is_followed_until_the_drift(watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Lines come in pieces, and a half-written line is no row yet."""
+    monkeypatch.setattr("surrogym_trainer.watching.logs.LOOK_SECONDS", 0.02)
+    monkeypatch.setattr("surrogym_trainer.watching.logs.READING", 0.0)
+    log = tmp_path / "log.csv"
+    text = "\n".join([HEADING, *lines(300, seed=6, worn_from=150)]) + "\n"
+    pieces = [text[i : i + 400] for i in range(0, len(text), 400)]
+    log.write_text(pieces[0], encoding="utf-8")
+
+    def grow() -> None:
+        for piece in pieces[1:]:
+            time.sleep(0.05)
+            with log.open("a", encoding="utf-8") as opened:
+                opened.write(piece)
+
+    writer = threading.Thread(target=grow)
+    writer.start()
+    try:
+        followed = watch(log, "--follow", "--json")
+    finally:
+        writer.join()
+    at_once = watch(log, "--json")
+    assert (followed.code, at_once.code) == (1, 1)
+    assert followed.json["rejected"] == []
+    assert followed.json["drift"] == at_once.json["drift"]
+
+
+def test_what_has_become_shorter_is_another_log(watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr("surrogym_trainer.watching.logs.LOOK_SECONDS", 0.0)
+    monkeypatch.setattr("surrogym_trainer.watching.logs.READING", 0.0)
+    log = write(tmp_path / "log.csv", lines(200, seed=7))
+    threading.Timer(1.0, lambda: write(log, lines(20, seed=7))).start()
+    said = watch(log, "--follow")
+    assert said.code == 1
+    assert "grow" in said.err
+
+
+@pytest.mark.parametrize(("name", "which"), [("nobody", "1"), ("", "staging"), ("", "7")])
+def test_an_unknown_surrogate_or_policy_is_named(on_server: Watch, tank: str, tmp_path: Path, name: str, which: str):
+    log = write(tmp_path / "log.csv", lines(50, seed=8))
+    said = on_server("watch", name or tank, str(log), "--policy", which)
+    assert said.code == 1
+    assert (name or which) in said.err
+
+
+def _with(row: str, column: int, change: Callable[[float], float]) -> str:
+    cells = row.split(",")
+    cells[column] = f"{change(float(cells[column])):.6f}"
+    return ",".join(cells)
