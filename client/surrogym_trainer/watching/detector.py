@@ -14,8 +14,8 @@ than a standard normal variable.
 
 Without a change the error e of a step has these parts, of which z = (e - m) / sqrt(s^2 + (SHARE d)^2) is made:
 
-- a mean m that the stream has shown, as far as it is within ``BIAS`` standard deviations d of the model. A policy
-  spends its time at few states, where the error of a right model is the same again and again;
+- a mean m that the stream has shown, within ``BIAS`` standard deviations d of the model. A policy spends its time at
+  few states, where the error of a right model is the same again and again. Before the first step it is N(0, d^2);
 - the uncertainty d of the model at this step;
 - noise of standard deviation s. The stream shows it, beginning with the model's error on left-out samples.
 
@@ -38,7 +38,6 @@ BIAS = 3.0  # deviations of the model up to which a mean error counts as the mod
 SHARE = 1.5  # deviations of the model that count as one of the error
 MOST = 4.0  # deviations to which an error is limited
 OUTLYING = 3.0  # deviations to which an error is limited before mean and noise learn from it
-MEAN_STEPS = 10.0  # weight of "no mean error", in steps
 NOISE_STEPS = 20.0  # weight of the error on left-out samples, in steps
 NEGLIGIBLE = 0.1  # share of the tolerance below which no error means anything
 
@@ -69,9 +68,8 @@ class Detector:
         false_alarm_steps: average number of steps up to a false alarm, at least."""
         self._least = NEGLIGIBLE * tolerance
         self._alarm = false_alarm_steps
-        self._sum, self._mean_steps = np.zeros(len(claimed)), np.full(len(claimed), MEAN_STEPS)
+        self._sum, self._known_steps = np.zeros(len(claimed)), np.zeros(len(claimed))
         self._squares = NOISE_STEPS * np.maximum(claimed, self._least) ** 2
-        self._noise_steps = np.full(len(claimed), NOISE_STEPS)
         count = 2 * len(SHIFTS) + len(SPREADS)
         half = [1 / (4 * len(SHIFTS))] * (2 * len(SHIFTS)) + [1 / (2 * len(SPREADS))] * len(SPREADS)
         self._weights = np.array(half) / len(claimed)  # (B,): half of the stake is on shifts, half on spreads
@@ -94,8 +92,9 @@ class Detector:
         """
         known = np.isfinite(error)
         uncertain = np.hypot(deviation, self._least)
-        noise = np.sqrt(self._squares / self._noise_steps)
-        mean = (self._sum / self._mean_steps).clip(-BIAS * uncertain, BIAS * uncertain)
+        noise = np.sqrt(self._squares / (NOISE_STEPS + self._known_steps))
+        mean = self._sum / (self._known_steps + (noise / uncertain) ** 2)  # given the errors, with the prior N(0, d^2)
+        mean = mean.clip(-BIAS * uncertain, BIAS * uncertain)
         beyond = np.where(known, error - mean, 0.0)
         log_bets = np.where(known[:, None], _log_bets(beyond / np.hypot(noise, SHARE * uncertain)), 0.0)
         self._evidence = (1 + self._evidence) * np.exp(log_bets)
@@ -110,9 +109,8 @@ class Detector:
         limited = beyond.clip(-OUTLYING * noise, OUTLYING * noise)
         self._sum += np.where(known, mean + limited, 0.0)
         self._squares += np.where(known, limited**2, 0.0)
-        self._mean_steps += known
-        self._noise_steps += known
-        self._squares = np.maximum(self._squares, self._noise_steps * self._least**2)
+        self._known_steps += known
+        self._squares = np.maximum(self._squares, (NOISE_STEPS + self._known_steps) * self._least**2)
 
     def _found(self) -> Drift:
         output, bet = np.unravel_index(int((self._evidence * self._weights).argmax()), self._evidence.shape)

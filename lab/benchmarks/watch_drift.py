@@ -1,0 +1,291 @@
+"""After how many real steps ``surrogym watch`` finds that a plant has changed, and how often it is wrong.
+
+A model of each plant from textbook physics (``support.levitation``) is fitted to one round of samples. A controller
+runs the plant in closed loop, which changes at a random step, or has changed before the first one. The watcher sees the
+same as on a server, in this process. Fouling takes 0.1 % of the actuator at each step.
+
+A change shows only where it moves a state by more than its noise: a pendulum at rest does not feel its friction. So the
+steps are counted from the change, and those of them at which it shows.
+
+Run it by::
+
+    python lab/benchmarks/watch_drift.py --first-seed 450 --seeds 3
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple, cast
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+
+import numpy as np
+import torch
+from common import parser, started, write
+from scipy.linalg import solve_discrete_are
+
+from support.changing import Array, Changing, Machine
+from support.levitation import PLANTS
+from support.real_steps import arrays, samples_of
+from surrogym_client.transport import Api
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.sampling.design import Decision, advance, initial_queries
+from surrogym_server.sampling.state import DesignState, Request
+from surrogym_server.sampling.uncertainty import query_uncertainty
+from surrogym_shared.spec import Design
+from surrogym_shared.wire import SurrogateView
+from surrogym_trainer.evaluation.comparing import StepOfEpisode
+from surrogym_trainer.watching.watcher import BATCH, Alarm, Watcher
+
+HEALTHY = 7_000  # steps of the unchanged plant, for each plant and seed
+BEFORE = 200  # steps before a change, and up to one episode more
+AFTER = 400
+AIM = 30  # steps
+EPISODES = 50  # of a mean return
+Change = Callable[[Machine, int], dict[str, float]]  # the plant, steps since the change: parameters
+
+
+def _offset(machine: Machine, _: int) -> dict[str, float]:
+    low, high = next(iter(machine.ranges.values()))
+    return {"shift": 0.02 * (high - low)}
+
+
+CHANGES: Mapping[str, Change] = {
+    "mass +30 %": lambda machine, _: {"mass": 1.3 * machine.real["mass"]},
+    "friction x 2": lambda machine, _: {"friction": 2 * machine.real["friction"]},
+    "dead time +1": lambda *_: {"delay": 1.0},
+    "offset 2 %": _offset,
+    "slow fouling": lambda machine, since: {"pump": machine.real["pump"] * 0.999**since},
+    "worn actuator": lambda machine, _: {"pump": 0.8 * machine.real["pump"]},
+}
+NEEDS = {"mass +30 %": "mass", "friction x 2": "friction"}  # parameter that a plant has or not
+
+
+@dataclass(frozen=True)
+class Row:
+    """One change of one plant. Steps are None if it was not found."""
+
+    plant: str
+    change: str
+    seed: int
+    at_once: bool  # whether the plant has changed before the first step
+    steps: int | None  # from the change up to the alarm
+    shown: int | None  # those of these steps at which the change moves a state by more than its noise
+    output: str
+    region: str
+    lost: float | None  # share of the controller's gain that the fouling has cost at the alarm
+
+
+class Stream(NamedTuple):
+    steps: list[StepOfEpisode]
+    showing: list[bool]  # whether the change moves a state by more than its noise
+
+
+class Served:
+    """The routes of a server that a watcher asks, for a model in this process."""
+
+    def __init__(self, made: Decision) -> None:
+        self._model: DynamicsModel = made.model
+        self._tolerances = np.array(made.tolerances)
+
+    def predict(self, _: str, q: Any, u: Any, **__: Any) -> SimpleNamespace:
+        with torch.inference_mode():
+            found = self._model.transition(torch.tensor(q), torch.tensor(u))
+        return SimpleNamespace(
+            next_coordinates=found.q_next.tolist(), reward=found.reward.tolist(), terminated=[False] * len(q)
+        )
+
+    def query_uncertainty(self, _: str, q: Any, u: Any, **__: Any) -> SimpleNamespace:
+        with torch.inference_mode():
+            found = query_uncertainty(self._model, np.array(q), np.array(u), self._tolerances)
+        return SimpleNamespace(outputs=list(self._model.definition.outputs), deviation=found.deviation)
+
+
+class Case(NamedTuple):
+    """A plant with its model and its controller."""
+
+    machine: Machine
+    served: Served
+    view: SurrogateView
+    act: Callable[[Array], Array]
+
+    def watcher(self) -> Watcher:
+        return Watcher(cast(Api, self.served), self.view)
+
+
+def fitted(machine: Machine, seed: int) -> Case:
+    design = Design(initial=machine.budget, budget=machine.budget, seed=seed)
+    spec = machine.spec.model_copy(update={"design": design})
+    plant, definition = Changing(machine, machine.real, np.random.default_rng([seed, 1])), definition_from_spec(spec)
+    points = zip(*(one.numpy() for one in arrays(initial_queries(definition, machine.budget))), strict=True)
+    samples = samples_of([plant.step_from(*point) for point in points])
+    made = advance(definition, samples, DesignState(), Request(machine.budget, spec.design.target))
+    outputs = [
+        SimpleNamespace(name=name, tolerance=tolerance, leave_one_out_error=one.leave_one_out_error, noise=one.noise)
+        for name, tolerance, one in zip(definition.outputs, made.tolerances, made.confidences, strict=True)
+    ]
+    view = SimpleNamespace(name="plant", spec=spec, model_version=1, fidelity=SimpleNamespace(outputs=outputs))
+    return Case(machine, Served(made), cast(SurrogateView, view), controller(machine))
+
+
+def controller(machine: Machine) -> Callable[[Array], Array]:
+    """A linear-quadratic regulator about the middle; the pendulum swings up by its energy first."""
+
+    def after(q: Array, u: Array) -> Array:
+        return machine.formula(q[None], u[None], machine.real)[0][0]
+
+    size, small = len(machine.ranges), 1e-5
+    middle, hold = np.zeros(size), np.array([3 / 2.2 - 1 if machine.name == "tanks" else 0.0])
+    a = np.stack([(after(middle + d, hold) - after(middle - d, hold)) / (2 * small) for d in small * np.eye(size)], 1)
+    b = (after(middle, hold + small) - after(middle, hold - small))[:, None] / (2 * small)
+    spans = np.array([high - low for low, high in machine.ranges.values()])
+    cost = 0.05 * np.eye(1)
+    p = solve_discrete_are(a, b, np.diag(1 / spans**2), cost)
+    gain = np.linalg.solve(cost + b.T @ p @ b, b.T @ p @ a)
+
+    def act(q: Array) -> Array:
+        u = hold - q @ gain.T
+        if machine.name == "pendulum":
+            lacking = 15 - (0.5 * q[:, 1] ** 2 + 15 * np.cos(q[:, 0]))
+            swing = (0.4 * np.where(q[:, 1] < 0, -1, 1) * lacking)[:, None]
+            u = np.where(np.abs(q[:, :1]) < 0.35, u, swing)
+        clipped: Array = u.clip(-1, 1)
+        return clipped
+
+    return act
+
+
+def stream_of(case: Case, change: Change | None, at: int, count: int, seed: int) -> Stream:
+    """Steps of the closed loop from the declared starts, episode after episode."""
+    machine, rng = case.machine, np.random.default_rng([seed, 5])
+    low, high = np.array(list(machine.start.values())).T
+    spans = np.array([end - begin for begin, end in machine.ranges.values()])
+    found, showing, q, t, before = [], [], None, 0, np.zeros((1, machine.actions))
+    for i in range(count):
+        if q is None:
+            q, t, before = rng.uniform(low, high)[None], 0, np.zeros((1, machine.actions))
+        u = case.act(q)
+        new = change(machine, i - at) if change is not None and i >= at else {}
+        taken, parameters = before if new.get("delay") else u, {**machine.real, **new}
+        q_next, reward, over = machine.step(q, taken, parameters, rng)
+        shift = new.get("shift", 0.0) * np.eye(len(low))[0]
+        moved = machine.formula(q - shift, taken, parameters)[0] + shift - machine.formula(q, u, machine.real)[0]
+        showing.append(bool((np.abs(moved) > machine.noise * spans).any()))
+        state, action, following = (tuple(one[0].tolist()) for one in (q, u, q_next))
+        found.append(StepOfEpisode(0, i, state, action, following, float(reward[0]), terminated=False))
+        t, before = t + 1, u
+        q = None if over[0] or t == machine.time_limit else q_next
+    return Stream(found, showing)
+
+
+def first_alarm(watcher: Watcher, steps: Sequence[StepOfEpisode]) -> Alarm | None:
+    for first in range(0, len(steps), BATCH):
+        if (alarm := watcher.take(steps[first : first + BATCH])) is not None:
+            return alarm
+    return None
+
+
+def rows_of(case: Case, seed: int) -> Iterator[Row]:
+    for number, (name, change) in enumerate(CHANGES.items()):
+        if NEEDS.get(name, "pump") not in case.machine.real:
+            continue
+        for at_once in (False, True):
+            own = seed + 1_000 * (number + 1)
+            at = 0 if at_once else BEFORE + int(np.random.default_rng(own).integers(case.machine.time_limit))
+            stream = stream_of(case, change, at, at + AFTER, own)
+            alarm = first_alarm(case.watcher(), stream.steps)
+            if alarm is None or alarm.line < at:
+                early = "" if alarm is None else "a false alarm before"
+                yield Row(case.machine.name, name, seed, at_once, None, None, early, "", None)
+                continue
+            end = alarm.line + 1
+            shown = sum(stream.showing[at:end])
+            lost = lost_share(case, change(case.machine, end - at), seed) if name == "slow fouling" else None
+            where = "" if alarm.region is None else alarm.region.words()
+            yield Row(case.machine.name, name, seed, at_once, end - at, shown, alarm.output, where, lost)
+
+
+def lost_share(case: Case, parameters: dict[str, float], seed: int) -> float:
+    """Share of the controller's gain over no action that a change costs."""
+
+    def mean(new: dict[str, float], act: Callable[[Array], Array]) -> float:
+        machine, rng = case.machine, np.random.default_rng([seed, 77])
+        low, high = np.array(list(machine.start.values())).T
+        q, total = rng.uniform(low, high, (EPISODES, len(low))), np.zeros(EPISODES)
+        running = np.ones(EPISODES, bool)
+        for _ in range(machine.time_limit):
+            q, reward, over = machine.step(q, act(q), {**machine.real, **new}, rng)
+            total += np.where(running, reward, 0.0)
+            running &= ~over
+        return float(total.mean())
+
+    idle = mean({}, lambda q: np.zeros((len(q), case.machine.actions)))
+    real = mean({}, case.act)
+    return (real - mean(parameters, case.act)) / max(real - idle, 1e-9)
+
+
+def false_alarms(case: Case, seed: int, count: int) -> list[str]:
+    """The false alarms of a healthy stream, which is watched anew after each."""
+    steps, found = stream_of(case, None, 0, count, seed).steps, []
+    while (alarm := first_alarm(case.watcher(), steps)) is not None:
+        found.append(alarm.words())
+        steps = steps[alarm.compared :]
+    return found
+
+
+def table(rows: Sequence[Row]) -> str:
+    lines = [
+        f"| plant | change | runs | found within {AIM} | steps: median, most | of these show it | "
+        "changed before: within, median |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for plant, change in dict.fromkeys((row.plant, row.change) for row in rows):
+        own = [row for row in rows if (row.plant, row.change) == (plant, change)]
+        later, at_once = [one for one in own if not one.at_once], [one for one in own if one.at_once]
+        cells = [plant, change, str(len(later)), _within(later), _steps(later), _shown(later)]
+        lines.append(f"| {' | '.join(cells)} | {_within(at_once)}, {_steps(at_once)} |")
+    return "\n".join(lines)
+
+
+def _within(rows: Sequence[Row]) -> str:
+    return f"{sum(row.steps is not None and row.steps <= AIM for row in rows)} of {len(rows)}"
+
+
+def _steps(rows: Sequence[Row]) -> str:
+    steps = [np.inf if row.steps is None else row.steps for row in rows]
+    return f"{np.median(steps):g}, {max(steps):g}"
+
+
+def _shown(rows: Sequence[Row]) -> str:
+    shown = [np.inf if row.shown is None else row.shown for row in rows]
+    return f"{np.median(shown):g}, {max(shown):g}"
+
+
+def main() -> None:
+    made = parser(__doc__)
+    made.add_argument("--first-seed", type=int, default=400)
+    made.add_argument("--seeds", type=int, default=3)
+    options = started(made)
+    rows: list[Row] = []
+    wrong: dict[str, list[str]] = {}
+    steps = 500 if options.quick else HEALTHY
+    for machine in PLANTS:
+        for seed in range(options.first_seed, options.first_seed + (1 if options.quick else options.seeds)):
+            case = fitted(machine, seed)
+            rows += rows_of(case, seed)
+            wrong[f"{machine.name} {seed}"] = false_alarms(case, seed, steps)
+            print(f"{machine.name} {seed}: {len(wrong[f'{machine.name} {seed}'])} false alarms in {steps} steps")
+    lost = [row.lost for row in rows if row.lost is not None]
+    print(table(rows))
+    print(f"false alarms: {sum(map(len, wrong.values()))} in {steps * len(wrong)} healthy steps")
+    print(f"gain lost by fouling at the alarm: median {np.median(lost):.1%}, most {max(lost):.1%}")
+    write(options.out, "watch-drift", {"rows": [asdict(row) for row in rows], "false_alarms": wrong, "steps": steps})
+
+
+if __name__ == "__main__":
+    main()
