@@ -198,12 +198,12 @@ def repeats(definition: EnvironmentDefinition, learned: Samples, unseen: Samples
         choice = Choice("gaussian_process", tuple(settings.items()))
         made = replace(definition, learning=replace(definition.learning, model=choice))
         model = gaussian_processes(made, learned)
-        moved[sharing] = model.transition(unseen.q, unseen.u, deviations=True)
+        moved[sharing] = model.transition(unseen.q, unseen.u, stds=True)
     size = increments(definition, unseen).std(0, correction=0)
     for column, (index, output) in enumerate(zip(definition.moving, model.transitions, strict=True)):
         for sharing, found in moved.items():
             off = (found.q_next - unseen.q_next)[:, index] / size[column]
-            row = scored(off, (found.deviation[:, index] / size[column]) ** 2)
+            row = scored(off, (found.std[:, index] / size[column]) ** 2)
             shown = {"structure": "repeats" if sharing else AS_IT_IS, "output": f"{output.name} (repeats)"}
             yield {**shown, "of": output.shared, "chosen": bool(output.shared), **row}
 

@@ -96,7 +96,7 @@ def predictions(batch: int, out: Path, seconds: float) -> Row:
     at = torch.from_numpy(np.random.default_rng(1).normal(size=(batch, INPUTS)))
 
     def ours() -> tuple[torch.Tensor, torch.Tensor]:
-        return serving.mean_and_deviation(at, range(OUTPUTS))
+        return serving.mean_and_std(at, range(OUTPUTS))
 
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -135,7 +135,7 @@ def growth(points: int, seconds: float) -> Row:
     one = posteriors[0]
     subjects = {
         "mean": timed(lambda: serving.mean(at)),
-        "mean, variance": timed(lambda: serving.mean_and_deviation(at, range(OUTPUTS))),
+        "mean, variance": timed(lambda: serving.mean_and_std(at, range(OUTPUTS))),
         "products": timed(products(serving, len(at), range(OUTPUTS))),
         "extend": timed(lambda: one.extend(at[0], at[0, 0])),
         "factorise": timed(lambda: condition(one.hyper, one.x, one.y)),
@@ -182,7 +182,7 @@ def two_threads(model: GaussianProcessModel, seconds: float) -> Iterator[Row]:
         "AUR-D, N=1,024": stepping(model, 1_024),
         "AUR-D, N=4,096": stepping(model, 4_096),
         "AUR-P, 64 x 1,000": stepping(model, PARTICLE_LANES, particles=1_000, **AUR_P),
-        "mean, variance, 8,192": lambda: serving.mean_and_deviation(at, range(OUTPUTS)),
+        "mean, variance, 8,192": lambda: serving.mean_and_std(at, range(OUTPUTS)),
     }.items():
         made = measure({f"{count} threads": threaded(count, call) for count in (1, 2)}, seconds)
         yield {"what": what, **made, "1 over 2": made["1 threads"] / made["2 threads"]}

@@ -92,7 +92,7 @@ def rows_of(task: str, seed: int, *, judged: bool) -> list[Row]:
             continue
         inside = tuple(int(_inside(one, tolerance).sum()) for one in (kept, mixed[i]))
         factor = _factor(kept, tolerance)
-        wide = [Prediction(p.error, factor * p.deviation) for p in own[i]]
+        wide = [Prediction(p.error, factor * p.std) for p in own[i]]
         found = scores_of(own[i], tolerance), scores_of(wide, tolerance)
         if found[0] is None or found[1] is None:
             continue
@@ -141,16 +141,16 @@ def mixture_of(model: DynamicsModel, samples: Samples) -> Predictions:
 
 
 def _mixed(parts: tuple[Prediction, ...]) -> Prediction:
-    errors, deviations = np.array([p.error for p in parts]), np.array([p.deviation for p in parts])
-    return Prediction(float(errors.mean()), float(np.sqrt(np.mean(deviations**2) + errors.var())))
+    errors, stds = np.array([p.error for p in parts]), np.array([p.std for p in parts])
+    return Prediction(float(errors.mean()), float(np.sqrt(np.mean(stds**2) + errors.var())))
 
 
 def _inside(predictions: tuple[Prediction, ...], tolerance: float) -> np.ndarray:
-    return np.array([abs(p.error) <= max(HALF * p.deviation, tolerance) for p in predictions])
+    return np.array([abs(p.error) <= max(HALF * p.std, tolerance) for p in predictions])
 
 
 def _factor(predictions: tuple[Prediction, ...], tolerance: float) -> float:
-    needed = [abs(p.error) / max(HALF * p.deviation, 1e-300) if abs(p.error) > tolerance else 0 for p in predictions]
+    needed = [abs(p.error) / max(HALF * p.std, 1e-300) if abs(p.error) > tolerance else 0 for p in predictions]
     return max(1.0, sorted(needed)[ceil(LEVEL * len(needed)) - 1])
 
 

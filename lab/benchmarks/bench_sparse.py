@@ -149,14 +149,14 @@ def designed(spec: EnvironmentSpec, family: str, settings: Mapping[str, Any]) ->
 
 def held_out(definition: EnvironmentDefinition, model: DynamicsModel, unseen: Samples) -> dict[str, Any]:
     """Errors and coverage of one step, and of ten."""
-    made = model.transition(unseen.q, unseen.u, deviations=True, reward_deviation=True)
-    assert made.deviation is not None
-    assert made.reward_deviation is not None
+    made = model.transition(unseen.q, unseen.u, stds=True, reward_std=True)
+    assert made.std is not None
+    assert made.reward_std is not None
     truth = torch.cat([increments(definition, unseen), unseen.reward[:, None]], 1)
     off = model.means(unseen.q, unseen.u) - truth
     error = (off.square().mean(0).sqrt() / truth.std(0)).tolist()
-    latent = torch.cat([made.deviation, made.reward_deviation[:, None]], 1)
-    noise = 0.0 if (able := offers(model, LearnedNoise)) is None else latent.new_tensor(able.noise_deviations)
+    latent = torch.cat([made.std, made.reward_std[:, None]], 1)
+    noise = 0.0 if (able := offers(model, LearnedNoise)) is None else latent.new_tensor(able.noise_stds)
     inside = (off.abs() <= WITHIN * (latent.square() + noise**2).sqrt()).double().mean(0)
     starts = torch.arange(0, len(unseen) - AHEAD, AHEAD)
     starts = starts[starts % EPISODE <= EPISODE - AHEAD]

@@ -67,10 +67,10 @@ def driven(one: OpenFmu, spec: EnvironmentSpec, shown: list[str], start: np.ndar
 def compared(model: DynamicsModel, rows: np.ndarray, u: np.ndarray) -> tuple[float, float]:
     """Largest differences of coordinates, and of deviations, between single steps of the FMU and of the model."""
     size, outputs = len(model.definition.coordinates), len(model.definition.outputs) - 1
-    moved = model.transition(torch.from_numpy(rows[:, :size].copy()), torch.from_numpy(u[:, None]), deviations=True)
-    assert moved.deviation is not None
-    deviations = (rows[:, 2 * size : 2 * size + outputs] - moved.deviation.numpy()) / model.scales[:-1].numpy()
-    return np.abs(rows[:, size : 2 * size] - moved.q_next.numpy()).max(), np.abs(deviations).max()
+    moved = model.transition(torch.from_numpy(rows[:, :size].copy()), torch.from_numpy(u[:, None]), stds=True)
+    assert moved.std is not None
+    stds = (rows[:, 2 * size : 2 * size + outputs] - moved.std.numpy()) / model.scales[:-1].numpy()
+    return np.abs(rows[:, size : 2 * size] - moved.q_next.numpy()).max(), np.abs(stds).max()
 
 
 def main() -> None:
@@ -96,8 +96,8 @@ def main() -> None:
                     rows.append(driven(one, spec, shown, begin, u))
                     seconds += time.perf_counter() - began
                     actions.append(u)
-            state, deviation = compared(local.model, np.concatenate(rows), np.concatenate(actions))
-            print(f"  {EPISODES * STEPS} steps: coordinates differ by {state:.1e}, deviations by {deviation:.1e}")
+            state, std = compared(local.model, np.concatenate(rows), np.concatenate(actions))
+            print(f"  {EPISODES * STEPS} steps: coordinates differ by {state:.1e}, deviations by {std:.1e}")
             print(f"  {1e6 * seconds / EPISODES / STEPS:.0f} µs a step and its values through fmpy")
             machine = original.make(f"fmu:{plant}", spec=spec)
             ranges = [[getattr(c.sampling, end) for c in spec.coordinates] for end in ("low", "high")]

@@ -114,7 +114,7 @@ def design(machine: Machine, given: argparse.Namespace) -> None:
 def imagine(machine: Machine, given: argparse.Namespace) -> None:
     for seed in given.all_seeds:
         model, found = random_model(machine, 100, 10, (0.0, LOUD), seed)
-        sensors = tuple((name, one.deviation) for name, one in zip(machine.ranges, found, strict=False) if one)
+        sensors = tuple((name, one.std) for name, one in zip(machine.ranges, found, strict=False) if one)
         noisy = {"process_noise": True}
         cases = {"left out": {}, "drives the state": noisy, "seen alone": {**noisy, "sensor_noise": sensors}}
         words = [f"{name} {_imagined(machine, model, seed, chosen):.1f}" for name, chosen in cases.items()]

@@ -195,8 +195,8 @@ def case_of(
         q, target = samples.q, increments(definition, samples)[:, column]
         used = usable(definition, column, samples.q_next, chosen, past_limits=output.past_limits)
     x = encode(definition, chosen, q, samples.u, samples.q_next[:, lead])[used]
-    target, deviation = target[used], float(target[used].std(correction=0))
-    if len(target) < UNSEEN // 10 or deviation < 1e-9:
+    target, std = target[used], float(target[used].std(correction=0))
+    if len(target) < UNSEEN // 10 or std < 1e-9:
         return None
     mirror = reflection(definition, chosen)
     options = FitOptions(quadratic=output.name == REWARD)
@@ -209,7 +209,7 @@ def case_of(
         posterior.y,
         x,
         output.standardised(target, x),
-        output.scale * output.amplitude(x) / deviation,
+        output.scale * output.amplitude(x) / std,
         options,
         mirror,
         given & (entries >= len(definition.coordinates)),

@@ -103,7 +103,7 @@ class LocalSurrogate:
     def step(
         self, session: str, action: Floats | Ints, *, mask: Bools | None = None, deviations: bool = False
     ) -> StepResult:
-        asked = quick(Step, session=session, seq=None, action=action, mask=mask, deviations=deviations, within=None)
+        asked = quick(Step, session=session, seq=None, action=action, mask=mask, stds=deviations, within=None)
         outcome = self._advance(asked)
         assert isinstance(outcome, tuple)
         return outcome[0]

@@ -72,9 +72,9 @@ def test_steps_are_those_of_the_served_model(surrogate, twin):
     model = LocalSurrogate.from_bytes(surrogate.spec, surrogate.model).model
     q, rows = torch.tensor([[0.3, 0.1]], dtype=torch.float64), []
     for action in pumped():
-        moved = model.transition(q, torch.from_numpy(action[None]), deviations=True)
+        moved = model.transition(q, torch.from_numpy(action[None]), stds=True)
         q = moved.q_next
-        rows.append([*q[0].tolist(), *moved.deviation[0].tolist(), float(moved.reward)])
+        rows.append([*q[0].tolist(), *moved.std[0].tolist(), float(moved.reward)])
     with opened(twin) as one:
         one.begin({"upper": 0.3, "lower": 0.1})
         np.testing.assert_allclose(driven(one, pumped()), rows, rtol=1e-9, atol=1e-9)

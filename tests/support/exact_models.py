@@ -23,10 +23,10 @@ class ExactModel(DynamicsModel):
     definition: EnvironmentDefinition
     move: Callable[[Tensor, Tensor], Tensor]
     pay: Callable[[Tensor, Tensor], Tensor]
-    deviation: float = 0.0
-    reward_deviation: Callable[[Tensor], Tensor] = lambda q: torch.zeros(len(q), dtype=torch.float64)
+    std: float = 0.0
+    reward_std: Callable[[Tensor], Tensor] = lambda q: torch.zeros(len(q), dtype=torch.float64)
     terminal_reward: float = 0.0
-    process_deviation: float = 0.0
+    process_std: float = 0.0
     samples: int = 1
     digest: str = ""
 
@@ -55,20 +55,20 @@ class ExactModel(DynamicsModel):
         *,
         noise: Tensor | None = None,
         process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
+        stds: bool = False,
+        reward_std: bool = False,
     ) -> Transition:
         q_next, moving = self.move(q, u), list(self.definition.moving)
         if process is not None:
-            q_next[..., moving] += self.process_deviation * process
+            q_next[..., moving] += self.process_std * process
         if noise is not None:
-            q_next[..., moving] += self.deviation * noise
-        deviation = torch.full((len(q), len(moving)), self.deviation, dtype=q.dtype)
+            q_next[..., moving] += self.std * noise
+        std = torch.full((len(q), len(moving)), self.std, dtype=q.dtype)
         return Transition(
             settle(self.definition, q_next),
             self.pay(q, u),
-            deviation if deviations else None,
-            self.reward_deviation(q) if reward_deviation else None,
+            std if stds else None,
+            self.reward_std(q) if reward_std else None,
         )
 
 

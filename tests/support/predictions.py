@@ -18,13 +18,13 @@ WAYS = ("mean", "particles", "functions", "in C")
 
 def check_processes(model: GaussianProcessModel, points: tuple[Tensor, Tensor]) -> None:
     """At points q (m, C), u (m, F) the transition has the means and deviations of the outputs' processes."""
-    moved = model.transition(*points, deviations=True)
-    assert moved.deviation is not None
+    moved = model.transition(*points, stds=True)
+    assert moved.std is not None
     for column, output in enumerate(model.transitions):
         x = process_inputs(model.definition, output, PredictedSteps(*points, points[0]))
-        mean, deviation = output.mean_and_deviation(x)
+        mean, std = output.mean_and_std(x)
         torch.testing.assert_close(moved.q_next[:, column] - points[0][:, column], mean, rtol=1e-6, atol=1e-9)
-        torch.testing.assert_close(moved.deviation[:, column], deviation, rtol=1e-4, atol=1e-7)
+        torch.testing.assert_close(moved.std[:, column], std, rtol=1e-4, atol=1e-7)
 
 
 def check_compiled(model: GaussianProcessModel, points: tuple[Tensor, Tensor], how: str) -> None:
@@ -41,11 +41,11 @@ def check_compiled(model: GaussianProcessModel, points: tuple[Tensor, Tensor], h
         given = {n: torch.randn(rows, size, generator=generator, dtype=torch.float64) for n in ("noise", "process")}
     if how == "functions":
         given = {"paths": model.draw(torch.randn(rows, model.path_size, generator=generator, dtype=torch.float64))}
-        ours = model.transition_along(given["paths"], *points, deviations=True)
+        ours = model.transition_along(given["paths"], *points, stds=True)
     else:
-        ours = model.transition(*points, deviations=True, **given)
+        ours = model.transition(*points, stds=True, **given)
     arrays = {name: given[name].numpy() if name in given else None for name in ("noise", "process", "paths")}
-    theirs = compiled(*(p.numpy() for p in points), **arrays, deviations=True, reward_deviation=False)
+    theirs = compiled(*(p.numpy() for p in points), **arrays, stds=True, reward_std=False)
     torch.testing.assert_close(torch.from_numpy(theirs.q_next), ours.q_next, rtol=1e-7, atol=1e-8)
     torch.testing.assert_close(torch.from_numpy(theirs.reward), ours.reward, rtol=1e-7, atol=1e-8)
-    torch.testing.assert_close(torch.from_numpy(theirs.deviation[:, :size]), ours.deviation, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(torch.from_numpy(theirs.std[:, :size]), ours.std, rtol=1e-4, atol=1e-7)

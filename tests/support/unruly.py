@@ -40,7 +40,7 @@ def raised(error: BaseException) -> Callable[[Any], Any]:
 TRANSITIONS: dict[str, Callable[[Any], Any]] = {
     "nan": lambda made: replace(made, q_next=made.q_next * torch.nan),
     "reward": lambda made: replace(made, reward=made.reward * torch.nan),
-    "negative": lambda made: replace(made, deviation=None if made.deviation is None else -1 - made.deviation),
+    "negative": lambda made: replace(made, std=None if made.std is None else -1 - made.std),
     "shape": lambda made: replace(made, reward=made.reward[:, None]),
     "narrow": lambda made: replace(made, q_next=made.q_next[:, :1]),
     "nothing": lambda _: None,

@@ -39,4 +39,4 @@ class FocusedVariance(Acquisition):
     def value(self, candidates: CandidateView) -> Tensor:
         column = candidates.model.definition.coordinate_names.index(self.coordinate)
         away = (candidates.points.q[:, column] - self.near) / self.width
-        return candidates.deviation * (-0.5 * away.square()).exp()
+        return candidates.std * (-0.5 * away.square()).exp()

@@ -53,7 +53,7 @@ class Regression:
         errors = torch.stack([wrong.square().mean(0).sqrt(), *within], 1)
         return cls(*map(in_rows, (weights, root, noise, scale, errors)))
 
-    def deviation(self, x: Tensor) -> Tensor:
+    def std(self, x: Tensor) -> Tensor:
         """Of the mean at features x (m, d), (m, p)."""
         return torch.linalg.vector_norm(x @ self.root, dim=1)[:, None] * self.noise
 
@@ -77,14 +77,14 @@ class LinearModel(DynamicsModel, FunctionDraws, LeaveOneOut):
         *,
         noise: Tensor | None = None,
         process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
+        stds: bool = False,
+        reward_std: bool = False,
     ) -> Transition:
         x = features(self.definition, q, u)
-        spread = self.changes.deviation(x)
+        spread = self.changes.std(x)
         change = x @ self.changes.weights
         change = change if noise is None else change + spread * noise
-        return self._transition(q, u, change, self.pay.weights, process, spread, deviations, reward_deviation)
+        return self._transition(q, u, change, self.pay.weights, process, spread, stds, reward_std)
 
     @property
     def path_size(self) -> int:
@@ -105,15 +105,15 @@ class LinearModel(DynamicsModel, FunctionDraws, LeaveOneOut):
         u: Tensor,
         *,
         process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
+        stds: bool = False,
+        reward_std: bool = False,
     ) -> Transition:
         d, p = self.changes.weights.shape
         away = paths[:, : self.path_size].reshape(len(paths), d, p + 1)
         x = features(self.definition, q, u)
         change = torch.einsum("md,mdp->mp", x, self.changes.weights + away[..., :p])
-        spread, pay = self.changes.deviation(x), self.pay.weights + away[..., p:]
-        return self._transition(q, u, change, pay, process, spread, deviations, reward_deviation)
+        spread, pay = self.changes.std(x), self.pay.weights + away[..., p:]
+        return self._transition(q, u, change, pay, process, spread, stds, reward_std)
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         change = features(self.definition, q, u) @ self.changes.weights
@@ -150,18 +150,18 @@ class LinearModel(DynamicsModel, FunctionDraws, LeaveOneOut):
         pay: Tensor,
         process: Tensor | None,
         spread: Tensor,
-        deviations: bool,
-        reward_deviation: bool,
+        stds: bool,
+        reward_std: bool,
     ) -> Transition:
         """The step of changes (m, M), paid by weights ``pay`` (d, 1), or (m, d, 1) of each row's own function."""
         change = change if process is None else change + self.changes.noise * process
         q_next = moved(self.definition, self._inverse, q, u, placed(self.definition, change))
         state = q_next if self.definition.reward_timing == "after" else q
         x = features(self.definition, state, u)
-        reward, doubt = (x[:, None] @ pay)[:, 0, 0], self.pay.deviation(x)[:, 0]
+        reward, doubt = (x[:, None] @ pay)[:, 0, 0], self.pay.std(x)[:, 0]
         if (known := self.definition.declared_reward) is not None:
             reward, doubt = known(q_next if known.after else q, u), torch.zeros_like(doubt)
-        return Transition(q_next, reward, spread if deviations else None, doubt if reward_deviation else None)
+        return Transition(q_next, reward, spread if stds else None, doubt if reward_std else None)
 
     @cached_property
     def _inverse(self) -> ObservationInverse | None:

@@ -207,7 +207,7 @@ def uncertainty(said: Said[UncertaintyResult]) -> replies.Uncertainty:
         model_version=said.version,
         outputs=list(said.outputs),
         mean=result.mean.tolist(),
-        deviation=result.deviation.tolist(),
+        deviation=result.std.tolist(),
         model_uncertainty=result.model_uncertainty.tolist(),
         input_probability=result.input_probability.tolist(),
         log_uncertainty_index=result.log_uncertainty_index.tolist(),
@@ -222,7 +222,7 @@ def prediction(said: Said[PointPrediction]) -> replies.Prediction:
         next_coordinates=result.next_coordinates.tolist(),
         next_observation=result.next_observation.tolist(),
         reward=result.reward.tolist(),
-        reward_deviation=result.reward_deviation.tolist(),
+        reward_deviation=result.reward_std.tolist(),
         terminated=result.terminated.tolist(),
     )
 

@@ -1,6 +1,6 @@
 """A surrogate as an FMU of FMI 3.0: a digital twin, with the uncertainty of each step.
 
-The FMU steps like a session in the variant ``deterministic``: by the mean, with the deviations beside it.
+The FMU steps like a session in the variant ``deterministic``: by the mean, with the standard deviations beside it.
 """
 
 from __future__ import annotations

@@ -149,7 +149,7 @@ def fingerprint_of(request: Advance) -> Fingerprint:
     """Fingerprint of a request. Only a request with the same fingerprint is a repeat, on any transport."""
     match request:
         case Step():
-            return Fingerprint("step", _columns(request.action, 2), request.mask, request.deviations)
+            return Fingerprint("step", _columns(request.action, 2), request.mask, request.stds)
         case Reset():
             return Fingerprint("reset", request.seed, request.mask)
         case Rollout():
@@ -194,7 +194,7 @@ def carried_out(
         request, Step
     ):  # checked first and without a pattern, because most requests are steps, and this is faster
         u = policy_actions(session.definition.action, request.action, session.settings.num_envs)
-        stepped, result = _stepped(session, u, request.mask, request.deviations, models, interrupts)
+        stepped, result = _stepped(session, u, request.mask, request.stds, models, interrupts)
         return stepped, (result,)
     match request:
         case Reset():
@@ -230,14 +230,12 @@ def _next_step(
 
 
 def _stepped(
-    session: Session, u: Array, mask: Bools | None, deviations: bool, models: Models, interrupts: bool
+    session: Session, u: Array, mask: Bools | None, stds: bool, models: Models, interrupts: bool
 ) -> tuple[Session, StepResult]:
     surrogate, device = session.surrogate_id, session.definition.device
     latest = models.latest(surrogate) if session.model == "latest" else session.model
     try:
-        return step_session(
-            session, u, mask, deviations, lambda version: models.get(surrogate, version, device), latest
-        )
+        return step_session(session, u, mask, stds, lambda version: models.get(surrogate, version, device), latest)
     except SurrogymError:
         raise
     except (

@@ -8,7 +8,7 @@ from typing import Any
 
 from surrogym_server.environment.points import Points
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
+from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, stds
 from surrogym_server.sampling.judging import monte_carlo
 from surrogym_server.sampling.limits import Limit
 from surrogym_server.sampling.tolerances import default_tolerances
@@ -50,5 +50,5 @@ def fidelity_of(model: DynamicsModel, defaults: Sequence[float], target: float) 
     defaults = defaults or default_tolerances(model.definition, model.scales.tolist())
     tolerances = model.definition.tolerances_or(defaults)
     points = Points(*monte_carlo(model.definition))
-    confidences = confidences_of(model, points, deviations(model, points.q, points.u), tolerances)
+    confidences = confidences_of(model, points, stds(model, points.q, points.u), tolerances)
     return fidelity_fields(model, confidences, tolerances, target)

@@ -77,7 +77,7 @@ class Step:
     seq: int | None
     action: Array  # (N, F), or (N,) if F = 1, as policies send it
     mask: Bools | None = None  # (N,) lanes that take part; None: all
-    deviations: bool = False
+    stds: bool = False
     within: float | None = None
 
 

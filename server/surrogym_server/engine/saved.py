@@ -103,7 +103,7 @@ def _settings(saved: dict[str, Any], starts: NDArray[Any] | None, device: torch.
     limits, noise, residual = saved["reward_limits"], saved["sensor_noise"], saved.get("residual")
     tuples = {
         "reward_limits": None if limits is None else (limits[0], limits[1]),
-        "sensor_noise": tuple((name, deviation) for name, deviation in noise),
+        "sensor_noise": tuple((name, std) for name, std in noise),
         "residual": None if residual is None else Residual.from_saved(residual),
     }
     visited = None if starts is None else torch.from_numpy(starts).to(device)

@@ -141,7 +141,7 @@ def step_session(
     session: Session,
     action: Floats,
     mask: Bools | None,
-    deviations: bool,
+    stds: bool,
     model_of: ModelOf,
     latest: int,
 ) -> tuple[Session, StepResult]:
@@ -151,7 +151,7 @@ def step_session(
     """
     if mask is not None:
         _check_mask(mask, session.settings.num_envs)
-    lanes, transition = _step_versions(session, action, mask, deviations, model_of)
+    lanes, transition = _step_versions(session, action, mask, stds, model_of)
     if session.settings.reward_limits is not None:
         transition = within(session.settings.reward_limits, transition)
     versions = np.where(transition.reset_lanes, latest, session.versions)
@@ -160,11 +160,11 @@ def step_session(
 
 
 def _step_versions(
-    session: Session, action: Floats, mask: Bools | None, deviations: bool, model_of: ModelOf
+    session: Session, action: Floats, mask: Bools | None, stds: bool, model_of: ModelOf
 ) -> tuple[LaneState, LaneTransition]:
     first = session.versions[0]
     if (session.versions == first).all():
-        return step(model_of(int(first)), session.settings, session.lanes, action, mask, deviations)
+        return step(model_of(int(first)), session.settings, session.lanes, action, mask, stds)
     lanes, parts = session.lanes, []
     for version in np.unique(session.versions):
         index = np.flatnonzero(session.versions == version)
@@ -174,7 +174,7 @@ def _step_versions(
             session.lanes.take(index),
             action[index],
             None if mask is None else mask[index],
-            deviations,
+            stds,
         )
         lanes = lanes.put(index, part)
         parts.append((index, transition))
@@ -192,7 +192,7 @@ def _join(parts: Sequence[tuple[NDArray[np.intp], LaneTransition]]) -> LaneTrans
     transitions = [transition for _, transition in parts]
     final_lanes = np.concatenate([index[t.final_lanes] for index, t in parts])
     final_order = np.argsort(final_lanes)
-    deviation = [t.deviation for t in transitions if t.deviation is not None]
+    stds = [t.std for t in transitions if t.std is not None]
     untrusted = [t.untrusted for t in transitions if t.untrusted is not None]
     return LaneTransition(
         observation=lanewise([t.observation for t in transitions]),
@@ -203,7 +203,7 @@ def _join(parts: Sequence[tuple[NDArray[np.intp], LaneTransition]]) -> LaneTrans
         final_observation=np.concatenate([t.final_observation for t in transitions])[final_order],
         reset_lanes=lanewise([t.reset_lanes for t in transitions]),
         reward_mean=lanewise([t.reward_mean for t in transitions]),
-        deviation=lanewise(deviation) if deviation else None,
+        std=lanewise(stds) if stds else None,
         untrusted=lanewise(untrusted) if untrusted else None,
     )
 
@@ -219,7 +219,7 @@ def _result(transition: LaneTransition, versions: Versions) -> StepResult:
         final_observation=transition.final_observation,
         model_version=versions,
         reward_mean=transition.reward_mean,
-        deviation=transition.deviation,
+        deviation=transition.std,
         untrusted=transition.untrusted,
     )
 

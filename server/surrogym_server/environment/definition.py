@@ -116,7 +116,8 @@ class DesignDefinition:
         initial: queries of the initial design.
         hypercube_tries: Latin hypercubes to choose the most spread one from.
         acquisition: criterion of the adaptive queries.
-        tolerance: ``relative`` to an output's deviation over the initial design, or ``raw``: 1 in the output's unit.
+        tolerance: ``relative`` to an output's standard deviation over the initial design, or ``raw``: 1 in the
+            output's unit.
         monte_carlo: points that estimate the confidence index (eq. 8).
         visited_candidates: whether visited states join the candidates and the reference.
         input_probability: P_i (eq. 11) while no policy has visited anything: ``uniform``, or the density of the
@@ -258,8 +259,8 @@ class EnvironmentDefinition:
         p = torch.from_numpy(probabilities).to(self.device)
         q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(self.coordinates)], -1)
         shown = self.observe(q)
-        deviation = shown.std(0, correction=0)
-        return shown.mean(0), torch.where(deviation > 1e-9, deviation, 1.0)
+        std = shown.std(0, correction=0)
+        return shown.mean(0), torch.where(std > 1e-9, std, 1.0)
 
     @cached
     def bounds(self) -> tuple[Tensor, Tensor]:

@@ -235,7 +235,7 @@ class Bound(Parameters):
         alpha = (self.y - weights @ known) / noise
         left = prior - float(square.trace())
         logs = (n - m) * math.log(noise) + 2 * float(np.log(root.diagonal()).sum())
-        z = self.in_deviations(theta)
+        z = self.standardised(theta)
         value = 0.5 * (logs + self.y @ alpha + left / noise + z @ z) + self._constant
 
         back = scipy.linalg.solve_triangular(lower, np.eye(m), lower=True, trans=1, check_finite=False)  # L^-T

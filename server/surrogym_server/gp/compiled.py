@@ -148,28 +148,28 @@ def _explain(factor: Floats, k: Floats) -> None:
 
 
 @inlined
-def _deviation(head: Floats, rows: Floats, own: Floats, explained: Floats, deviation: Floats) -> None:
+def _std(head: Floats, rows: Floats, own: Floats, explained: Floats, std: Floats) -> None:
     """Write sqrt(k(x, x) - |L^-1 k|^2) to an array (B,)."""
     size, lanes = own.shape
-    deviation[:] = 0.0
+    std[:] = 0.0
     if head[0, PARITY] != 0:
         for j in range(size):
             for b in range(lanes):
-                deviation[b] += rows[OF_MIRROR, j] * own[j, b] * own[j, b]
-        exponential(deviation)
+                std[b] += rows[OF_MIRROR, j] * own[j, b] * own[j, b]
+        exponential(std)
         for b in range(lanes):
-            deviation[b] *= head[0, PARITY] * head[0, SIGNAL]
+            std[b] *= head[0, PARITY] * head[0, SIGNAL]
     for b in range(lanes):
-        deviation[b] += head[0, PRIOR]
+        std[b] += head[0, PRIOR]
     for j in range(size):
         for b in range(lanes):
             square = own[j, b] * own[j, b]
-            deviation[b] += square * (rows[OF_PRIOR, j] + square * rows[OF_PRIOR + 1, j])
+            std[b] += square * (rows[OF_PRIOR, j] + square * rows[OF_PRIOR + 1, j])
     for i in range(len(explained)):
         for b in range(lanes):
-            deviation[b] -= explained[i, b] * explained[i, b]
+            std[b] -= explained[i, b] * explained[i, b]
     for b in range(lanes):
-        deviation[b] = head[0, SCALE] * np.sqrt(max(deviation[b], 0.0))
+        std[b] = head[0, SCALE] * np.sqrt(max(std[b], 0.0))
 
 
 @inlined
@@ -218,7 +218,7 @@ def _add_residuals(
 
 @inlined
 def predict(
-    numbers: Floats, places: Ints, at: int, x: Floats, wanted: bool, paths: Floats, mean: Floats, deviation: Floats
+    numbers: Floats, places: Ints, at: int, x: Floats, wanted: bool, paths: Floats, mean: Floats, std: Floats
 ) -> None:
     """Write the mean and, if wanted, the latent standard deviation at inputs x (d, B) to arrays (B,) each.
 
@@ -250,4 +250,4 @@ def predict(
         _add_residuals(head, rows, kept, turned, own, k, paths, mean)
     if wanted:
         _explain(matrix(numbers, places, at + FACTOR), k)
-        _deviation(head, rows, own, k, deviation)
+        _std(head, rows, own, k, std)

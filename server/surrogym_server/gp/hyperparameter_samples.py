@@ -71,20 +71,20 @@ class _Chain:
 
     def __init__(self, evidence: Evidence, rng: np.random.Generator) -> None:
         self._evidence, self._rng = evidence, rng
-        self._mean, self._deviation = evidence.prior.T
+        self._mean, self._std = evidence.prior.T
 
     def log_likelihood(self, theta: Array) -> float:
         """Log evidence without the prior; -inf beyond the bounds of a fit."""
         if (theta < self._evidence.lower).any() or (theta > self._evidence.upper).any():
             return -math.inf
         negative, _ = self._evidence(theta)
-        z = (theta - self._mean) / self._deviation
+        z = (theta - self._mean) / self._std
         return 0.5 * float(z @ z) - negative
 
     def update(self, theta: Array, level: float) -> tuple[Array, float]:
         """The next theta, and its log likelihood."""
         rng, around = self._rng, theta - self._mean
-        other = self._deviation * rng.standard_normal(len(theta))
+        other = self._std * rng.standard_normal(len(theta))
         least = level + math.log(1 - rng.random())
         angle = rng.uniform(0, 2 * math.pi)
         low, high = angle - 2 * math.pi, angle

@@ -76,7 +76,7 @@ class Parameters:
         quadratic = float(values[-2]) if self.options.quadratic else 0.0
         return values[: self.d], float(values[self.d]), linear, quadratic, float(values[-1])
 
-    def in_deviations(self, theta: Array) -> Array:
+    def standardised(self, theta: Array) -> Array:
         """Distance of theta from the priors' means, in their standard deviations.
 
         The priors' negative log density is half of its square, ``prior_constant``, and log(2 pi) / 2 for each.

@@ -32,8 +32,8 @@ class LeftOut:
     @classmethod
     def of(cls, error: Tensor, variance: Tensor) -> LeftOut:
         """Compute it from errors (n,) and the variances (n,) predicted with them, noise included."""
-        size, deviation = error.abs(), variance.sqrt()
-        one, two = (float((size <= width * deviation).double().mean()) for width in (1, 2))
+        size, std = error.abs(), variance.sqrt()
+        one, two = (float((size <= width * std).double().mean()) for width in (1, 2))
         log_density = -0.5 * float((size.square() / variance + (2 * math.pi * variance).log()).mean())
         return cls(float(size.square().mean().sqrt()), one, two, log_density)
 

@@ -131,7 +131,7 @@ class Evidence(Parameters):
         slopes += [[linear * (half @ self.linear)]] * self.options.linear
         slopes += [[quadratic * (half @ self.quadratic)]] * self.options.quadratic
         trace = 0.5 * (weights @ weights - inverse.trace())
-        z = self.in_deviations(theta)
+        z = self.standardised(theta)
         value = 0.5 * (self.y @ weights + z @ z) + log_root + self.constant
         gradient = z / self.prior[:, 1] - np.concatenate([*slopes, [noise * trace]])
         return Evaluated(float(value), gradient, half, weighted, weights)

@@ -72,7 +72,7 @@ class _Process:
         exponent: Tensor = distance.square_().mul_(-0.5)
         return exponent
 
-    def deviation(self, x: Tensor, z: Tensor, squared: Tensor, smooth: Tensor) -> Tensor:
+    def std(self, x: Tensor, z: Tensor, squared: Tensor, smooth: Tensor) -> Tensor:
         """Latent standard deviation (m,), in the output's unit. Overwrites its columns of ``smooth`` (m, S)."""
         k = smooth[:, self.span]
         if self.variance_by_differences and not self.mean_by_differences:
@@ -86,8 +86,8 @@ class _Process:
             k.addmm_(z, self.polynomial)
         v = torch.linalg.solve_triangular(self.factor, k.T, upper=False)
         variance = prior - torch.linalg.vector_norm(v, dim=0).square_()
-        deviation: Tensor = variance.clamp_min_(0).sqrt_().mul_(self.scale)
-        return deviation
+        std: Tensor = variance.clamp_min_(0).sqrt_().mul_(self.scale)
+        return std
 
 
 @dataclass(frozen=True)
@@ -129,19 +129,19 @@ class Serving:
         """Means at x (m, d), shape (m, O)."""
         return in_blocks(self.rows, lambda rows: (self._means(*self._covariances(rows)),), x)[0]
 
-    def mean_and_deviation(self, x: Tensor, wanted: Sequence[int]) -> tuple[Tensor, Tensor]:
+    def mean_and_std(self, x: Tensor, wanted: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Means at x (m, d), and latent standard deviations of the columns ``wanted``, 0 in the others: (m, O) each."""
 
         def block(rows: Tensor) -> tuple[Tensor, Tensor]:
             z, smooth = self._covariances(rows)
             mean, squared = self._means(z, smooth), z.square()
-            deviation = torch.zeros_like(mean)
+            std = torch.zeros_like(mean)
             for column in self.processes.keys() & set(wanted):
-                deviation[:, column] = self.processes[column].deviation(rows, z, squared, smooth)
-            return mean, deviation
+                std[:, column] = self.processes[column].std(rows, z, squared, smooth)
+            return mean, std
 
-        mean, deviation = in_blocks(self.rows, block, x)
-        return mean, deviation
+        mean, std = in_blocks(self.rows, block, x)
+        return mean, std
 
     def _covariances(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """z (m, D), and the smooth covariances with the points of all processes, over their sigma_f^2, (m, S)."""

@@ -57,8 +57,8 @@ class FunctionDraws(ABC):
         u: Tensor,
         *,
         process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
+        stds: bool = False,
+        reward_std: bool = False,
     ) -> Transition:
         """Predict as ``transition`` does, with each row along a sampled function of its own.
 
@@ -87,7 +87,7 @@ class LeaveOneOutErrors:
     """Errors of one output when each sample in turn is predicted from all others."""
 
     error: float  # root mean square, in the output's unit
-    within_one: float  # share of the samples within one predictive deviation: 0.68 if the deviations are right
+    within_one: float  # share of the samples within one predictive standard deviation; 0.68 if that is right
     within_two: float  # the same within two: 0.95
 
 
@@ -111,14 +111,14 @@ class LearnedNoise(ABC):
 
     @property
     @abstractmethod
-    def noise_deviations(self) -> tuple[float, ...]:
+    def noise_stds(self) -> tuple[float, ...]:
         """Standard deviation of each output's noise, in the output's unit, (O,)."""
 
     @property
     def possible_noise(self) -> tuple[float, ...]:
         """Standard deviation of each output's noise in another explanation of the samples, if it is at least
         as likely, (O,). Those that it has learned if the family looks for no other."""
-        return self.noise_deviations
+        return self.noise_stds
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class OutputOutlook(ABC):
 
     @property
     @abstractmethod
-    def deviation(self) -> Tensor:
+    def std(self) -> Tensor:
         """Return the standard deviations at the candidates, (m,)."""
 
     @abstractmethod
@@ -172,7 +172,7 @@ class PathOutlook(ABC):
 
     @property
     @abstractmethod
-    def deviation(self) -> Tensor:
+    def std(self) -> Tensor:
         """Return the standard deviation at each step, in the output's unit, (b, T)."""
 
     @abstractmethod
@@ -201,9 +201,9 @@ class PredictedSteps:
 class Lookahead(ABC):
     """Ability to forecast how further real steps would change the standard deviations, before they are taken.
 
-    Fallback of ``sampling``: a sample is assumed to be correlated with nearby points, by their distance in deviations
-    of the sampling range. Along paths the steps count as independent, and a planned path does not change the model for
-    the next one.
+    Fallback of ``sampling``: a sample is assumed to be correlated with nearby points, by their distance in standard
+    deviations of the sampling range. Along paths the steps count as independent, and a planned path does not change the
+    model for the next path.
     """
 
     @abstractmethod
@@ -264,7 +264,7 @@ class ArrayTransition:
 
     q_next: Floats  # (m, C)
     reward: Floats  # (m,) as in ``Transition``
-    deviation: Floats  # (m, O) of the requested outputs, the reward's last
+    std: Floats  # (m, O) of the requested outputs, the reward's last
     terminated: NDArray[np.bool_]  # (m,)
 
 
@@ -282,8 +282,8 @@ class ArraySteps(ABC):
         noise: Floats | None,
         process: Floats | None,
         paths: Floats | None,
-        deviations: bool,
-        reward_deviation: bool,
+        stds: bool,
+        reward_std: bool,
     ) -> ArrayTransition:
         """Predict the step from q (m, C) under u (m, F).
 
@@ -308,7 +308,7 @@ class CompiledSteps(ABC):
         """
 
     @abstractmethod
-    def compiled_pays(self, *, deviations: bool) -> bool:
+    def compiled_pays(self, *, stds: bool) -> bool:
         """Whether compiled steps are faster, with standard deviations in every step or without."""
 
 

@@ -45,14 +45,14 @@ class ConstantErrors(FunctionDraws):
         u: Tensor,
         *,
         process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
+        stds: bool = False,
+        reward_std: bool = False,
     ) -> Transition:
         return self.model.transition(
             q,
             u,
             noise=paths[:, : self.path_size],
             process=process,
-            deviations=deviations,
-            reward_deviation=reward_deviation,
+            stds=stds,
+            reward_std=reward_std,
         )

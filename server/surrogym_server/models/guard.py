@@ -59,13 +59,13 @@ def require_sound(model: DynamicsModel, q: Tensor, u: Tensor) -> None:
     """Raise ``PluginFailed`` unless a model's attributes, and its predictions at q (m, C) under u (m, F), have the
     shapes of the port and are finite, standard deviations are not negative, and probabilities lie in 0 to 1."""
     definition, outputs = model.definition, len(model.definition.outputs)
-    predicted = model.transition(q, u, deviations=True, reward_deviation=True)
-    require_shapes(model, predicted, q, deviations=True)
+    predicted = model.transition(q, u, stds=True, reward_std=True)
+    require_shapes(model, predicted, q, stds=True)
     require_numbers(definition, "next coordinates", predicted.q_next, q.shape)
     require_numbers(definition, "reward", predicted.reward, q.shape[:1])
-    assert predicted.deviation is not None
-    assert predicted.reward_deviation is not None
-    require_deviations(model, torch.cat([predicted.deviation, predicted.reward_deviation[:, None]], -1))
+    assert predicted.std is not None
+    assert predicted.reward_std is not None
+    require_stds(model, torch.cat([predicted.std, predicted.reward_std[:, None]], -1))
     require_numbers(definition, "means", model.means(q, u), (len(q), outputs))
     require_numbers(definition, "scales", model.scales, (outputs,))
     if definition.learns_termination:
@@ -79,23 +79,23 @@ def require_sound(model: DynamicsModel, q: Tensor, u: Tensor) -> None:
         raise _wrong(definition, "expected a description that can be written as JSON", in_one_line(error)) from error
 
 
-def require_shapes(model: DynamicsModel, predicted: Transition, q: Tensor, *, deviations: bool = False) -> None:
-    """Raise ``PluginFailed`` unless a prediction from q (m, C) has the shapes of the port. With ``deviations`` these
+def require_shapes(model: DynamicsModel, predicted: Transition, q: Tensor, *, stds: bool = False) -> None:
+    """Raise ``PluginFailed`` unless a prediction from q (m, C) has the shapes of the port. With ``stds`` these
     must be present."""
     definition, rows = model.definition, len(q)
     if not isinstance(predicted, Transition):
         raise _wrong(definition, "expected transition to return a Transition", type(predicted).__name__)
     _require_shape(definition, "next coordinates", predicted.q_next, q.shape)
     _require_shape(definition, "reward", predicted.reward, (rows,))
-    if deviations or predicted.deviation is not None:
-        _require_shape(definition, "deviation", predicted.deviation, (rows, len(definition.outputs) - 1))
-    if deviations or predicted.reward_deviation is not None:
-        _require_shape(definition, "standard deviation of the reward", predicted.reward_deviation, (rows,))
+    if stds or predicted.std is not None:
+        _require_shape(definition, "standard deviation", predicted.std, (rows, len(definition.outputs) - 1))
+    if stds or predicted.reward_std is not None:
+        _require_shape(definition, "standard deviation of the reward", predicted.reward_std, (rows,))
 
 
-def require_deviations(model: DynamicsModel, deviation: Tensor) -> None:
+def require_stds(model: DynamicsModel, std: Tensor) -> None:
     """Raise ``PluginFailed`` unless standard deviations (m, O) of all outputs are finite and not negative."""
-    for name, column in zip(model.definition.outputs, deviation.T, strict=True):
+    for name, column in zip(model.definition.outputs, std.T, strict=True):
         require_numbers(model.definition, f"standard deviation of {name!r}", column, column.shape)
         if bool((column < 0).any()):
             raise _wrong(

@@ -35,8 +35,8 @@ class Transition:
 
     q_next: Tensor  # (m, C)
     reward: Tensor  # (m,) mean, without the penalty and without the terminal reward; see ``paid``
-    deviation: Tensor | None  # (m, M) of each transition output, if requested
-    reward_deviation: Tensor | None  # (m,) if requested
+    std: Tensor | None  # (m, M) of each transition output, if requested
+    reward_std: Tensor | None  # (m,) if requested
 
 
 class DynamicsModel(ABC):
@@ -49,7 +49,7 @@ class DynamicsModel(ABC):
     - Next states are within the environment's limits: they have passed ``step_rules.settle``.
     - Deviations are standard deviations of the unknown function, in each output's own unit: finite, not negative, and
       without the noise of a single step.
-    - What the definition declares is not learned: a declared reward is exact and has a deviation of 0.
+    - What the definition declares is not learned: a declared reward is exact and has a standard deviation of 0.
     - A frozen dataclass of tensors, tuples, mappings and dataclasses moves to a device by itself; other classes
       override ``on``.
     """
@@ -67,20 +67,20 @@ class DynamicsModel(ABC):
         *,
         noise: Tensor | None = None,
         process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
+        stds: bool = False,
+        reward_std: bool = False,
     ) -> Transition:
         """Predict the step from q (m, C) under u (m, F): by the mean, or as a sample if ``noise`` is given.
 
         Args:
             q: coordinates before the step.
             u: action, in the model's units.
-            noise: standard normal numbers (m, M). Each transition output is mean + deviation * noise instead of its
+            noise: standard normal numbers (m, M). Each transition output is mean + std * noise instead of its
                 mean. An output that depends on the prediction of another uses the other's draw.
             process: standard normal numbers (m, M). Each output is also moved by its learned noise (w of eq. 2). A
                 family that learns no noise ignores them.
-            deviations: whether to return the deviations of the transition outputs.
-            reward_deviation: whether to return the deviation of the reward.
+            stds: whether to return the standard deviations of the transition outputs.
+            reward_std: whether to return the standard deviation of the reward.
         """
 
     @abstractmethod

@@ -41,9 +41,7 @@ class CandidateView:
     points: Points  # m states and actions
     output: int  # number of the output, in the order of the definition
     tolerance: float  # tolerance of the output, in the output's unit
-    deviation: (
-        Tensor  # (m,) latent standard deviation, in the output's unit, as if all pending queries had been answered
-    )
+    std: Tensor  # (m,) latent standard deviation, in the output's unit, as if all pending queries had been answered
     distance: Tensor  # (m,) distance to the nearest query so far, in standard deviations of the sampling range
     log_probability: Tensor  # (m,) logarithm of the input probability P_i (eq. 11); 0 without ``reads_probability``
     _reduction: Callable[[], Tensor]
@@ -61,13 +59,13 @@ class PathView:
 
     tolerance: float  # tolerance of the output, in the output's unit
     weight: Tensor  # (b, T) at least 0; depends on where the step lies and how well it can be predicted
-    _deviation: Callable[[], Tensor]
+    _std: Callable[[], Tensor]
     _information: Callable[[], Tensor]
 
     @cached_property
-    def deviation(self) -> Tensor:
+    def std(self) -> Tensor:
         """Latent standard deviation at each step, in the output's unit, (b, T)."""
-        return self._deviation()
+        return self._std()
 
     @cached_property
     def information(self) -> Tensor:
@@ -121,10 +119,10 @@ class Variance(Acquisition):
     """Criterion: the latent standard deviation at the candidate."""
 
     def value(self, candidates: CandidateView) -> Tensor:
-        return candidates.deviation
+        return candidates.std
 
     def path_value(self, paths: PathView) -> Tensor:
-        return (paths.weight * paths.deviation).cumsum(-1)
+        return (paths.weight * paths.std).cumsum(-1)
 
 
 @dataclass(frozen=True)
@@ -134,11 +132,11 @@ class UncertaintyIndex(Acquisition):
     reads_probability: ClassVar[bool] = True
 
     def value(self, candidates: CandidateView) -> Tensor:
-        log_u_m = log_model_uncertainty(candidates.deviation, candidates.tolerance)
+        log_u_m = log_model_uncertainty(candidates.std, candidates.tolerance)
         return log_uncertainty_index(log_u_m, candidates.log_probability)
 
     def path_value(self, paths: PathView) -> Tensor:
-        return (paths.weight * log_model_uncertainty(paths.deviation, paths.tolerance).exp()).cumsum(-1)
+        return (paths.weight * log_model_uncertainty(paths.std, paths.tolerance).exp()).cumsum(-1)
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ def candidate_view(
         points=candidates.points,
         output=column,
         tolerance=tolerance,
-        deviation=outlook.deviation,
+        std=outlook.std,
         distance=distance,
         log_probability=candidates.log_p,
         _reduction=lambda: outlook.reduction(candidates.weights),

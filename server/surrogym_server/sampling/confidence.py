@@ -39,24 +39,24 @@ class OutputConfidence:
     prequential: PrequentialScores | None = None  # scores of predictions made before learning from the sample
 
 
-def deviations(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:
+def stds(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:
     """Latent standard deviation of every output, the reward last, at q (m, C) and u (m, F): (m, O)."""
-    transition = model.transition(q, u, deviations=True, reward_deviation=True)
-    require_shapes(model, transition, q, deviations=True)
-    assert transition.deviation is not None
-    assert transition.reward_deviation is not None
-    return torch.cat([transition.deviation, transition.reward_deviation[:, None]], -1)
+    transition = model.transition(q, u, stds=True, reward_std=True)
+    require_shapes(model, transition, q, stds=True)
+    assert transition.std is not None
+    assert transition.reward_std is not None
+    return torch.cat([transition.std, transition.reward_std[:, None]], -1)
 
 
-def certainty(deviation: Tensor, tolerance: Tensor | float) -> Tensor:
+def certainty(std: Tensor, tolerance: Tensor | float) -> Tensor:
     """Certainty C_m = Phi(tau / sigma) (eq. 9); 1 if sigma is 0."""
-    index: Tensor = torch.special.ndtr(tolerance / deviation)
+    index: Tensor = torch.special.ndtr(tolerance / std)
     return index
 
 
-def log_model_uncertainty(deviation: Tensor, tolerance: Tensor | float) -> Tensor:
+def log_model_uncertainty(std: Tensor, tolerance: Tensor | float) -> Tensor:
     """Logarithm of the model uncertainty, log U_m = log Phi(-tau / sigma) (eq. 10); finite also if sigma is 0."""
-    log_uncertainty: Tensor = torch.special.log_ndtr(-(tolerance / deviation).clamp_max(SUREST))
+    log_uncertainty: Tensor = torch.special.log_ndtr(-(tolerance / std).clamp_max(SUREST))
     return log_uncertainty
 
 
@@ -66,22 +66,22 @@ def log_uncertainty_index(log_model_uncertainty: Tensor, log_probability: Tensor
 
 
 def confidences_of(
-    model: DynamicsModel, points: Points, deviation: Tensor, tolerances: Sequence[float]
+    model: DynamicsModel, points: Points, std: Tensor, tolerances: Sequence[float]
 ) -> list[OutputConfidence]:
     """Confidence of every output (O,) from its standard deviations (m, O) over the points of the Monte Carlo set."""
     able = offers(model, LeaveOneOut)
     errors = [None] * len(tolerances) if able is None else able.leave_one_out()
-    doubt = log_model_uncertainty(deviation, deviation.new_tensor(tolerances)).exp()
+    doubt = log_model_uncertainty(std, std.new_tensor(tolerances)).exp()
     regions = regions_of(model.definition, points, doubt)
-    confidences = [confidence(deviation[:, i], tolerances[i], errors[i]) for i in range(len(tolerances))]
+    confidences = [confidence(std[:, i], tolerances[i], errors[i]) for i in range(len(tolerances))]
     return [replace(one, region=region) for one, region in zip(confidences, regions, strict=True)]
 
 
-def confidence(deviation: Tensor, tolerance: float, errors: LeaveOneOutErrors | None) -> OutputConfidence:
+def confidence(std: Tensor, tolerance: float, errors: LeaveOneOutErrors | None) -> OutputConfidence:
     """Confidence of one output, from standard deviations (m,) over the Monte Carlo set and leave-one-out errors."""
     return OutputConfidence(
-        float(certainty(deviation, tolerance).mean()),
-        float(certainty(deviation, 1.0).mean()),
-        float((deviation <= tolerance).double().mean()),
+        float(certainty(std, tolerance).mean()),
+        float(certainty(std, 1.0).mean()),
+        float((std <= tolerance).double().mean()),
         *((None, None, None) if errors is None else (errors.error, errors.within_one, errors.within_two)),
     )

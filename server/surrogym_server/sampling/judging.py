@@ -12,10 +12,10 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.guard import plugin_calls, require_deviations
+from surrogym_server.models.guard import plugin_calls, require_stds
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.candidates import Candidates, candidates_of, with_reserved
-from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
+from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, stds
 from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, random_points
 from surrogym_server.sampling.noise import SLACK, established_noise, widened_by
@@ -61,14 +61,14 @@ def judge_model(
     widened = widened_by(noise, tolerances)
     points = Points(*monte_carlo(definition))
     with plugin_calls(definition):
-        deviation = deviations(model, points.q, points.u)
-        require_deviations(model, deviation)
-        without_noise = confidences_of(model, points, deviation, widened)
+        std = stds(model, points.q, points.u)
+        require_stds(model, std)
+        without_noise = confidences_of(model, points, std, widened)
     confidences = tuple(
         replace(
             c,
             noise=float(w),
-            sensor_noise=0.0 if one is None else one.deviation,
+            sensor_noise=0.0 if one is None else one.std,
             past=past[i],
             prequential=scores_of(state.predictions[i], widened[i]) if state.predictions else None,
         )

@@ -35,7 +35,7 @@ class Repeats:
     """Pooled differences between results of the same step."""
 
     degrees: int  # degrees of freedom: samples less distinct steps
-    deviation: Tensor  # (O,) standard deviation of one result, in each output's unit
+    std: Tensor  # (O,) standard deviation of one result, in each output's unit
 
 
 def repeats(model: DynamicsModel, samples: Samples) -> Repeats:
@@ -77,7 +77,7 @@ def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequen
     if differences.degrees < ENOUGH:
         return torch.zeros_like(model_noise)
     confirmed = (model_noise > limits) & _confirmed(differences, limits)
-    return torch.where(confirmed, model_noise.minimum(AT_MOST * differences.deviation), 0.0)
+    return torch.where(confirmed, model_noise.minimum(AT_MOST * differences.std), 0.0)
 
 
 def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Points | None:
@@ -110,7 +110,7 @@ def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float
 def _confirmed(differences: Repeats, limits: Tensor) -> Tensor:
     """Whether repeats show that each output's noise exceeds ``NEGLIGIBLE`` times its limit (O,), (O,) bool."""
     bound = (NEGLIGIBLE * limits).square() * float(scipy.special.chdtri(differences.degrees, LEVEL))
-    return differences.degrees * differences.deviation.square() > bound
+    return differences.degrees * differences.std.square() > bound
 
 
 def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
@@ -125,7 +125,7 @@ def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
 def _refuted(differences: Repeats, model_noise: Tensor) -> Tensor:
     """Whether repeats show that most of each output's learned noise (O,) is misfit of the model, (O,) bool."""
     bound = (model_noise / AT_MOST).square() * float(scipy.special.chdtri(differences.degrees, 1 - LEVEL))
-    return differences.degrees * differences.deviation.square() <= bound
+    return differences.degrees * differences.std.square() <= bound
 
 
 def widened_by(noise: Tensor, tolerances: Sequence[float]) -> tuple[float, ...]:
@@ -146,4 +146,4 @@ def _model_noise(model: DynamicsModel, tolerances: Sequence[float]) -> tuple[Ten
     able = offers(model, LearnedNoise)
     if able is None:
         return torch.zeros_like(limits), limits
-    return torch.tensor(able.noise_deviations, dtype=limits.dtype), limits
+    return torch.tensor(able.noise_stds, dtype=limits.dtype), limits

@@ -36,7 +36,7 @@ def _log_kernel(coordinate: CoordinateDefinition, at: Tensor, states: Tensor, ba
     """Log density (m, v) of one coordinate at m points under a kernel at each of v states, over the uniform one."""
     difference = at[:, None] - states[None]
     if coordinate.kind == "angle":
-        spread = _circular_deviation(states)
+        spread = _circular_std(states)
         kappa = 1 / (bandwidth * spread).square()
         log_normaliser = torch.log(torch.special.i0e(kappa))  # i0(k) = i0e(k) exp(k)
         return kappa * (difference.cos() - 1) - log_normaliser
@@ -46,6 +46,6 @@ def _log_kernel(coordinate: CoordinateDefinition, at: Tensor, states: Tensor, ba
     return -0.5 * (difference / width).square() - width.log() - 0.5 * math.log(2 * math.pi) - log_uniform
 
 
-def _circular_deviation(angles: Tensor) -> Tensor:
+def _circular_std(angles: Tensor) -> Tensor:
     length = torch.hypot(angles.cos().mean(), angles.sin().mean()).clamp(1e-9, 1 - 1e-6)
     return (-2 * length.log()).sqrt()

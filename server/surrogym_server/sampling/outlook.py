@@ -13,7 +13,7 @@ from surrogym_server.environment.features import distances
 from surrogym_server.environment.points import Points
 from surrogym_server.models.abilities import Lookahead, OutputOutlook, PathOutlook, PredictedSteps, offers
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.confidence import deviations
+from surrogym_server.sampling.confidence import stds
 
 
 def outlook_of(
@@ -32,7 +32,7 @@ def path_outlook(model: DynamicsModel, steps: PredictedSteps, column: int) -> Pa
     """Return the predicted information of steps along b paths of T steps, for the output with number ``column``."""
     if (able := offers(model, Lookahead)) is not None:
         return able.along(steps, column)
-    spread = deviations(model, steps.flat.q, steps.flat.u)[:, column].reshape(steps.q.shape[:-1])
+    spread = stds(model, steps.flat.q, steps.flat.u)[:, column].reshape(steps.q.shape[:-1])
     return IndependentSteps(spread, torch.ones_like(spread, dtype=torch.bool))
 
 
@@ -62,7 +62,7 @@ class NearbyAnswers(OutputOutlook):
         cls, model: DynamicsModel, candidates: Points, reference: Points, unanswered: Points
     ) -> tuple[NearbyAnswers, ...]:
         """Build the outlook of every output (O,). The ``unanswered`` queries count as answered."""
-        own, there = (deviations(model, points.q, points.u).square() for points in (candidates, reference))
+        own, there = (stds(model, points.q, points.u).square() for points in (candidates, reference))
         definition, learns = model.definition, torch.ones(len(candidates), dtype=torch.bool)
         outputs = (
             cls(definition, candidates, reference, own[:, column], there[:, column], learns)
@@ -72,7 +72,7 @@ class NearbyAnswers(OutputOutlook):
         return tuple(reduce(cls.answered, queries, output) for output in outputs)
 
     @property
-    def deviation(self) -> Tensor:
+    def std(self) -> Tensor:
         return self.own.sqrt()
 
     def reduction(self, weights: Tensor) -> Tensor:
@@ -97,7 +97,7 @@ class IndependentSteps(PathOutlook):
     learns: Tensor  # (b, T) bool: whether a model learns from the step, because its lags are known
 
     @property
-    def deviation(self) -> Tensor:
+    def std(self) -> Tensor:
         return self.spread
 
     def information(self, weight: Tensor, tolerance: float) -> Tensor:

@@ -63,11 +63,11 @@ def _unknown(model: DynamicsModel, samples: Samples, points: Points, tolerance: 
     It does if it is not known to the tolerance, or if it is predicted to be clearly above the reward of every sample.
     While no sample has a reward that a trainer can distinguish from 0, every point does.
     """
-    foretold = model.transition(points.q, points.u, reward_deviation=True)
-    assert foretold.reward_deviation is not None
+    foretold = model.transition(points.q, points.u, reward_std=True)
+    assert foretold.reward_std is not None
     low, best = float(samples.reward.min()), float(samples.reward.max())
     unmet = foretold.reward - best > UNMET * (foretold.reward - low)
-    return (foretold.reward_deviation > tolerance) | unmet | (best - low < _least(samples))
+    return (foretold.reward_std > tolerance) | unmet | (best - low < _least(samples))
 
 
 def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Points, rng: np.random.Generator) -> Points:

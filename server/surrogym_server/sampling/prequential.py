@@ -29,7 +29,7 @@ class Prediction:
     """Prediction of one output of a sample, by a model that had not learned from the sample."""
 
     error: float  # sample less predicted mean, in the output's unit
-    deviation: float  # predictive standard deviation, with the noise of a single step
+    std: float  # predictive standard deviation, with the noise of a single step
 
 
 Predictions = tuple[tuple[Prediction, ...], ...]  # for each output (O,) its predictions, the oldest first
@@ -51,8 +51,8 @@ def scores_of(predictions: Sequence[Prediction], tolerance: float) -> Prequentia
     if not predictions:
         return None
     error = torch.tensor([p.error for p in predictions], dtype=torch.float64)
-    deviation = torch.tensor([p.deviation for p in predictions], dtype=torch.float64)
-    half = [(half_width(level) * deviation).clamp_min(tolerance) for level in LEVELS]
+    std = torch.tensor([p.std for p in predictions], dtype=torch.float64)
+    half = [(half_width(level) * std).clamp_min(tolerance) for level in LEVELS]
     within_50, within_80, within_90 = (float((error.abs() <= one).double().mean()) for one in half)
     score = interval_score(-half[-1], half[-1], error, LEVELS[-1]) / tolerance
     return PrequentialScores(len(predictions), within_50, within_80, within_90, float(score.mean()))
@@ -75,19 +75,19 @@ def predicted(model: DynamicsModel, samples: Samples) -> Predictions:
     Left out are outputs of steps that ended at a declared limit, because the limit cuts the change off, and rewards of
     steps that ended the episode, because they contain the terminal reward.
     """
-    transition = model.transition(samples.q, samples.u, deviations=True, reward_deviation=True)
-    assert transition.deviation is not None
-    assert transition.reward_deviation is not None
+    transition = model.transition(samples.q, samples.u, stds=True, reward_std=True)
+    assert transition.std is not None
+    assert transition.reward_std is not None
     mean = torch.cat([model.means(samples.q, samples.u)[:, :-1], transition.reward[:, None]], -1)
     error = torch.cat([increments(model.definition, samples), samples.reward[:, None]], -1) - mean
-    rewarded = torch.hypot(transition.reward_deviation, _reward_deviation_by_state(model, samples))
-    deviation = torch.hypot(torch.cat([transition.deviation, rewarded[:, None]], -1), _noise(model, error))
-    usable = error.isfinite() & deviation.isfinite()
+    rewarded = torch.hypot(transition.reward_std, _reward_std_by_state(model, samples))
+    std = torch.hypot(torch.cat([transition.std, rewarded[:, None]], -1), _noise(model, error))
+    usable = error.isfinite() & std.isfinite()
     if not model.definition.moves_observation:
         usable[:, :-1] &= ~saturated(model.definition, samples.q_next)[:, None]
     usable[:, -1] &= ~samples.terminated
     return tuple(
-        tuple(map(Prediction, error[rows, i].tolist(), deviation[rows, i].tolist())) for i, rows in enumerate(usable.T)
+        tuple(map(Prediction, error[rows, i].tolist(), std[rows, i].tolist())) for i, rows in enumerate(usable.T)
     )
 
 
@@ -98,7 +98,7 @@ def latest(before: Predictions, new: Predictions) -> Predictions:
 
 def pairs_of(predictions: Predictions) -> list[list[list[float]]]:
     """Convert predictions to JSON: for each output a list of pairs [error, standard deviation]."""
-    return [[[p.error, p.deviation] for p in output] for output in predictions]
+    return [[[p.error, p.std] for p in output] for output in predictions]
 
 
 def from_pairs(pairs: Sequence[Sequence[Sequence[float]]]) -> Predictions:
@@ -109,10 +109,10 @@ def from_pairs(pairs: Sequence[Sequence[Sequence[float]]]) -> Predictions:
 def _noise(model: DynamicsModel, like: Tensor) -> Tensor:
     """Standard deviation of the noise of a single step, as the model has learned it, (O,)."""
     able = offers(model, LearnedNoise)
-    return like.new_zeros(like.shape[1]) if able is None else like.new_tensor(able.noise_deviations)
+    return like.new_zeros(like.shape[1]) if able is None else like.new_tensor(able.noise_stds)
 
 
-def _reward_deviation_by_state(model: DynamicsModel, samples: Samples) -> Tensor:
+def _reward_std_by_state(model: DynamicsModel, samples: Samples) -> Tensor:
     """Standard deviation (m,) of the reward because the next state is uncertain; 0 if the reward does not depend on it.
 
     First order: the root sum of squares of the reward's changes when each output moves by one standard deviation.

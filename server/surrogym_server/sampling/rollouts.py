@@ -193,11 +193,11 @@ def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Path
     q, running, drift = starts, starts.new_ones(len(starts)), starts.new_zeros(len(starts))
     steps: list[tuple[Tensor, ...]] = []
     for u in actions.unbind(1):
-        step = model.transition(q, u, deviations=True)
-        assert step.deviation is not None
+        step = model.transition(q, u, stds=True)
+        assert step.std is not None
         still = running * ~model.terminated(step.q_next)
         steps.append((q, u, step.q_next, running, 1 - still, drift))
-        drift = drift + (step.deviation / starts.new_tensor(spread)).square().sum(-1)
+        drift = drift + (step.std / starts.new_tensor(spread)).square().sum(-1)
         q, running = step.q_next, still
     return Paths(*(torch.stack(column, 1) for column in zip(*steps, strict=True)))
 
@@ -216,7 +216,7 @@ def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
 
 def _view(output: PathOutlook, weight: Tensor, tolerance: float) -> PathView:
     """Return paths, whose steps have the weights (b, T), as an acquisition sees them for one output."""
-    return PathView(tolerance, weight, lambda: output.deviation, lambda: output.information(weight, tolerance))
+    return PathView(tolerance, weight, lambda: output.std, lambda: output.information(weight, tolerance))
 
 
 def _worth(model: DynamicsModel, aim: Aim, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:

@@ -42,7 +42,7 @@ class SensorNoise:
     """Noise of one output's sensor."""
 
     share: float  # share of the noise's variance that comes from the sensor
-    deviation: float  # standard deviation of one measurement, in the output's unit
+    std: float  # standard deviation of one measurement, in the output's unit
     step: float  # standard deviation of all noise of a single step
 
 
@@ -91,14 +91,14 @@ def _carried(model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoi
     variance = torch.zeros(len(sensors), dtype=torch.float64)
     for index, sensor in zip(model.definition.moving, sensors, strict=False):
         if sensor is not None:
-            variance += sensor.deviation**2 * _differences(model, samples, index).square().mean(0)
+            variance += sensor.std**2 * _differences(model, samples, index).square().mean(0)
     return CARRIED * variance.sqrt()
 
 
 def _model_noise(model: DynamicsModel) -> Tensor:
     """Standard deviation of the noise that the model has learned for each output, (O,)."""
     able = offers(model, LearnedNoise)
-    result = [0.0] * len(model.definition.outputs) if able is None else able.noise_deviations
+    result = [0.0] * len(model.definition.outputs) if able is None else able.noise_stds
     return torch.tensor(result, dtype=torch.float64)
 
 

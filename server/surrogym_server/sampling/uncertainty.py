@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from surrogym_server.environment.points import Points
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.candidates import input_probability, under_random_actions
-from surrogym_server.sampling.confidence import certainty, deviations, log_model_uncertainty, log_uncertainty_index
+from surrogym_server.sampling.confidence import certainty, log_model_uncertainty, log_uncertainty_index, stds
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ class UncertaintyResult:
     mean: (
         Array  # predicted change of each coordinate, or of each observation entry that the model moves; then the reward
     )
-    deviation: Array
+    std: Array
     model_uncertainty: Array
     input_probability: Array
     log_uncertainty_index: Array
@@ -36,10 +36,10 @@ def query_uncertainty(
     """Return mean, standard deviation, U_m, P_i and log U at q (n, C) and u (n, F), for tolerances (O,)."""
     at, action = torch.from_numpy(q), torch.from_numpy(u)
     states = None if occupancy is None else torch.from_numpy(occupancy)
-    mean, deviation = model.means(at, action), deviations(model, at, action)
-    log_p = input_probability(model, Points(at, action), states)[:, None].expand_as(deviation)
-    log_u_m = log_model_uncertainty(deviation, torch.from_numpy(tolerances))
-    parts = (mean, deviation, log_u_m.exp(), log_p.exp(), log_uncertainty_index(log_u_m, log_p))
+    mean, std = model.means(at, action), stds(model, at, action)
+    log_p = input_probability(model, Points(at, action), states)[:, None].expand_as(std)
+    log_u_m = log_model_uncertainty(std, torch.from_numpy(tolerances))
+    parts = (mean, std, log_u_m.exp(), log_p.exp(), log_uncertainty_index(log_u_m, log_p))
     return UncertaintyResult(*(p.numpy() for p in parts))
 
 
@@ -54,5 +54,5 @@ def visited_confidence(model: DynamicsModel, states: Array, tolerances: Sequence
     definition = model.definition
     rng = np.random.default_rng(definition.design.seed)
     points = under_random_actions(definition, torch.from_numpy(states), rng)
-    sure = certainty(deviations(model, points.q, points.u), torch.tensor(tolerances, dtype=torch.float64))
+    sure = certainty(stds(model, points.q, points.u), torch.tensor(tolerances, dtype=torch.float64))
     return float(sure.mean(0).min())

@@ -18,7 +18,7 @@ from surrogym_server.models.abilities import (
     UncertainHyperparameters,
     offers,
 )
-from surrogym_server.sampling.confidence import deviations
+from surrogym_server.sampling.confidence import stds
 from surrogym_server.testing.cases import ModelCase, close
 
 DRAWS = 400
@@ -43,13 +43,13 @@ def a_drawn_function_is_one_function(case: ModelCase) -> None:
         assert close(made[0], made[2])
 
 
-def drawn_functions_scatter_as_the_deviations_say(case: ModelCase) -> None:
+def drawn_functions_scatter_as_the_stds_say(case: ModelCase) -> None:
     if (able := offers(case.model, FunctionDraws)) is None:
         return
     q, u = case.points.q[:1], case.points.u[:1]
     paths = able.draw(case.noise(DRAWS, able.path_size))
     made = able.transition_along(paths, q.expand(DRAWS, -1), u.expand(DRAWS, -1)).q_next[:, 1]
-    said = float(deviations(case.model, q, u)[0, 1])
+    said = float(stds(case.model, q, u)[0, 1])
     assert float(made.std()) < 2 * said + 1e-9
     assert float(made.std()) > said / 2 - 1e-9
 
@@ -75,24 +75,24 @@ def leave_one_out_errors_are_there_for_every_output(case: ModelCase) -> None:
 
 def learned_noise_is_there_for_every_output(case: ModelCase) -> None:
     if (able := offers(case.model, LearnedNoise)) is not None:
-        deviations = able.noise_deviations
-        assert len(deviations) == len(case.definition.outputs)
-        assert all(math.isfinite(one) and one >= 0 for one in deviations)
+        stds = able.noise_stds
+        assert len(stds) == len(case.definition.outputs)
+        assert all(math.isfinite(one) and one >= 0 for one in stds)
 
 
-def an_outlook_begins_with_the_deviations_and_an_answer_lowers_them(case: ModelCase) -> None:
+def an_outlook_begins_with_the_stds_and_an_answer_lowers_them(case: ModelCase) -> None:
     if (able := offers(case.model, Lookahead)) is None:
         return
     points, nothing = case.points, case.points[:0]
-    said = deviations(case.model, points.q, points.u)
+    said = stds(case.model, points.q, points.u)
     for column, output in enumerate(able.outlook(points, points[:8], nothing)):
         if output is None:
             continue
-        assert torch.allclose(output.deviation, said[:, column], rtol=1e-4, atol=1e-8)
-        after = output.observe(3).deviation
-        assert bool((after <= output.deviation + 1e-12).all())
+        assert torch.allclose(output.std, said[:, column], rtol=1e-4, atol=1e-8)
+        after = output.observe(3).std
+        assert bool((after <= output.std + 1e-12).all())
         if output.learns[3]:
-            assert after[3] < output.deviation[3] or float(output.deviation[3]) == 0
+            assert after[3] < output.std[3] or float(output.std[3]) == 0
         reduction = output.reduction(torch.full((8,), 1 / 8, dtype=torch.float64))
         assert reduction.shape == (len(points),)
         assert float(reduction.min()) >= 0
@@ -105,7 +105,7 @@ def what_is_assumed_is_as_what_is_observed(case: ModelCase) -> None:
     pairs = zip(able.outlook(points, nothing, points[[4]]), able.outlook(points, nothing, nothing), strict=True)
     for assumed, begun in pairs:
         if assumed is not None and begun is not None:
-            assert torch.allclose(assumed.deviation, begun.observe(4).deviation, rtol=1e-4, atol=1e-8)
+            assert torch.allclose(assumed.std, begun.observe(4).std, rtol=1e-4, atol=1e-8)
 
 
 def paths_tell_more_the_longer_they_are(case: ModelCase) -> None:
@@ -116,18 +116,18 @@ def paths_tell_more_the_longer_they_are(case: ModelCase) -> None:
     for column in range(len(case.definition.outputs)):
         if (along := able.along(steps, column)) is not None:
             information = along.information(weight, 0.1)
-            assert information.shape == along.deviation.shape == along.learns.shape == (3, 4)
+            assert information.shape == along.std.shape == along.learns.shape == (3, 4)
             assert float(information.min()) >= 0
             assert float(information.diff(dim=1).min()) >= -1e-9
 
 
-def steps_that_are_taken_lower_the_deviations(case: ModelCase) -> None:
+def steps_that_are_taken_lower_the_stds(case: ModelCase) -> None:
     if (able := offers(case.model, Lookahead)) is None:
         return
     taken = case.points[:4]
     q_next = case.model.transition(taken.q, taken.u).q_next
     model = able.as_if_answered(PredictedSteps(taken.q, taken.u, q_next))
-    before, after = (deviations(m, taken.q, taken.u) for m in (case.model, model))
+    before, after = (stds(m, taken.q, taken.u) for m in (case.model, model))
     assert float(after.sum()) <= float(before.sum()) + 1e-9
 
 
@@ -146,13 +146,13 @@ def _paths(case: ModelCase, points: Points) -> PredictedSteps:
 
 LAWS_OF_ABILITIES: tuple[Callable[[ModelCase], None], ...] = (
     a_drawn_function_is_one_function,
-    drawn_functions_scatter_as_the_deviations_say,
+    drawn_functions_scatter_as_the_stds_say,
     a_drawn_function_may_have_columns_beyond_its_own,
     leave_one_out_errors_are_there_for_every_output,
     learned_noise_is_there_for_every_output,
-    an_outlook_begins_with_the_deviations_and_an_answer_lowers_them,
+    an_outlook_begins_with_the_stds_and_an_answer_lowers_them,
     what_is_assumed_is_as_what_is_observed,
     paths_tell_more_the_longer_they_are,
-    steps_that_are_taken_lower_the_deviations,
+    steps_that_are_taken_lower_the_stds,
     doubts_about_edges_are_probabilities_of_error,
 )

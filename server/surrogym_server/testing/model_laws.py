@@ -27,7 +27,7 @@ from surrogym_server.testing.cases import ModelCase, close
 from surrogym_server.virtual import VirtualSettings, create, reset, step
 from surrogym_shared.kinds import Variant
 
-GUESS = 0.5  # of the deviation of the targets: the error of a family that learns is smaller
+GUESS = 0.5  # of the standard deviation of the targets: the error of a family that learns is smaller
 RESERVED = "samples."
 NONSENSE: tuple[Any, ...] = ("nonsense", [], None, math.inf)
 
@@ -37,21 +37,21 @@ def predictions_have_their_shapes_and_are_finite(case: ModelCase) -> None:
     made = _everything(case.model, case)
     assert made.q_next.shape == case.points.q.shape
     assert made.reward.shape == (m,)
-    assert made.deviation is not None
-    assert made.reward_deviation is not None
-    assert made.deviation.shape == (m, outputs - 1)
-    assert made.reward_deviation.shape == (m,)
+    assert made.std is not None
+    assert made.reward_std is not None
+    assert made.std.shape == (m, outputs - 1)
+    assert made.reward_std.shape == (m,)
     assert case.model.means(case.points.q, case.points.u).shape == (m, outputs)
-    for values in (made.q_next, made.reward, made.deviation, made.reward_deviation):
+    for values in (made.q_next, made.reward, made.std, made.reward_std):
         assert values.dtype == torch.float64, "everything is float64"
         assert bool(torch.isfinite(values).all())
-    assert float(made.deviation.min()) >= 0
-    assert float(made.reward_deviation.min()) >= 0
+    assert float(made.std.min()) >= 0
+    assert float(made.reward_std.min()) >= 0
 
 
-def deviations_are_given_where_they_are_asked_for(case: ModelCase) -> None:
+def stds_are_given_where_they_are_asked_for(case: ModelCase) -> None:
     plain = case.model.transition(case.points.q, case.points.u)
-    assert (plain.deviation, plain.reward_deviation) == (None, None)
+    assert (plain.std, plain.reward_std) == (None, None)
     made = _everything(case.model, case)
     assert close(plain.q_next, made.q_next), "what is asked for beside it changes no prediction"
     assert close(plain.reward, made.reward)
@@ -81,8 +81,8 @@ def without_points_there_are_no_steps(case: ModelCase) -> None:
     """A prediction of no points has no rows, and gives no warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        made = case.model.transition(case.points.q[:0], case.points.u[:0], deviations=True, reward_deviation=True)
-    assert (made.deviation is not None, made.reward_deviation is not None) == (True, True)
+        made = case.model.transition(case.points.q[:0], case.points.u[:0], stds=True, reward_std=True)
+    assert (made.std is not None, made.reward_std is not None) == (True, True)
     assert made.q_next.shape == (0, len(case.definition.coordinates))
     assert made.reward.shape == (0,)
 
@@ -94,12 +94,12 @@ def next_states_are_where_the_environment_can_be(case: ModelCase) -> None:
     assert torch.equal(made.q_next, settle(case.definition, made.q_next))
 
 
-def a_draw_is_the_mean_and_noise_times_the_deviation(case: ModelCase) -> None:
+def a_draw_is_the_mean_and_noise_times_the_std(case: ModelCase) -> None:
     """For the speed: the angle, which depends on the predicted speed, uses the draw of the speed."""
     q, u, noise = case.points.q, case.points.u, case.noise(len(case.points), 2)
-    made = case.model.transition(q, u, noise=noise, deviations=True)
-    assert made.deviation is not None
-    change = case.model.means(q, u)[:, :-1] + made.deviation * noise
+    made = case.model.transition(q, u, noise=noise, stds=True)
+    assert made.std is not None
+    change = case.model.means(q, u)[:, :-1] + made.std * noise
     assert close(made.q_next[:, 1], settle(case.definition, q + placed(case.definition, change))[:, 1])
 
 
@@ -133,8 +133,8 @@ def what_is_declared_is_not_learned(case: ModelCase) -> None:
     made = _everything(case.model, case)
     if (known := case.definition.declared_reward) is not None:
         assert close(made.reward, known(case.points.q, case.points.u))
-        assert made.reward_deviation is not None
-        assert float(made.reward_deviation.max()) == 0
+        assert made.reward_std is not None
+        assert float(made.reward_std.max()) == 0
     if not case.definition.learns_termination:
         assert torch.equal(case.model.terminated(case.points.q), case.definition.terminated(case.points.q))
 
@@ -219,7 +219,7 @@ def every_variant_steps(case: ModelCase) -> None:
         )
         lanes, _ = reset(case.definition, settings, create(case.definition, settings, 0), 0)
         for _ in range(5):
-            lanes, made = step(case.model, settings, lanes, np.ones((4, 1)), deviations=True)
+            lanes, made = step(case.model, settings, lanes, np.ones((4, 1)), stds=True)
             assert np.isfinite(made.observation).all()
             assert np.isfinite(made.reward).all()
 
@@ -234,13 +234,13 @@ def a_round_of_the_design_asks_for_more(case: ModelCase) -> None:
 
 LAWS_OF_MODELS: tuple[Callable[[ModelCase], None], ...] = (
     predictions_have_their_shapes_and_are_finite,
-    deviations_are_given_where_they_are_asked_for,
+    stds_are_given_where_they_are_asked_for,
     the_same_call_gives_the_same_numbers,
     learning_twice_gives_the_same_model,
     points_do_not_see_those_beside_them,
     without_points_there_are_no_steps,
     next_states_are_where_the_environment_can_be,
-    a_draw_is_the_mean_and_noise_times_the_deviation,
+    a_draw_is_the_mean_and_noise_times_the_std,
     lags_repeat_the_step,
     it_learns,
     scales_and_words_are_there_for_every_output,
@@ -259,7 +259,7 @@ LAWS_OF_MODELS: tuple[Callable[[ModelCase], None], ...] = (
 
 
 def _everything(model: DynamicsModel, case: ModelCase) -> Transition:
-    return model.transition(case.points.q, case.points.u, deviations=True, reward_deviation=True)
+    return model.transition(case.points.q, case.points.u, stds=True, reward_std=True)
 
 
 def _equal(one: Transition, other: Transition) -> bool:

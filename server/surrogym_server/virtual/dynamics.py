@@ -29,7 +29,7 @@ class Moved:
     reward_mean: Tensor  # (N,)
     reward: Tensor  # (N,) penalised, eq. 14
     terminated: Tensor  # (N,) bool
-    deviation: Tensor | None  # (N, O)
+    std: Tensor | None  # (N, O)
 
 
 def move_mean(
@@ -37,7 +37,7 @@ def move_mean(
     q: Tensor,
     u: Tensor,
     penalty: float,
-    deviations: bool,
+    stds: bool,
     *,
     process: Tensor | None = None,
     paths: Tensor | None = None,
@@ -51,15 +51,15 @@ def move_mean(
         process: (N, M), standard normal; adds the learned noise.
     """
     step = model.transition if paths is None else partial(function_draws(model, functions).transition_along, paths)
-    transition = step(q, u, process=process, deviations=deviations, reward_deviation=deviations or penalty > 0)
+    transition = step(q, u, process=process, stds=stds, reward_std=stds or penalty > 0)
     require_shapes(model, transition, q)
-    over, spread = model.terminated(transition.q_next), transition.reward_deviation
+    over, spread = model.terminated(transition.q_next), transition.reward_std
     mean = paid(model.terminal_reward, transition.reward, over)
     reward = mean if spread is None else penalised(mean, penalty, spread)
-    all_deviations = None
-    if transition.deviation is not None and spread is not None:
-        all_deviations = torch.cat([transition.deviation, spread[:, None]], -1)
-    return Moved(transition.q_next, q.new_zeros(len(q), 0, q.shape[1]), mean, reward, over, all_deviations)
+    all_stds = None
+    if transition.std is not None and spread is not None:
+        all_stds = torch.cat([transition.std, spread[:, None]], -1)
+    return Moved(transition.q_next, q.new_zeros(len(q), 0, q.shape[1]), mean, reward, over, all_stds)
 
 
 def move_particles(
@@ -83,27 +83,25 @@ def move_particles(
     q, action = particles.flatten(0, 1), u.repeat_interleave(count, 0)
     flat_noise, flat_process = (None if n is None else n.flatten(0, 1) for n in (noise, process))
     transition = (model.transition if steps is None else partial(_compiled_transition, steps))(
-        q, action, noise=flat_noise, process=flat_process, deviations=True, reward_deviation=True
+        q, action, noise=flat_noise, process=flat_process, stds=True, reward_std=True
     )
     require_shapes(model, transition, q)
-    spread = transition.reward_deviation
-    assert transition.deviation is not None
+    spread = transition.reward_std
+    assert transition.std is not None
     assert spread is not None
     moved = transition.q_next.reshape(lanes, count, size)
     output = mean_state(model.definition, moved)
     over = model.terminated(output)
     mean = paid(model.terminal_reward, transition.reward, over.repeat_interleave(count))
     weight = _weights(spread.reshape(lanes, count), model.scales[-1], weighting)
-    deviation = torch.cat([transition.deviation, spread[:, None]], -1).reshape(
-        lanes, count, len(model.definition.outputs)
-    )
+    std = torch.cat([transition.std, spread[:, None]], -1).reshape(lanes, count, len(model.definition.outputs))
     return Moved(
         output,
         moved,
         (weight * mean.reshape(lanes, count)).sum(1),
         (weight * penalised(mean, penalty, spread).reshape(lanes, count)).sum(1),
         over,
-        deviation.square().mean(1).sqrt(),
+        std.square().mean(1).sqrt(),
     )
 
 
@@ -114,8 +112,8 @@ def _compiled_transition(
     *,
     noise: Tensor | None,
     process: Tensor | None,
-    deviations: bool,
-    reward_deviation: bool,
+    stds: bool,
+    reward_std: bool,
 ) -> Transition:
     """Predict like ``DynamicsModel.transition``, in compiled code."""
     shaken, shaped = (None if n is None else n.contiguous().numpy() for n in (noise, process))
@@ -125,18 +123,16 @@ def _compiled_transition(
         noise=shaken,
         process=shaped,
         paths=None,
-        deviations=deviations,
-        reward_deviation=reward_deviation,
+        stds=stds,
+        reward_std=reward_std,
     )
-    deviation = torch.from_numpy(moved.deviation)
-    return Transition(
-        torch.from_numpy(moved.q_next), torch.from_numpy(moved.reward), deviation[:, :-1], deviation[:, -1]
-    )
+    std = torch.from_numpy(moved.std)
+    return Transition(torch.from_numpy(moved.q_next), torch.from_numpy(moved.reward), std[:, :-1], std[:, -1])
 
 
-def penalised(reward: Tensor, penalty: float, deviation: Tensor) -> Tensor:
+def penalised(reward: Tensor, penalty: float, std: Tensor) -> Tensor:
     """Subtract ``penalty`` standard deviations (m,) from rewards (m,)."""
-    return reward - penalty * deviation  # eq. 14
+    return reward - penalty * std  # eq. 14
 
 
 def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:

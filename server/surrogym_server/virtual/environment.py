@@ -43,13 +43,13 @@ class VirtualSettings:
     particles: int = 1_000
     propagation: Propagation = "sample"
     weighting: Weighting = "inverse_variance"
-    spread: float = 0.01  # first deviation of particles, as a share of each coordinate's range
+    spread: float = 0.01  # first standard deviation of particles, as a share of each coordinate's range
     functions: int | None = None  # number of functions that lanes of variant pathwise share; None: one for each lane
     residual: Residual | None = None  # systematic errors that are added to each prediction
     process_noise: bool = False  # the learned noise moves the state, w of eq. 2
     sensor_noise: SensorNoise = ()  # errors of observed coordinates, which don't move the state
     reward_limits: tuple[float, float] | None = None  # of mean rewards; None: none
-    trust: float | None = None  # truncate an episode if an output deviates by more, in its deviations over the samples
+    trust: float | None = None  # truncate at a predicted std above this multiple of that of the samples
     caution: float = 0.0  # doubts that are subtracted from each reward, see ``_doubted``
     compiled: bool = False  # compute steps in compiled code if the model offers it; chosen when the session opens
     visited: Tensor | None = field(default=None, compare=False, repr=False)  # (k, C) states of real steps
@@ -72,7 +72,7 @@ class LaneTransition:
     final_observation: Floats  # (K, D) float32
     reset_lanes: Bools  # (N,) lanes in which a new episode began
     reward_mean: Floats  # (N,)
-    deviation: Floats | None  # (N, O)
+    std: Floats | None  # (N, O)
     untrusted: Bools | None  # (N,) truncated for leaving the trusted range; None without one
     left: Bools | None = None  # (N,) ended with the outside reward; None if no lane can leave the sampling range
 
@@ -132,7 +132,7 @@ def step(
     lanes: LaneState,
     u: Floats,
     mask: Bools | None = None,
-    deviations: bool = False,
+    stds: bool = False,
     particle_steps: ArraySteps | None = None,
 ) -> tuple[LaneState, LaneTransition]:
     """Step lanes in torch: the reference form of ``virtual.step``, with the same arguments and errors.
@@ -146,7 +146,7 @@ def step(
         active = with_paths(model, active, settings.functions)
     action = torch.from_numpy(u).to(definition.device)
     action = action if isinstance(moving, slice) else action[moving]
-    moved = _move(model, settings, active, action, deviations, particle_steps)
+    moved = _move(model, settings, active, action, stds, particle_steps)
     if settings.residual is not None:
         moved = with_residual(model, settings.residual, active, action, moved)
     moved = _doubted(model, settings, moved)
@@ -177,7 +177,7 @@ def step(
         final_observation=final_observation,
         reset_lanes=np.zeros(len(reward), dtype=bool) if beginning is None else _array(beginning),
         reward_mean=_array(_scatter(moving, moved.reward_mean)) if penalised else reward.copy(),
-        deviation=None if moved.deviation is None or not deviations else _array(_scatter(moving, moved.deviation)),
+        std=None if moved.std is None or not stds else _array(_scatter(moving, moved.std)),
         untrusted=None if untrusted is None else _array(_scatter(moving, untrusted)),
         left=None if left is None else _array(_scatter(moving, left)),
     )
@@ -207,7 +207,7 @@ def _move(
     settings: VirtualSettings,
     lanes: LaneState,
     u: Tensor,
-    deviations: bool,
+    stds: bool,
     particle_steps: ArraySteps | None,
 ) -> Moved:
     outputs, particles = len(model.definition.outputs) - 1, lanes.particles.shape[1]
@@ -234,7 +234,7 @@ def _move(
         lanes.q,
         u,
         settings.penalty,
-        deviations or settings.doubts,
+        stds or settings.doubts,
         process=None if process is None else process[:, 0],
         paths=lanes.path if settings.variant == "pathwise" else None,
         functions=settings.functions,
@@ -246,8 +246,8 @@ def _doubted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> M
     standard deviations over the samples, times the standard deviation of the reward over the samples."""
     if settings.caution == 0:
         return moved
-    assert moved.deviation is not None
-    doubt = (moved.deviation / model.scales).amax(1) * model.scales[-1]
+    assert moved.std is not None
+    doubt = (moved.std / model.scales).amax(1) * model.scales[-1]
     return replace(moved, reward=moved.reward - settings.caution * doubt)
 
 
@@ -256,8 +256,8 @@ def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) ->
     standard deviations."""
     if settings.trust is None:
         return None
-    assert moved.deviation is not None
-    return (moved.deviation > settings.trust * model.scales).any(1)
+    assert moved.std is not None
+    return (moved.std > settings.trust * model.scales).any(1)
 
 
 def _left(definition: EnvironmentDefinition, moved: Moved, untrusted: Tensor | None) -> Tensor | None:

@@ -19,7 +19,7 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.dynamics import Moved
 from surrogym_server.virtual.lanes import LaneState
 
-FARTHEST = 3.0  # deviations to which a standardised input is limited
+FARTHEST = 3.0  # standard deviations to which a standardised input is limited
 
 
 @dataclass(frozen=True)

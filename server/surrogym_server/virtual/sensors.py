@@ -12,7 +12,7 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 
-SensorNoise = tuple[tuple[str, float], ...]  # deviation of one measurement, by coordinate
+SensorNoise = tuple[tuple[str, float], ...]  # name of a coordinate, standard deviation of one measurement
 MEASURED = 2.0  # variances of a measurement in that of a step's noise: one at its start, and one at its end
 
 
@@ -30,7 +30,7 @@ def driving(model: DynamicsModel, noise: SensorNoise, process: Tensor) -> Tensor
     if not noise or able is None or model.definition.moves_observation:
         return process
     spread = _spread(model.definition, noise)[list(model.definition.moving)]
-    learned = torch.tensor(able.noise_deviations[:-1], dtype=spread.dtype, device=spread.device)
+    learned = torch.tensor(able.noise_stds[:-1], dtype=spread.dtype, device=spread.device)
     share = MEASURED * spread.square() / learned.square().clamp_min(torch.finfo(spread.dtype).tiny)
     return process * (1 - share).clamp_min(0).sqrt()
 

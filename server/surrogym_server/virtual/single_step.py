@@ -21,17 +21,17 @@ class PointPrediction:
     next_coordinates: Array  # (n, C)
     next_observation: Array  # (n, D)
     reward: Array  # (n,) mean, without the penalty
-    reward_deviation: Array  # (n,)
+    reward_std: Array  # (n,)
     terminated: NDArray[Any]  # (n,) bool
 
 
 def predict_points(model: DynamicsModel, q: Array, u: Array) -> PointPrediction:
     """Predict one mean step from each of q (n, C) under u (n, F)."""
     at, action = torch.from_numpy(q), torch.from_numpy(u)
-    predicted = model.transition(at, action, reward_deviation=True)
+    predicted = model.transition(at, action, reward_std=True)
     require_shapes(model, predicted, at)
-    q_next, deviation = predicted.q_next, predicted.reward_deviation
-    assert deviation is not None
+    q_next, std = predicted.q_next, predicted.reward_std
+    assert std is not None
     over = model.terminated(q_next)
     reward, observation = paid(model.terminal_reward, predicted.reward, over), model.definition.observe(q_next)
-    return PointPrediction(*(t.numpy() for t in (q_next, observation, reward, deviation, over)))
+    return PointPrediction(*(t.numpy() for t in (q_next, observation, reward, std, over)))

@@ -47,13 +47,13 @@ def start_particles(
 ) -> Tensor:
     """Initial particles (N, P, C) around starts q (N, C): normal, with a fixed small standard deviation in each
     dimension (section 4)."""
-    each = [_deviation(definition, i, spread) for i in range(len(definition.coordinates))]
-    deviation = torch.tensor(each, dtype=q.dtype, device=q.device)
+    each = [_std(definition, i, spread) for i in range(len(definition.coordinates))]
+    std = torch.tensor(each, dtype=q.dtype, device=q.device)
     noise = normal_noise(lanes, Purpose.SPREAD, count, len(definition.coordinates))
-    return settle(definition, q[:, None] + deviation * noise)
+    return settle(definition, q[:, None] + std * noise)
 
 
-def _deviation(definition: EnvironmentDefinition, index: int, spread: float) -> float:
+def _std(definition: EnvironmentDefinition, index: int, spread: float) -> float:
     coordinate = definition.coordinates[index]
     if coordinate.kind == "constant":
         return 0.0

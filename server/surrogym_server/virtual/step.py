@@ -20,9 +20,9 @@ def in_fastest_form(settings: VirtualSettings, model: DynamicsModel) -> VirtualS
 
     Compiled steps know no residual.
     """
-    deviations = settings.variant == "probabilistic" or settings.penalty > 0 or settings.doubts
+    stds = settings.variant == "probabilistic" or settings.penalty > 0 or settings.doubts
     able = None if settings.residual is not None else offers(model, CompiledSteps)
-    if able is None or not able.compiled_pays(deviations=deviations):
+    if able is None or not able.compiled_pays(stds=stds):
         return settings
     try:
         return replace(settings, compiled=_array_steps(model, replace(settings, compiled=True)) is not None)
@@ -37,7 +37,7 @@ def step(
     lanes: LaneState,
     u: Floats,
     mask: Bools | None = None,
-    deviations: bool = False,
+    stds: bool = False,
 ) -> tuple[LaneState, LaneTransition]:
     """Step all lanes, or those of the mask (N,), under u (N, F), the model's actions.
 
@@ -47,10 +47,10 @@ def step(
     """
     move = _array_steps(model, settings)
     if move is None or settings.variant == "probabilistic":
-        return environment.step(model, settings, lanes, u, mask, deviations, particle_steps=move)
+        return environment.step(model, settings, lanes, u, mask, stds, particle_steps=move)
     from surrogym_server.virtual.compiled.step import compiled_step
 
-    return compiled_step(model, move, settings, lanes, u, mask, deviations)
+    return compiled_step(model, move, settings, lanes, u, mask, stds)
 
 
 def _array_steps(model: DynamicsModel, settings: VirtualSettings) -> ArraySteps | None:

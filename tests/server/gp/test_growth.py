@@ -109,6 +109,6 @@ def test_inputs_beyond_the_edge_stay_finite_and_monotone():
     assert float(steep.diff(dim=0)) == pytest.approx(1e-6 * math.exp(4), rel=1e-4)
 
 
-def test_growing_processes_refuse_inputs_beyond_two_deviations():
+def test_growing_processes_refuse_inputs_beyond_two_stds():
     with pytest.raises(ValueError, match="within 2"):
         fit_growing(torch.full((3, 1), 2.5, dtype=torch.float64), torch.zeros(3), ALL[:1], FitOptions(), [])

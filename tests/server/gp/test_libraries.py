@@ -28,11 +28,11 @@ def points(rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor, torch.
     return x, y, torch.from_numpy(rng.normal(size=(TESTS, INPUTS)) * 1.5)
 
 
-def assert_agree(posterior: Posterior, at: torch.Tensor, mean: np.ndarray, deviation: np.ndarray) -> None:
+def assert_agree(posterior: Posterior, at: torch.Tensor, mean: np.ndarray, std: np.ndarray) -> None:
     ours, latent = posterior.mean_and_variance(at)
     prior = variance(posterior.hyper, at).numpy()
     np.testing.assert_allclose((ours.numpy() - mean) / np.sqrt(prior), 0, atol=1e-6)
-    np.testing.assert_allclose((latent.numpy() - deviation**2) / prior, 0, atol=1e-6)
+    np.testing.assert_allclose((latent.numpy() - std**2) / prior, 0, atol=1e-6)
     np.testing.assert_allclose(posterior.mean(at).numpy(), ours.numpy(), atol=1e-12)
 
 
@@ -86,10 +86,10 @@ def test_gpytorch(rng, plain):
     try:
         with torch.no_grad(), gpytorch.settings.fast_computations(False, False, False):
             reference = Reference(x, y, plain)(Reference.expand(at))
-            mean, deviation = reference.mean.numpy(), reference.variance.sqrt().numpy()
+            mean, std = reference.mean.numpy(), reference.variance.sqrt().numpy()
     finally:
         torch.set_default_dtype(torch.float32)
-    assert_agree(condition(plain, x, y), at, mean, deviation)
+    assert_agree(condition(plain, x, y), at, mean, std)
 
 
 def test_the_prior_variance_is_the_covariances_diagonal(rng, hyper):

@@ -23,11 +23,11 @@ def part(of: tuple[int, int], seed: int, n: int = 25, size: int = 5, scale: floa
     """A process of ``size`` inputs whose targets are a function ``of`` two of them, in this order."""
     x = 2 * torch.rand(n, size, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1
     target = scale * f(x[:, of[0]], x[:, of[1]]) + 3
-    centre, deviation = float(target.mean()), float(target.std(correction=0))
-    y = (target - centre) / deviation
+    centre, std = float(target.mean()), float(target.std(correction=0))
+    y = (target - centre) / std
     inputs = tuple(sorted(of))
     whole, fewer = fit(x, y, OPTIONS), fit(x[:, list(inputs)], y, OPTIONS)
-    made = Part(x, y, whole.posterior.hyper, centre, deviation, OPTIONS, inputs, fewer.posterior.hyper, signs=None)
+    made = Part(x, y, whole.posterior.hyper, centre, std, OPTIONS, inputs, fewer.posterior.hyper, signs=None)
     return replace(made, **kept)
 
 

@@ -47,9 +47,9 @@ def reference(hyper: Hyperparameters, x: np.ndarray, y: np.ndarray, at: np.ndarr
 
 def served(posterior: Posterior, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     compiled = Serving.of([Output(0, posterior, (0, 1))], columns=1, width=2, device=at.device)
-    mean, deviation = compiled.mean_and_deviation(at, [0])
+    mean, std = compiled.mean_and_std(at, [0])
     torch.testing.assert_close(compiled.mean(at), mean, rtol=0, atol=0)
-    return mean[:, 0], deviation[:, 0].square()
+    return mean[:, 0], std[:, 0].square()
 
 
 @pytest.mark.parametrize("length", [0.5, 2.0, 20.0])

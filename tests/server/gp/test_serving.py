@@ -35,34 +35,34 @@ def test_every_output_is_its_posterior(outputs, at, monkeypatch, device, toleran
     monkeypatch.setattr(serving, "MEAN_TOLERANCE", tolerance)
     monkeypatch.setattr(serving, "VARIANCE_TOLERANCE", tolerance)
     compiled = Serving.of(to_device(tuple(outputs), device), COLUMNS, WIDTH, device)
-    mean, deviation = (values.cpu() for values in compiled.mean_and_deviation(at.to(device), range(COLUMNS)))
+    mean, std = (values.cpu() for values in compiled.mean_and_std(at.to(device), range(COLUMNS)))
     torch.testing.assert_close(compiled.mean(at.to(device)).cpu(), mean, rtol=0, atol=0)
     assert (mean[:, 2] == 0).all()
     assert (mean[:, CONSTANT] == 2.5).all()
-    assert (deviation[:, [2, CONSTANT]] == 0).all()
+    assert (std[:, [2, CONSTANT]] == 0).all()
     for output in outputs[1:]:
         expected, variance = output.posterior.mean_and_variance(at[:, list(output.inputs)])
         torch.testing.assert_close(
             mean[:, output.column], output.centre + output.scale * expected, rtol=1e-9, atol=1e-9
         )
-        torch.testing.assert_close(deviation[:, output.column], output.scale * variance.sqrt(), rtol=1e-7, atol=1e-9)
+        torch.testing.assert_close(std[:, output.column], output.scale * variance.sqrt(), rtol=1e-7, atol=1e-9)
 
 
-def test_deviations_that_were_not_requested_are_zero(outputs, at):
+def test_stds_that_were_not_requested_are_zero(outputs, at):
     compiled = Serving.of(outputs, COLUMNS, WIDTH)
-    _, some = compiled.mean_and_deviation(at, [1])
-    _, every = compiled.mean_and_deviation(at, range(COLUMNS))
+    _, some = compiled.mean_and_std(at, [1])
+    _, every = compiled.mean_and_std(at, range(COLUMNS))
     assert torch.equal(some[:, 1], every[:, 1])
     assert (some[:, [0, 2, 3, 4]] == 0).all()
 
 
 def test_blocks_change_no_more_than_last_bits(outputs, at, monkeypatch):
     compiled = Serving.of(outputs, COLUMNS, WIDTH)
-    whole = compiled.mean_and_deviation(at, range(COLUMNS))
+    whole = compiled.mean_and_std(at, range(COLUMNS))
     monkeypatch.setattr(serving, "BLOCK", 1)
     monkeypatch.setattr(serving, "MIN_ROWS", 5)
     assert compiled.rows == 5
-    for ours, theirs in zip(compiled.mean_and_deviation(at, range(COLUMNS)), whole, strict=True):
+    for ours, theirs in zip(compiled.mean_and_std(at, range(COLUMNS)), whole, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
 
 

@@ -66,9 +66,9 @@ def test_it_is_served_extended_and_drawn_from_as_any_other(drawn: tuple[Hyperpar
     through = condition_sparse(*drawn)
     at = torch.tensor([[0.3, -0.4], [2.5, 1.0]], dtype=torch.float64)
     mean, variance = through.mean_and_variance(at)
-    served, deviation = Serving.of([Output(0, through, (0, 1))], 1, 2).mean_and_deviation(at, (0,))
+    served, std = Serving.of([Output(0, through, (0, 1))], 1, 2).mean_and_std(at, (0,))
     torch.testing.assert_close(served[:, 0], mean, rtol=0, atol=1e-8)
-    torch.testing.assert_close(deviation[:, 0].square(), variance, rtol=1e-3, atol=1e-8)
+    torch.testing.assert_close(std[:, 0].square(), variance, rtol=1e-3, atol=1e-8)
     extended = through.extend(at[1], function(at)[1])
     assert extended.mean(at)[1] == pytest.approx(float(function(at)[1]), abs=1e-2)
     assert extended.mean_and_variance(at)[1][1] < variance[1]

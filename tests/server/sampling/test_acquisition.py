@@ -16,7 +16,7 @@ from surrogym_server.plugins import Choice
 from surrogym_server.sampling.acquisition import ACQUISITIONS, PathView, Variance, acquisition_of, path_value_of
 from surrogym_server.sampling.batch import NEAR, candidate_view, choose, nearest
 from surrogym_server.sampling.candidates import Candidates
-from surrogym_server.sampling.confidence import deviations
+from surrogym_server.sampling.confidence import stds
 from surrogym_server.sampling.outlook import outlook_of
 from surrogym_server.sampling.rollouts import Aim, path_values, predict_paths
 
@@ -64,16 +64,14 @@ def test_every_acquisition_keeps_the_laws(model, candidates, name):
 
 
 def test_the_index_is_uncertainty_times_probability(model, candidates):
-    sigma = deviations(model, candidates.points.q, candidates.points.u)[:, 1].numpy()
+    sigma = stds(model, candidates.points.q, candidates.points.u)[:, 1].numpy()
     expected = norm.sf(0.02 / sigma) * np.exp(candidates.log_p.numpy())
     np.testing.assert_allclose(value(model, candidates, "uncertainty_index", 1).exp().numpy(), expected, rtol=1e-4)
 
 
-def test_variance_looks_at_the_deviation_alone(model, candidates):
+def test_variance_looks_at_the_std_alone(model, candidates):
     said = value(model, candidates, "variance", 2)
-    torch.testing.assert_close(
-        said, deviations(model, candidates.points.q, candidates.points.u)[:, 2], rtol=1e-6, atol=0
-    )
+    torch.testing.assert_close(said, stds(model, candidates.points.q, candidates.points.u)[:, 2], rtol=1e-6, atol=0)
 
 
 def test_integrated_variance_prefers_queries_that_inform_many_points(model, candidates):
@@ -122,12 +120,12 @@ def test_a_constant_output_is_queried_far_from_earlier_queries(model, candidates
     assert pick == int(nearest(model.definition, candidates.points, taken).argmax())
 
 
-def test_near_is_measured_in_deviations_of_the_sampling_range(definition):
+def test_near_is_measured_standardised_of_the_sampling_range(definition):
     taken = Points(torch.tensor([[3.14, 1.0]]).double(), torch.tensor([[0.5]]).double())
-    deviation = 16 / 12**0.5
+    std = 16 / 12**0.5
     q = torch.tensor([[3.14, 1.0]] * 2).double()
-    q[0, 1] += 0.9 * NEAR * deviation
-    q[1, 1] += 1.1 * NEAR * deviation
+    q[0, 1] += 0.9 * NEAR * std
+    q[1, 1] += 1.1 * NEAR * std
     assert (nearest(definition, Points(q, taken.u.expand(2, 1)), taken) / NEAR).tolist() == pytest.approx([0.9, 1.1])
     turned = Points(torch.tensor([[3.14 - 2 * torch.pi, 1.0]]).double(), taken.u)
     assert nearest(definition, turned, taken).tolist() == pytest.approx([0], abs=1e-6)
@@ -148,18 +146,18 @@ def leave(_: torch.Tensor) -> object:
 @pytest.mark.parametrize(
     ("answer", "said"),
     [
-        (lambda deviation: deviation.sum(), r"expected a tensor of shape \(60,\), got \(\)"),
-        (lambda deviation: deviation[:7], r"expected a tensor of shape \(60,\), got \(7,\)"),
-        (lambda deviation: deviation[:, None], r"expected a tensor of shape \(60,\), got \(60, 1\)"),
-        (lambda deviation: deviation.numpy(), r"expected a tensor of shape \(60,\), got ndarray"),
-        (lambda deviation: deviation * torch.nan, "expected finite values, got 60 of 60 that are infinite or NaN"),
+        (lambda std: std.sum(), r"expected a tensor of shape \(60,\), got \(\)"),
+        (lambda std: std[:7], r"expected a tensor of shape \(60,\), got \(7,\)"),
+        (lambda std: std[:, None], r"expected a tensor of shape \(60,\), got \(60, 1\)"),
+        (lambda std: std.numpy(), r"expected a tensor of shape \(60,\), got ndarray"),
+        (lambda std: std * torch.nan, "expected finite values, got 60 of 60 that are infinite or NaN"),
         (lambda _: ("angle", "speed").index("x"), r"ValueError: tuple.index\(x\): x not in tuple"),
         (leave, "SystemExit: no licence"),
     ],
 )
 def test_an_answer_that_breaks_the_laws_names_the_acquisition(model, candidates, monkeypatch, answer, said):
     """By its values the design spends real steps; argmax of NaN or of a scalar would choose without a word."""
-    monkeypatch.setattr(Variance, "value", lambda _, view: answer(view.deviation))
+    monkeypatch.setattr(Variance, "value", lambda _, view: answer(view.std))
     nothing = candidates.points[:0]
     expected = f"^the choice of the next queries failed: acquisition variance: {said}"
     with pytest.raises(ChoiceFailed, match=expected):

@@ -16,8 +16,8 @@ from support.real_steps import join
 from surrogym_server.sampling.confidence import (
     certainty,
     confidence,
-    deviations,
     log_model_uncertainty,
+    stds,
 )
 from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.uncertainty import query_uncertainty, visited_confidence
@@ -41,7 +41,7 @@ def test_confidence_of_the_papers_tolerance_is_the_papers():
     assert made.confidence_index == made.confidence_index_paper == pytest.approx((0.8413447461 + 0.6914624613) / 2)
 
 
-def test_nothing_known_is_a_half_and_no_deviation_is_certain():
+def test_nothing_known_is_a_half_and_no_std_is_certain():
     torch.testing.assert_close(certainty(tensor(1e12, 0.0), 0.1), tensor(0.5, 1.0))
     assert log_model_uncertainty(tensor(0.0), 0.1).exp().item() == 0
     assert math.isfinite(log_model_uncertainty(tensor(0.0), 0.1).item()), "as JSON has no infinity"
@@ -53,9 +53,9 @@ def test_model_uncertainty_is_what_certainty_leaves():
 
 
 def test_small_uncertainties_stay_ordered_where_one_minus_phi_is_zero():
-    deviation = tensor(1 / 9, 1 / 10, 1 / 20, 1 / 100)
-    assert torch.all(1 - certainty(deviation, 1.0) == 0)
-    log_u = log_model_uncertainty(deviation, 1.0)
+    std = tensor(1 / 9, 1 / 10, 1 / 20, 1 / 100)
+    assert torch.all(1 - certainty(std, 1.0) == 0)
+    log_u = log_model_uncertainty(std, 1.0)
     assert torch.all(log_u.diff() < 0)
     np.testing.assert_allclose(log_u.numpy(), norm.logsf([9, 10, 20, 100]), rtol=1e-9)
 
@@ -64,8 +64,8 @@ def test_query_uncertainty_says_all_of_it(model, points, unseen):
     q, u = (t.numpy() for t in points)
     tolerances = np.array([0.01, 0.02, 0.1])
     made = query_uncertainty(model, q, u, tolerances)
-    np.testing.assert_allclose(made.deviation, deviations(model, *points).numpy())
-    np.testing.assert_allclose(made.model_uncertainty, norm.sf(tolerances / made.deviation), rtol=1e-9)
+    np.testing.assert_allclose(made.std, stds(model, *points).numpy())
+    np.testing.assert_allclose(made.model_uncertainty, norm.sf(tolerances / made.std), rtol=1e-9)
     np.testing.assert_allclose(made.input_probability, 1)
     np.testing.assert_allclose(made.mean, model.means(*points).numpy())
     visited = query_uncertainty(model, q, u, tolerances, unseen.q.numpy())

@@ -11,7 +11,7 @@ from surrogym_server.models.abilities import LeaveOneOut, PredictedSteps, offers
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.batch import choose
 from surrogym_server.sampling.candidates import Candidates
-from surrogym_server.sampling.confidence import confidences_of, deviations
+from surrogym_server.sampling.confidence import confidences_of, stds
 from surrogym_server.sampling.endings import edge_in_doubt
 from surrogym_server.sampling.outlook import as_if_answered, outlook_of, path_outlook
 from surrogym_server.sampling.rollouts import Aim, plan_round
@@ -34,22 +34,22 @@ def candidates(points) -> Points:
 
 def test_leave_one_out_errors_are_unknown(plain, candidates):
     assert offers(plain, LeaveOneOut) is None
-    judged = confidences_of(plain, candidates, deviations(plain, candidates.q, candidates.u), TOLERANCES)
+    judged = confidences_of(plain, candidates, stds(plain, candidates.q, candidates.u), TOLERANCES)
     assert {(j.leave_one_out_error, j.leave_one_out_within_one) for j in judged} == {(None, None)}
 
 
 def test_an_answer_is_worth_what_lies_near_it(plain, candidates):
     reference = candidates[30:]
     outlook = outlook_of(plain, candidates, reference, candidates[:0])[2]
-    torch.testing.assert_close(outlook.deviation, 0.1 * candidates.q[:, 1].abs())
+    torch.testing.assert_close(outlook.std, 0.1 * candidates.q[:, 1].abs())
     here = torch.zeros(30, dtype=torch.float64)
     here[4] = 1.0
     reduction = outlook.reduction(here)
     assert int(reduction.argmax()) == 34
-    assert float(reduction[34]) == pytest.approx(float(outlook.deviation[34]) ** 2)
+    assert float(reduction[34]) == pytest.approx(float(outlook.std[34]) ** 2)
     after = outlook.observe(34)
-    assert float(after.deviation[34]) == 0
-    assert bool((after.deviation <= outlook.deviation).all())
+    assert float(after.std[34]) == 0
+    assert bool((after.std <= outlook.std).all())
     assert float(after.reduction(here).max()) == 0
 
 
@@ -57,7 +57,7 @@ def test_queries_assumed_and_observed_do_the_same(plain, candidates):
     observed = [o.observe(4).observe(9) for o in outlook_of(plain, candidates, candidates, candidates[:0])]
     assumed = outlook_of(plain, candidates, candidates, candidates[[4, 9]])
     for one, other in zip(observed, assumed, strict=True):
-        torch.testing.assert_close(one.deviation, other.deviation)
+        torch.testing.assert_close(one.std, other.std)
 
 
 def test_a_batch_spreads(plain, candidates):

@@ -36,7 +36,7 @@ class ClaimsNoise(ExactModel, LearnedNoise):
     noise: tuple[float, ...] = (0.2, 0.0, 0.0)
 
     @property
-    def noise_deviations(self) -> tuple[float, ...]:
+    def noise_stds(self) -> tuple[float, ...]:
         return self.noise
 
 
@@ -56,11 +56,11 @@ def samples(model: ExactModel, again: int, noise: float = 0.0, count: int = 12, 
     return Samples(q, u, q_next, model.pay(q, u), torch.zeros(len(q), dtype=torch.bool))
 
 
-def test_deviations_of_repeated_steps_are_pooled(model: ClaimsNoise):
+def test_stds_of_repeated_steps_are_pooled(model: ClaimsNoise):
     taken = samples(model, again=400, noise=0.3)
     found = repeats(model, taken)
     assert found.degrees == 400
-    assert found.deviation.tolist() == pytest.approx([0.3, 0.0, 0.0], abs=0.03)
+    assert found.std.tolist() == pytest.approx([0.3, 0.0, 0.0], abs=0.03)
     assert repeats(model, samples(model, again=0)).degrees == 0
 
 

@@ -14,7 +14,7 @@ from surrogym_server.environment.features import encode
 from surrogym_server.environment.points import Points
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
-from surrogym_server.sampling.confidence import deviations
+from surrogym_server.sampling.confidence import stds
 from surrogym_server.sampling.latin_hypercube import random_points
 from surrogym_server.sampling.outlook import outlook_of
 from surrogym_shared.spec import Reward
@@ -43,18 +43,18 @@ def answered(model: GaussianProcessModel, query: Points) -> GaussianProcessModel
     return replace(model, transitions=tuple(map(extended, model.transitions)), reward=extended(model.reward))
 
 
-def test_it_begins_with_the_deviations_of_the_model(model, candidates):
+def test_it_begins_with_the_stds_of_the_model(model, candidates):
     outlook = outlook_of(model, candidates, candidates[NOTHING], candidates[NOTHING])
-    said = torch.stack([output.deviation for output in outlook], -1)
-    torch.testing.assert_close(said, deviations(model, candidates.q, candidates.u), rtol=1e-6, atol=1e-9)
+    said = torch.stack([output.std for output in outlook], -1)
+    torch.testing.assert_close(said, stds(model, candidates.q, candidates.u), rtol=1e-6, atol=1e-9)
 
 
 def test_the_reduction_is_what_the_answer_brings(model, candidates, reference):
     weights = torch.arange(1.0, 26.0, dtype=torch.float64) / 325
     outlook = outlook_of(model, candidates, reference, candidates[NOTHING])
-    before = deviations(model, reference.q, reference.u).square()
+    before = stds(model, reference.q, reference.u).square()
     for index in range(3):
-        after = deviations(answered(model, candidates[index : index + 1]), reference.q, reference.u).square()
+        after = stds(answered(model, candidates[index : index + 1]), reference.q, reference.u).square()
         brought = weights @ (before - after)
         said = torch.stack([output.reduction(weights)[index] for output in outlook])
         torch.testing.assert_close(said, brought, rtol=1e-4, atol=1e-10)
@@ -65,7 +65,7 @@ def test_queries_assumed_and_candidates_observed_do_the_same(model, candidates, 
     observed = [o.observe(4).observe(9) for o in outlook_of(model, candidates, reference, candidates[NOTHING])]
     assumed = outlook_of(model, candidates, reference, candidates[[4, 9]])
     for one, other in zip(observed, assumed, strict=True):
-        torch.testing.assert_close(one.deviation, other.deviation, rtol=1e-6, atol=1e-9)
+        torch.testing.assert_close(one.std, other.std, rtol=1e-6, atol=1e-9)
         torch.testing.assert_close(one.reduction(weights), other.reduction(weights), rtol=1e-5, atol=1e-12)
 
 
@@ -76,8 +76,8 @@ def test_an_answer_at_a_bound_teaches_the_dynamics_nothing(model):
     theta, speed, reward = outlook_of(model, points, points[NOTHING], points[NOTHING])
     assert speed.learns.tolist() == [False, True]
     assert reward.learns.tolist() == [True, True]
-    torch.testing.assert_close(speed.observe(0).deviation, speed.deviation)
-    assert speed.observe(1).deviation[1] < speed.deviation[1]
+    torch.testing.assert_close(speed.observe(0).std, speed.std)
+    assert speed.observe(1).std[1] < speed.std[1]
     assert theta.learns.tolist() == [model.transitions[0].feature_map.lead, True]
 
 
@@ -92,5 +92,5 @@ def test_a_reward_after_the_step_is_known_where_the_step_leads(candidates):
     spec = pendulum().model_copy(update={"reward": Reward(timing="after")})
     model = learn(definition_from_spec(spec), random_steps(spec, 12, seed=0)).model
     outlook = outlook_of(model, candidates, candidates[NOTHING], candidates[NOTHING])
-    expected = deviations(model, candidates.q, candidates.u)[:, -1]
-    torch.testing.assert_close(outlook[-1].deviation, expected, rtol=1e-6, atol=1e-9)
+    expected = stds(model, candidates.q, candidates.u)[:, -1]
+    torch.testing.assert_close(outlook[-1].std, expected, rtol=1e-6, atol=1e-9)

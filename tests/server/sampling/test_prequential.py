@@ -38,7 +38,7 @@ def test_the_interval_score_is_the_sum_of_two_quantile_losses():
         np.testing.assert_allclose(scored.numpy(), expected, rtol=1e-12)
 
 
-def test_right_deviations_have_the_nominal_coverage_and_the_least_expected_score():
+def test_right_stds_have_the_nominal_coverage_and_the_least_expected_score():
     """With sigma = 1 the expected score of the central 90 % interval is 4 / alpha phi(z)."""
     errors = np.random.default_rng(1).normal(size=40_000).tolist()
     right, narrow, wide = (scores_of([Prediction(e, d) for e in errors], 1e-9) for d in (1.0, 0.5, 2.0))
@@ -65,16 +65,16 @@ def test_no_predictions_have_no_scores():
     assert scores_of([], 0.1) is None
 
 
-def test_a_model_predicts_new_samples_with_its_own_deviation(model, unseen):
+def test_a_model_predicts_new_samples_with_its_own_std(model, unseen):
     free = unseen.at(~saturated(model.definition, unseen.q_next))
     made = predicted(model, free)
     errors = torch.tensor([[p.error for p in output] for output in made], dtype=torch.float64).T
     truth = torch.cat([increments(model.definition, free), free.reward[:, None]], -1)
     torch.testing.assert_close(errors, truth - model.means(free.q, free.u))
-    latent = model.transition(free.q, free.u, deviations=True).deviation
+    latent = model.transition(free.q, free.u, stds=True).std
     assert latent is not None
-    expected = torch.hypot(latent, latent.new_tensor(model.noise_deviations[:-1]))
-    found = torch.tensor([[p.deviation for p in output] for output in made[:-1]], dtype=torch.float64)
+    expected = torch.hypot(latent, latent.new_tensor(model.noise_stds[:-1]))
+    found = torch.tensor([[p.std for p in output] for output in made[:-1]], dtype=torch.float64)
     torch.testing.assert_close(found.T, expected)
 
 
@@ -86,7 +86,7 @@ def test_changes_that_a_limit_cuts_and_rewards_of_the_last_step_are_left_out(mod
     assert counts == [int((~cut).sum())] * 2 + [len(unseen) - 7]
 
 
-def test_the_uncertainty_of_the_next_state_is_part_of_its_rewards_deviation():
+def test_the_uncertainty_of_the_next_state_is_part_of_its_rewards_std():
     """Against draws of the next state, for a declared reward that reads it, which is exact otherwise."""
     term = RewardTerm(shape="square", of=(Quantity(term=Term.linear(omega=1)),))
     reward = DeclaredReward(kind="declared", timing="after", terms=(term,))
@@ -95,7 +95,7 @@ def test_the_uncertainty_of_the_next_state_is_part_of_its_rewards_deviation():
     fresh = random_steps(swing_up(), 20, seed=4)
     noise = torch.randn(1_000, 20, len(definition.outputs) - 1, generator=torch.Generator().manual_seed(5))
     drawn = torch.stack([model.transition(fresh.q, fresh.u, noise=one.double()).reward for one in noise]).std(0)
-    found = np.array([p.deviation for p in predicted(model, fresh)[-1]])
+    found = np.array([p.std for p in predicted(model, fresh)[-1]])
     np.testing.assert_allclose(np.median(found / drawn.numpy()), 1, atol=0.05)
 
 

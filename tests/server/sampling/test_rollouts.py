@@ -19,7 +19,7 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import PredictedSteps
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.lookahead import process_inputs
-from surrogym_server.sampling.confidence import deviations
+from surrogym_server.sampling.confidence import stds
 from surrogym_server.sampling.design import advance, initial_queries
 from surrogym_server.sampling.rollouts import (
     Aim,
@@ -192,7 +192,7 @@ def test_a_rollout_that_is_pending_leaves_less_to_learn(model: GaussianProcessMo
     again, first = (float(path_values(m, aim, paths)[0, -1]) for m in (done, model))
     assert again < 0.1 * first
     q, u = start_points(model.definition, 50, rng(2)), torch.full((50, 1), 2.0, dtype=torch.float64)
-    before, after = deviations(model, q, u), deviations(done, q, u)
+    before, after = stds(model, q, u), stds(done, q, u)
     assert bool((after <= before + 1e-9).all())
     torch.testing.assert_close(done.transition(q, u).q_next, model.transition(q, u).q_next, rtol=0, atol=1e-6)
 
@@ -357,7 +357,7 @@ def test_no_snapshot_so_far_means_a_plan_from_a_reset(model: GaussianProcessMode
 def test_a_pending_query_from_a_snapshot_is_done_there(model: GaussianProcessModel):
     place, actions = torch.tensor([[2.0, 6.0]], dtype=torch.float64), torch.full((1, 1), 2.0, dtype=torch.float64)
     done = as_if_done(model, Query.rollout([[2.0]], "fast"), {"fast": (2.0, 6.0)}, rng())
-    before, after = (deviations(m, place, actions)[0, 1] for m in (model, done))
+    before, after = (stds(m, place, actions)[0, 1] for m in (model, done))
     assert after < 0.2 * before
 
 

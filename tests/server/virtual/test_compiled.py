@@ -85,7 +85,7 @@ def require_agreement(one: tuple[LaneState, LaneTransition], other: tuple[LaneSt
                 continue
             a, b = np.asarray(a), np.asarray(b)
             assert (a.dtype, a.shape) == (b.dtype, b.shape), field.name
-            tolerance = 2e-6 if field.name == "deviation" or a.dtype == np.float32 else 1e-8
+            tolerance = 2e-6 if field.name == "std" or a.dtype == np.float32 else 1e-8
             np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance, err_msg=field.name)
 
 
@@ -101,8 +101,8 @@ def test_compiled_steps_agree_with_torch(model, choice):
         settings = replace(settings, start_visited=0.5, visited=lanes.q + 0.01)
     for count in range(STEPS):
         u = actions(model, rng)
-        made = step(model, settings, lanes, u, deviations=count % 2 == 1)
-        require_agreement(made, step(model, replace(settings, compiled=False), lanes, u, deviations=count % 2 == 1))
+        made = step(model, settings, lanes, u, stds=count % 2 == 1)
+        require_agreement(made, step(model, replace(settings, compiled=False), lanes, u, stds=count % 2 == 1))
         lanes = made[0]
 
 
@@ -156,7 +156,7 @@ def test_session_whose_model_fails_to_compile_steps_by_torch(model, monkeypatch,
     assert "torch computes them" in caplog.text
 
 
-def test_deviations_of_many_points_are_left_to_torch(monkeypatch):
+def test_stds_of_many_points_are_left_to_torch(monkeypatch):
     case = CASES["case: learned reward"]
     model = gaussian_processes(case.definition, case.samples)
     monkeypatch.setattr(gaussian_process_model, "COMPILED_SOLVES", len(case.samples.q) - 1)
@@ -179,7 +179,7 @@ def test_the_outside_reward_of_compiled_steps_is_that_of_torch(choice, time_limi
     left, lanes = 0, replace(lanes, q=fast)
     for _ in range(STEPS):
         u = actions(model, rng)
-        made = step(model, settings, lanes, u, deviations=True)
-        require_agreement(made, step(model, replace(settings, compiled=False), lanes, u, deviations=True))
+        made = step(model, settings, lanes, u, stds=True)
+        require_agreement(made, step(model, replace(settings, compiled=False), lanes, u, stds=True))
         left, lanes = left + int(made[1].left.sum()), made[0]
     assert left >= 4

@@ -98,11 +98,11 @@ def test_in_next_step_the_step_after_the_end_only_resets(cartpole_model, started
     lanes, ended = step(cartpole_model, settings, lanes, np.ones((2, 1)))
     assert ended.truncated.all()
     assert ended.reward.tolist() == [1.0, 1.0]
-    lanes, begun = step(cartpole_model, settings, lanes, np.ones((2, 1)), deviations=True)
+    lanes, begun = step(cartpole_model, settings, lanes, np.ones((2, 1)), stds=True)
     assert begun.reset_lanes.all()
     assert begun.reward.tolist() == [0.0, 0.0]
     assert not (begun.terminated | begun.truncated).any()
-    assert begun.deviation.shape == (2, 5)
+    assert begun.std.shape == (2, 5)
     assert lanes.episode.tolist() == [1, 1]
     assert lanes.elapsed.tolist() == [0, 0]
 

@@ -51,7 +51,7 @@ def test_leaving_the_range_ends_an_episode_and_pays_missing_steps(of_a_log, star
 
 
 def test_leaving_the_trusted_range_pays_too(of_a_log, started):
-    unsure = replace(of_a_log, deviation=0.5)
+    unsure = replace(of_a_log, std=0.5)
     settings, lanes = started(unsure, 2, time_limit=10, trust=0.4)
     _, moved = step(unsure, settings, lanes, STILL)
     assert moved.terminated.all()

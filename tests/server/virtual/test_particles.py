@@ -40,8 +40,8 @@ def cart() -> ExactModel:
         definition_from_spec(CART),
         move=lambda q, u: q + u,
         pay=lambda q, u: 10 * q[:, 0] + 0 * u[:, 0],
-        deviation=0.5,
-        reward_deviation=lambda q: q[:, 0].abs(),
+        std=0.5,
+        reward_std=lambda q: q[:, 0].abs(),
     )
 
 
@@ -50,18 +50,18 @@ def column(*values: float) -> torch.Tensor:
 
 
 def test_the_mean_moves_and_the_reward_is_its_lower_confidence_bound(cart):
-    moved = move_mean(cart, column(1.0, 2.5), column(0.5, 1.0), penalty=3.0, deviations=True)
+    moved = move_mean(cart, column(1.0, 2.5), column(0.5, 1.0), penalty=3.0, stds=True)
     assert moved.q[:, 0].tolist() == [1.5, 3.5]
     assert moved.reward_mean.tolist() == [10.0, 25.0]
     assert moved.reward.tolist() == [10 - 3 * 1.0, 25 - 3 * 2.5]
     assert moved.terminated.tolist() == [False, True]
-    assert moved.deviation.tolist() == [[0.5, 1.0], [0.5, 2.5]]
+    assert moved.std.tolist() == [[0.5, 1.0], [0.5, 2.5]]
 
 
 def test_without_a_penalty_the_reward_is_the_mean(cart):
-    moved = move_mean(cart, column(1.0), column(0.5), penalty=0.0, deviations=False)
+    moved = move_mean(cart, column(1.0), column(0.5), penalty=0.0, stds=False)
     assert moved.reward.tolist() == moved.reward_mean.tolist() == [10.0]
-    assert moved.deviation is None
+    assert moved.std is None
 
 
 def test_particles_are_weighed_by_inverse_variance(cart):
@@ -72,7 +72,7 @@ def test_particles_are_weighed_by_inverse_variance(cart):
     assert float(moved.q) == pytest.approx((1.5 + 2.5 + 4.5) / 3)
     assert float(moved.reward_mean) == pytest.approx((16 * 10 + 4 * 20 + 1 * 40) / 21)
     assert float(moved.reward) == pytest.approx((16 * (10 - 3) + 4 * (20 - 6) + 1 * (40 - 12)) / 21)
-    assert moved.deviation[0].tolist() == [pytest.approx(0.5), pytest.approx(math.sqrt((1 + 4 + 16) / 3))]
+    assert moved.std[0].tolist() == [pytest.approx(0.5), pytest.approx(math.sqrt((1 + 4 + 16) / 3))]
 
 
 def test_or_alike(cart):
@@ -89,7 +89,7 @@ def test_a_certain_particle_takes_all_the_weight_and_stays_finite(cart):
 
 
 def test_weights_do_not_depend_on_the_rewards_unit(cart):
-    certain = replace(cart, reward_deviation=lambda q: 0 * q[:, 0])
+    certain = replace(cart, reward_std=lambda q: 0 * q[:, 0])
     particles = torch.tensor([[[1.0], [2.0]]], dtype=torch.float64)
     moved = move_particles(certain, particles, column(0.0), 0.0, None, "inverse_variance")
     assert float(moved.reward) == pytest.approx(15)
@@ -154,11 +154,11 @@ def test_particles_moved_by_the_mean_keep_their_distance(cart, started):
 
 def test_a_step_in_which_every_lane_resets_moves_no_particle(cart, started):
     settings, lanes = started(cart, 2, variant="probabilistic", particles=3, time_limit=1)
-    lanes, ended = step(cart, settings, lanes, np.zeros((2, 1)), deviations=True)
-    lanes, begun = step(cart, settings, lanes, np.zeros((2, 1)), deviations=True)
+    lanes, ended = step(cart, settings, lanes, np.zeros((2, 1)), stds=True)
+    lanes, begun = step(cart, settings, lanes, np.zeros((2, 1)), stds=True)
     assert ended.truncated.all()
     assert begun.reset_lanes.all()
-    assert begun.deviation.tolist() == [[0.0, 0.0]] * 2
+    assert begun.std.tolist() == [[0.0, 0.0]] * 2
     assert lanes.particles.shape == (2, 3, 1)
 
 
@@ -179,7 +179,7 @@ def test_compiled_particles_of_a_hidden_reward_agree_with_torch():
         for how in (steps, None)
     )
     assert float(theirs.reward_mean.max()) > 0.1
-    for name in ("particles", "reward_mean", "reward", "deviation"):
+    for name in ("particles", "reward_mean", "reward", "std"):
         torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=2e-5, atol=0.0)
 
 

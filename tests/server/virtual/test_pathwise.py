@@ -78,11 +78,11 @@ def test_functions_scatter_as_the_posterior_does(model, started):
     settings, lanes = started(model, count, variant="pathwise")
     _, q = moved(model, settings, lanes, *point)
     one = torch.tensor([point], dtype=torch.float64)
-    expected = model.transition(one, torch.full((1, 1), 0.5, dtype=torch.float64), deviations=True)
-    mean, (angle, speed) = expected.q_next[0].numpy(), expected.deviation[0].tolist()
-    deviation = np.array([np.hypot(angle, 0.05 * speed), speed])
-    assert (np.abs(q.mean(0) - mean) < 5 * deviation / np.sqrt(count)).all()
-    np.testing.assert_allclose(q.std(0), deviation, rtol=0.25)
+    expected = model.transition(one, torch.full((1, 1), 0.5, dtype=torch.float64), stds=True)
+    mean, (angle, speed) = expected.q_next[0].numpy(), expected.std[0].tolist()
+    std = np.array([np.hypot(angle, 0.05 * speed), speed])
+    assert (np.abs(q.mean(0) - mean) < 5 * std / np.sqrt(count)).all()
+    np.testing.assert_allclose(q.std(0), std, rtol=0.25)
 
 
 def test_functions_pass_through_the_samples(model, samples, started):
@@ -133,7 +133,7 @@ def test_the_reward_follows_a_function_as_well(model, started):
 def test_a_family_that_draws_no_functions_keeps_its_errors_for_the_episode(started):
     """Each lane lies the same number of deviations from the mean at every step, another in each episode."""
     exact = exact_pendulum()
-    model = ExactModel(exact.definition, lambda q, _: q.clone(), exact.pay, deviation=0.01)
+    model = ExactModel(exact.definition, lambda q, _: q.clone(), exact.pay, std=0.01)
     settings, lanes = started(model, 3, variant="pathwise", autoreset_mode="same_step", time_limit=4)
     moved = [lanes.q[:, 1]]
     for _ in range(8):

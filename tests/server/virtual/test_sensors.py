@@ -20,13 +20,13 @@ LANES = 2_000
 @dataclass(frozen=True)
 class Noisy(ExactModel, LearnedNoise):
     @property
-    def noise_deviations(self) -> tuple[float, ...]:
-        return (*(self.process_deviation for _ in self.definition.moving), 0.0)
+    def noise_stds(self) -> tuple[float, ...]:
+        return (*(self.process_std for _ in self.definition.moving), 0.0)
 
 
 @pytest.fixture
 def model(pendulum_model: ExactModel) -> Noisy:
-    return Noisy(pendulum_model.definition, pendulum_model.move, pendulum_model.pay, process_deviation=0.1)
+    return Noisy(pendulum_model.definition, pendulum_model.move, pendulum_model.pay, process_std=0.1)
 
 
 def speed_name(model: ExactModel) -> str:

@@ -15,7 +15,7 @@ STILL = np.zeros((3, 1))
 @pytest.fixture
 def unsure(pendulum_model) -> ExactModel:
     """Its reward deviates by its angle; every output's targets deviate by 1."""
-    return replace(pendulum_model, deviation=0.5, reward_deviation=lambda q: q[:, 0].abs())
+    return replace(pendulum_model, std=0.5, reward_std=lambda q: q[:, 0].abs())
 
 
 def stepped(model, started, angles, **chosen):
@@ -28,12 +28,12 @@ def test_an_episode_ends_where_any_output_leaves_the_range(unsure, started):
     _, transition = stepped(unsure, started, [0.1, 0.8, -2.0], trust=0.7)
     assert transition.untrusted.tolist() == transition.truncated.tolist() == [False, True, True]
     assert not transition.terminated.any()
-    assert transition.deviation is None, "nobody asked for it"
+    assert transition.std is None, "nobody asked for it"
     _, transition = stepped(unsure, started, [0.1, 0.2, 0.3], trust=0.4)
     assert transition.untrusted.all(), "the dynamics deviate by 0.5"
 
 
-def test_the_range_is_in_units_of_the_samples_deviation(unsure, started):
+def test_the_range_is_in_units_of_the_samples_std(unsure, started):
     class Wider(ExactModel):
         @property
         def scales(self) -> torch.Tensor:
@@ -62,8 +62,8 @@ def test_a_lane_that_left_begins_anew(unsure, started):
     assert lanes.episode.tolist() == [0, 1, 1]
 
 
-def test_process_noise_moves_the_state_by_its_learned_deviation(pendulum_model, started):
-    shaken = replace(pendulum_model, process_deviation=0.02)
+def test_process_noise_moves_the_state_by_its_learned_std(pendulum_model, started):
+    shaken = replace(pendulum_model, process_std=0.02)
     settings, lanes = started(shaken, 2_000, process_noise=True)
     still, _ = step(shaken, replace(settings, process_noise=False), lanes, np.zeros((2_000, 1)))
     moved, _ = step(shaken, settings, lanes, np.zeros((2_000, 1)))
@@ -75,7 +75,7 @@ def test_process_noise_moves_the_state_by_its_learned_deviation(pendulum_model, 
 
 
 def test_each_particle_is_shaken_by_itself(pendulum_model, started):
-    shaken = replace(pendulum_model, process_deviation=0.02)
+    shaken = replace(pendulum_model, process_std=0.02)
     chosen = {"variant": "probabilistic", "particles": 4, "spread": 0.0, "propagation": "mean"}
     settings, lanes = started(shaken, 3, process_noise=True, **chosen)
     lanes, _ = step(shaken, settings, lanes, STILL)

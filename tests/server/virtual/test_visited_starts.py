@@ -44,30 +44,30 @@ def test_without_a_share_starts_are_as_before(pendulum_model: ExactModel, starte
 
 def test_doubt_lowers_the_reward_and_not_its_mean(pendulum_model: ExactModel, started):
     """The dynamics deviate by 0.5 and the reward by the angle, in deviations of 1 over the samples."""
-    unsure = replace(pendulum_model, deviation=0.5, reward_deviation=lambda q: q[:, 0].abs())
+    unsure = replace(pendulum_model, std=0.5, reward_std=lambda q: q[:, 0].abs())
     settings, lanes = started(unsure, 3, caution=2.0)
     q = torch.tensor([[0.1, 0.0], [0.8, 0.0], [-2.0, 0.0]], dtype=torch.float64)
     _, transition = step(unsure, settings, replace(lanes, q=q), np.zeros((3, 1)))
     np.testing.assert_allclose(transition.reward_mean - transition.reward, [1.0, 1.6, 4.0])
-    assert transition.deviation is None, "nobody asked for it"
+    assert transition.std is None, "nobody asked for it"
     _, sure = step(pendulum_model, settings, replace(lanes, q=q), np.zeros((3, 1)))
     np.testing.assert_array_equal(sure.reward, sure.reward_mean)
 
 
-def test_doubt_is_in_units_of_the_samples_deviations(pendulum_model: ExactModel, started):
+def test_doubt_is_in_units_of_the_samples_stds(pendulum_model: ExactModel, started):
     class Wider(ExactModel):
         @property
         def scales(self) -> torch.Tensor:
             return torch.tensor([1.0, 10.0, 4.0], dtype=torch.float64)
 
     wider = Wider(**{name: getattr(pendulum_model, name) for name in pendulum_model.__dataclass_fields__})
-    settings, lanes = started(replace(wider, deviation=0.5), 2, caution=1.0)
-    _, transition = step(replace(wider, deviation=0.5), settings, lanes, np.zeros((2, 1)))
+    settings, lanes = started(replace(wider, std=0.5), 2, caution=1.0)
+    _, transition = step(replace(wider, std=0.5), settings, lanes, np.zeros((2, 1)))
     np.testing.assert_allclose(transition.reward_mean - transition.reward, 0.5 / 1.0 * 4.0)
 
 
 def test_doubt_lowers_rewards_of_particles_too(pendulum_model: ExactModel, started):
-    unsure = replace(pendulum_model, deviation=0.5)
+    unsure = replace(pendulum_model, std=0.5)
     settings, lanes = started(unsure, 2, caution=2.0, variant="probabilistic", particles=3)
     _, transition = step(unsure, settings, lanes, np.zeros((2, 1)))
     np.testing.assert_allclose(transition.reward_mean - transition.reward, 1.0)

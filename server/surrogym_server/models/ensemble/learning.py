@@ -16,7 +16,7 @@ from surrogym_server.models.ensemble.networks import Networks
 from surrogym_server.models.ensemble.training import Training, cross_entropy, squared_error, train, train_with_noise
 
 MIN_POINTS = 2
-CONSTANT = 1e-9  # an output whose deviation is below this share of its own size never varied
+CONSTANT = 1e-9  # an output whose standard deviation is below this share of its own size never varied
 REWARD_SEED, END_SEED = 1, 2  # added to the seed, so that reward and end have other networks than the transition
 
 
@@ -60,7 +60,7 @@ def _with_noise(training: Training, x: Tensor, y: Tensor) -> Regression:
     target, centre, scale = standardised(y)
     networks, noisy = train_with_noise(training, x, target)
     noise = Noise(noisy, torch.zeros_like(scale))
-    noise = replace(noise, size=noise.deviation(x).square().mean(0).sqrt())
+    noise = replace(noise, size=noise.std(x).square().mean(0).sqrt())
     return Regression(networks, centre, scale, noise)
 
 

@@ -21,9 +21,9 @@ class Noise:
     """Noise of single steps that depends on the inputs, in standard deviations of the outputs."""
 
     networks: Networks  # of its log variance
-    size: Tensor  # (p,) deviation over the samples: root mean square
+    size: Tensor  # (p,) standard deviation over the samples: root mean square
 
-    def deviation(self, x: Tensor) -> Tensor:
+    def std(self, x: Tensor) -> Tensor:
         """Standard deviation at x (m, d), that of the members' mean variance, (m, p)."""
         return bounded(self.networks(x)).exp().mean(0).sqrt()
 
@@ -44,7 +44,7 @@ class Regression:
     def shaken(self, x: Tensor, process: Tensor) -> Tensor:
         """Noise at x (m, d), of standard normal numbers (m, p), (m, p)."""
         assert self.noise is not None
-        return self.scale * self.noise.deviation(x) * process
+        return self.scale * self.noise.std(x) * process
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
     digest: str
 
     @property
-    def noise_deviations(self) -> tuple[float, ...]:
+    def noise_stds(self) -> tuple[float, ...]:
         """Root mean squares over the samples; 0 for the reward."""
         assert self.transitions.noise is not None
         return (*(self.transitions.scale * self.transitions.noise.size).tolist(), 0.0)
@@ -108,14 +108,14 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         names, scales = self.definition.outputs, self.scales.tolist()
         outputs = [
             {"name": name, "kernel": structure, "scale": scale, "noise": noise}
-            for name, structure, scale, noise in zip(names, self.structures, scales, self.noise_deviations, strict=True)
+            for name, structure, scale, noise in zip(names, self.structures, scales, self.noise_stds, strict=True)
         ]
         return {"outputs": outputs, "terminal_reward": self.terminal_reward, "samples": self.samples}
 
     def _step(
         self,
-        deviations: bool,
-        reward_deviation: bool,
+        stds: bool,
+        reward_std: bool,
         q: Tensor,
         u: Tensor,
         noise: Tensor | None,
@@ -125,13 +125,13 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         member = None if paths is None else paths[:, 0].long()
         x = self._inputs.of_transition(q, u)
         changes = self.transitions(x)
-        spread = between(changes).sqrt() if deviations or noise is not None else q.new_zeros(len(q), 0)
+        spread = between(changes).sqrt() if stds or noise is not None else q.new_zeros(len(q), 0)
         change = _chosen(changes, member)
         change = change if noise is None else change + spread * noise
         change = change if process is None else change + self.transitions.shaken(x, process)
         q_next = self._arrived(q, u, change)
         rewards = self._rewards(q, u, q_next)
-        doubt = between(rewards).sqrt() if reward_deviation else q.new_zeros(len(q), 0)
+        doubt = between(rewards).sqrt() if reward_std else q.new_zeros(len(q), 0)
         return q_next, _chosen(rewards, member), spread, doubt
 
     def _rewards(self, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-LEAST_NOISE, MOST_NOISE = 0.003, 10.0  # bounds of a deviation of noise, in deviations of an output
+LEAST_NOISE, MOST_NOISE = 0.003, 10.0  # bounds of a standard deviation of noise, in standard deviations of an output
 
 
 @dataclass(frozen=True)

@@ -29,10 +29,10 @@ class SteppedInBlocks(DynamicsModel, FunctionDraws):
         *,
         noise: Tensor | None = None,
         process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
+        stds: bool = False,
+        reward_std: bool = False,
     ) -> Transition:
-        return self._in_blocks(q, u, noise, process, None, deviations, reward_deviation)
+        return self._in_blocks(q, u, noise, process, None, stds, reward_std)
 
     def transition_along(
         self,
@@ -41,16 +41,16 @@ class SteppedInBlocks(DynamicsModel, FunctionDraws):
         u: Tensor,
         *,
         process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
+        stds: bool = False,
+        reward_std: bool = False,
     ) -> Transition:
-        return self._in_blocks(q, u, None, process, paths, deviations, reward_deviation)
+        return self._in_blocks(q, u, None, process, paths, stds, reward_std)
 
     @abstractmethod
     def _step(
         self,
-        deviations: bool,
-        reward_deviation: bool,
+        stds: bool,
+        reward_std: bool,
         q: Tensor,
         u: Tensor,
         noise: Tensor | None,
@@ -60,8 +60,8 @@ class SteppedInBlocks(DynamicsModel, FunctionDraws):
         """Next states (m, C), rewards (m,), and the requested standard deviations, (m, M) and (m,), else (m, 0) and
         (m,).
 
-        Rows follow the mean, moved by ``noise`` (m, M) deviations, or each its own function of ``paths`` (m, W).
-        ``process`` (m, M) adds the learned noise.
+        Each row follows the mean, moved by ``noise`` (m, M) standard deviations, or its own function of ``paths``
+        (m, W). ``process`` (m, M) adds the learned noise.
         """
 
     def _in_blocks(
@@ -71,12 +71,12 @@ class SteppedInBlocks(DynamicsModel, FunctionDraws):
         noise: Tensor | None,
         process: Tensor | None,
         paths: Tensor | None,
-        deviations: bool,
-        reward_deviation: bool,
+        stds: bool,
+        reward_std: bool,
     ) -> Transition:
-        step = partial(self._step, deviations, reward_deviation)
+        step = partial(self._step, stds, reward_std)
         q_next, reward, spread, doubt = in_blocks(self.rows, step, q, u, noise, process, paths)
-        return Transition(q_next, reward, spread if deviations else None, doubt if reward_deviation else None)
+        return Transition(q_next, reward, spread if stds else None, doubt if reward_std else None)
 
     def _arrived(self, q: Tensor, u: Tensor, change: Tensor) -> Tensor:
         return moved(self.definition, self._inverse, q, u, placed(self.definition, change))

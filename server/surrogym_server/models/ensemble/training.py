@@ -4,9 +4,9 @@ Of member k the weights minimise, over n samples (x_i, y_i) of standardised inpu
 
     1/n sum_i |y_i - f_k(x_i)|^2 + sigma^2 / n sum_j (w_j - w_kj)^2 / v_j,
 
-with w_k drawn from a normal prior of variances v, and sigma the deviation of the noise. For a linear model these are
-draws from the posterior; for networks they are so approximately. Far from samples the members differ as their priors
-do.
+with w_k drawn from a normal prior of variances v, and sigma the standard deviation of the noise. For a linear model the
+members are samples of the posterior; for networks they are so approximately. Far from samples the members differ as
+their priors do.
 
 With noise, each member has a second network g_k for the log variance of a step, and 1/2 (log v + |y - f|^2 / v) with
 v = exp(g_k(x)) takes the place of the squared error. So the mean need not follow steps that it can't predict, such as
@@ -34,13 +34,11 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from surrogym_server.models.ensemble.networks import Networks, basis, bounded, nonlinear
 from surrogym_server.tensors import in_rows
 
-NOISE = 0.01  # sigma, in deviations of an output
+NOISE = 0.01  # sigma, in standard deviations of an output
 RIDGE = 1e-3  # of the skip, in samples
 RATE = 0.01  # initial learning rate; it decays to 0 by a cosine
 LARGEST_BATCH = 512
-NOISE_BEGINS = math.exp(
-    -1.5
-)  # deviation of the noise before training, in deviations of an output; 0.05 fails at contacts
+NOISE_BEGINS = math.exp(-1.5)  # std of the noise before training, in stds of an output; 0.05 fails at contacts
 Loss = Callable[[Tensor, Tensor], Tensor]  # of predictions (K, m, p) and targets (m, p)
 
 

@@ -90,10 +90,10 @@ class GaussianProcessModel(
         *,
         noise: Tensor | None = None,
         process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
+        stds: bool = False,
+        reward_std: bool = False,
     ) -> Transition:
-        return self._predictor.transition(q, u, noise, process, None, deviations, reward_deviation)
+        return self._predictor.transition(q, u, noise, process, None, stds, reward_std)
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         change, q_next, reward = self._predictor.means(q, u)
@@ -137,18 +137,18 @@ class GaussianProcessModel(
         u: Tensor,
         *,
         process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
+        stds: bool = False,
+        reward_std: bool = False,
     ) -> Transition:
-        return self._predictor.transition(q, u, None, process, paths, deviations, reward_deviation)
+        return self._predictor.transition(q, u, None, process, paths, stds, reward_std)
 
     @property
     def uncertain_functions(self) -> FunctionDraws:
         return self._uncertain_functions
 
     @property
-    def noise_deviations(self) -> tuple[float, ...]:
-        return tuple(output.noise_deviation for output in self.outputs)
+    def noise_stds(self) -> tuple[float, ...]:
+        return tuple(output.noise_std for output in self.outputs)
 
     @property
     def possible_noise(self) -> tuple[float, ...]:
@@ -212,15 +212,15 @@ class GaussianProcessModel(
     def promise(self, q: Tensor, u: Tensor) -> Tensor:
         """Mean plus one standard deviation of the reward's targets."""
         steps = PredictedSteps(q, u, self._predictor.transition(q, u, None, None, None, False, False).q_next)
-        mean, deviation = self.reward.target(process_inputs(self.definition, self.reward, steps))
-        return mean + deviation
+        mean, std = self.reward.target(process_inputs(self.definition, self.reward, steps))
+        return mean + std
 
     def compiled(self) -> ArraySteps | None:
         return self._compiled
 
-    def compiled_pays(self, *, deviations: bool) -> bool:
+    def compiled_pays(self, *, stds: bool) -> bool:
         points = max((len(o.posterior.x) for o in self.outputs if o.posterior is not None), default=0)
-        return not deviations or points <= COMPILED_SOLVES
+        return not stds or points <= COMPILED_SOLVES
 
     def step_source(self) -> StepSource | None:
         if self._compiled is None:

@@ -36,28 +36,28 @@ def observe(numbers: Floats, places: Ints, q: Floats, observation: Singles) -> N
 
 
 @inlined
-def _exceeds(deviation: Floats, trust: float, scales: Floats) -> bool:
+def _exceeds(std: Floats, trust: float, scales: Floats) -> bool:
     doubtful = False
-    for o in range(len(deviation)):
-        doubtful |= deviation[o] > trust * scales[o]
+    for o in range(len(std)):
+        doubtful |= std[o] > trust * scales[o]
     return doubtful
 
 
 @inlined
-def _doubt(deviation: Floats, scales: Floats) -> float:
+def _doubt(std: Floats, scales: Floats) -> float:
     """The largest standard deviation, in standard deviations over the samples, times that of the reward."""
     most = 0.0
-    for o in range(len(deviation)):
-        most = max(most, deviation[o] / scales[o])
+    for o in range(len(std)):
+        most = max(most, std[o] / scales[o])
     return float(most * scales[-1])
 
 
 @inlined
-def _penalised(mean: float, deviation: Floats, penalty: float, caution: float, scales: Floats) -> float:
+def _penalised(mean: float, std: Floats, penalty: float, caution: float, scales: Floats) -> float:
     """A mean reward less penalties of the standard deviations (O,), that of the reward last. Those of weight 0 are not
     read."""
-    paid = mean if penalty == 0 else mean - penalty * deviation[-1]
-    return float(paid - caution * _doubt(deviation, scales) if caution > 0 else paid)
+    paid = mean if penalty == 0 else mean - penalty * std[-1]
+    return float(paid - caution * _doubt(std, scales) if caution > 0 else paid)
 
 
 @inlined
@@ -92,7 +92,7 @@ def conclude(
     moving: Bools,
     q_next: Floats,
     pay: Floats,
-    deviation: Floats,
+    std: Floats,
     over: Bools,
     scales: Floats,
     terminal_reward: float,
@@ -130,10 +130,10 @@ def conclude(
         if not moving[n]:
             continue
         mean = pay[row] + terminal_reward if over[row] else pay[row]
-        doubtful = trust < np.inf and _exceeds(deviation[row], trust, scales)
+        doubtful = trust < np.inf and _exceeds(std[row], trust, scales)
         left = not (np.isnan(outside_reward) or over[row]) and (doubtful or _is_outside(q_next[row], inside))
         rewards[1, n] = mean
-        rewards[0, n] = _penalised(mean, deviation[row], penalty, caution, scales)
+        rewards[0, n] = _penalised(mean, std[row], penalty, caution, scales)
         if left:
             lacking = max(time_limit - elapsed[n], 1) if time_limit >= 0 else 1
             rewards[0, n] = rewards[1, n] = outside_reward * lacking

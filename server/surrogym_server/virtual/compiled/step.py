@@ -65,14 +65,14 @@ def compiled_step(
     lanes: LaneState,
     u: NDArray[np.floating[Any]],
     mask: Bools | None,
-    deviations: bool,
+    stds: bool,
 ) -> tuple[LaneState, LaneTransition]:
     """Step lanes as ``virtual.environment.step`` does; ``move`` holds the model's compiled steps."""
     definition, changed = model.definition, _Changed.of(lanes)
     running, moving, beginning = _divided(settings, lanes, changed.phase, mask)
     if settings.variant == "pathwise":
         lanes = lanes.put(moving, with_paths(model, lanes.take(moving), settings.functions))
-    moved = _moved(model, move, settings, lanes, u, moving, deviations)
+    moved = _moved(model, move, settings, lanes, u, moving, stds)
     ended = _concluded(model, settings, running, moved, changed)
     final_lanes = NO_LANES
     if settings.autoreset_mode == "same_step":
@@ -92,7 +92,7 @@ def compiled_step(
         final_observation=final_observation,
         reset_lanes=np.zeros(len(changed.phase), dtype=bool) if beginning is None else beginning,
         reward_mean=changed.rewards[1],
-        deviation=_scattered(running, moved.deviation) if deviations else None,
+        std=_scattered(running, moved.std) if stds else None,
         untrusted=None if settings.trust is None else changed.ends[2],
         left=None if definition.outside_reward is None else changed.ends[4],
     )
@@ -117,10 +117,10 @@ def _moved(
     lanes: LaneState,
     u: NDArray[np.floating[Any]],
     moving: Chosen,
-    deviations: bool,
+    stds: bool,
 ) -> ArrayTransition:
     """Move the moving lanes, in their order."""
-    wanted, process = deviations or settings.doubts, None
+    wanted, process = stds or settings.doubts, None
     if settings.process_noise:
         drawn = normal_noise(lanes, Purpose.PROCESS, 1, len(model.definition.outputs) - 1)[:, 0]
         process = driving(model, settings.sensor_noise, drawn).numpy()
@@ -130,8 +130,8 @@ def _moved(
         noise=None,
         process=None if process is None else _rows(moving, process),
         paths=_rows(moving, lanes.path.numpy()) if settings.variant == "pathwise" else None,
-        deviations=wanted,
-        reward_deviation=wanted or settings.penalty > 0,
+        stds=wanted,
+        reward_std=wanted or settings.penalty > 0,
     )
 
 
@@ -149,7 +149,7 @@ def _concluded(
         moving,
         moved.q_next,
         moved.reward,
-        moved.deviation,
+        moved.std,
         moved.terminated,
         scales,
         model.terminal_reward,

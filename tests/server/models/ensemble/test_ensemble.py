@@ -48,8 +48,8 @@ def definition(model) -> EnvironmentDefinition:
 
 def test_members_disagree_more_where_nothing_was_seen(model):
     steps = random_steps(pendulum(), 24, seed=0)
-    near = model.transition(steps.q, steps.u, deviations=True).deviation
-    far = model.transition(torch.tensor([[0.0, 60.0]]).double(), torch.zeros(1, 1).double(), deviations=True).deviation
+    near = model.transition(steps.q, steps.u, stds=True).std
+    far = model.transition(torch.tensor([[0.0, 60.0]]).double(), torch.zeros(1, 1).double(), stds=True).std
     assert float(far[0, 1]) > 10 * float(near[:, 1].median())
 
 
@@ -65,9 +65,9 @@ def test_the_mean_is_that_of_the_members(model):
     members = torch.arange(4.0, dtype=torch.float64)[:, None]
     one = [model.transition_along(member.expand(10, 1), steps.q, steps.u) for member in members]
     speeds = torch.stack([made.q_next[:, 1] for made in one])
-    made = model.transition(steps.q, steps.u, deviations=True)
+    made = model.transition(steps.q, steps.u, stds=True)
     torch.testing.assert_close(speeds.mean(0), made.q_next[:, 1])
-    torch.testing.assert_close(speeds.std(0), made.deviation[:, 1])
+    torch.testing.assert_close(speeds.std(0), made.std[:, 1])
 
 
 def test_another_seed_gives_other_members(model):
@@ -95,9 +95,9 @@ def test_the_papers_representation_moves_the_observation():
 def test_an_output_that_never_varied_is_constant_and_certain():
     made = ensemble(cartpole())
     steps = random_steps(cartpole(), 5, seed=9)
-    moved = made.transition(steps.q, steps.u, reward_deviation=True)
+    moved = made.transition(steps.q, steps.u, reward_std=True)
     assert made.structures[-1] == "constant"
-    assert (moved.reward.tolist(), moved.reward_deviation.tolist()) == ([1.0] * 5, [0.0] * 5)
+    assert (moved.reward.tolist(), moved.reward_std.tolist()) == ([1.0] * 5, [0.0] * 5)
 
 
 def test_very_many_samples_are_learned_from_in_batches():
@@ -143,7 +143,7 @@ def test_noise_is_learned_where_it_is(beta):
     noise = torch.randn(300, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     y = torch.sin(x) + 0.5 * noise * (x > 0)
     networks, noisy = train_with_noise(Training(4, 16, 300, 0, beta), x, y)
-    found = Noise(noisy, torch.ones(1)).deviation(x)[:, 0]
+    found = Noise(noisy, torch.ones(1)).std(x)[:, 0]
     assert float(found[x[:, 0] < -0.2].median()) < 0.1
     assert 0.3 < float(found[x[:, 0] > 0.2].median()) < 0.7
     quiet = x[:, 0] < -0.2
@@ -161,20 +161,20 @@ def test_with_beta_1_the_mean_learns_what_noise_could_explain():
     for beta in (0.0, 1.0):
         mean, noisy = train_with_noise(Training(4, 16, 600, 0, beta), x, y)
         errors[beta] = float((mean(x).mean(0) - y)[jump].square().mean().sqrt())
-        deviation = Noise(noisy, torch.ones(1)).deviation(x)[:, 0]
-        assert float(deviation[jump].mean()) > float(deviation[~jump].median()), "noise is learned with each beta"
+        std = Noise(noisy, torch.ones(1)).std(x)[:, 0]
+        assert float(std[jump].mean()) > float(std[~jump].median()), "noise is learned with each beta"
     assert errors[1.0] < 0.5 * errors[0.0]
 
 
 def test_process_noise_moves_steps_by_the_learned_noise(model):
     steps, able = random_steps(pendulum(), 10, seed=3), offers(model, LearnedNoise)
     assert able is not None
-    assert 0 < able.noise_deviations[1] < 0.5 * float(model.scales[1])
-    assert able.noise_deviations[-1] == 0, "that of the reward is not learned"
+    assert 0 < able.noise_stds[1] < 0.5 * float(model.scales[1])
+    assert able.noise_stds[-1] == 0, "that of the reward is not learned"
     still, moved = (model.transition(steps.q, steps.u, process=torch.full((10, 2), w).double()) for w in (0.0, 1.0))
     assert torch.equal(still.q_next, model.transition(steps.q, steps.u).q_next)
     shift = moved.q_next[:, 1] - still.q_next[:, 1]
-    assert float(shift.square().mean().sqrt()) == pytest.approx(able.noise_deviations[1], rel=0.5)
+    assert float(shift.square().mean().sqrt()) == pytest.approx(able.noise_stds[1], rel=0.5)
     paths = torch.ones(10, 1, dtype=torch.float64)
     along = [model.transition_along(paths, steps.q, steps.u, process=p).q_next[:, 1] for p in (None, torch.ones(10, 2))]
     torch.testing.assert_close(along[1] - along[0], shift)

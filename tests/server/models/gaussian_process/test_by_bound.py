@@ -77,9 +77,9 @@ def test_with_few_samples_it_is_exact():
         for family in ("gaussian_process", "sparse_gaussian_process")
     )
     unseen = random_steps(spec, 20, seed=1)
-    ours, theirs = (m.transition(unseen.q, unseen.u, deviations=True) for m in (sparse, exact))
+    ours, theirs = (m.transition(unseen.q, unseen.u, stds=True) for m in (sparse, exact))
     assert torch.equal(ours.q_next, theirs.q_next)
-    assert torch.equal(ours.deviation, theirs.deviation)
+    assert torch.equal(ours.std, theirs.std)
     assert sparse.description == exact.description
 
 
@@ -90,14 +90,14 @@ def test_it_learns_the_step_and_its_noise_through_a_few_of_the_samples():
     off = found.means(unseen.q, unseen.u)[:, :-1] - increments(found.definition, unseen)
     assert float(off[:, 3:].square().mean().sqrt()) < 0.4 * NOISE
     assert float(off[:, :3].square().mean().sqrt()) < 1e-4
-    assert found.noise_deviations[3:6] == pytest.approx([NOISE] * 3, rel=0.1)
+    assert found.noise_stds[3:6] == pytest.approx([NOISE] * 3, rel=0.1)
 
 
 def test_its_intervals_hold_what_they_promise():
     found, unseen = model(), steps(2_000, seed=2)
-    made = found.transition(unseen.q, unseen.u, deviations=True)
+    made = found.transition(unseen.q, unseen.u, stds=True)
     off = (made.q_next - unseen.q_next)[:, 3:]
-    within = (off.abs() <= 1.645 * made.deviation[:, 3:]).double().mean()
+    within = (off.abs() <= 1.645 * made.std[:, 3:]).double().mean()
     assert 0.8 < float(within) <= 1
 
 
@@ -112,20 +112,20 @@ def test_a_stored_model_predicts_the_same():
     assert torch.equal(loaded.means(unseen.q, unseen.u), found.means(unseen.q, unseen.u))
 
 
-def test_drawn_functions_scatter_as_deviations_say():
+def test_drawn_functions_scatter_as_stds_say():
     found = model(20)
     unseen = steps(4, seed=4)
     noise = torch.randn(400, found.path_size, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    paths, made = found.draw(noise), found.transition(unseen.q, unseen.u, deviations=True)
+    paths, made = found.draw(noise), found.transition(unseen.q, unseen.u, stds=True)
     for i in range(len(unseen)):
         drawn = found.transition_along(paths, unseen.q[i].expand(400, -1), unseen.u[i].expand(400, -1))
-        torch.testing.assert_close(drawn.q_next[:, 3:].std(0), made.deviation[i, 3:], rtol=0.25, atol=1e-4)
+        torch.testing.assert_close(drawn.q_next[:, 3:].std(0), made.std[i, 3:], rtol=0.25, atol=1e-4)
 
 
 def test_fewer_inducing_points_are_less_sure():
     unseen = steps(200, seed=5)
-    few, many = (model(m).transition(unseen.q, unseen.u, deviations=True).deviation for m in (20, 120))
-    noises = [np.array(model(m).noise_deviations[3:6]) for m in (20, 120)]
+    few, many = (model(m).transition(unseen.q, unseen.u, stds=True).std for m in (20, 120))
+    noises = [np.array(model(m).noise_stds[3:6]) for m in (20, 120)]
     assert (
         float(few[:, 3:].square().mean()) + (noises[0] ** 2).mean()
         > float(many[:, 3:].square().mean()) + (noises[1] ** 2).mean()
@@ -175,7 +175,7 @@ def test_large_steps_are_divided_between_threads_to_the_same_bits(monkeypatch):
     move, unseen = model().compiled(), steps(100, seed=6)
     assert move is not None
     noise = np.random.default_rng(0).normal(size=(100, 6))
-    wanted: dict[str, Any] = {"process": None, "paths": None, "deviations": True, "reward_deviation": True}
+    wanted: dict[str, Any] = {"process": None, "paths": None, "stds": True, "reward_std": True}
     whole = move(unseen.q.numpy(), unseen.u.numpy(), noise=noise, **wanted)
     monkeypatch.setattr(step, "SPLIT", 0)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)

@@ -39,12 +39,12 @@ def test_predictions_survive_bit_for_bit(model):
     q = torch.rand(50, len(model.definition.coordinates), generator=generator, dtype=torch.float64)
     u = torch.randint(0, 2, (50, 1), generator=generator).double()
     noise = torch.randn(50, len(model.transitions), generator=generator, dtype=torch.float64)
-    for options in ({"deviations": True}, {"noise": noise}, {"reward_deviation": True}, {}):
+    for options in ({"stds": True}, {"noise": noise}, {"reward_std": True}, {}):
         ours, theirs = model.transition(q, u, **options), loaded.transition(q, u, **options)
         assert torch.equal(ours.q_next, theirs.q_next)
         assert torch.equal(ours.reward, theirs.reward)
-        assert ours.deviation is None or torch.equal(ours.deviation, theirs.deviation)
-        assert ours.reward_deviation is None or torch.equal(ours.reward_deviation, theirs.reward_deviation)
+        assert ours.std is None or torch.equal(ours.std, theirs.std)
+        assert ours.reward_std is None or torch.equal(ours.reward_std, theirs.reward_std)
 
 
 def test_a_flipped_bit_is_refused_or_says_nothing(model):

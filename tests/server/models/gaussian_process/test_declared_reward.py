@@ -16,7 +16,7 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
-from surrogym_server.sampling.confidence import deviations
+from surrogym_server.sampling.confidence import stds
 from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Inequality, Quantity, RewardTerm, Term
 
 ANGLE, SPEED = Quantity(term=Term.linear(theta=1)), Quantity(term=Term.linear(speed=1))
@@ -49,11 +49,11 @@ def model() -> GaussianProcessModel:
 
 def test_pendulums_reward_is_what_it_declares(model):
     steps = random_steps(PENDULUM, 100, seed=1)
-    predicted = model.transition(steps.q, steps.u, reward_deviation=True)
+    predicted = model.transition(steps.q, steps.u, reward_std=True)
     torch.testing.assert_close(predicted.reward, steps.reward, rtol=0, atol=1e-6)
-    assert float(predicted.reward_deviation.max()) == 0
+    assert float(predicted.reward_std.max()) == 0
     torch.testing.assert_close(model.means(steps.q, steps.u)[:, -1], steps.reward, rtol=0, atol=1e-6)
-    assert float(deviations(model, steps.q, steps.u)[:, -1].max()) == 0
+    assert float(stds(model, steps.q, steps.u)[:, -1].max()) == 0
     described = model.description["outputs"][-1]
     assert described["kernel"] == "declared"
     assert described["scores"]["declared, largest error over the samples"] < 1e-6

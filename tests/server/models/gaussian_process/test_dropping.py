@@ -89,10 +89,10 @@ def test_predictions_are_better_without_them(model):
     assert error(model, steps(400, 9)) < 0.1 * error(whole, steps(400, 9))
 
 
-def test_errors_are_within_the_deviations(model):
+def test_errors_are_within_the_stds(model):
     test = steps(400, 9)
-    moved = model.transition(test.q, test.u, deviations=True)
-    within = (moved.q_next - test.q_next).abs() <= 1.645 * moved.deviation + 1e-3
+    moved = model.transition(test.q, test.u, stds=True)
+    within = (moved.q_next - test.q_next).abs() <= 1.645 * moved.std + 1e-3
     assert float(within.double().mean()) > 0.85
 
 

@@ -85,10 +85,10 @@ def test_an_edge_in_doubt_deviates():
     model = learn(definition_from_spec(plane()), drifting(until_goal, 40)).model
     inside = model.jumps[0].region.probability
     q, u = drifting(until_goal, 400, seed=2).q, torch.zeros(400, 1, dtype=torch.float64)
-    predicted = model.transition(q, u, reward_deviation=True)
+    predicted = model.transition(q, u, reward_std=True)
     doubtful = inside(predicted.q_next)
     expected = (doubtful * (1 - doubtful)).sqrt()
-    torch.testing.assert_close(predicted.reward_deviation, expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(predicted.reward_std, expected, rtol=0, atol=1e-6)
     assert float(expected.max()) > 0.3
 
 
@@ -115,9 +115,9 @@ def test_forms_whose_weights_exceed_1_by_rounding_leave_no_negative_variance():
     model = replace(model, jumps=(replace(model.jumps[0], region=region),))
     unseen = drifting(sparse, 1000, seed=1)
     assert (region.probability(unseen.q) == 1).any()
-    plain = model.transition(unseen.q, unseen.u, reward_deviation=True)
-    assert plain.reward_deviation.isfinite().all()
+    plain = model.transition(unseen.q, unseen.u, reward_std=True)
+    assert plain.reward_std.isfinite().all()
     if (steps := model.compiled()) is not None:
         q, u = (np.ascontiguousarray(x) for x in (unseen.q, unseen.u))
-        moved = steps(q, u, noise=None, process=None, paths=None, deviations=False, reward_deviation=True)
-        assert np.isfinite(moved.deviation[:, -1]).all()
+        moved = steps(q, u, noise=None, process=None, paths=None, stds=False, reward_std=True)
+        assert np.isfinite(moved.std[:, -1]).all()

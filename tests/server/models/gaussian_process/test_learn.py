@@ -99,11 +99,11 @@ def test_where_every_sample_was_cut_they_are_all_that_is_known(pendulum_definiti
     assert [o.left_out for o in model.transitions] == [0, 0]
 
 
-def test_a_constant_output_has_no_process_and_no_deviation(cartpole_model):
+def test_a_constant_output_has_no_process_and_no_std(cartpole_model):
     assert cartpole_model.reward.posterior is None
-    mean, deviation = cartpole_model.reward.mean_and_deviation(torch.zeros(3, 5, dtype=torch.float64))
+    mean, std = cartpole_model.reward.mean_and_std(torch.zeros(3, 5, dtype=torch.float64))
     assert mean.tolist() == [1.0] * 3
-    assert deviation.tolist() == [0.0] * 3
+    assert std.tolist() == [0.0] * 3
 
 
 def test_an_ending_adds_its_terminal_reward(cartpole_definition):
@@ -210,8 +210,8 @@ def test_structure_of_some_samples_and_a_process_of_all_predict_as_before(
     part = learn(pendulum_definition, steps).model
     assert part.structures == whole.structures
     assert [len(o.posterior.y) for o in part.outputs] == [len(o.posterior.y) for o in whole.outputs]
-    ours, theirs = (m.transition(later.q, later.u, deviations=True, reward_deviation=True) for m in (part, whole))
-    for name in ("q_next", "reward", "deviation", "reward_deviation"):
+    ours, theirs = (m.transition(later.q, later.u, stds=True, reward_std=True) for m in (part, whole))
+    for name in ("q_next", "reward", "std", "reward_std"):
         torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-2, atol=1e-4)
     again = learn(pendulum_definition, steps).model
     assert to_bytes(again) == to_bytes(part)

@@ -16,23 +16,23 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 
 def test_leave_one_out_error_is_of_models_that_never_saw_the_point(pendulum_definition, pendulum_samples):
     reward = learn(pendulum_definition, pendulum_samples).model.reward
-    posterior, errors, deviations = reward.posterior, [], []
+    posterior, errors, stds = reward.posterior, [], []
     for i in range(len(posterior.y)):
         others = torch.arange(len(posterior.y)) != i
         k = posterior.factor @ posterior.factor.T
         weights = torch.linalg.solve(k[others][:, others], posterior.y[others])
         errors.append(float(k[i, others] @ weights - posterior.y[i]))
         known = k[i, others] @ torch.linalg.solve(k[others][:, others], k[others, i])
-        deviations.append(float((k[i, i] - known).sqrt()))
+        stds.append(float((k[i, i] - known).sqrt()))
     expected = reward.scale * float(np.sqrt(np.mean(np.square(errors))))
     error, within_one, within_two = astuple(reward.leave_one_out())
     assert error == pytest.approx(expected, rel=1e-4)
-    assert within_one == np.mean(np.abs(errors) <= deviations)
-    assert within_two == np.mean(np.abs(errors) <= 2 * np.array(deviations))
+    assert within_one == np.mean(np.abs(errors) <= stds)
+    assert within_two == np.mean(np.abs(errors) <= 2 * np.array(stds))
     assert replace(reward, posterior=None).leave_one_out() == LeaveOneOutErrors(0.0, 1.0, 1.0)
 
 
-def test_deviations_that_tell_the_truth_hold_two_thirds_and_nineteen_in_twenty():
+def test_stds_that_tell_the_truth_hold_two_thirds_and_nineteen_in_twenty():
     """A process whose data are its own draws is right about its errors."""
     generator = torch.Generator().manual_seed(0)
     x = 4 * torch.rand(300, 1, generator=generator, dtype=torch.float64)

@@ -49,15 +49,15 @@ def test_the_pendulum_is_predicted_where_it_was_not_sampled(pendulum_model):
     assert q_next[:, 1].abs().max() <= 8
 
 
-def test_a_draw_is_the_mean_plus_deviations(pendulum_model):
+def test_a_draw_is_the_mean_plus_stds(pendulum_model):
     q = torch.tensor([[0.5, 1.0], [2.0, -3.0]], dtype=torch.float64)
     u, noise = torch.zeros(2, 1, dtype=torch.float64), torch.tensor([[1.0, -2.0], [0.0, 0.5]], dtype=torch.float64)
-    mean = pendulum_model.transition(q, u, deviations=True)
+    mean = pendulum_model.transition(q, u, stds=True)
     drawn = pendulum_model.transition(q, u, noise=noise)
-    speed = mean.q_next[:, 1] + mean.deviation[:, 1] * noise[:, 1]
+    speed = mean.q_next[:, 1] + mean.std[:, 1] * noise[:, 1]
     torch.testing.assert_close(drawn.q_next[:, 1], speed)
-    assert drawn.deviation is None
-    assert mean.deviation.shape == (2, 2)
+    assert drawn.std is None
+    assert mean.std.shape == (2, 2)
     quiet = pendulum_model.transition(q, u, noise=torch.zeros_like(noise))
     torch.testing.assert_close(quiet.q_next, mean.q_next)
 
@@ -68,7 +68,7 @@ def test_a_step_in_blocks_of_rows_is_a_step_of_each(pendulum_model, monkeypatch,
     model = replace(pendulum_model, reward=replace(pendulum_model.reward, feature_map=feature_map))
     points = random_steps(pendulum(), 20, seed=3)
     noise = torch.randn(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    asked = {"deviations": True, "reward_deviation": True}
+    asked = {"stds": True, "reward_std": True}
     whole = model.transition(points.q, points.u, noise=noise, **asked)
     monkeypatch.setattr(serving, "BLOCK", 1)
     monkeypatch.setattr(serving, "MIN_ROWS", 7)
@@ -76,7 +76,7 @@ def test_a_step_in_blocks_of_rows_is_a_step_of_each(pendulum_model, monkeypatch,
     singles = [
         model.transition(points.q[i : i + 1], points.u[i : i + 1], noise=noise[i : i + 1], **asked) for i in range(20)
     ]
-    for name in ("q_next", "reward", "deviation", "reward_deviation"):
+    for name in ("q_next", "reward", "std", "reward_std"):
         torch.testing.assert_close(getattr(blocks, name), getattr(whole, name), rtol=0, atol=1e-7)
         alone = torch.cat([getattr(single, name) for single in singles])
         torch.testing.assert_close(alone, getattr(whole, name), rtol=0, atol=1e-7)
@@ -85,19 +85,19 @@ def test_a_step_in_blocks_of_rows_is_a_step_of_each(pendulum_model, monkeypatch,
 def test_a_model_predicts_what_its_processes_do(pendulum_model):
     """Compiled, each output is the posterior that was fitted."""
     points = random_steps(pendulum(), 50, seed=3)
-    predicted = pendulum_model.transition(points.q, points.u, deviations=True, reward_deviation=True)
+    predicted = pendulum_model.transition(points.q, points.u, stds=True, reward_std=True)
     angle, speed = pendulum_model.transitions
     lead = predicted.q_next[:, 1:]
-    for output, change, deviation in (
-        (angle, wrap(predicted.q_next[:, 0] - points.q[:, 0]), predicted.deviation[:, 0]),
-        (speed, predicted.q_next[:, 1] - points.q[:, 1], predicted.deviation[:, 1]),
-        (pendulum_model.reward, predicted.reward, predicted.reward_deviation),
+    for output, change, std in (
+        (angle, wrap(predicted.q_next[:, 0] - points.q[:, 0]), predicted.std[:, 0]),
+        (speed, predicted.q_next[:, 1] - points.q[:, 1], predicted.std[:, 1]),
+        (pendulum_model.reward, predicted.reward, predicted.reward_std),
     ):
         x = encode(pendulum_model.definition, output.feature_map, points.q, points.u, lead)
-        mean, expected = output.mean_and_deviation(x)
+        mean, expected = output.mean_and_std(x)
         inside = lead[:, 0].abs() < 8
         torch.testing.assert_close(change[inside], mean[inside], rtol=0, atol=1e-7 * output.scale)
-        torch.testing.assert_close(deviation, expected, rtol=1e-3, atol=1e-4 * output.scale)
+        torch.testing.assert_close(std, expected, rtol=1e-3, atol=1e-4 * output.scale)
 
 
 def test_an_angle_that_reads_the_lead_follows_the_drawn_speed(pendulum_definition, half_saturated):
@@ -107,8 +107,8 @@ def test_an_angle_that_reads_the_lead_follows_the_drawn_speed(pendulum_definitio
     assert angle.feature_map.lead
     assert not speed.feature_map.lead
     q, u = torch.tensor([[0.5, 1.0]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
-    deviation = model.transition(q, u, deviations=True).deviation
-    kick = torch.tensor([[0.0, 1.0]], dtype=torch.float64) / deviation
+    std = model.transition(q, u, stds=True).std
+    kick = torch.tensor([[0.0, 1.0]], dtype=torch.float64) / std
     pushed = model.transition(q, u, noise=kick).q_next
     rest = model.transition(q, u, noise=torch.zeros_like(kick)).q_next
     change = pushed - rest
@@ -121,12 +121,12 @@ def test_the_reward_reads_the_state_that_its_timing_names(pendulum_model, timing
     feature_map = replace(pendulum_model.reward.feature_map, after=timing == "after")
     model = replace(pendulum_model, reward=replace(pendulum_model.reward, feature_map=feature_map))
     q, u = torch.tensor([[0.0, 6.0]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
-    predicted = model.transition(q, u, reward_deviation=True)
+    predicted = model.transition(q, u, reward_std=True)
     angle, speed = (q if timing == "before" else predicted.q_next)[0].tolist()
     assert abs(predicted.q_next[0, 0] - q[0, 0]) > 0.2
     assert float(predicted.reward) == pytest.approx(-(angle**2 + 0.1 * speed**2), abs=0.05)
-    assert float(predicted.reward_deviation) > 0
-    assert model.transition(q, u).reward_deviation is None
+    assert float(predicted.reward_std) > 0
+    assert model.transition(q, u).reward_std is None
 
 
 def test_predicted_points_are_complete(pendulum_model, cartpole_model):

@@ -122,9 +122,9 @@ def test_model_by_logarithms_survives_storage():
     model = gaussian_processes(DEFINITION, drifting(bump, 12))
     loaded = from_bytes(DEFINITION, to_bytes(model))
     q, u = PLACE.expand(5, 2), torch.linspace(-1, 1, 5, dtype=torch.float64)[:, None]
-    one, other = (m.transition(q, u, reward_deviation=True) for m in (model, loaded))
+    one, other = (m.transition(q, u, reward_std=True) for m in (model, loaded))
     assert torch.equal(one.reward, other.reward)
-    assert torch.equal(one.reward_deviation, other.reward_deviation)
+    assert torch.equal(one.reward_std, other.reward_std)
 
 
 @pytest.mark.parametrize("change", [{"sign": 2.0}, {"size": -1.0}, {"base": float("inf")}])

@@ -96,28 +96,28 @@ def test_compiled_steps_are_the_same(model, points, how):
     check_compiled(model, points, how)
 
 
-def test_drawn_functions_spread_as_the_deviations_say(model, points):
+def test_drawn_functions_spread_as_the_stds_say(model, points):
     count = 2_000
     noise = torch.randn(count, model.path_size, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     functions = model.draw(noise)
     for row in (0, 11, 23):
         q, u = (p[row].expand(count, -1) for p in points)
         spread = model.transition_along(functions, q, u).q_next.std(0)
-        said = model.transition(q[:1], u[:1], deviations=True).deviation[0]
+        said = model.transition(q[:1], u[:1], stds=True).std[0]
         torch.testing.assert_close(spread, said, rtol=0.25, atol=1e-5)
 
 
-def test_an_outlook_foretells_the_deviations_after_an_answer(model, points):
+def test_an_outlook_foretells_the_stds_after_an_answer(model, points):
     candidates = Points(*(p[:20] for p in points))
     outlook = model.outlook(candidates, candidates[:5], candidates[:0])[0]
     output = model.transitions[0]
     x = process_inputs(model.definition, output, PredictedSteps(candidates.q, candidates.u, candidates.q))
-    torch.testing.assert_close(outlook.deviation, output.mean_and_deviation(x)[1], rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(outlook.std, output.mean_and_std(x)[1], rtol=1e-4, atol=1e-7)
     posterior = output.posterior
     hyper = posterior.hyper
     answered = condition(hyper, torch.cat([posterior.x, x[3:4]]), torch.cat([posterior.y, posterior.y[:1]]))
-    after = replace(output, posterior=answered).mean_and_deviation(x)[1]
-    torch.testing.assert_close(outlook.observe(3).deviation, after, rtol=1e-3, atol=1e-6)
+    after = replace(output, posterior=answered).mean_and_std(x)[1]
+    torch.testing.assert_close(outlook.observe(3).std, after, rtol=1e-3, atol=1e-6)
 
 
 def test_left_out_samples_are_those_of_processes_without_them(model):
@@ -173,9 +173,9 @@ def test_a_fit_after_a_sample_far_out_has_fewer_rates_than_its_warm_start():
 
 def test_predictions_far_from_the_samples_are_finite(model):
     q = torch.tensor([[0.5, 1e6], [0.5, -1e6], [1e6, 0.0]], dtype=torch.float64)
-    moved = model.transition(q, torch.zeros(3, 1, dtype=torch.float64), deviations=True)
+    moved = model.transition(q, torch.zeros(3, 1, dtype=torch.float64), stds=True)
     assert bool(torch.isfinite(moved.q_next).all())
-    assert bool(torch.isfinite(moved.deviation).all())
+    assert bool(torch.isfinite(moved.std).all())
 
 
 def test_a_well_known_output_is_not_searched_for_rates():
@@ -210,7 +210,7 @@ def test_compiled_features_after_one_with_a_rate_are_the_same():
         noise=None,
         process=None,
         paths=None,
-        deviations=False,
-        reward_deviation=False,
+        stds=False,
+        reward_std=False,
     )
     torch.testing.assert_close(torch.from_numpy(theirs.q_next), ours, rtol=1e-7, atol=1e-8)

@@ -86,10 +86,10 @@ def test_predictions_are_much_better_with_them(model):
         assert error(model, column) < 0.3 * error(apart, column)
 
 
-def test_errors_are_within_the_deviations(model):
+def test_errors_are_within_the_stds(model):
     test = steps(400, 9)
-    moved = model.transition(test.q, test.u, deviations=True)
-    within = (moved.q_next - test.q_next).abs() <= 1.645 * moved.deviation + 1e-4
+    moved = model.transition(test.q, test.u, stds=True)
+    within = (moved.q_next - test.q_next).abs() <= 1.645 * moved.std + 1e-4
     assert float(within[:, 1:].double().mean()) > 0.85
 
 

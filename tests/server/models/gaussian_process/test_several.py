@@ -45,14 +45,14 @@ def test_each_row_follows_the_model_that_its_draw_names(model, points):
     several = model.uncertain_functions
     assert isinstance(several, FunctionsOfSeveral)
     paths = drawn(several, ROWS)
-    moved = several.transition_along(paths, *points, deviations=True, reward_deviation=True)
+    moved = several.transition_along(paths, *points, stds=True, reward_std=True)
     assert len(paths[:, 0].unique()) > 2
     for row in range(0, ROWS, 5):
         at = slice(row, row + 1)
         one = several.models[int(paths[row, 0])].transition_along(
-            paths[at, 1:], points[0][at], points[1][at], deviations=True, reward_deviation=True
+            paths[at, 1:], points[0][at], points[1][at], stds=True, reward_std=True
         )
-        for name in ("q_next", "reward", "deviation", "reward_deviation"):
+        for name in ("q_next", "reward", "std", "reward_std"):
             torch.testing.assert_close(getattr(moved, name)[at], getattr(one, name), rtol=1e-9, atol=1e-9)
 
 
@@ -64,7 +64,7 @@ def test_compiled_steps_follow_the_same_functions(model, points):
         pytest.skip("steps can't be compiled here")
     paths = drawn(several, ROWS)
     arrays = [tensor.numpy() for tensor in points]
-    moved = steps(*arrays, noise=None, process=None, paths=paths.numpy(), deviations=False, reward_deviation=False)
+    moved = steps(*arrays, noise=None, process=None, paths=paths.numpy(), stds=False, reward_std=False)
     reference = several.transition_along(paths, *points)
     np.testing.assert_allclose(moved.q_next, reference.q_next, atol=1e-8)
     np.testing.assert_allclose(moved.reward, reference.reward, atol=1e-8)

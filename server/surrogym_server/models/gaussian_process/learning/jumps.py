@@ -27,8 +27,8 @@ SPLITS = 3  # the widest gaps of the sorted rewards are tried ...
 GAP = 0.2  # ... if they are wider than this share of their range
 MARGIN = 2.0  # log odds for each sample by which a jump must win: smooth bumps reached 1.5, jumps began at 2.9
 WORTH = 5.0  # log odds by which one more jump must win
-SIZE = 3.0  # a priori deviation of a jump, in deviations of the reward
-FLOOR = 1e-4  # deviation of the noise of an output that never varied
+SIZE = 3.0  # a priori standard deviation of a jump, in standard deviations of the reward
+FLOOR = 1e-4  # standard deviation of the noise of an output that never varied
 
 Split = tuple[float, Region, OutputModel, Tensor]
 
@@ -72,8 +72,8 @@ def _splits(
             continue
         process = learner.output(REWARD, samples.reward, inputs, outside, outside)
         x = inputs[process.feature_map][inside]
-        mean, deviation = process.mean_and_deviation(x)
-        residual, spread = (samples.reward[inside] - mean) / plain.scale, deviation / plain.scale
+        mean, std = process.mean_and_std(x)
+        residual, spread = (samples.reward[inside] - mean) / plain.scale, std / plain.scale
         gain = _evidence(process, int(outside.sum()), plain.scale) + _paid_inside(residual, spread)
         gain -= _evidence(plain, int(going.sum()), plain.scale)
         if gain < 0:

@@ -31,7 +31,7 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 
 WIDER = " past limits"  # suffix of an output's name, for its hyperparameters
 HELD = " held"  # the same
-SHORT = 0.01  # of the targets' deviation: a prediction that falls less short of a limit satisfies the inequality
+SHORT = 0.01  # a prediction that falls short of a limit by less satisfies the inequality; in stds of the targets
 ROUNDS = 3  # of fits, each with the inequalities that the last process violates
 WORSE = 10.0  # largest growth of the misfit by a round; few samples measure it roughly
 MOST = 200  # samples that become observations in one round

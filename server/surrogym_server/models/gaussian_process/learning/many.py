@@ -28,7 +28,7 @@ from surrogym_server.gp import (
 )
 from surrogym_server.gp.subsets import SOME
 
-EXPLAINED = 0.01  # of the targets' deviation: a process that foretells its samples as well needs no other structure
+EXPLAINED = 0.01  # a process whose error is smaller needs no other structure; in standard deviations of the targets
 
 
 class ManySamples(ABC):

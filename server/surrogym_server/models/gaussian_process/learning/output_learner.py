@@ -23,8 +23,8 @@ from surrogym_server.models.port import Warm
 # where something is; few samples look like noise over the lead alone; and what is seen of one side alone says nothing
 # of the other, mirrored or not. What pays in one place alone seldom asks for the action as well.
 LEAD_ODDS, ALONE_ODDS, PARITY_ODDS, PLACE_ODDS = 3.0, -6.0, -3.0, 3.0
-CONSTANT = 1e-9  # an output whose deviation is below this share of its own size never varied
-SMALLEST = 1e-100  # deviation of an output: squares of a smaller one underflow
+CONSTANT = 1e-9  # an output whose standard deviation is below this share of its own size never varied
+SMALLEST = 1e-100  # standard deviation of an output: squares of a smaller one underflow
 PEAK = "reward peak"  # the logarithm of a reward
 
 

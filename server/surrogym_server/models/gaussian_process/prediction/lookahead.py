@@ -1,8 +1,8 @@
 """Effect of further real steps on the standard deviations of processes, before they are taken.
 
-The deviations of a process depend on where it is observed, not on the observed values. So the outlook after a query
-needs no guess of its answer. Only processes that read a predicted value (the lead, the next state of a reward) use the
-present model's prediction.
+The standard deviations of a process depend on where it is observed, not on the observed values. So the outlook after a
+query needs no guess of its answer. Only processes that read a predicted value (the lead, the next state of a reward)
+use the present model's prediction.
 
 The first t points of a predicted path give the following information about an output:
 
@@ -52,10 +52,10 @@ class ProcessOutlook(OutputOutlook):
         return cls(joint, learns[: spans[0]], shared, output.scale, slope_at(output, x[: spans[1]]))
 
     @property
-    def deviation(self) -> Tensor:
+    def std(self) -> Tensor:
         count = len(self.learns)
-        deviation = self.scale * self.joint.variance[:count].sqrt()
-        return deviation if self.slope is None else deviation * self.slope[:count]
+        std = self.scale * self.joint.variance[:count].sqrt()
+        return std if self.slope is None else std * self.slope[:count]
 
     def reduction(self, weights: Tensor) -> Tensor:
         """sum_r w_r k(x_r, x)^2 / (k(x, x) + sigma_n^2), Cohn (NIPS 1993), in closed form for a Gaussian process.
@@ -87,8 +87,8 @@ class ProcessAlongPaths(PathOutlook):
     learns: Tensor  # (b, T) bool
 
     @property
-    def deviation(self) -> Tensor:
-        return self.output.mean_and_deviation(self.x.flatten(0, 1))[1].reshape(self.learns.shape)
+    def std(self) -> Tensor:
+        return self.output.mean_and_std(self.x.flatten(0, 1))[1].reshape(self.learns.shape)
 
     def information(self, weight: Tensor, tolerance: float) -> Tensor:
         output = self.output

@@ -41,7 +41,7 @@ class OutputGroup:
 
     encoder: Encoder
     serving: Serving
-    noise_deviation: Tensor  # (O,) learned noise, in each output's unit
+    noise_std: Tensor  # (O,) learned noise, in each output's unit
     drawn: tuple[Drawn, ...]  # by output, except constant ones, which have no function to draw
     end: int  # end of its draws' weights
     grown: tuple[Grown, ...] = ()
@@ -75,17 +75,17 @@ class OutputGroup:
     ) -> tuple[Tensor, Tensor]:
         """Values at features x (m, d), and the latent standard deviations of the wanted columns, (m, O) each.
 
-        A value is the posterior's mean. ``kick`` (m, O) moves it by latent deviations, ``process`` (m, O) by deviations
-        of the noise, and with ``paths`` (m, W) it is that of a drawn function, one for each row.
+        A value is the posterior's mean. ``kick`` (m, O) moves it by latent standard deviations, ``process`` (m, O) by
+        standard deviations of the noise. With ``paths`` (m, W) it is that of a posterior sample, one for each row.
         """
         if wanted:
-            value, spread = self.serving.mean_and_deviation(x, wanted)
+            value, spread = self.serving.mean_and_std(x, wanted)
         else:
             value, spread = self.serving.mean(x), x.new_zeros(len(x), 0)
         if kick is not None:
             value = torch.addcmul(value, spread, kick)
         if process is not None:
-            value = torch.addcmul(value, self.noise_deviation, process)
+            value = torch.addcmul(value, self.noise_std, process)
         if paths is not None:
             value = value + self._residuals(x, paths)
         for one in self.grown:
@@ -96,7 +96,7 @@ class OutputGroup:
         return value, spread
 
     def _residuals(self, x: Tensor, paths: Tensor) -> Tensor:
-        residuals = x.new_zeros(len(x), len(self.noise_deviation))
+        residuals = x.new_zeros(len(x), len(self.noise_std))
         for one in self.drawn:
             residual = one.pathwise.residual(x[:, one.inputs], paths[:, one.span])
             residuals[:, one.column] = one.scale * residual

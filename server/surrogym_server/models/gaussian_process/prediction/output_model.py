@@ -20,8 +20,8 @@ class OutputModel:
     """The process of one output, and the scaling of its targets: y = (target - centre) / (scale * amplitude).
 
     The amplitude is 1, unless the feature map has rates. ``posterior`` is None for an output that never varied; its
-    mean is ``centre`` and its deviation 0. With a ``warp`` the targets are logarithms, but means, deviations and errors
-    are still in the output's unit.
+    mean is ``centre`` and its standard deviation 0. With a ``warp`` the targets are logarithms, but means, standard
+    deviations and errors are still in the output's unit.
     """
 
     name: str
@@ -43,7 +43,7 @@ class OutputModel:
         mean = self.centre + self.scale * self.amplitude(x) * self.posterior.mean(x)
         return mean if self.warp is None else self.warp.value(mean)
 
-    def mean_and_deviation(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def mean_and_std(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Posterior mean and latent standard deviation at x (m, d), in the output's unit, (m,) each."""
         return paid(self.warp, *self.target(x))
 
@@ -75,7 +75,7 @@ class OutputModel:
         return NOISE_FLOOR if self.warp is None else PEAK_NOISE
 
     @property
-    def noise_deviation(self) -> float:
+    def noise_std(self) -> float:
         """Standard deviation of the learned noise, in the output's unit; that of a warped output at a value as large as
         its size, and with rates that at the points, as a root mean square."""
         return 0.0 if self.posterior is None else self._of_noise(self.posterior.hyper.noise_variance)
@@ -87,7 +87,7 @@ class OutputModel:
             return 0.0
         hyper = self.posterior.hyper
         options = FitOptions(hyper.linear_variance > 0, hyper.quadratic_variance > 0, noise_floor=self.noise_floor)
-        return max(self.noise_deviation, self._of_noise(noisy_explanation(self.posterior, options)))
+        return max(self.noise_std, self._of_noise(noisy_explanation(self.posterior, options)))
 
     def _of_noise(self, variance: float) -> float:
         noise = self.scale * self._typical_amplitude * math.sqrt(variance)
@@ -147,6 +147,6 @@ class OutputModel:
         return float((foretold - seen).square().mean().sqrt())
 
 
-def paid(warp: Warp | None, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+def paid(warp: Warp | None, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation (m,) of the output, given those of its targets."""
-    return (mean, deviation) if warp is None else (warp.value(mean), warp.deviation(mean, deviation))
+    return (mean, std) if warp is None else (warp.value(mean), warp.std(mean, std))

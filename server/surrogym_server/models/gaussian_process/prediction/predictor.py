@@ -41,20 +41,20 @@ class Predictor:
         noise: Tensor | None,
         process: Tensor | None,
         paths: Tensor | None,
-        deviations: bool,
-        reward_deviation: bool,
+        stds: bool,
+        reward_std: bool,
     ) -> Transition:
         """Predict like ``DynamicsModel.transition``, in blocks of rows, with variances only as requested."""
-        wanted = self._columns if deviations or noise is not None else ()
-        wanted += (self._reward_column,) if reward_deviation else ()
+        wanted = self._columns if stds or noise is not None else ()
+        wanted += (self._reward_column,) if reward_std else ()
         rows = min(group.serving.rows for group in self._groups if group)
         q_next, mean, spread = in_blocks(rows, partial(self._step, wanted), q, u, noise, process, paths)
         reward, edges = self._rewarded(q, u, q_next, mean[:, -1])
         return Transition(
             q_next,
             reward,
-            spread[:, list(self._columns)] if deviations else None,
-            self._reward_spread(mean[:, -1], spread[:, -1], edges) if reward_deviation else None,
+            spread[:, list(self._columns)] if stds else None,
+            self._reward_spread(mean[:, -1], spread[:, -1], edges) if reward_std else None,
         )
 
     def means(self, q: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -118,7 +118,7 @@ class Predictor:
         """Standard deviation (m,) of the reward, given mean and standard deviation (m,) of its process and the variance
         of its edges."""
         if self.reward.warp is not None:
-            spread = self.reward.warp.deviation(mean, spread)
+            spread = self.reward.warp.std(mean, spread)
         return (spread.square() + edges).sqrt()
 
     def _in_columns(self, noise: Tensor | None) -> Tensor | None:

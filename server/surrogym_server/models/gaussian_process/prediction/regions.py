@@ -136,8 +136,8 @@ class Classifier:
     def probability(self, q: Tensor) -> Tensor:
         """Probability that q (m, C) lies inside, (m,): that the latent value is above 0."""
         u = q.new_zeros(len(q), self.definition.action.size)
-        mean, deviation = self.process.mean_and_deviation(encode(self.definition, self.process.feature_map, q, u))
-        return likely(mean, deviation)
+        mean, std = self.process.mean_and_std(encode(self.definition, self.process.feature_map, q, u))
+        return likely(mean, std)
 
     @property
     def description(self) -> Mapping[str, Any]:
@@ -189,7 +189,7 @@ def jumped(jumps: Sequence[Jump], q: Tensor) -> tuple[Tensor, Tensor]:
     return added, variance
 
 
-def likely(mean: Tensor, deviation: Tensor) -> Tensor:
+def likely(mean: Tensor, std: Tensor) -> Tensor:
     """Probability (m,) that a latent value with this mean and standard deviation is above 0."""
-    probability: Tensor = torch.special.ndtr(mean / deviation.clamp_min(1e-9))
+    probability: Tensor = torch.special.ndtr(mean / std.clamp_min(1e-9))
     return probability

@@ -97,8 +97,8 @@ class FunctionsOfSeveral(FunctionDraws, CompiledSteps):
         u: Tensor,
         *,
         process: Tensor | None = None,
-        deviations: bool = False,
-        reward_deviation: bool = False,
+        stds: bool = False,
+        reward_std: bool = False,
     ) -> Transition:
         parts, places = [], []
         for index, rows in _members(paths[:, 0].long(), len(self.models)):
@@ -109,16 +109,16 @@ class FunctionsOfSeveral(FunctionDraws, CompiledSteps):
                     q[rows],
                     u[rows],
                     process=None if process is None else process[rows],
-                    deviations=deviations,
-                    reward_deviation=reward_deviation,
+                    stds=stds,
+                    reward_std=reward_std,
                 )
             )
         order = torch.argsort(torch.cat(places))
         return Transition(
             torch.cat([part.q_next for part in parts])[order],
             torch.cat([part.reward for part in parts])[order],
-            _joined([part.deviation for part in parts], order),
-            _joined([part.reward_deviation for part in parts], order),
+            _joined([part.std for part in parts], order),
+            _joined([part.reward_std for part in parts], order),
         )
 
     def compiled(self) -> ArraySteps | None:
@@ -126,9 +126,9 @@ class FunctionsOfSeveral(FunctionDraws, CompiledSteps):
         able = tuple(step for step in steps if step is not None)
         return StepsOfSeveral(able[0].definition, able) if len(able) == len(steps) else None
 
-    def compiled_pays(self, *, deviations: bool) -> bool:
+    def compiled_pays(self, *, stds: bool) -> bool:
         first = self.models[0]
-        return isinstance(first, CompiledSteps) and first.compiled_pays(deviations=deviations)
+        return isinstance(first, CompiledSteps) and first.compiled_pays(stds=stds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,8 +146,8 @@ class StepsOfSeveral(ArraySteps):
         noise: Floats | None,
         process: Floats | None,
         paths: Floats | None,
-        deviations: bool,
-        reward_deviation: bool,
+        stds: bool,
+        reward_std: bool,
     ) -> ArrayTransition:
         assert paths is not None
         outputs = len(self.definition.outputs)
@@ -160,8 +160,8 @@ class StepsOfSeveral(ArraySteps):
                 noise=None if noise is None else noise[which],
                 process=None if process is None else process[which],
                 paths=np.ascontiguousarray(paths[which, 1:]),
-                deviations=deviations,
-                reward_deviation=reward_deviation,
+                stds=stds,
+                reward_std=reward_std,
             )
             for whole, part in zip(vars(all_).values(), vars(moved).values(), strict=True):
                 whole[which] = part

@@ -3,8 +3,9 @@
 A reward that differs from its base in one place only is flat almost everywhere, so a Gaussian process of its values
 learns that it is flat. Its logarithm is not flat: the logarithm of a bump is a parabola, which a few samples determine.
 
-Predictions are medians. Deviations are half the distance between the quantiles one deviation of y away from the median.
-Both stay meaningful if y is uncertain by several units; the moments of a log-normal distribution do not.
+Predictions are medians. A standard deviation is half the distance between the two quantiles that lie one standard
+deviation of y away from the median. Both stay meaningful if y is uncertain by several units; the moments of a
+log-normal distribution do not.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class Warp:
     Attributes:
         base: reward far from the peak.
         sign: 1 if rewards lie above it, -1 if below.
-        size: deviation of the rewards over the samples, in their unit; it corresponds to ``scale`` of other outputs.
+        size: standard deviation of the rewards over the samples, in their unit: the ``scale`` of other outputs.
     """
 
     base: float
@@ -37,7 +38,7 @@ class Warp:
         """Reward of y (m,)."""
         return self.base + self.sign * y.clamp_max(LARGEST).exp()
 
-    def deviation(self, y: Tensor, spread: Tensor) -> Tensor:
+    def std(self, y: Tensor, spread: Tensor) -> Tensor:
         """Standard deviation of the reward if y (m,) has standard deviation spread (m,)."""
         return 0.5 * ((y + spread).clamp_max(LARGEST).exp() - (y - spread).clamp_max(LARGEST).exp())
 

@@ -33,7 +33,7 @@ Bools = NDArray[np.bool_]
 # Of each form: its weight, whether it is a classifier, and the places of what it reads: axes, cuts and rules and
 # whether it is a complement, or features, process and number of features (a process of -1 is a constant).
 WEIGHT, CLASSIFIES, FIRST, SECOND, THIRD = range(5)
-LEAST_DEVIATION = 1e-9
+LEAST_STD = 1e-9
 
 
 def add_region(tables: TablesBuilder, region: Region) -> int:
@@ -95,13 +95,13 @@ def _classified(
             raw[c, b] = q[c, b]
     x = np.empty((width, lanes))
     encode(numbers, places, features, observe, raw, size, x, 0, width)
-    mean, deviation = np.zeros(lanes), np.zeros(lanes)
+    mean, std = np.zeros(lanes), np.zeros(lanes)
     if process >= 0:
-        predict(numbers, places, process, x, True, np.empty((0, 0)), mean, deviation)
+        predict(numbers, places, process, x, True, np.empty((0, 0)), mean, std)
     else:
         mean[:] = matrix(numbers, places, -process - 1)[0, 0]
     for b in range(lanes):
-        z = mean[b] / max(deviation[b], LEAST_DEVIATION)
+        z = mean[b] / max(std[b], LEAST_STD)
         mean[b] = 0.5 * math.erfc(-z / math.sqrt(2.0))
     return mean
 
@@ -164,13 +164,13 @@ def judge(
     q: Floats,
     q_next: Floats,
     actions: int,
-    reward_deviation: bool,
+    reward_std: bool,
     reward: Floats,
-    deviation: Floats,
+    std: Floats,
     terminated: Bools,
 ) -> None:
     """Apply learned regions to steps from q to q_next (N, C): jumps to ``reward`` (N,) and to its standard deviation,
-    the last column of ``deviation`` (N, O), and learned ends to ``terminated`` (N,). ``actions`` is F."""
+    the last column of ``std`` (N, O), and learned ends to ``terminated`` (N,). ``actions`` is F."""
     head = matrix(numbers, places, HEAD)
     observe = int(head[0, OBSERVE])
     for begin in range(0, len(q), BLOCK):
@@ -184,9 +184,9 @@ def judge(
         add_jumped(numbers, places, int(head[0, JUMPS]), observe, state, actions, pay, variance)
         for b in range(lanes):
             reward[begin + b] += pay[b]
-            if reward_deviation:
-                known = deviation[begin + b, -1]
-                deviation[begin + b, -1] = np.sqrt(known * known + variance[b])
+            if reward_std:
+                known = std[begin + b, -1]
+                std[begin + b, -1] = np.sqrt(known * known + variance[b])
         if head[0, ENDING] != NONE:
             inside = probability(numbers, places, int(head[0, ENDING]), observe, arrived, actions)
             for b in range(lanes):

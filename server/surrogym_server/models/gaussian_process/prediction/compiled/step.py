@@ -56,7 +56,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-CENTRE, NOISE, STAGE = range(3)  # of each column of outputs: constant, deviation of its noise, and its stage
+CENTRE, NOISE, STAGE = range(3)  # of each column of outputs: constant, standard deviation of its noise, and its stage
 FIRST, LED, AFTER = range(3)  # stages: what reads (q, u), what reads the lead too, what reads the next state
 STAGES = 3
 
@@ -170,8 +170,8 @@ def _predict_stage(
     noise: Floats,
     process: Floats,
     paths: Floats,
-    deviations: bool,
-    reward_deviation: bool,
+    stds: bool,
+    reward_std: bool,
     mean: Floats,
     spread: Floats,
 ) -> None:
@@ -186,7 +186,7 @@ def _predict_stage(
         if processes[p, 0] != stage:
             continue
         column, number = int(processes[p, 1]), int(processes[p, 2])
-        wanted = reward_deviation if number == last else deviations or len(noise) > 0
+        wanted = reward_std if number == last else stds or len(noise) > 0
         drawn = paths[:, int(processes[p, 4]) :]
         predict(numbers, places, int(processes[p, 3]), x, wanted, drawn, mean[column], spread[number])
         if number < last and len(noise):
@@ -266,18 +266,18 @@ def step(
     noise: Floats,
     process: Floats,
     paths: Floats,
-    deviations: bool,
-    reward_deviation: bool,
+    stds: bool,
+    reward_std: bool,
     q_next: Floats,
     reward: Floats,
-    deviation: Floats,
+    std: Floats,
     terminated: Bools,
 ) -> None:
     """Compute steps from q (N, C) under u (N, F).
 
-    If they have rows, ``noise`` (N, M) moves the outputs by latent deviations, ``process`` (N, M) moves them by
-    deviations of the learned noise, and the outputs follow the functions ``paths`` (N, W). Results are written to
-    ``q_next`` (N, C), ``reward`` (N,), ``deviation`` (N, O) as far as requested, and ``terminated`` (N,).
+    Unless empty, ``noise`` (N, M) moves the outputs by latent standard deviations, ``process`` (N, M) moves them by
+    standard deviations of the learned noise, and ``paths`` (N, W) are the functions that the outputs follow. Results
+    are written to ``q_next`` (N, C), ``reward`` (N,), ``std`` (N, O) as far as requested, and ``terminated`` (N,).
     """
     head, size, actions = matrix(numbers, places, HEAD), q.shape[1], u.shape[1]
     columns, leads = len(matrix(numbers, places, int(head[0, OUTPUTS]))), int(head[0, LEADS])
@@ -290,7 +290,7 @@ def step(
                 raw[c, b] = q[begin + b, c]
             for f in range(actions):
                 raw[size + f, b] = u[begin + b, f]
-        mean, spread = np.zeros((columns, lanes)), np.zeros((deviation.shape[1], lanes))
+        mean, spread = np.zeros((columns, lanes)), np.zeros((std.shape[1], lanes))
         x, end = np.empty((width, lanes)), begin + lanes
         kick, shake, drawn = noise[begin:end], process[begin:end], paths[begin:end]
         for stage in range(STAGES):
@@ -298,9 +298,7 @@ def step(
                 _arrive(numbers, places, head, raw, mean, arrived)
             if head[0, HAS_STAGE + stage]:
                 _encode_stage(numbers, places, head, stage, raw, arrived, mean, x)
-                _predict_stage(
-                    numbers, places, head, stage, x, kick, shake, drawn, deviations, reward_deviation, mean, spread
-                )
+                _predict_stage(numbers, places, head, stage, x, kick, shake, drawn, stds, reward_std, mean, spread)
         if head[0, WARP] != NONE:
             _unwarp(matrix(numbers, places, int(head[0, WARP])), mean[columns - 1], spread[len(spread) - 1])
         if head[0, DECLARED] != NONE:
@@ -311,7 +309,7 @@ def step(
             for c in range(size):
                 q_next[begin + b, c] = arrived[c, b]
             for o in range(len(spread)):
-                deviation[begin + b, o] = spread[o, b]
+                std[begin + b, o] = spread[o, b]
             reward[begin + b], terminated[begin + b] = mean[columns - 1, b], over[b]
 
 
@@ -344,8 +342,8 @@ class StepsOfModel(ArraySteps):
         noise: Floats | None,
         process: Floats | None,
         paths: Floats | None,
-        deviations: bool,
-        reward_deviation: bool,
+        stds: bool,
+        reward_std: bool,
     ) -> ArrayTransition:
         count = len(q)
         moved = ArrayTransition(
@@ -361,11 +359,11 @@ class StepsOfModel(ArraySteps):
                 noise[at],
                 process[at],
                 paths[at],
-                deviations,
-                reward_deviation,
+                stds,
+                reward_std,
                 moved.q_next[at],
                 moved.reward[at],
-                moved.deviation[at],
+                moved.std[at],
                 moved.terminated[at],
             )
 
@@ -381,9 +379,9 @@ class StepsOfModel(ArraySteps):
                 q,
                 moved.q_next,
                 u.shape[1],
-                reward_deviation,
+                reward_std,
                 moved.reward,
-                moved.deviation,
+                moved.std,
                 moved.terminated,
             )
         return moved
