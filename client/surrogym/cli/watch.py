@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,7 +16,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from surrogym_shared.logs.checking import ReadLog
+    from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
+    from surrogym_trainer.evaluation.comparing import StepOfEpisode
     from surrogym_trainer.watching.watcher import Alarm, Watcher
 
 SHOWN = 8  # most rows to show that can't be used
@@ -29,7 +32,13 @@ def register(app: typer.Typer) -> None:
 def command(
     context: typer.Context,
     surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.", autocompletion=names_of_surrogates)],
-    log: Annotated[Path, typer.Argument(help="Log of real steps: CSV, NPZ, Parquet, HDF5 or a Minari data set.")],
+    log: Annotated[
+        Path,
+        typer.Argument(
+            help="Log of real steps: CSV, NPZ, Parquet, HDF5 or a Minari data set; - reads lines of CSV from standard "
+            "input."
+        ),
+    ],
     policy: Annotated[
         str, typer.Option(help="Policy whose promise depends on the machine: a version, an alias, or latest.")
     ],
@@ -56,20 +65,25 @@ def command(
     """
     from surrogym.cli.errors import CommandError
     from surrogym_shared.terminal import on_interrupt, progress
-    from surrogym_trainer.watching.logs import read_growing, read_once
     from surrogym_trainer.watching.watcher import Watcher
 
     with service.connect(context) as api:
         view, version = api.surrogate(surrogate), api.policies.get(surrogate, policy.rpartition("@")[2]).version
         if view.fidelity is None:
             raise CommandError(f"{surrogate!r} has no model yet: there is nothing to compare the log with")
-        watcher = Watcher(api, view, false_alarm_steps)
-        logs = read_growing(log, mapping, view.spec) if follow else iter([read_once(log, mapping, view.spec)])
+        watcher, seen = Watcher(api, view, false_alarm_steps), _Seen()
         with (
             on_interrupt(lambda: f"interrupted; no drift in {watcher.compared} real steps"),
             progress("watch", quiet=output.quiet) as update,
         ):
-            read, alarm = _watched(watcher, logs, update)
+            for read in _logs(log, mapping, view.spec, follow=follow):
+                seen.add(read)
+                if (alarm := _watched(watcher, seen.steps, update, len(seen.rejected))) is not None:
+                    break
+            else:
+                alarm = None
+        if not watcher.compared + watcher.left_out:
+            raise CommandError(f"expected real steps in {log}, got none")
         stored = None if alarm is None else watcher.withdraw(version, alarm)
     named = f"{surrogate}@{version}"
     result = {
@@ -78,57 +92,76 @@ def command(
         "compared": watcher.compared,
         "left_out": watcher.left_out,
         "evidence": watcher.evidence,
-        **_of_log(read),
+        "rejected": [{"line": line, "reason": reason} for line, reason in seen.rejected.items()],
+        "notes": list(seen.notes),
         "drift": None if alarm is None else {**asdict(alarm), "region": alarm.region and alarm.region._asdict()},
         "trusted": None if stored is None else stored.trusted,
     }
-    output.give(result, lambda: "\n".join(_words(log, read, watcher, alarm, named)))
+    output.give(result, lambda: "\n".join(_words(seen, watcher, alarm, named)))
     if alarm is not None:
         raise typer.Exit(1)
 
 
-def _watched(watcher: Watcher, logs: Iterator[ReadLog], update: Update) -> tuple[ReadLog, Alarm | None]:
-    """Compare the steps of a log, and of the same log again after it has grown, up to a drift or its end."""
-    from surrogym_trainer.watching.logs import steps_after
+def _logs(log: Path, mapping: Path | None, spec: EnvironmentSpec, *, follow: bool) -> Iterator[ReadLog]:
+    """Return a log once, or its latest rows again and again."""
+    from surrogym_trainer.watching.logs import chunks_of_file, chunks_of_stream, read_growing, read_once
+
+    if str(log) == "-":
+        return read_growing(chunks_of_stream(sys.stdin.buffer), "standard input", mapping, spec)
+    if follow:
+        return read_growing(chunks_of_file(log), str(log), mapping, spec)
+    return iter([read_once(log, mapping, spec)])
+
+
+class _Seen:
+    """What was read of a log so far."""
+
+    def __init__(self) -> None:
+        self.steps: list[StepOfEpisode] = []  # that are new
+        self.rejected: dict[int, str] = {}  # by line
+        self.notes: tuple[str, ...] = ()
+        self._line = 0
+
+    def add(self, read: ReadLog) -> None:
+        """Take the rows of a log that come after those before."""
+        from surrogym_shared.words import has
+        from surrogym_trainer.watching.logs import steps_after
+
+        self.steps = steps_after(read, self._line)
+        self._line = max([self._line, *(step.number for step in self.steps)])
+        self.rejected.update(read.rejected)
+        ends = f"{has(read.steps.ends, 'row')} no next state, at the end of an episode or before a gap"
+        self.notes = (*read.notes, *([ends] if read.steps.ends else []))
+
+
+def _watched(watcher: Watcher, steps: list[StepOfEpisode], update: Update, rejected: int) -> Alarm | None:
+    """Compare steps up to a drift or their end."""
     from surrogym_trainer.watching.watcher import BATCH
 
-    line = 0
-    for read in logs:
-        steps = steps_after(read, line)
-        for first in range(0, len(steps), BATCH):
-            batch = steps[first : first + BATCH]
-            if (alarm := watcher.take(batch)) is not None:
-                return read, alarm
-            line = batch[-1].number
-            update(None, f"{watcher.compared} real steps, no drift")
-    return read, None
+    for first in range(0, len(steps), BATCH):
+        if (alarm := watcher.take(steps[first : first + BATCH])) is not None:
+            return alarm
+        unused = f"; {rejected} rows can't be compared" if rejected else ""
+        update(None, f"{watcher.compared} real steps, no drift{unused}")
+    return None
 
 
-def _of_log(read: ReadLog) -> dict[str, Any]:
-    return {
-        "rows": len(read.table),
-        "without_next_state": read.steps.ends,
-        "rejected": [{"line": line, "reason": reason} for line, reason in read.rejected],
-        "interval": read.steps.interval,
-        "notes": list(read.notes),
-    }
+def _words(seen: _Seen, watcher: Watcher, alarm: Alarm | None, named: str) -> list[str]:
+    from surrogym_shared.words import counted
 
-
-def _words(log: Path, read: ReadLog, watcher: Watcher, alarm: Alarm | None, named: str) -> list[str]:
-    from surrogym_shared.words import counted, has
-
-    lines = [f"{log}: {counted(len(read.table), 'row')}, {counted(len(read.steps), 'step')}", *read.notes]
-    if read.steps.ends:
-        lines.append(f"{has(read.steps.ends, 'row')} no next state, at the end of an episode or before a gap")
-    if read.rejected:
-        lines.append(f"{counted(len(read.rejected), 'row')} can't be compared:")
-        lines += [f"  line {line}: {reason}" for line, reason in read.rejected[:SHOWN]]
+    lines = [*seen.notes]
+    if seen.rejected:
+        lines.append(f"{counted(len(seen.rejected), 'row')} can't be compared:")
+        lines += [f"  line {line}: {reason}" for line, reason in list(seen.rejected.items())[:SHOWN]]
     if watcher.left_out:
         lines.append(f"{counted(watcher.left_out, 'step')} left out, in which a constant changed or a lag is not known")
     if alarm is None:
         return [*lines, f"no drift in {counted(watcher.compared, 'real step')}"]
+    found = f"drift, found in line {alarm.line} after {counted(alarm.compared, 'real step')}: {alarm.words()}"
+    if alarm.from_the_start:
+        found += "; it is there from the start, so the log may be of another machine, or the model was never right here"
     return [
         *lines,
-        f"drift, found in line {alarm.line} after {counted(alarm.compared, 'real step')}: {alarm.words()}",
+        found,
         f"{named} is not trusted from now on; next: surrogym policy show {named}",
     ]

@@ -1,25 +1,30 @@
-"""Logs of real steps for a watcher: read once, or again whenever they have grown."""
+"""Logs of real steps for a watcher: read once, or piece by piece while they grow."""
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from surrogym_sampler.logs import ReadLog, UnusableLog, read_log
 from surrogym_sampler.logs.importing import Options
 from surrogym_sampler.logs.reading import format_of
 from surrogym_shared.logs.checking import check_log
+from surrogym_shared.logs.columns import LogMapping
 from surrogym_shared.logs.decoding import decoded
 from surrogym_shared.logs.roles import read_roles
+from surrogym_shared.logs.table import Ints
 from surrogym_shared.logs.text import table_of_text
 from surrogym_shared.logs.too_few import TooFewSteps
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.evaluation.comparing import StepOfEpisode
 
 LOOK_SECONDS = 1.0  # between two looks at a log that grows
-READING = 10.0  # a look waits for this many times the seconds that reading took
+LATEST = 1_000  # rows of such a log that are kept: its clock and its units are judged by them
+CHUNK = 2**20  # most bytes of a stream at once
 UNITS = (1.0, 1e3, 1e6, 1e9)  # of a clock in a second
 OFF = 0.1  # share by which the interval of a log may differ from the sampling period
 
@@ -55,39 +60,80 @@ def read_once(path: Path, mapping: Mapping_, spec: EnvironmentSpec) -> ReadLog:
     return _checked(read_log(path, Options(mapping, spec)), spec)
 
 
-def read_growing(path: Path, mapping: Mapping_, spec: EnvironmentSpec) -> Iterator[ReadLog]:
-    """Read a log of text again and again, without end. A last line without its end is left for the next look.
+def read_growing(chunks: Iterable[bytes], where: str, mapping: Mapping_, spec: EnvironmentSpec) -> Iterator[ReadLog]:
+    """Read a log of text in pieces, and return its latest rows after each piece that completes a line.
 
     Raises:
-        UnusableLog: as of ``read_once``, or the log is no text, or has become shorter.
+        UnusableLog: as of ``read_once``.
+    """
+    growing = _Growing(where, mapping, spec)
+    for chunk in chunks:
+        if (log := growing.add(chunk)) is not None:
+            yield log
+
+
+def chunks_of_file(path: Path) -> Iterator[bytes]:
+    """Return what a file has and what is added to it, without end.
+
+    Raises:
+        UnusableLog: it is no text, or has become shorter.
         OSError: it can't be read.
     """
     if (kind := format_of(path)) != "csv":
         raise UnusableLog(f"expected a log of text (CSV) that grows, got {kind} in {path}: leave out --follow")
-    size = 0
+    read = 0
     while True:
-        began = time.monotonic()
-        content = path.read_bytes()
-        complete = content[: content.rfind(b"\n") + 1]
-        if len(complete) < size:
-            raise UnusableLog(f"expected {path} to grow, got {len(complete)} bytes after {size}: watch the new log")
-        if len(complete) > size:
-            size = len(complete)
-            if (log := _of_text(complete, path, mapping, spec)) is not None:
-                yield log
-        time.sleep(max(LOOK_SECONDS, READING * (time.monotonic() - began)))
+        with path.open("rb") as file:
+            if (size := file.seek(0, os.SEEK_END)) < read:
+                raise UnusableLog(f"expected {path} to grow, got {size} bytes after {read}: watch the new log")
+            file.seek(read)
+            chunk = file.read(size - read)
+        read += len(chunk)
+        yield chunk
+        time.sleep(LOOK_SECONDS)
 
 
-def _of_text(content: bytes, path: Path, mapping: Mapping_, spec: EnvironmentSpec) -> ReadLog | None:
-    """Return the log in complete lines; None while it has no usable step."""
-    text, remarks = decoded(content, str(path))
-    table, roles = read_roles(table_of_text(text, str(path), remarks=remarks), mapping)
-    if not len(table):
-        return None
-    try:
-        return _checked(check_log(table, roles, spec), spec)
-    except TooFewSteps:
-        return None
+def chunks_of_stream(stream: BinaryIO) -> Iterator[bytes]:
+    """Return what comes from a stream as soon as it comes. Its last line may lack its end."""
+    while chunk := os.read(stream.fileno(), CHUNK):
+        yield chunk
+    yield b"\n"
+
+
+class _Growing:
+    """The heading and the latest rows of a log of text that grows."""
+
+    def __init__(self, where: str, mapping: Mapping_, spec: EnvironmentSpec) -> None:
+        self._where, self._spec = where, spec
+        self._mapping: Mapping_ | LogMapping = mapping
+        self._text, self._rest = b"", b""  # complete lines, and a line that is not complete yet
+        self._dropped = 0  # lines between the heading and the latest rows
+
+    def add(self, chunk: bytes) -> ReadLog | None:
+        """Return the latest rows with those of a chunk; None if it completes no line, or there is no usable step."""
+        complete, end, self._rest = (self._rest + chunk).rpartition(b"\n")
+        if not complete.strip():
+            return None
+        self._text += complete + end
+        text, remarks = decoded(self._text, self._where)
+        table = table_of_text(text, self._where, remarks=remarks)
+        if not len(table):
+            return None
+        table, roles = read_roles(replace(table, lines=table.lines + self._dropped), self._mapping)
+        if len(table) > 2 * LATEST:
+            self._drop(table.lines)
+            self._mapping = roles.mapping
+        try:
+            return _checked(check_log(table, roles, self._spec), self._spec)
+        except TooFewSteps:
+            return None
+
+    def _drop(self, rows: Ints) -> None:
+        """Drop all rows but the latest. ``rows`` are the lines of all rows, (n,)."""
+        first, kept = int(rows[0]) - self._dropped - 1, int(rows[-LATEST]) - self._dropped - 1
+        lines = self._text.splitlines(keepends=True)
+        self._text = b"".join([*lines[:first], *lines[kept:]])
+        self._dropped += kept - first
 
 
 def _checked(log: ReadLog, spec: EnvironmentSpec) -> ReadLog:

@@ -74,6 +74,11 @@ class Alarm:
     line: int
     region: Region | None
 
+    @property
+    def from_the_start(self) -> bool:
+        """Whether most of the steps show it, so that no healthy time came before."""
+        return self.latest > self.compared / 2
+
     def words(self) -> str:
         """Describe the error in a sentence."""
         how = "in both directions, root mean square" if self.both else "on average"
