@@ -18,6 +18,7 @@ from support.server import ServerProcess
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_shared import wire
+from surrogym_shared.wire.drifts import AddDrift
 from surrogym_trainer.evaluation.evaluator import Evaluation, Trace
 from surrogym_trainer.evaluation.videos import record
 
@@ -65,6 +66,18 @@ def test_promise_and_real_return_stand_beside_each_other(url: str, open_page: Op
     expect(part.locator(".episodes canvas")).to_have_count(2)  # a picture for each coordinate
     part.get_by_role("button", name="Make it production").click()
     expect(part.locator("summary").first).to_contain_text("production")
+    assert complaints == []
+
+
+def test_drift_is_shown_as_soon_as_it_is_reported(url: str, open_page: Open, complaints: list[str]):
+    page = open_page(f"{url}/#/s/worse")
+    first = page.locator("#policies summary").last
+    expect(first).to_contain_text("real mean return")
+    expect(first).not_to_contain_text("Not trusted: since")
+    drift = AddDrift(output="speed", error=0.1, words="speed is off", steps=9, idempotency_key="a")
+    with Api(url) as api:
+        api.connection.send("POST", "/v1/surrogates/worse/policies/1/drifts", drift.model_dump_json().encode())
+    expect(first).to_contain_text(re.compile(r"Not trusted: since 20\d\d-.* UTC, drift: speed is off"))
     assert complaints == []
 
 

@@ -37,8 +37,12 @@ export function meanWords({ mean, mean_interval: interval }) {
   return number(mean, 4) + (interval ? ` (${number(interval.low)} to ${number(interval.high)})` : "");
 }
 
-/** One sentence: what it promised, and what came. */
+/** In words: what it promised, what came, and why that is not trusted. */
 export function sentence(policy) {
+  return `${outcome(policy)}${policy.trusted === false ? ` Not trusted: ${policy.reason}.` : ""}`;
+}
+
+function outcome(policy) {
   const [real, { promise }] = [realOf(policy), policy];
   const said = promise ? `Promised ${number(promise.low)} to ${number(promise.high)}` : "No promise";
   if (!real) return `${said}; no real episodes from the declared starts yet.`;
