@@ -264,6 +264,16 @@ def test_a_policy_that_is_not_trusted_is_not_named_for_production(modelled: Know
     assert "policy alias" in told(replace(modelled, policy=policy(), real=evaluation()))["What to do next"]
 
 
+@pytest.mark.parametrize("tested", [True, False])
+def test_after_a_drift_the_only_step_is_to_begin_again(modelled: Known, tested: bool):
+    """Real steps of the changed machine would be mixed with those of the old one."""
+    drifted = policy(trusted=False, reason="since today, drift: speed is off", drifted_at=1.0)
+    parts = told(replace(modelled, policy=drifted, real=evaluation() if tested else None))
+    assert "drift: speed is off" in parts["Was it predicted?"]
+    assert "the machine has changed" in parts["What to do next"]
+    assert "surrogym" not in parts["What to do next"]
+
+
 def test_without_a_policy_each_section_says_so_and_the_model_is_shown(modelled: Known):
     parts = told(modelled)
     assert parts[""] == "There is a model of pendulum from 6 real steps, and no controller yet."

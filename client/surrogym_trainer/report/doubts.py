@@ -63,6 +63,8 @@ def next_steps(known: Known) -> list[str]:
         ]
     run = f"surrogym evaluate policy.zip{_where(known)}"
     fetch = f"Fetch its file for the next commands: surrogym policy get {name}@{policy.version} --out policy.zip"
+    if policy.drifted_at is not None:
+        return ["Don't use it: the machine has changed. Register it under another name, and begin again."]
     if real is None:
         return [fetch, f"Test it in reality: {run} --compare zero", *_of_the_model(known)]
     found = []

@@ -304,10 +304,11 @@ class PolicyView(Reply):
     promise: PolicyPromise | None = Field(description="promise of the policy")
     audit: PolicyAudit | None = Field(description="audit of the policy")
     trusted: bool | None = Field(
-        description="verdict on the promise; false if the latest evaluation that judges the promise broke it; null: "
-        "none was made"
+        description="verdict on the promise; false if the latest evaluation that judges it broke it, or if drift was "
+        "found later; null: none was made"
     )
     reason: str = Field(description="reason of the verdict")
+    drifted_at: float | None = Field(default=None, description="when drift was found, if the verdict rests on it")
     differs: str | None = Field(
         description="difference between the specification that the policy was trained for and the surrogate's; "
         "null if there is none"

@@ -89,7 +89,8 @@ def _card(record: PolicyRecord) -> wire.PushedCard:
 def _fields(record: PolicyRecord, card: wire.PushedCard) -> dict[str, Any]:
     names = ("algorithm", "virtual_steps", "imagined_return", "promise", "audit")
     evaluations = [_evaluation(evaluation, card) for evaluation in record.evaluations]
-    trusted, reason = _trust(card, evaluations, record.drifts)
+    drift = _standing(evaluations, record.drifts)
+    trusted, reason = _trust(card, evaluations) if drift is None else (False, _words(drift))
     return {
         "version": record.version,
         "created_at": record.created_at,
@@ -97,6 +98,7 @@ def _fields(record: PolicyRecord, card: wire.PushedCard) -> dict[str, Any]:
         **{name: getattr(card, name) for name in names},
         "trusted": trusted,
         "reason": reason,
+        "drifted_at": None if drift is None else drift.created_at,
         "differs": record.card.get("differs"),
         "pushed_by": record.card.get(PUSHED_BY),
         "files": [
@@ -107,24 +109,33 @@ def _fields(record: PolicyRecord, card: wire.PushedCard) -> dict[str, Any]:
     }
 
 
-def _trust(
-    card: wire.PushedCard, evaluations: list[dict[str, Any]], drifts: tuple[EvaluationRecord, ...]
-) -> tuple[bool | None, str]:
-    """The verdict on a promise with its reason: that of the card, unless what came last shows another: a drift, or an
-    evaluation that judges the promise and broke it."""
-    judged = [one for one in evaluations if one["promise_kept"] is not None]
-    latest = max(judged, key=lambda one: int(one["id"]), default=None)
-    drift = max(drifts, key=lambda one: one.id, default=None)
-    if drift is not None and (latest is None or drift.id > int(latest["id"])):
-        found = read_stored(AddDrift, "a drift", {**drift.summary[DRIFT], "idempotency_key": "-"})
-        since = datetime.fromtimestamp(drift.created_at, UTC)
-        return False, f"since {since:%Y-%m-%d %H:%M} UTC, drift: {found.words}"
+def _trust(card: wire.PushedCard, evaluations: list[dict[str, Any]]) -> tuple[bool | None, str]:
+    """The verdict on a promise with its reason: that of the card, unless the latest evaluation that judges the promise
+    broke it."""
+    latest = _latest(evaluations)
     if latest is None or latest["promise_kept"] or card.promise is None:
         return card.trusted, card.reason
     return False, (
         f"the latest evaluation broke the promise: a mean return of {latest['mean']:.4g}, where at least "
         f"{card.promise.low:.4g} was promised"
     )
+
+
+def _standing(evaluations: list[dict[str, Any]], drifts: tuple[EvaluationRecord, ...]) -> EvaluationRecord | None:
+    """The latest drift, unless a later evaluation judges the promise."""
+    judged, drift = _latest(evaluations), max(drifts, key=lambda one: one.id, default=None)
+    return drift if drift is not None and (judged is None or drift.id > int(judged["id"])) else None
+
+
+def _words(drift: EvaluationRecord) -> str:
+    found = read_stored(AddDrift, "a drift", {**drift.summary[DRIFT], "idempotency_key": "-"})
+    return f"since {datetime.fromtimestamp(drift.created_at, UTC):%Y-%m-%d %H:%M} UTC, drift: {found.words}"
+
+
+def _latest(evaluations: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """The latest evaluation that judges the promise."""
+    judged = [one for one in evaluations if one["promise_kept"] is not None]
+    return max(judged, key=lambda one: int(one["id"]), default=None)
 
 
 def _evaluation(record: EvaluationRecord, card: wire.PushedCard) -> dict[str, Any]:

@@ -193,12 +193,13 @@ def test_drift_withdraws_the_trust_until_an_evaluation_keeps_the_promise(
     assert policy.reason.startswith("since ")
     assert policy.reason.endswith(f"drift: {routes.DRIFT_EXAMPLE['words']}")
     assert len(policy.evaluations) == 1
+    assert policy.drifted_at is not None
     assert f"surrogym_policy_drift_time_seconds{series}" in client.get("/metrics").text
     broken = api.policies.evaluate(surrogate, 1, episodes("after", returns=[-180.0] * 30, lengths=[200] * 30))
     assert (broken.promise_kept, api.policies.get(surrogate, 1).trusted) == (False, False)
     api.policies.evaluate(surrogate, 1, episodes("later", **many))
     kept = api.policies.get(surrogate, 1)
-    assert (kept.trusted, kept.reason) == (True, "an audit passed")
+    assert (kept.trusted, kept.reason, kept.drifted_at) == (True, "an audit passed", None)
 
 
 @pytest.mark.parametrize(("field", "value"), [("error", float("inf")), ("words", "a\0b"), ("steps", -1), ("more", 1)])
