@@ -14,6 +14,7 @@ import pytest
 from support.saying import Said
 from support.server import ServerProcess
 from support.tank import HEADING, lines, watched_tank, write
+from surrogym_client.errors import ServerUnreachable
 from surrogym_client.transport import Api
 
 Watch = Callable[..., Said]
@@ -101,6 +102,29 @@ def test_a_worn_pump_costs_the_trust_once_and_is_said_everywhere(
     assert (now.trusted, ledger["logged"]) == (False, 79)
     for text in (now.reason, shown.out, on_server("status", tank).out):
         assert "drift: level is" in text
+
+
+def test_a_drift_is_shown_although_the_server_does_not_take_it(
+    watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    def gone(*_: object) -> None:
+        raise ServerUnreachable("the server is gone")
+
+    monkeypatch.setattr("surrogym_trainer.watching.watcher.Watcher.withdraw", gone)
+    said = watch(write(tmp_path / "log.csv", lines(300, seed=5, worn_from=150)))
+    assert said.code == 1
+    assert "level is" in said.err
+    assert "the server is gone" in said.err
+
+
+def test_a_column_that_changes_its_unit_is_no_drift(watch: Watch, policy: Callable[[], Any], tmp_path: Path):
+    before, rows = policy(), lines(300, seed=9)
+    in_percent = [_with(row, 1, lambda level: 100 * level) for row in rows[250:]]
+    said = watch(write(tmp_path / "log.csv", [*rows[:250], *in_percent]), "--json")
+    assert said.code == 0, said.err
+    assert said.json["compared"] == 249
+    assert [one["line"] for one in said.json["rejected"]] == list(range(251, 301))
+    assert policy() == before
 
 
 def test_a_log_of_another_machine_is_told_from_one_that_changed(watch: Watch, tmp_path: Path):

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from surrogym_shared.logs.checking import ReadLog
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
+    from surrogym_shared.wire import PolicyView
     from surrogym_trainer.evaluation.comparing import StepOfEpisode
     from surrogym_trainer.watching.watcher import Alarm, Watcher
 
@@ -84,7 +85,7 @@ def command(
                 alarm = None
         if not watcher.compared + watcher.left_out:
             raise CommandError(f"expected real steps in {log}, got none")
-        stored = None if alarm is None else watcher.withdraw(version, alarm)
+        stored = None if alarm is None else _withdrawn(watcher, version, alarm)
     named = f"{surrogate}@{version}"
     result = {
         "policy": named,
@@ -125,11 +126,13 @@ class _Seen:
     def add(self, read: ReadLog) -> None:
         """Take the rows of a log that come after those before."""
         from surrogym_shared.words import has
-        from surrogym_trainer.watching.logs import steps_after
+        from surrogym_trainer.watching.logs import impossible, steps_after
 
-        self.steps = steps_after(read, self._line)
-        self._line = max([self._line, *(step.number for step in self.steps)])
-        self.rejected.update(read.rejected)
+        new = steps_after(read, self._line)
+        self._line = max([self._line, *(step.number for step in new)])
+        faults = {step.number: reason for step in new if (reason := impossible(read.spec, step)) is not None}
+        self.steps = [step for step in new if step.number not in faults]
+        self.rejected.update({**dict(read.rejected), **faults})
         ends = f"{has(read.steps.ends, 'row')} no next state, at the end of an episode or before a gap"
         self.notes = (*read.notes, *([ends] if read.steps.ends else []))
 
@@ -144,6 +147,18 @@ def _watched(watcher: Watcher, steps: list[StepOfEpisode], update: Update, rejec
         unused = f"; {rejected} rows can't be compared" if rejected else ""
         update(None, f"{watcher.compared} real steps, no drift{unused}")
     return None
+
+
+def _withdrawn(watcher: Watcher, version: int, alarm: Alarm) -> PolicyView:
+    """Report a drift to the server. If that fails, the drift is shown with the error."""
+    from surrogym_client.errors import SurrogymClientError
+    from surrogym_shared.terminal import say
+
+    try:
+        return watcher.withdraw(version, alarm)
+    except SurrogymClientError:
+        say(f"drift, found in line {alarm.line}, but not reported to the server: {alarm.words()}")
+        raise
 
 
 def _words(seen: _Seen, watcher: Watcher, alarm: Alarm | None, named: str) -> list[str]:

@@ -19,7 +19,8 @@ from surrogym_shared.logs.roles import read_roles
 from surrogym_shared.logs.table import Ints
 from surrogym_shared.logs.text import table_of_text
 from surrogym_shared.logs.too_few import TooFewSteps
-from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.logs.units import BEYOND
+from surrogym_shared.spec import EnvironmentSpec, limits
 from surrogym_trainer.evaluation.comparing import StepOfEpisode
 
 LOOK_SECONDS = 1.0  # between two looks at a log that grows
@@ -47,6 +48,19 @@ def steps_after(log: ReadLog, line: int) -> list[StepOfEpisode]:
         for i in range(len(steps))
         if lines[i] > line
     ]
+
+
+def impossible(spec: EnvironmentSpec, step: StepOfEpisode) -> str | None:
+    """Say which coordinate of a step is so far outside its range that it is in another unit, or no measurement."""
+    for number, coordinate in enumerate(spec.coordinates):
+        low, high = limits(coordinate.sampling)
+        if coordinate.kind == "angle" or low == high:
+            continue
+        far = BEYOND * (high - low)
+        for value in (step.coordinates[number], step.next_coordinates[number]):
+            if not low - far <= value <= high + far:
+                return f"{coordinate.name}: expected a value near its range of {low:.4g} to {high:.4g}, got {value:.6g}"
+    return None
 
 
 def read_once(path: Path, mapping: Mapping_, spec: EnvironmentSpec) -> ReadLog:
