@@ -8,7 +8,7 @@ from fastapi import APIRouter, Path, Query, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 
-from surrogym_server.api.auth import ADMIN, READ, TRAIN, holder, role_of
+from surrogym_server.api.auth import ADMIN, READ, TRAIN, TRAIN_OR_SAMPLE, holder, role_of
 from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.json_body import example
 from surrogym_server.api.problems import documented
@@ -171,7 +171,7 @@ def evaluate(
     "/{version}/drifts",
     status_code=201,
     summary="Report drift",
-    dependencies=[TRAIN],
+    dependencies=[TRAIN_OR_SAMPLE],
     responses=documented(*THERE),
 )
 def report_drift(
