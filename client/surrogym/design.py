@@ -195,7 +195,7 @@ class Design:
             InvalidInput: the budget has fewer steps left, or the states have the wrong shape or are not finite.
         """
         left = self.budget - self._spoken_for()
-        wanted = checks.whole("steps", steps, 1, left, why=", because the budget has no more left")
+        wanted = checks.whole("steps", steps, 1, left, why=", the rest of the budget")
         self._visited = None if visited is None else checks.states(self._definition, "visited", visited)
         self._extra = wanted
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, FilePath, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FilePath, ValidationError, model_validator
 
 from surrogym_server.errors import InvalidInput
 from surrogym_server.logs import LogFormat
 from surrogym_server.storage.records import Synchronous
-from surrogym_shared.checks import first_fault
+from surrogym_shared.faults import first_fault
 from surrogym_shared.secret_files import parse_token, tokens_in
 from surrogym_shared.wire import MAX_LANES, Role
 
@@ -22,6 +23,12 @@ LOCAL_NAMES = ("localhost",)
 MIN_TOKEN_LENGTH = 8
 
 LogLevel = Literal["critical", "error", "warning", "info", "debug"]
+
+
+def _without_path(url: str) -> str:
+    if not re.fullmatch(r"https?://[^/@?#]+/?", url):
+        raise ValueError(f"expected an address such as https://surrogates.example.org, without a path, got {url!r}")
+    return url
 
 
 class Settings(BaseModel):
@@ -40,7 +47,9 @@ class Settings(BaseModel):
         Synchronous, Field(description="of a SQLite file: full survives a loss of power, normal a crash alone")
     ] = "full"
     public_url: Annotated[
-        str | None, Field(pattern=r"^https?://[^/@?#]+/?$", description="address that browsers know, behind a proxy")
+        str | None,
+        AfterValidator(_without_path),
+        Field(description="address that browsers know, behind a proxy"),
     ] = None
     tokens: dict[str, Role] = Field(default_factory=dict, description="role of each bearer token")
     token_file: Path | None = Field(default=None, description="file with one token a line, alone or as role:token")

@@ -93,7 +93,10 @@ class ActingPolicy:
                 raise ValueError(f"policy: expected finite numbers in {name}, got NaN or infinity")
         if self.log_deviations is not None and np.abs(self.log_deviations).max() > MAX_LOG_DEVIATION:
             most = np.abs(self.log_deviations).max()
-            raise ValueError(f"policy: expected log_deviations within +-{MAX_LOG_DEVIATION}, got {most:g}")
+            raise ValueError(
+                f"policy: expected log_deviations between -{MAX_LOG_DEVIATION} and {MAX_LOG_DEVIATION}, got "
+                f"{most:g} in size"
+            )
         if not (self.deviation > 0).all():
             raise ValueError(f"policy: expected a positive standard deviation, got {self.deviation.min():g}")
 

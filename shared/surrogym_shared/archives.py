@@ -90,7 +90,7 @@ def _opened(zipped: Path | bytes, limit: int) -> Iterator[zipfile.ZipFile]:
         with zipfile.ZipFile(io.BytesIO(zipped) if isinstance(zipped, bytes) else zipped) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
             if size > limit:
-                raise ValueError(f"expected at most {limit} bytes inside, got {size}")
+                raise ValueError(f"expected at most {limit} bytes after decompression, got {size}")
             yield archive
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
         raise ValueError(f"expected a zip file, got content that can't be read as one: {error}") from error
@@ -99,7 +99,7 @@ def _opened(zipped: Path | bytes, limit: int) -> Iterator[zipfile.ZipFile]:
 def _stream(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> IO[bytes]:
     """Open an entry. It is decompressed to the size in its header, and no further."""
     if entry.compress_type not in INFLATED:
-        raise ValueError(f"expected {entry.filename!r} stored or deflated, got compression {entry.compress_type}")
+        raise ValueError(f"expected {entry.filename!r} uncompressed or deflated, got zip method {entry.compress_type}")
     return archive.open(entry)
 
 

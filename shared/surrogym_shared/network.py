@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, PositiveInt, ValidationError
 
-from surrogym_shared.checks import first_fault
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
 
 if TYPE_CHECKING:
@@ -135,7 +134,7 @@ class Network:
             arrays = read_arrays(entries[ARRAYS], MAX_BYTES, partial(_require_chain, head))
         except (LookupError, TypeError, OSError, ValueError, RecursionError, MemoryError) as error:
             raise ValueError(
-                f"{path} is not a network of arrays: {error}; save or download the policy again"
+                f"{path} is not a policy of surrogym train: {error}; save or download the policy again"
             ) from error
         layers = tuple(Layer(*(arrays[name] for name in names)) for names in head.names)
         outside = {name: arrays[name] for name in OUTSIDE}
@@ -201,6 +200,8 @@ def _read_head(content: bytes) -> _Head:
     try:
         return _Head.model_validate_json(content)
     except ValidationError as error:
+        from surrogym_shared.faults import first_fault  # only a fault needs it
+
         raise ValueError(f"{HEAD}: {first_fault(error)}; save or download the policy again") from error
 
 
@@ -221,7 +222,7 @@ def _require_chain(head: _Head, headers: Mapping[str, Header]) -> None:
             raise ValueError(f"expected {name} as floats of shape {shape}, got {header.dtype} of {header.shape}")
     outputs = headers[head.names[-1][1]].shape[0]
     if head.counts and sum(head.counts) != outputs:
-        raise ValueError(f"expected {sum(head.counts)} outputs for the counts, got {outputs}")
+        raise ValueError(f"expected {sum(head.counts)} outputs, one for each choice of an action, got {outputs}")
 
 
 def _chained(head: _Head, headers: Mapping[str, Header]) -> dict[str, tuple[int, ...]]:

@@ -139,7 +139,7 @@ class Registry(Generic[T]):
         If several packages add the same name, none is loaded, because the order of the search path must not decide.
         """
         if len(entries) > 1:
-            raise _Unfit("they have the same name, so none of them is used: uninstall all but one")
+            raise _Unfit("several plug-ins have this name, so none of them is used: uninstall all but one")
         (entry,) = entries
         if _same(entry.name, self._built_in):
             raise _Unfit(f"expected a name that differs from the built-in {', '.join(self._built_in)}")

@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from surrogym_shared.checks import first_fault
-from surrogym_shared.spec import NAME_IN_WORDS, NAME_PATTERN, EnvironmentSpec
+from surrogym_shared import patterns
+from surrogym_shared.faults import first_fault
+from surrogym_shared.spec import EnvironmentSpec
 
 FORMAT = 1
 MAX_FILE_BYTES = 256 * 1024 * 1024
@@ -121,7 +122,9 @@ class SurrogateFile:
             own = json.loads(header[METADATA].pop(OWN))
             if own["format"] != FORMAT:
                 raise NotASurrogateFile(
-                    f"expected a surrogate's file of format {FORMAT}, got {own['format']!r}: export it by this release"
+                    f"expected a surrogate's file of format {FORMAT}, got format {own['format']!r}: export it "
+                    "again by the version "
+                    "of surrogym that reads it"
                 )
             spec = EnvironmentSpec.model_validate(own["spec"])
             names = [one for one in RealSamples.__dataclass_fields__ if one != LOGGED or SAMPLES + one in header]
@@ -140,7 +143,11 @@ class SurrogateFile:
                 f"expected a specification without faults, got {first_fault(error)}; export the surrogate again"
             ) from error
         except UNREADABLE as error:
-            raise NotASurrogateFile(f"expected a surrogate's file, got {len(data)} bytes: {error!r}") from error
+            raise NotASurrogateFile(
+                f"expected a surrogate's file, got one that is damaged or of another kind ({error!r}): export it "
+                "again by "
+                "surrogym export"
+            ) from error
         _require_shapes(spec, samples)
         return cls(name, spec, model, samples, tolerances, ledger, predictions)
 
@@ -173,9 +180,13 @@ def _split(data: bytes) -> tuple[Header, bytes]:
     try:
         header = json.loads(data[LENGTH_BYTES:end])
     except UNREADABLE as error:
-        raise NotASurrogateFile("expected a header in JSON, got other content") from error
+        raise NotASurrogateFile(
+            "expected a surrogate's file with a header in JSON, got other content: export it again"
+        ) from error
     if not isinstance(header, dict) or not isinstance(header.get(METADATA, {}), dict):
-        raise NotASurrogateFile("expected a header with names and arrays, got other content")
+        raise NotASurrogateFile(
+            "expected a surrogate's file whose header names arrays, got other content: export it again"
+        )
     return header, data[end:]
 
 
@@ -189,9 +200,9 @@ def _array(entry: Any, body: bytes) -> NDArray[Any]:
     """Return the array that an entry of the header describes. Raises one of ``UNREADABLE`` if the entry is invalid."""
     dtype, shape, (start, stop) = DTYPES[entry["dtype"]], [int(n) for n in entry["shape"]], entry["data_offsets"]
     if min(shape, default=0) < 0 or not 0 <= start <= stop <= len(body):
-        raise ValueError(f"an array of shape {shape} at {start} to {stop} of {len(body)} bytes")
+        raise ValueError(f"an array of shape {shape} from byte {start} to {stop}, where the file has {len(body)}")
     if math.prod(shape) * dtype.itemsize != stop - start:
-        raise ValueError(f"an array of shape {shape} in {stop - start} bytes")
+        raise ValueError(f"an array of shape {shape}, which needs other than its {stop - start} bytes")
     raw = np.frombuffer(body[start:stop], dtype=np.uint8 if dtype == np.bool_ else dtype).reshape(shape)
     return raw.astype(np.bool_ if dtype == np.bool_ else np.float64)
 
@@ -205,8 +216,10 @@ def _pair(pair: Any) -> list[float]:
 
 
 def _name(name: object) -> str:
-    if not isinstance(name, str) or not re.fullmatch(NAME_PATTERN, name):
-        raise NotASurrogateFile(f"its name: expected {NAME_IN_WORDS}, got {name!r}")
+    if not isinstance(name, str) or not re.fullmatch(patterns.NAME, name):
+        raise NotASurrogateFile(
+            f"the surrogate's name in the file: expected {patterns.IN_WORDS[patterns.NAME]}, got {name!r}"
+        )
     return name
 
 

@@ -68,12 +68,12 @@ def test_a_name_of_no_environment_is_one_sentence(surrogym) -> None:
     [
         (
             '{"coordinates": [',
-            "env.json is not a specification: no JSON from line 1, column 18 on (Expecting value)",
+            "env.json is not a specification: expected JSON, got a fault in line 1, column 18 (Expecting value)",
         ),
         (" \n", "env.json is not a specification: it is empty"),
         (json.dumps({"specification": {}}), "is not a specification: "),
-        (json.dumps({"specification": {}, "design": {}}), "got 'design' beside 'specification', where only real_steps"),
-        (json.dumps({"specification": {}, "Desing": {}}), "got 'Desing' beside 'specification', where only real_steps"),
+        (json.dumps({"specification": {}, "design": {}}), "at its top level, got 'design'"),
+        (json.dumps({"specification": {}, "Desing": {}}), "at its top level, got 'Desing'"),
         (json.dumps({"colour": 1}), "env.json is not a specification: colour: unknown entry; expected some of "),
     ],
 )

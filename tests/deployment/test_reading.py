@@ -196,5 +196,5 @@ def test_choices_that_do_not_fit_are_refused(tmp_path: Path):
 def test_a_file_with_a_wrong_checksum_is_no_policy(tmp_path: Path):
     path = network(tmp_path, plant())
     path.write_bytes(bytes(b ^ 0xFF if 200 < i < 260 else b for i, b in enumerate(path.read_bytes())))
-    with pytest.raises(UnusablePolicy, match="not a network of arrays"):
+    with pytest.raises(UnusablePolicy, match="not a policy of"):
         controller_of(path)

@@ -254,7 +254,7 @@ def test_queries_near_visited_states_can_be_added_within_the_budget():
     before = len(run(design))
     design.improve(2, np.zeros((50, 2)))
     assert len(run(design)) >= 2
-    with pytest.raises(InvalidInput, match="because the budget has no more left, got 30"):
+    with pytest.raises(InvalidInput, match="the rest of the budget, got 30"):
         design.improve(30)
     assert design.steps >= before + 2
 

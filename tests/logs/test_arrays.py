@@ -35,9 +35,9 @@ def test_an_array_that_is_no_column_is_ignored(tmp_path: Path, spare: np.ndarray
 
 
 def test_a_column_of_another_length_is_refused(tmp_path: Path):
-    with pytest.raises(UnusableLog, match="expected columns of one length in"):
+    with pytest.raises(UnusableLog, match="expected arrays of the same number of rows in"):
         read(tmp_path, x=np.zeros(20), speed=np.zeros(21), action=np.zeros(20))
-    with pytest.raises(UnusableLog, match="expected columns of one length in"):
+    with pytest.raises(UnusableLog, match="expected arrays of the same number of rows in"):
         read(tmp_path, **VECTORS | {"r": np.zeros(21)})
 
 

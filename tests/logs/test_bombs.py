@@ -43,7 +43,7 @@ def test_bytes_of_an_npz_are_counted_in_its_directory(tmp_path: Path):
     with zipfile.ZipFile(tmp_path / "log.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
         zeros(file, "x", MIB)
         file.getinfo("x.npy").file_size = 1025 * MIB + 128  # of the directory, which is written last
-    refused(tmp_path / "log.npz", "expected at most 1073741824 bytes inside, got 1074790")
+    refused(tmp_path / "log.npz", "expected at most 1073741824 bytes after decompression, got 1074790")
 
 
 def test_arrays_of_an_npz_are_counted_and_not_listed(tmp_path: Path):

@@ -201,7 +201,7 @@ def test_the_command_drafts_registers_and_waits(
         ),
         (
             ["--register", "my tank"],
-            "expected a name of at most 64 letters, digits, '.', '_' and '-' for the surrogate",
+            "name of the surrogate: expected 1 to 64 letters, digits, '.', '_' or '-'",
         ),
         (["--map", "nothing.toml"], "nothing.toml: No such file"),
     ],

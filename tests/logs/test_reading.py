@@ -264,7 +264,7 @@ def test_marked_states_leave_other_columns_out():
     [
         (["a", "b"], "expected a column of the action, such as action_valve, got \\['a', 'b'\\]"),
         (["action"], "expected a column of the state"),
-        (["a", "b", "action", "next_a"], "expected next states of all of \\['a', 'b'\\] or of none"),
+        (["a", "b", "action", "next_a"], "expected a column of the next state for all of \\['a', 'b'\\] or for none"),
     ],
 )
 def test_columns_that_say_too_little_are_refused(heading: list[str], says: str):

@@ -71,7 +71,7 @@ def test_broken_files_are_named(tanks: Path, tmp_path: Path) -> None:
         ({"steps": 1.0}, "expected fmu, and optionally step, actions, coordinates and start"),
         ({"actions": ["pump", "pump"]}, "actions: expected each variable once, got 'pump' twice"),
         ({"coordinates": ["lower", "lower"]}, "coordinates: expected each variable once, got 'lower' twice"),
-        ({"step": -1.0}, "step: Input should be greater than 0"),
+        ({"step": -1.0}, "step: expected a number greater than 0"),
     ],
 )
 def test_choices_that_do_not_fit_are_named(tanks: Path, tmp_path: Path, choices, message: str) -> None:

@@ -187,7 +187,7 @@ def test_a_snapshot_keeps_the_past():
 
 def test_a_snapshot_that_is_too_short_is_refused():
     environment = answering(Clock())
-    with pytest.raises(StepFailed, match="at least 24 bytes, got 3"):
+    with pytest.raises(StepFailed, match="at least 24 bytes"):
         environment.restore(b"3.0")
-    with pytest.raises(StepFailed, match="running episode to save with its lags, got none"):
+    with pytest.raises(StepFailed, match="got none: reset"):
         environment.save()

@@ -235,14 +235,14 @@ def bomb(name: str) -> bytes:
 def test_weights_that_would_inflate_are_refused(tmp_path: Path):
     policy = changed(saved(tmp_path, "PPO, continuous"), policy__pth=bomb("archive/data/0"))
     assert policy.stat().st_size < 2**20
-    with pytest.raises(UnusablePolicy, match=rf"expected at most \d+ bytes inside, got {2**25}"):
+    with pytest.raises(UnusablePolicy, match=rf"expected at most \d+ bytes after decompression, got {2**25}"):
         load_policy(policy)
 
 
 def test_a_policy_that_would_inflate_is_refused(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("surrogym_trainer.policies.structure.MAX_BYTES", 2**20)
     (tmp_path / "policy.zip").write_bytes(bomb("policy.pth"))
-    with pytest.raises(UnusablePolicy, match=f"expected at most {2**20} bytes inside, got {2**25}"):
+    with pytest.raises(UnusablePolicy, match=f"expected at most {2**20} bytes after decompression, got {2**25}"):
         load_policy(tmp_path / "policy.zip")
 
 
@@ -304,10 +304,10 @@ def test_experience_beyond_its_bound_is_refused_for_learning_alone(tmp_path: Pat
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ({"batch_size": "x"}, "data: batch_size: Input should be a valid integer, got 'x'"),
-        ({"n_epochs": 10**9}, "data: n_epochs: Input should be less than or equal to 10000, got 1000000000"),
-        ({"gamma": float("nan")}, "data: gamma: Input should be a finite number, got nan"),
-        ({"_n_updates": [1]}, "data: _n_updates: Input should be a valid integer"),
+        ({"batch_size": "x"}, "data: batch_size: expected a whole number, got 'x'"),
+        ({"n_epochs": 10**9}, "data: n_epochs: expected a number less than or equal to 10000, got 1000000000"),
+        ({"gamma": float("nan")}, "data: gamma: expected a finite number, got nan"),
+        ({"_n_updates": [1]}, "data: _n_updates: expected a whole number"),
     ],
     ids=str,
 )

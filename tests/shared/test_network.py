@@ -106,5 +106,5 @@ def test_another_file_is_refused(tmp_path: Path, content):
     else:
         path.write_bytes(content)
     assert not Network.is_at(path)
-    with pytest.raises(ValueError, match="not a network of arrays"):
+    with pytest.raises(ValueError, match="not a policy of"):
         Network.load(path)

@@ -89,7 +89,8 @@ def test_of_two_packages_with_one_name_none_is_used_and_both_are_named(sites: Si
     assert things.names == ("plain",)
     assert things.broken == {
         "same": f"package 'first', entry point same = 'first:Member'; package 'second', entry point "
-        f"Same = 'second:Member' of {GROUP}: they have the same name, so none of them is used: uninstall all but one"
+        f"Same = 'second:Member' of {GROUP}: several plug-ins have this name, so none of them is used: uninstall "
+        "all but one"
     }
 
 

@@ -89,17 +89,17 @@ def test_it_continues_from_a_network(surrogate, tmp_path: Path):
     second = train(surrogate, tmp_path / "second.zip", small(start_from=first.path, seed=1, total_steps=320))
     assert second.path.exists()
     wider = small(total_steps=320, start_from=first.path, hyperparameters=SMALL | {"units": 6})
-    with pytest.raises(ValueError, match="expected a network of 31 parameters, got 21"):
+    with pytest.raises(ValueError, match="expected a network with 31 parameters"):
         train(surrogate, tmp_path / "third.zip", wider)
 
 
 def test_unknown_hyperparameters_are_refused(surrogate, tmp_path: Path):
-    with pytest.raises(ValueError, match="CMAES takes population, starts, units, sigma, got gamma"):
+    with pytest.raises(ValueError, match="population, starts, units, sigma, got gamma"):
         train(surrogate, tmp_path / "policy.zip", small(hyperparameters={"gamma": 0.9}))
 
 
 def test_it_is_not_prolonged(surrogate, tmp_path: Path):
-    with pytest.raises(ValueError, match="expected no prolonging, or another algorithm"):
+    with pytest.raises(ValueError, match="can't be prolonged"):
         train(surrogate, tmp_path / "policy.zip", small(prolong=True))
     assert not list(tmp_path.iterdir())
     assert not is_prolonged(small(total_steps=None), pendulum())

@@ -35,15 +35,13 @@ def test_a_policy_of_stable_baselines3_is_continued_by_its_own_library(tmp_path:
 
 
 def test_a_tracker_is_refused_where_nothing_is_logged():
-    with pytest.raises(
-        ValueError, match="FASTPPO supports no tracker: expected none, or another algorithm, got mlflow"
-    ):
+    with pytest.raises(ValueError, match="FASTPPO reports to no tracker: leave mlflow out"):
         search_for(TrainSettings("fastppo", tracker="mlflow"))
 
 
 @pytest.mark.parametrize("chosen", [{"start_visited": 0.5}, {"horizon": 20}], ids=["visited starts", "horizon"])
 def test_a_search_over_whole_episodes_refuses_parts_of_them(chosen: dict):
-    with pytest.raises(ValueError, match="runs whole episodes: expected no start_visited or horizon"):
+    with pytest.raises(ValueError, match="runs whole episodes"):
         search_for(TrainSettings(algorithm="cmaes", **chosen))
     search_for(TrainSettings(algorithm="fastppo", **chosen))
 

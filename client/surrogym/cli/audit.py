@@ -157,11 +157,13 @@ def _require_fit(predict: Predict, spec: EnvironmentSpec, misfit: str) -> None:
         return
     own, seen = len(spec.observation), len(predict.mean)
     if seen != own:
-        raise CommandError(f"{misfit}: expected a policy of {own} observations, got one of {seen}")
+        raise CommandError(
+            f"{misfit}: expected a policy that reads {own} numbers of the observation, got one that reads {seen}"
+        )
     choices = counts_of(spec)
     wanted, got = choices or spec.action.size, predict.counts or len(predict.low)
     if wanted != got:
-        raise CommandError(f"{misfit}: expected a policy of actions {wanted}, got one of {got}")
+        raise CommandError(f"{misfit}: expected a policy with {_actions(wanted)}, got one with {_actions(got)}")
 
 
 def _of_another(card: PolicyCard) -> PolicyCard:
@@ -190,3 +192,10 @@ def session_of(card: PolicyCard, view: SurrogateView) -> dict[str, object]:
     judged = card.settings.get("judge") or card.settings.get("session") or {}
     noise: dict[str, object] = noise_of(view)
     return {**noise, **judged} if isinstance(judged, dict) else noise
+
+
+def _actions(known: int | tuple[int, ...]) -> str:
+    """The actions of a network: the number of choices of each discrete action, or the number of continuous ones."""
+    if isinstance(known, int):
+        return f"{known} continuous action{'s' * (known != 1)}"
+    return f"discrete actions of {' and '.join(map(str, known))} choices"

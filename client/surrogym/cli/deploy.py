@@ -105,11 +105,15 @@ class Checking:
 
         if not self.check:
             if self.env is not None:
-                raise CommandError("expected --env together with --check, got --env alone")
+                raise CommandError(
+                    "expected --env together with --check, got --env alone: give --check as well, or leave --env out"
+                )
             yield None
             return
         if target.running is None:
-            raise CommandError("expected --check with a target that runs on this machine, got st: check it on the PLC")
+            raise CommandError(
+                "--check can't run structured text on this machine: leave --check out, and test the program on the PLC"
+            )
         if self.env is None and policy.card.surrogate is None:
             raise CommandError("--check needs --env, because no card beside the policy names its surrogate")
         with terminations_as_interrupts(), target.running(controller) as running, self._episode(policy) as episode:

@@ -73,6 +73,6 @@ def invalid(error: Exception) -> str:
     """Describe the first validation error of a model, with its place."""
     from pydantic import ValidationError
 
-    from surrogym_shared.checks import first_fault
+    from surrogym_shared.faults import first_fault
 
     return first_fault(error) if isinstance(error, ValidationError) else str(error)

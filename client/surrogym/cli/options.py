@@ -220,7 +220,7 @@ def read_spec_file(path: Path) -> SpecContent:
     from pydantic import ValidationError
 
     from surrogym.cli.errors import CommandError
-    from surrogym_shared.checks import first_fault
+    from surrogym_shared.faults import first_fault
     from surrogym_shared.spec import EnvironmentSpec
 
     content = path.read_bytes()
@@ -231,8 +231,9 @@ def read_spec_file(path: Path) -> SpecContent:
         described = isinstance(read, dict) and "specification" in read
         if described and (beside := sorted(map(str, read.keys() - DESCRIBED))):
             raise CommandError(
-                f"{path} is not a specification: got {beside[0]!r} beside 'specification', where only "
-                f"{', '.join(DESCRIBED[:-1])} may stand; entries of a specification stand within it"
+                f"{path} is not a specification: expected only {', '.join(DESCRIBED)} at its top level, got "
+                f"{beside[0]!r} as "
+                "well; entries of a specification belong inside 'specification'"
             )
         spec = EnvironmentSpec.model_validate_json(json.dumps(read["specification"]) if described else content)
     except ValidationError as error:
@@ -241,11 +242,12 @@ def read_spec_file(path: Path) -> SpecContent:
         ) from error
     except json.JSONDecodeError as error:
         raise CommandError(
-            f"{path} is not a specification: no JSON from line {error.lineno}, column {error.colno} on ({error.msg})"
+            f"{path} is not a specification: expected JSON, got a fault in line {error.lineno}, column {error.colno} "
+            f"({error.msg}); correct it and try again"
         ) from error
     except UnicodeDecodeError as error:
         raise CommandError(
-            f"{path} is not a specification: expected JSON as text in UTF-8; write it again in UTF-8"
+            f"{path} is not a specification: expected JSON as text in UTF-8, got other bytes; write it again in UTF-8"
         ) from error
     except (ValueError, RecursionError) as error:
         raise CommandError(f"{path} is not a specification: {error}") from error

@@ -17,7 +17,6 @@ from pydantic import ValidationError
 
 from surrogym_client.errors import SessionLost, SurrogymClientError
 from surrogym_shared.acting import ActingPolicy, NoiseKey
-from surrogym_shared.checks import first_fault
 from surrogym_shared.port import (
     Bools,
     Floats,
@@ -68,6 +67,8 @@ def session_request(num_envs: int, mode: AutoresetMode, options: dict[str, Any])
     try:
         return OpenSession(num_envs=num_envs, autoreset_mode=mode, **options)
     except ValidationError as error:
+        from surrogym_shared.faults import first_fault  # only a fault needs it
+
         raise ValueError(f"session options: {first_fault(error, got=True)}") from error
 
 
@@ -182,7 +183,7 @@ class Lanes:
         if seed is None or isinstance(seed, int | np.integer):
             return self.port.reset(self.view.id, seed=seed, mask=mask)
         if len(seed) != self.num_envs:
-            raise ValueError(f"seed: expected one number or {self.num_envs}, one a lane, got {len(seed)}")
+            raise ValueError(f"seed: expected one number, or {self.num_envs}, one for each lane, got {len(seed)}")
         chosen = np.ones(self.num_envs, dtype=bool) if mask is None else mask
         seeded = chosen & [s is not None for s in seed]
         if (chosen & ~seeded).any():

@@ -116,7 +116,10 @@ def wait_for_design(
             return view
         if view.phase == "failed":
             raise DesignUnfinished(f"the design of {name!r} failed: {view.error}")
-    raise DesignUnfinished(f"the design of {name!r} had not ended after {seconds:g} s: its phase is {_phase(view)}")
+    raise DesignUnfinished(
+        f"the design of {name!r} has not ended after {seconds:g} s, its phase is {_phase(view)}: see surrogym "
+        f"status {name}"
+    )
 
 
 def wait_for_answers(
@@ -138,8 +141,13 @@ def wait_for_answers(
             return
         begun = begun or view.queries.leased > 0 or any(query.attempts for query in wanted)
         if not begun and time.monotonic() >= started + FIRST_LEASE_SECONDS:
-            raise NobodyAnswers(f"no sampler has begun a query of {name!r} within {FIRST_LEASE_SECONDS:g} s")
-    raise DesignUnfinished(f"{len(queries)} queries of {name!r} were not all answered after {seconds:g} s")
+            raise NobodyAnswers(
+                f"no sampler has begun a query of {name!r} within {FIRST_LEASE_SECONDS:g} s: start surrogym sample "
+                f"{name}"
+            )
+    raise DesignUnfinished(
+        f"{len(queries)} queries of {name!r} were not all answered after {seconds:g} s: see surrogym status {name}"
+    )
 
 
 def wait_for_model(
@@ -160,7 +168,9 @@ def wait_for_model(
             f"the fit of {view.samples} steps of {name!r} has not ended after {seconds:g} s; it "
             f"continues on the server, and surrogym status {name} shows the model once it is there"
         )
-    raise DesignUnfinished(f"there was no model of {name!r} after {seconds:g} s: its phase is {_phase(view)}")
+    raise DesignUnfinished(
+        f"there is no model of {name!r} after {seconds:g} s, its phase is {_phase(view)}: see surrogym status {name}"
+    )
 
 
 def _looks(

@@ -461,7 +461,7 @@ class Api:
                     yield parse(wire.Event, line.removeprefix("data:").strip().encode(), path)
                 elif line.startswith(":"):
                     yield None
-        raise ServerUnreachable(f"the server at {self.url} ended the stream of events")
+        raise ServerUnreachable(f"the server at {self.url} ended the stream of events: connect again")
 
     def _of_points(
         self,
@@ -473,7 +473,9 @@ class Api:
     ) -> P:
         """Evaluate a model at any number of points, in requests that are small enough for the server."""
         if len(coordinates) != len(action):
-            raise ValueError(f"expected an action for each of {len(coordinates)} points, got {len(action)}")
+            raise ValueError(
+                f"expected as many actions as coordinates, got {len(action)} actions and {len(coordinates)} coordinates"
+            )
         parts: list[P] = []
         size = max(1, _NUMBERS // max(1, len([*coordinates[0], *action[0]]))) if coordinates else 1
         for start in range(0, len(coordinates), size) or [0]:

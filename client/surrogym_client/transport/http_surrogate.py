@@ -254,7 +254,10 @@ class HttpSurrogate:
     def _given_up(self, live: _Live, what: str) -> SurrogymClientError:
         with suppress(SurrogymClientError):
             self.connection.send("DELETE", live.route, retries=Retries(seconds=0))
-        return refused_here(Code.UNKNOWN_SESSION, f"the session lost its host, and the next one {what}: open a new one")
+        return refused_here(
+            Code.UNKNOWN_SESSION,
+            f"the machine that held the session has ended, and the next one {what}: open a new session",
+        )
 
     def _sent(self, live: _Live, sent: Sent) -> tuple[bytes, tuple[int, Any]]:
         attempt = self._attempt(live, sent.what, sent.content, sent.timeout)

@@ -9,7 +9,6 @@ from pydantic import ValidationError
 
 from surrogym_client.errors import ProtocolMismatch
 from surrogym_shared import wire
-from surrogym_shared.checks import first_fault
 
 R = TypeVar("R", bound=wire.Reply)
 
@@ -23,6 +22,8 @@ def parse(reply: type[R], content: bytes, path: str) -> R:
     try:
         return reply.model_validate_json(content)
     except ValidationError as error:
+        from surrogym_shared.faults import first_fault  # only a fault needs it
+
         raise ProtocolMismatch(f"unexpected answer of {path}: {first_fault(error)}") from error
 
 

@@ -10,22 +10,20 @@ from urllib.parse import quote
 
 from surrogym_client.errors import refused_here
 from surrogym_shared.codes import Code
-from surrogym_shared.spec import NAME_IN_WORDS, NAME_PATTERN
+from surrogym_shared.patterns import ALIAS, IN_WORDS, NAME, POLICY
 
-POLICY_PATTERN = r"[a-z0-9][a-z0-9_-]{0,31}"
 SESSION_PATTERN = r"[^/\\]*[^/\\.][^/\\]*"  # the server chooses the form of session ids
 
 
 def surrogate(name: str) -> str:
     """Return the route of a surrogate. Raises ``InvalidInput`` for an invalid name."""
-    return f"/v1/surrogates/{_segment(name, NAME_PATTERN, f'name of a surrogate: expected {NAME_IN_WORDS}')}"
+    return f"/v1/surrogates/{_segment(name, NAME, f'name of a surrogate: expected {IN_WORDS[NAME]}')}"
 
 
 def policy(name: str, which: str | int) -> str:
     """Return the route of a policy by its version, an alias or ``latest``. Raises ``InvalidInput`` for an invalid
     one."""
-    expected = "policy: expected a version, an alias or latest"
-    return f"{surrogate(name)}/policies/{_segment(str(which), POLICY_PATTERN, expected)}"
+    return f"{surrogate(name)}/policies/{_segment(str(which), POLICY, f'policy: expected {IN_WORDS[POLICY]}')}"
 
 
 def job(name: str, id: int) -> str:
@@ -35,7 +33,7 @@ def job(name: str, id: int) -> str:
 
 def alias(name: str) -> str:
     """Return an alias as the last part of a route. Raises ``InvalidInput`` for an invalid one."""
-    return _segment(name, POLICY_PATTERN, "alias of a policy: expected lower-case letters, digits, - and _")
+    return _segment(name, ALIAS, f"alias of a policy: expected {IN_WORDS[ALIAS]}")
 
 
 def session(identity: str) -> str:

@@ -57,7 +57,9 @@ def table_of_arrays(path: Path, arrays: dict[str, Any], names: Sequence[str] = (
     flat = _flat(path, columns)
     lengths = {name: len(arrays[name]) for name in columns}
     if len(set(lengths.values())) > 1:
-        raise UnusableLog(f"expected columns of one length in {path}, got {lengths}: cut them to the same steps")
+        raise UnusableLog(
+            f"expected arrays of the same number of rows in {path}, got {lengths}: cut them to the same steps"
+        )
     return Table(flat, np.arange(1, 1 + rows), unnamed=tuple(filter(is_unnamed, flat)), ignored=ignored)
 
 

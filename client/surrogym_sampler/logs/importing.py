@@ -14,6 +14,7 @@ import numpy as np
 from surrogym_client.transport.api import Api
 from surrogym_sampler.logs.outputs import rejected_file, require_outputs, write_draft
 from surrogym_sampler.logs.reading import read
+from surrogym_shared import patterns
 from surrogym_shared.logs.checking import ReadLog, check_log, draft_log, is_of_rejected, write_rejected
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.roles import read_roles
@@ -22,7 +23,6 @@ from surrogym_shared.logs.too_few import TooFewSteps
 from surrogym_shared.logs.transitions import Transitions
 from surrogym_shared.logs.units import require_reward_unit
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.spec.base import NAME_PATTERN
 from surrogym_shared.wire import NewSample
 from surrogym_shared.words import counted
 
@@ -180,11 +180,8 @@ def _write_draft(draft: str | Path | None, log: ReadLog) -> None:
 
 
 def _require_name(name: str) -> None:
-    if not re.match(NAME_PATTERN, name):
-        raise UnusableLog(
-            "expected a name of at most 64 letters, digits, '.', '_' and '-' for the surrogate, with a letter or digit "
-            f"first, got {name!r}"
-        )
+    if not re.fullmatch(patterns.NAME, name):
+        raise UnusableLog(f"name of the surrogate: expected {patterns.IN_WORDS[patterns.NAME]}, got {name!r}")
 
 
 def _require_reward_unit(log: ReadLog, api: Api, name: str) -> None:

@@ -60,7 +60,10 @@ class OriginalPort:
             NotParallel: several lanes, or a second session, of an environment that runs one instance at a time.
         """
         if request.autoreset_mode != "same_step":
-            raise ValueError(f"autoreset mode: expected same_step, got {request.autoreset_mode}")
+            raise ValueError(
+                "autoreset_mode: expected same_step, the only one of an original environment, got "
+                f"{request.autoreset_mode}"
+            )
         name, seed = f"original-{next(self._names)}", request.seed or 0
         limit = request.time_limit or self._spec.time_limit or LONGEST_EPISODE
         self._check_alone(sum(map(len, self._sessions.values())))

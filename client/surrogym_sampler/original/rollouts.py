@@ -90,7 +90,10 @@ class FromReset:
         if not self._prefix:
             return snapshot
         if self._at is None:
-            raise StepFailed("expected a running episode to save with its lags, got none")
+            raise StepFailed(
+                "expected a running episode, whose earlier states are saved as well, got none: reset the "
+                "environment first"
+            )
         return self._at.astype("<f8").tobytes() + snapshot
 
     def restore(self, snapshot: bytes) -> Array:
@@ -101,7 +104,10 @@ class FromReset:
         """
         self._at = None
         if len(snapshot) < self._prefix:
-            raise StepFailed(f"expected a snapshot of at least {self._prefix} bytes, got {len(snapshot)}")
+            raise StepFailed(
+                f"expected a snapshot of at least {self._prefix} bytes, which its earlier states take, got "
+                f"{len(snapshot)}"
+            )
         read = self._read(_saving(self._environment).restore(snapshot[self._prefix :]))
         before = np.frombuffer(snapshot[: self._prefix], dtype="<f8") if self._prefix else np.zeros(len(read))
         self._at = placed(self._spec, read, before)

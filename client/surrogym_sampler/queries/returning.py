@@ -25,7 +25,7 @@ from surrogym_sampler.queries.settings import SamplerSettings
 from surrogym_sampler.queries.snapshots import SnapshotFolder
 from surrogym_shared.spec import EnvironmentSpec, limits
 
-SKIPPED = "the design begins elsewhere, and surrogym doctor --env ENVIRONMENT checks save and restore"
+SKIPPED = "the design takes another state, and surrogym doctor --env ENVIRONMENT checks save and restore"
 MOST_HANGS = 2  # of ``save`` in a row; one may be the machine's fault
 ELSEWHERE = 0.01  # share of a sampling range by which a return may miss the coordinates that were saved, unmentioned
 

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from surrogym_sampler.original.errors import StepFailed
-from surrogym_shared.checks import first_fault
+from surrogym_shared.faults import first_fault
 from surrogym_shared.nouns import RealStep
 from surrogym_shared.wire import NewSample, Query, StepQuery
 

@@ -129,7 +129,7 @@ class SnapshotFolder:
                 "samplers one --snapshots folder"
             ) from error
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise SnapshotGone(f"snapshot {name} can't be read: {error}; the design begins elsewhere") from error
+            raise SnapshotGone(f"snapshot {name} can't be read: {error}; the design takes another state") from error
         if (form, made_by, list(coordinates)) != (FORM, self._environment, self._names):
             raise SnapshotGone(
                 f"expected a snapshot of {self._environment!r} in form {FORM}, got {name} of {made_by!r} in "
@@ -137,7 +137,7 @@ class SnapshotFolder:
             )
         if hashlib.sha256(state).hexdigest() != digest:
             raise SnapshotGone(
-                f"snapshot {name} is damaged: its bytes are not those that were written; the design begins elsewhere"
+                f"snapshot {name} is damaged: its bytes are not those that were written; the design takes another state"
             )
         return tuple(map(float, coordinates.values())), state
 

@@ -255,7 +255,7 @@ def _require_small(decision: Decision) -> None:
             "surrogym export-policy writes it for a larger machine"
         )
     if not (decision.deviation >= 1 / LARGEST).all():  # smaller ones are 0 in float
-        raise NotDeployable("expected a policy with positive standard deviations, got others")
+        raise NotDeployable("expected standard deviations of the observations above 0 in the policy, got others")
     arrays = (decision.mean, decision.deviation, decision.centre, decision.reach, *layers)
     _require_in_float("a policy", *arrays)
 
@@ -264,7 +264,9 @@ def _require_in_float(what: str, *arrays: Any) -> None:
     """Refuse numbers that a controller in float can't have."""
     for values in map(np.ravel, arrays):
         if len(wrong := values[~(np.abs(values) <= LARGEST)]):
-            raise NotDeployable(f"expected {what} of finite numbers up to {LARGEST:g}, for float, got {wrong[0]:g}")
+            raise NotDeployable(
+                f"expected {what} as finite numbers up to {LARGEST:g}, the range of float, got {wrong[0]:g}"
+            )
 
 
 def _measurements(spec: EnvironmentSpec, ranges: dict[str, tuple[float, float]]) -> tuple[Measurement, ...]:
@@ -358,7 +360,7 @@ def _fallback(action: Action, low: Array, high: Array, chosen: tuple[float, ...]
     if chosen is None:
         if not isinstance(action, BoxAction):
             raise NotDeployable(
-                f"a discrete action has no rest: expected --fallback with {len(low)} of the numbers "
+                f"a discrete action has no neutral value: expected --fallback with {len(low)} of the numbers "
                 f"{low.astype(int).tolist()} to {high.astype(int).tolist()}, which the controller takes on a fault"
             )
         return np.clip(np.zeros(len(low)), low, high)

@@ -36,7 +36,10 @@ def baseline(spec: EnvironmentSpec, controller: Controller, seed: int = 0) -> Pr
     if controller != "zero":
         raise ValueError(f"expected zero or random, got {controller}")
     if default_baseline(spec) != "zero":
-        raise ValueError("expected an environment with an action of zero, got one without: compare with random actions")
+        raise ValueError(
+            "the environment's actions do not include zero, so the controller zero can't act: compare with random "
+            "actions"
+        )
 
     def zero(observations: NDArray[np.float32]) -> NDArray[Any]:
         return np.zeros((len(observations), spec.action.size))

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError
 
 from surrogym_client.errors import SurrogymClientError
-from surrogym_shared.checks import first_fault
+from surrogym_shared.faults import first_fault
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import CurvePoint, SurrogateName
 from surrogym_trainer.policies.evidence import Audit, Promise

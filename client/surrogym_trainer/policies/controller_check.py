@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from surrogym_client.errors import SurrogymClientError
-from surrogym_shared.checks import first_fault
+from surrogym_shared.faults import first_fault
 
 FILE = "check.json"
 MOST_BYTES = 64 * 1024

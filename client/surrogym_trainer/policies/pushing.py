@@ -15,7 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 from surrogym_client.errors import InvalidInput
 from surrogym_client.transport import Api
 from surrogym_shared import wire
-from surrogym_shared.checks import first_fault
+from surrogym_shared.faults import first_fault
 from surrogym_trainer.policies.card import PolicyCard, UnusablePolicy, read_card
 
 MAX_WAITING_BYTES = 64 * 1024 * 1024

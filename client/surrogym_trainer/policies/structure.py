@@ -28,7 +28,7 @@ from torch.optim import RMSprop
 
 from surrogym_client.environments.spaces import space
 from surrogym_shared.archives import read_entries, stored
-from surrogym_shared.checks import first_fault
+from surrogym_shared.faults import first_fault
 from surrogym_shared.wire import ActionSpace, BoxSpace, DiscreteSpace, MultiDiscreteSpace
 from surrogym_trainer.policies.defaults import decaying
 from surrogym_trainer.policies.networks import PaperPolicy, Standardise

@@ -87,7 +87,9 @@ class ClosedLoop:
         self.settings = with_algorithm(self.settings, self.port.spec())
         if not search_for(self.settings).resumable:
             raise ValueError(
-                f"{self.settings.algorithm} can't start from a policy: expected no rounds, or another algorithm"
+                f"algorithm {self.settings.algorithm} can't continue the policy of the round before: train without "
+                "rounds, or "
+                "by another algorithm"
             )
         self._whole, self._part = shares(self.settings, self.rounds.rounds)
         self._prolong = is_prolonged(self.settings, self.port.spec())

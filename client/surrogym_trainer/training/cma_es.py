@@ -140,5 +140,7 @@ def _first(settings: TrainSettings, size: int) -> NDArray[np.float64]:
         return np.zeros(size)
     vector = Network.load(settings.start_from).vector
     if len(vector) != size:
-        raise ValueError(f"{settings.start_from}: expected a network of {size} parameters, got {len(vector)}")
+        raise ValueError(
+            f"{settings.start_from}: expected a network with {size} parameters, as this training has, got {len(vector)}"
+        )
     return vector

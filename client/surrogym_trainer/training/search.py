@@ -154,18 +154,32 @@ def search_for(settings: TrainSettings) -> PolicySearch:
     """
     name, kind = name_of(settings), SEARCHES.get(name_of(settings))
     if settings.prolong and not kind.prolongable:
-        raise ValueError(f"{name} trains for a fixed number of steps: expected no prolonging, or another algorithm")
+        raise ValueError(
+            f"algorithm {name} trains for a fixed number of steps, which can't be prolonged: train without prolong, or "
+            "by another algorithm"
+        )
     if kind.whole_episodes and (settings.start_visited is not None or settings.horizon is not None):
-        raise ValueError(f"{name} runs whole episodes: expected no start_visited or horizon, or another algorithm")
+        raise ValueError(
+            f"algorithm {name} runs whole episodes from the starts of the specification: leave start_visited and "
+            "horizon "
+            "out, or use another algorithm"
+        )
     if settings.tracker is not None and not kind.tracked:
-        raise ValueError(f"{name} supports no tracker: expected none, or another algorithm, got {settings.tracker}")
+        raise ValueError(
+            f"algorithm {name} reports to no tracker: leave {settings.tracker} out, or use another algorithm"
+        )
     if settings.start_from is not None and not kind.resumable:
-        raise ValueError(f"{name} always begins with a new network: expected no policy to start from")
+        raise ValueError(
+            f"algorithm {name} always begins with a new network: leave the policy to start from out, or use another "
+            "algorithm"
+        )
     try:
         return kind(**settings.hyperparameters)
     except TypeError as error:
         known = ", ".join(getattr(kind, "__dataclass_fields__", ())) or "other hyperparameters"
-        raise ValueError(f"{name} takes {known}, got {', '.join(settings.hyperparameters)}") from error
+        raise ValueError(
+            f"algorithm {name}: expected some of the hyperparameters {known}, got {', '.join(settings.hyperparameters)}"
+        ) from error
 
 
 def planned_steps(settings: TrainSettings) -> int:
@@ -177,7 +191,9 @@ def planned_steps(settings: TrainSettings) -> int:
     kind = SEARCHES.get(name_of(settings))
     total = kind.suggested_steps if settings.total_steps is None else settings.total_steps
     if total < 1 or (kind.most_steps is not None and total > kind.most_steps):
-        raise ValueError(f"virtual steps: expected 1 to {kind.most_steps or 'any number'}, got {total}")
+        raise ValueError(
+            f"virtual steps: expected {f'1 to {kind.most_steps}' if kind.most_steps else '1 or more'}, got {total}"
+        )
     return total
 
 

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from surrogym_client.errors import LeaseExpired, ServerUnreachable, SurrogymClientError, Unavailable
 from surrogym_client.transport.api import Api
 from surrogym_shared import wire
-from surrogym_shared.checks import first_fault
+from surrogym_shared.faults import first_fault
 from surrogym_trainer.policies.card import UnusablePolicy
 from surrogym_trainer.policies.pushing import push
 

@@ -51,7 +51,10 @@ class Gate:
         if self.open:
             return
         if token is None:
-            raise Unauthenticated("expected the header 'Authorization: Bearer <token>', got none")
+            raise Unauthenticated(
+                "expected the header 'Authorization: Bearer <token>', got none: set SURROGYM_TOKEN, or ask the "
+                "server's admin"
+            )
         role = self.role_of(token)
         if role not in (*allowed, "admin"):
             raise Forbidden(f"expected a token with role {' or '.join((*allowed, 'admin'))}, got {role}")

@@ -15,6 +15,7 @@ from starlette.requests import ClientDisconnect
 from surrogym_server import errors
 from surrogym_server.logs import REQUEST_ID
 from surrogym_shared.codes import PROBLEM_MEDIA_TYPE, STATUS, Code, Problem
+from surrogym_shared.faults import in_words
 from surrogym_shared.frames import FrameError
 
 CODES: dict[type[errors.SurrogymError], Code] = {
@@ -151,8 +152,10 @@ def validation_detail(found: Sequence[Any]) -> str:
 
     If a value fits none of several types, the deepest error is about the type that it nearly fits.
     """
-    telling = _located([max(found, key=lambda error: len(error["loc"]))])[0]
-    return f"{telling['field'] or 'the body'}: {telling['expected']}, got {telling['got']}"
+    telling = max(found, key=lambda error: len(error["loc"]))
+    said = in_words(telling)
+    came = "" if ", got " in said else f", got {shown(telling.get('input'))}"
+    return f"{_field(telling) or 'the body'}: {said}{came}"
 
 
 def shown(value: Any) -> str:
@@ -186,12 +189,16 @@ def _pieces(value: Any) -> Iterator[str]:
 def _located(found: Sequence[Any]) -> list[dict[str, str]]:
     return [
         {
-            "field": ".".join(str(part) for part in error["loc"] if _is_field(part)),
-            "expected": error["msg"].removeprefix("Value error, "),
-            "got": shown(error.get("input")),
+            "field": _field(error),
+            "expected": in_words(error).removeprefix("expected ").removesuffix(", got nothing"),
+            "got": "nothing" if error["type"] == "missing" else shown(error.get("input")),
         }
         for error in found[:16]
     ]
+
+
+def _field(error: Any) -> str:
+    return ".".join(str(part) for part in error["loc"] if _is_field(part))
 
 
 def _is_field(part: int | str) -> bool:

@@ -147,7 +147,7 @@ def _distribution(distribution: wire.Uniform | wire.Normal | wire.Fixed) -> dist
             return distributions.NormalDefinition(mean, std, *distribution.limits)
         case wire.Fixed(value=value):
             return distributions.FixedDefinition(value)
-    raise InvalidSpec(f"unknown distribution {distribution!r}")
+    raise InvalidSpec(f"expected a distribution that this version knows, got {distribution!r}")
 
 
 def _term(term: wire.Term, names: tuple[str, ...]) -> terms.TermDefinition:

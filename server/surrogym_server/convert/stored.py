@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from surrogym_server.errors import Damaged
-from surrogym_shared.checks import first_fault
+from surrogym_shared.faults import first_fault
 
 M = TypeVar("M", bound=BaseModel)
 

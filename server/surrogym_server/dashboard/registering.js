@@ -44,14 +44,9 @@ function read(text) {
 
 const lines = (title, entries) => (entries.length ? [h("h3", {}, title), h("ul", {}, entries.map((entry) => h("li", {}, String(entry))))] : []);
 
-const PLAIN = { "Field required": ["a value", "nothing"], "Extra inputs are not permitted": ["no field of this name"] };
-
 /** What the server refused, a line for each field. */
 function faults(error) {
-  const rows = (error.errors ?? []).map(({ field, expected, got }) => {
-    const [wanted = expected, came = got] = PLAIN[expected] ?? [];
-    return [h("code", {}, field.replace(/^spec\./, "") || "–"), wanted, came];
-  });
+  const rows = (error.errors ?? []).map(({ field, expected, got }) => [h("code", {}, field.replace(/^spec\./, "") || "–"), expected, got]);
   return h("div", { class: "card", role: "alert" },
     h("p", { class: "bad" }, rows.length ? `${plural(rows.length, "field")} can't be used. Correct the text, and check it again.` : error.message),
     rows.length ? table("Fields that can't be used", [["field", ""], ["expected", "wide"], ["got", "wide"]], rows, "") : "");

@@ -77,7 +77,7 @@ class ModelCache:
             except Damaged:
                 if self._newest().get(surrogate) == version:
                     raise
-        raise NoModel("expected a surrogate with a model, got one without: start surrogym sample, or import a log")
+        raise NoModel("the surrogate has no model yet: start surrogym sample, or import a log")
 
     def look(self) -> list[int]:
         """Publish the versions that other servers have stored of the surrogates in this cache.

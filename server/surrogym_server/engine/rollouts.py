@@ -57,8 +57,11 @@ def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Sessio
     """
     definition, lanes = session.definition, session.settings.num_envs
     _check_steps(run.steps, lanes)
-    if (wide := lanes * max(run.policy.units)) > MAX_ACTIVATIONS:
-        raise TooLarge(f"expected at most {MAX_ACTIVATIONS} units of a layer in all lanes, got {wide}")
+    if lanes * max(run.policy.units) > MAX_ACTIVATIONS:
+        raise TooLarge(
+            f"expected the widest layer of the policy to have at most {MAX_ACTIVATIONS} units times lanes, got "
+            f"{max(run.policy.units)} x {lanes}"
+        )
     actor = _actor(len(definition.observation_names), definition.action, run)
     waiting = _awaited(run, lanes)
     sensed_states = sensed(definition, session.settings.sensor_noise, session.lanes)
@@ -79,7 +82,7 @@ def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Sessio
 
 def _check_steps(steps: int, lanes: int) -> None:
     if steps * lanes > MAX_LANE_STEPS:
-        raise TooLarge(f"expected at most {MAX_LANE_STEPS} steps in all, got {steps} x {lanes}")
+        raise TooLarge(f"expected at most {MAX_LANE_STEPS} steps times lanes in one request, got {steps} x {lanes}")
 
 
 def _actor(observation: int, action: ActionDefinition, run: PolicyRun) -> Actor:
@@ -94,7 +97,7 @@ def _awaited(run: PolicyRun, lanes: int) -> Bools:
     if run.until is None:
         return np.ones(lanes, dtype=bool)
     if run.until.shape != (lanes,):
-        raise InvalidInput(f"until: expected {lanes} entries, one a lane, got {len(run.until)}")
+        raise InvalidInput(f"until: expected {lanes} entries, one for each lane, got {len(run.until)}")
     return run.until.copy()
 
 

@@ -233,7 +233,7 @@ def _visited(session: Session, mask: Bools | None) -> Session:
 
 def _check_mask(mask: Bools, num_envs: int) -> None:
     if mask.shape != (num_envs,):
-        raise InvalidInput(f"mask: expected {num_envs} entries, one a lane, got {len(mask)}")
+        raise InvalidInput(f"mask: expected {num_envs} entries, one for each lane, got {len(mask)}")
 
 
 def check_opening(session: Session, digest: str) -> Session:
@@ -243,7 +243,7 @@ def check_opening(session: Session, digest: str) -> Session:
         IdempotencyConflict: the body was different.
     """
     if session.opened_by is None or session.opened_by[1] != digest:
-        raise IdempotencyConflict("this idempotency key opened a session with another body")
+        raise IdempotencyConflict("this idempotency key opened a session with another body: use a new key")
     return session
 
 

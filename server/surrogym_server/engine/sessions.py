@@ -256,7 +256,12 @@ class LiveSessions:
     def _check_memory(self, nbytes: int) -> None:
         most, total = self._limits.nbytes, sum(live.nbytes for live in self._live.values())
         if nbytes > most:
-            raise TooLarge(f"expected lanes and answers of at most {_mebibytes(most)}, got {_mebibytes(nbytes)}")
+            raise TooLarge(
+                f"expected a session and its reply to take at most {_mebibytes(most)} of memory, got "
+                f"{_mebibytes(nbytes)}: "
+                "open fewer lanes, take fewer steps in one request, or start the server with a larger "
+                "--max-sessions-mib"
+            )
         if total + nbytes > most:
             raise Overloaded(
                 f"expected all sessions to take at most {_mebibytes(most)}, got {_mebibytes(total)} "
@@ -302,7 +307,9 @@ class LiveSessions:
     def _check_deadline(self, deadline: float | None, seconds: float) -> None:
         if deadline is not None and (left := deadline - self.clock()) < seconds:
             raise DeadlineExceeded(
-                f"expected an answer within {1e3 * max(left, 0):.0f} ms, but it would take {1e3 * seconds:.0f} ms"
+                f"the request would take {1e3 * seconds:.0f} ms, and {1e3 * max(left, 0):.0f} ms are left of the "
+                "time that it "
+                "allows: nothing was computed; allow more time"
             )
 
 

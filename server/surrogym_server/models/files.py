@@ -68,4 +68,4 @@ def _require_whole(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
     """Raise ``InvalidInput`` if the content has changed. A file without a checksum is not checked."""
     written = header.pop(CHECKSUM, None)
     if written is not None and written != _checksum(header, tensors):
-        raise InvalidInput("expected the checksum that the model was written with, got another: the file is damaged")
+        raise InvalidInput("the model is damaged: its checksum differs from the one that it was written with")

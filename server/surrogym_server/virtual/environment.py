@@ -315,7 +315,9 @@ def _seeded(lanes: LaneState, seed: int | Sequence[int], chosen: Chosen) -> Lane
         seeds, numbers = torch.full_like(lanes.seed, seed), torch.arange(len(lanes), device=lanes.seed.device)
     else:
         if len(seed) != len(lanes):
-            raise InvalidInput(f"seed: expected an integer or {len(lanes)} of them, got {len(seed)}")
+            raise InvalidInput(
+                f"seed: expected a whole number, or {len(lanes)} of them, one for each lane, got {len(seed)}"
+            )
         seeds, numbers = torch.tensor(list(seed), device=lanes.seed.device), torch.zeros_like(lanes.lane)
     replaced = torch.ones_like(lanes.seed, dtype=torch.bool) if isinstance(chosen, slice) else chosen
     return replace(
@@ -341,7 +343,7 @@ def chosen_lanes(mask: Bools | None, lanes: LaneState) -> Chosen:
     if mask is None:
         return EVERY
     if len(mask) != len(lanes):
-        raise InvalidInput(f"mask: expected {len(lanes)} entries, got {len(mask)}")
+        raise InvalidInput(f"mask: expected {len(lanes)} entries, one for each lane, got {len(mask)}")
     return torch.as_tensor(mask, dtype=torch.bool, device=lanes.seed.device)
 
 

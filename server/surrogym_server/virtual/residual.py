@@ -39,16 +39,21 @@ class Residual:
     def check(self, definition: EnvironmentDefinition) -> None:
         """Raise ``InvalidInput`` if the residual does not fit the environment."""
         if definition.moves_observation:
-            raise InvalidInput("residual: expected a model of coordinates, got one of observations")
+            raise InvalidInput(
+                "residual: expected a surrogate that models coordinates, got one of preset 'paper', which models "
+                "observations: "
+                "leave the residual out"
+            )
         outputs = len(definition.outputs)
         size = len(definition.coordinates) + len(definition.angles) + definition.action.size
         shapes = {len(self.centre), len(self.scale), *(len(row) - 1 for rows in self.weights for row in rows)}
         if shapes != {size} or {len(rows) for rows in self.weights} != {outputs}:
             raise InvalidInput(
-                f"residual: expected centre and scale of {size} inputs, and weights of {outputs} outputs by {size + 1}"
+                f"residual: expected centre and scale with {size} numbers each, one for each input of the model, and "
+                f"weights with {size + 1} numbers for each of {outputs} outputs, got other numbers of them"
             )
         if min(self.scale) <= 0:
-            raise InvalidInput(f"residual: expected scales above 0, got {min(self.scale)}")
+            raise InvalidInput(f"residual: expected each entry of scale above 0, got {min(self.scale)}")
 
     def of(self, definition: EnvironmentDefinition, lanes: LaneState, u: Tensor) -> Tensor:
         """Errors (N, O) of the step of lanes under u (N, F)."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from surrogym_shared.checks import first_fault
+from surrogym_shared.faults import first_fault
 from surrogym_shared.logs.columns import Roles
 from surrogym_shared.logs.drafting import Draft, declared_choices, draft, lost_ends, wrapped
 from surrogym_shared.logs.errors import UnusableLog

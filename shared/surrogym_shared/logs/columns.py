@@ -274,7 +274,8 @@ def _choices(mapped: LogMapping, action: Mapping[str, str], where: str) -> dict[
         return {}
     if set(mapped.discrete) != set(action):
         raise UnusableLog(
-            f"{where}: expected the choices of all of {list(action)} in discrete, got those of {list(mapped.discrete)}"
+            f"{where}: expected discrete to list the choices of each action ({listed(list(action))}), got those of "
+            f"{listed(list(mapped.discrete))}"
         )
     for name, values in mapped.discrete.items():
         if len(set(values)) < len(values):
@@ -371,13 +372,19 @@ def _checked(roles: Roles) -> Roles:
     coordinates or of none. Otherwise raise ``UnusableLog``."""
     for what, names in (("states", roles.state), ("actions", roles.action)):
         if len(names) > MAX_DIMENSIONS:
-            raise UnusableLog(f"expected at most {MAX_DIMENSIONS} {what}, got {len(names)}: choose by --map")
+            raise UnusableLog(
+                f"expected at most {MAX_DIMENSIONS} {what}, got {len(names)}: choose some in a mapping file (--map)"
+            )
     if long := [name for name in roles.state if not 1 <= len(name) <= LONGEST]:
-        raise UnusableLog(f"expected names of states with 1 to {LONGEST} letters, got {long[0]!r}: rename it by --map")
+        raise UnusableLog(
+            f"expected names of states with 1 to {LONGEST} letters, got {long[0]!r}: rename it in a mapping file "
+            "(--map)"
+        )
     if roles.following and set(roles.following) != set(roles.state):
         odd = sorted(set(roles.following) ^ set(roles.state))[0]
         raise UnusableLog(
-            f"expected next states of all of {listed(roles.state)} or of none, got {listed(roles.following)} "
+            f"expected a column of the next state for all of {listed(roles.state)} or for none, got "
+            f"{listed(roles.following)} "
             f"({odd!r} differs): name the columns in a mapping file (--map)"
         )
     for name, column in roles.following.items():

@@ -106,5 +106,9 @@ def episodes_by(name: str, cells: Cells) -> Cells:
         return np.cumsum(flags(name, cells)[0])
     values = measured(cells)
     if values is None:
-        raise UnusableLog(f"{name}: expected marks of the starts of episodes, 0 or 1, or numbers that start again")
+        raise UnusableLog(
+            f"{name}: expected 1 in the first row of each episode and 0 in the others, or a number that starts "
+            "again in each "
+            "episode, got other cells: correct the column, or leave it out with a mapping file (--map)"
+        )
     return np.cumsum(np.concatenate([[0], np.diff(values) <= 0]))

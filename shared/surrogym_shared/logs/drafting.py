@@ -71,7 +71,7 @@ def draft(roles: Roles, steps: Transitions, name: str, budget: int = 0) -> Draft
     if not any(c.kind != "constant" for c in coordinates):
         raise UnusableLog(
             f"expected at least one state that changes from row to row, got {list(roles.state)}, which never change: "
-            "log a run in which a state moves, or name the states by --map"
+            "log a run in which a state moves, or name the states in a mapping file (--map)"
         )
     columns = [index for index, one in enumerate(roles.state) if one in {c.name for c in coordinates}]
     starts = {c.name: _start(c, steps, index) for c, index in zip(coordinates, columns, strict=True)}

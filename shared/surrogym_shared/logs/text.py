@@ -191,6 +191,6 @@ def _require_names(where: str, names: Sequence[str]) -> None:
     if not any(names):
         raise UnusableLog(f"expected a log with a heading that names its columns, got none in {where}")
     if len(names) > MOST_COLUMNS:
-        raise UnusableLog(f"expected at most {MOST_COLUMNS} columns in {where}, got {len(names)}")
+        raise UnusableLog(f"expected at most {MOST_COLUMNS} columns in {where}, got {len(names)}: import some of them")
     if long := [name for name in names if len(name) > LONGEST_NAME]:
         raise UnusableLog(f"expected names of at most {LONGEST_NAME} letters in {where}, got {long[0][:40]!r}...")

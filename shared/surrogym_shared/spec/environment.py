@@ -9,9 +9,10 @@ from typing import Annotated, Literal, Self
 from pydantic import BeforeValidator, Field, StrictBool, StrictFloat, StrictInt, StrictStr, model_validator
 
 from surrogym_shared.checks import SHOWN, Number, Positive, require, require_known, require_unique
+from surrogym_shared.patterns import VISIBLE
 from surrogym_shared.presets import PRESETS, Preset, PresetName, Tolerance
 from surrogym_shared.spec.actions import Action
-from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, MAX_STARTS, REWARD, VISIBLE, Frozen, Name
+from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, MAX_STARTS, REWARD, Frozen, Name
 from surrogym_shared.spec.coordinates import Coordinate, StartDistribution, limits
 from surrogym_shared.spec.rewards import AnyReward, DeclaredReward, Reward, Success
 from surrogym_shared.spec.terms import AllOf, ObservationEntry, Term, Termination

@@ -10,8 +10,8 @@ from surrogym_shared.acting import MAX_ROLLOUT as MAX_ROLLOUT  # for modules tha
 from surrogym_shared.bounded import FailFast
 from surrogym_shared.kinds import AutoresetMode as AutoresetMode
 from surrogym_shared.kinds import Variant as Variant
-from surrogym_shared.spec import MAX_DIMENSIONS, NAME_PATTERN
-from surrogym_shared.spec.base import VISIBLE as VISIBLE
+from surrogym_shared.patterns import NAME, VISIBLE
+from surrogym_shared.spec import MAX_DIMENSIONS
 from surrogym_shared.states import Phase as Phase
 from surrogym_shared.states import Purpose as Purpose
 from surrogym_shared.states import QueryKind as QueryKind
@@ -30,7 +30,7 @@ MAX_MEASURED = 1e30  # variances overflow beyond it, so one larger sample would 
 
 Role = Literal["read", "train", "sample", "admin"]
 
-SurrogateName = Annotated[str, Field(pattern=NAME_PATTERN)]
+SurrogateName = Annotated[str, Field(pattern=NAME)]
 Key = Annotated[str, Field(min_length=1, max_length=128, pattern=VISIBLE)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Seq = Annotated[int, Field(ge=1)]

@@ -6,9 +6,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from surrogym_shared.patterns import POLICY, VISIBLE
 from surrogym_shared.states import JobEnd as JobEnd
 from surrogym_shared.states import JobStatus as JobStatus
-from surrogym_shared.wire.base import LEASE_SECONDS, VISIBLE, Key, Measured, Reply, Request
+from surrogym_shared.wire.base import LEASE_SECONDS, Key, Measured, Reply, Request
 
 MAX_JOB_EPISODES = 1_000  # real episodes of an evaluation
 MAX_JOB_STEPS = 10_000_000  # virtual steps of a training
@@ -52,7 +53,7 @@ class TrainTask(Request):
     @model_validator(mode="after")
     def _one_length(self) -> TrainTask:
         if self.preset == "quick" and self.steps is not None:
-            raise ValueError("expected steps or preset quick, got both")
+            raise ValueError("expected steps or preset quick, got both: leave one out")
         return self
 
 
@@ -60,7 +61,7 @@ class EvaluateTask(Request):
     """Evaluation of a stored policy by real episodes in the worker's environment, as by ``surrogym evaluate``."""
 
     kind: Literal["evaluate"]
-    policy: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")] = Field(
+    policy: Annotated[str, Field(pattern=POLICY)] = Field(
         default="latest", description="version or alias of the policy, or ``latest``"
     )
     episodes: Annotated[int, Field(ge=1, le=MAX_JOB_EPISODES)] = Field(
@@ -90,7 +91,9 @@ class EvaluateTask(Request):
     def _within_limit(self) -> EvaluateTask:
         if self.real_episodes > MAX_JOB_EPISODES:
             raise ValueError(
-                f"expected at most {MAX_JOB_EPISODES} episodes with the comparison's, got {self.real_episodes}"
+                f"expected at most {MAX_JOB_EPISODES} real episodes, those of the controllers to compare with "
+                "included, got "
+                f"{self.real_episodes}"
             )
         return self
 

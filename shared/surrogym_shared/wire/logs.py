@@ -7,8 +7,9 @@ from typing import Annotated
 from pydantic import Field
 
 from surrogym_shared.logs.columns import LogMapping
+from surrogym_shared.patterns import VISIBLE
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire.base import VISIBLE, Reply, Request
+from surrogym_shared.wire.base import Reply, Request
 
 MAX_LOG = 4 * 1024 * 1024  # letters
 MAX_REJECTED = 1_000  # rows that a reply lists

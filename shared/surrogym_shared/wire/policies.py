@@ -7,14 +7,15 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from surrogym_shared.kinds import Side
+from surrogym_shared.patterns import ALIAS, DIGEST, VISIBLE
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire.base import MAX_MEASURED, VISIBLE, Key, Measured, Reply, Request, Vector
+from surrogym_shared.wire.base import MAX_MEASURED, Key, Measured, Reply, Request, Vector
 
 PolicyForm = Literal["zip", "onnx", "pt2", "mp4", "gif"]  # endings of policy files
 Controller = Literal["policy", "zero", "random", "reference"]
 TraceRank = Literal["paired", "best", "median", "worst"]  # paired: from the same start for every controller
-Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256 of the file, as hex")]
-AliasName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
+Digest = Annotated[str, Field(pattern=DIGEST, description="SHA-256 of the file, as hex")]
+AliasName = Annotated[str, Field(pattern=ALIAS)]
 Count = Annotated[int, Field(ge=0, le=2**53)]
 Text = Annotated[str, Field(max_length=2_000, pattern=VISIBLE)]
 

@@ -137,7 +137,9 @@ class OpenSession(Request):
     @model_validator(mode="after")
     def _shares_of_starts_fit(self) -> Self:
         if (both := self.start_box + self.start_visited) > 1:
-            raise ValueError(f"start_box and start_visited: expected shares of 1 in all, got {both:g}")
+            raise ValueError(
+                f"start_box + start_visited: expected at most 1, as they are shares of the starts, got {both:g}"
+            )
         return self
 
     @model_validator(mode="after")
@@ -145,11 +147,13 @@ class OpenSession(Request):
         """Refuse options that the chosen variant would ignore."""
         for name in () if self.variant == "probabilistic" else OF_PARTICLES:
             if getattr(self, name) != type(self).model_fields[name].default:
-                raise ValueError(f"{name}: expected with variant probabilistic alone, got with {self.variant}")
+                raise ValueError(
+                    f"{name}: expected variant probabilistic, the only one with this option, got {self.variant}"
+                )
         if self.residual is not None and self.variant == "probabilistic":
-            raise ValueError("residual: expected with variant deterministic or pathwise, got with probabilistic")
+            raise ValueError("residual: expected variant deterministic or pathwise, got probabilistic")
         if self.functions is not None and self.variant != "pathwise":
-            raise ValueError(f"functions: expected with variant pathwise alone, got with {self.variant}")
+            raise ValueError(f"functions: expected variant pathwise, the only one with this option, got {self.variant}")
         return self
 
 
@@ -392,9 +396,10 @@ class RolloutSession(Request):
             got = "neither" if self.actions is None else "both"
             raise ValueError(f"expected either actions or a policy, got {got}")
         if (self.policy is None) != (self.steps is None):
-            raise ValueError("expected steps with a policy, and only with one")
+            came = "a policy without steps" if self.steps is None else "steps with actions"
+            raise ValueError(f"expected steps together with a policy, and not with actions, got {came}")
         if self.policy is None and (self.noise or self.until is not None):
-            raise ValueError("expected noise and until with a policy alone, got them with actions")
+            raise ValueError("expected noise and until only together with a policy, got one of them with actions")
         return self
 
 

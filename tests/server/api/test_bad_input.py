@@ -12,6 +12,7 @@ import pytest
 
 from support import pendulum
 from surrogym_shared.codes import PROBLEM_MEDIA_TYPE, STATUS, Code, Problem
+from surrogym_shared.patterns import IN_WORDS
 
 MAX_BODY = 32 * 1024 * 1024
 FILE = "application/octet-stream"
@@ -104,17 +105,17 @@ def crossed(field: str, value: Any) -> dict[str, Any]:
         ("coordinates.1.bounds.low", 9.0, "bounds cross"),
         ("action.low", [3.0], "action 0 crosses"),
         ("coordinates.1.sampling.high", 9.0, "leaves its bounds [-8.0, 8.0]"),
-        ("coordinates.0.colour", "red", "Extra inputs are not permitted, got 'red'"),
+        ("coordinates.0.colour", "red", "expected no entry of this name, got 'red'"),
         ("coordinates.0.sampling.low", float("nan"), "finite number, got nan"),
         ("start", {}, "start distribution lacks ['theta', 'theta_dot']"),
         ("time_limit", 0, "greater than or equal to 1, got 0"),
-        ("time_limit", True, "valid integer, got True"),
-        ("action.low", ["-2"], "valid number, got '-2'"),
+        ("time_limit", True, "whole number, got True"),
+        ("action.low", ["-2"], "expected a number, got '-2'"),
         ("coordinates.0.sampling.high", 1e308, "less than or equal to 1000000000000, got 1e+308"),
         ("coordinates.0.sampling", {"kind": "uniform", "low": 0, "high": 5e-324}, "too narrow"),
         ("coordinates.0.sampling", {"kind": "uniform", "low": 1e10, "high": 1e10 + 1}, "too narrow"),
         ("coordinates.1.bounds.stops", "theta_dot", "stops itself"),
-        ("termination", [[{"term": ONE, "relation": ">", "value": 0}]] * 17, "at most 16 items"),
+        ("termination", [[{"term": ONE, "relation": ">", "value": 0}]] * 17, "at most 16 entries"),
     ],
 )
 def test_a_contradictory_specification_is_refused(client: httpx.Client, name: str, field: str, value: Any, said: str):
@@ -165,11 +166,11 @@ def sample(**changes: Any) -> dict[str, Any]:
         ({"next_coordinates": [0.1, -1e308]}, "greater than or equal to -1000"),
         ({"action": [2.5]}, "action: expected entry 0 in [-2, 2], got 2.5"),
         ({"observation": [1.0]}, "samples.0.observation: expected 3 entries, got 1"),
-        ({"reward": float("nan")}, "samples.0.reward: Input should be a finite number, got nan"),
-        ({"coordinates": [float("inf"), 0.0]}, "samples.0.coordinates.0: Input should be a finite number, got inf"),
-        ({"reward": "1.0"}, "samples.0.reward: Input should be a valid number, got '1.0'"),
-        ({"terminated": 1}, "samples.0.terminated: Input should be a valid boolean, got 1"),
-        ({"mood": "good"}, "samples.0.mood: Extra inputs are not permitted, got 'good'"),
+        ({"reward": float("nan")}, "samples.0.reward: expected a finite number, got nan"),
+        ({"coordinates": [float("inf"), 0.0]}, "samples.0.coordinates.0: expected a finite number, got inf"),
+        ({"reward": "1.0"}, "samples.0.reward: expected a number, got '1.0'"),
+        ({"terminated": 1}, "samples.0.terminated: expected true or false, got 1"),
+        ({"mood": "good"}, "samples.0.mood: expected no entry of this name, got 'good'"),
         ({"query_id": 1}, "query_id and lease_token together"),
     ],
 )
@@ -221,7 +222,7 @@ def test_the_same_key_with_another_body(client: httpx.Client, fresh: str):
             {"coordinates": [[0, 0]], "action": [[0], [0]]},
             "actions as coordinates, got 2 actions and 1 coordinates",
         ),
-        ({"coordinates": [], "action": []}, "at least 1 item"),
+        ({"coordinates": [], "action": []}, "expected 1 or more entries"),
     ],
 )
 def test_an_impossible_manual_query_is_refused(client: httpx.Client, fresh: str, body: Any, said: str):
@@ -271,11 +272,11 @@ def test_an_unknown_occupancy_is_refused(client: httpx.Client, taught: str):
         ({"action": [[2.1], [0.0]]}, "expected entry 0 in [-2, 2], got 2.1 in row 0"),
         ({"action": [[float("nan")], [0.0]]}, "finite number, got nan"),
         ({"action": [[float("inf")], [0.0]]}, "finite number, got inf"),
-        ({"action": [["1"], [0.0]]}, "valid number, got '1'"),
-        ({"action": [[0.0], [0.0]], "mask": [True]}, "mask: expected 2 entries, one a lane, got 1"),
-        ({"action": [[0.0], [0.0]], "mask": [1, 0]}, "valid boolean, got 1"),
-        ({"action": [[0.0], [0.0]], "speed": 3}, "speed: Extra inputs are not permitted, got 3"),
-        ({}, "action: Field required"),
+        ({"action": [["1"], [0.0]]}, "expected a number, got '1'"),
+        ({"action": [[0.0], [0.0]], "mask": [True]}, "mask: expected 2 entries, one for each lane, got 1"),
+        ({"action": [[0.0], [0.0]], "mask": [1, 0]}, "true or false, got 1"),
+        ({"action": [[0.0], [0.0]], "speed": 3}, "speed: expected no entry of this name, got 3"),
+        ({}, "action: expected a value, got nothing"),
         ({"action": [[0.0], [0.0]], "seq": 0}, "greater than or equal to 1, got 0"),
     ],
 )
@@ -290,10 +291,10 @@ def test_an_impossible_step_is_refused(client: httpx.Client, session: str, body:
 @pytest.mark.parametrize(
     ("body", "said"),
     [
-        ({"seed": [1]}, "seed: expected an integer or 2 of them, got 1"),
+        ({"seed": [1]}, "seed: expected a whole number, or 2 of them, one for each lane, got 1"),
         ({"seed": -1}, "greater than or equal to 0, got -1"),
-        ({"seed": 1.5}, "valid integer"),
-        ({"mask": [True]}, "mask: expected 2 entries, got 1"),
+        ({"seed": 1.5}, "whole number"),
+        ({"mask": [True]}, "mask: expected 2 entries, one for each lane, got 1"),
     ],
 )
 def test_an_impossible_reset_is_refused(client: httpx.Client, session: str, body: Any, said: str):
@@ -329,13 +330,13 @@ def with_layers(count: int, units: int) -> dict[str, Any]:
     [
         ({}, "expected either actions or a policy, got neither"),
         ({**ROLL, "actions": [[[0.0], [0.0]]]}, "expected either actions or a policy, got both"),
-        ({"policy": POLICY}, "expected steps with a policy"),
-        ({"actions": [[[0.0], [0.0]]], "noise": {"seed": 0}}, "expected noise and until with a policy alone"),
+        ({"policy": POLICY}, "got a policy without steps"),
+        ({"actions": [[[0.0], [0.0]]], "noise": {"seed": 0}}, "expected noise and until only together with a policy"),
         ({**ROLL, "steps": 0}, "steps"),
-        ({**ROLL, "until": [True]}, "until: expected 2 entries, one a lane, got 1"),
+        ({**ROLL, "until": [True]}, "until: expected 2 entries, one for each lane, got 1"),
         ({**ROLL, "noise": {"seed": -1}}, "seed"),
         ({**ROLL, "noise": {"seed": 0}}, "expected log_deviations for the noise"),
-        ({**ROLL, "noise": {"seed": 0}, "policy": {**POLICY, "log_deviations": [81]}}, "within +-80, got 81"),
+        ({**ROLL, "noise": {"seed": 0}, "policy": {**POLICY, "log_deviations": [81]}}, "between -80 and 80, got 81"),
         ({**ROLL, "policy": {**POLICY, "mean": [0, 0]}}, "expected deviation of shape (2,), got (3,)"),
         ({**ROLL, "policy": {**POLICY, "deviation": [1, 0, 1]}}, "expected a positive standard deviation, got 0"),
         ({**ROLL, "policy": {**POLICY, "mean": [0, 0, 1e300]}}, "finite numbers in mean"),
@@ -425,3 +426,28 @@ def test_bytes_that_are_no_text(client: httpx.Client):
     reply = client.post("/v1/surrogates", content=b"\xff\xfe{", headers={"content-type": "application/json"})
     refused(reply, Code.INVALID_REQUEST, "expected JSON in UTF-8")
     assert reply.status_code == 422
+
+
+def test_every_pattern_of_a_text_is_described_in_words(client: httpx.Client):
+    """A name with a space was refused by a regular expression."""
+    patterns = set(entries(client.get("/openapi.json").json(), "pattern"))
+    assert patterns
+    assert patterns <= IN_WORDS.keys()
+
+
+def entries(node: Any, key: str) -> Iterator[str]:
+    """All texts under ``key`` in a value from JSON."""
+    if isinstance(node, dict):
+        yield from (value for name, value in node.items() if name == key and isinstance(value, str))
+        node = list(node.values())
+    for inner in node if isinstance(node, list) else ():
+        yield from entries(inner, key)
+
+
+def test_a_name_with_a_space_is_refused_with_the_allowed_characters(client: httpx.Client):
+    refused(
+        client.post("/v1/surrogates", json={"name": "my tank", "spec": pendulum.spec()}),
+        Code.INVALID_REQUEST,
+        "name: expected 1 to 64 letters, digits, '.', '_' or '-'",
+        "got 'my tank'",
+    )

@@ -211,7 +211,7 @@ def test_shares_of_starts_above_one_are_refused(client: httpx.Client, name: str)
     pendulum.teach(client, name, budget=5)
     asked = {"start_box": 0.5, "start_visited": 0.6}
     refused = client.post(f"/v1/surrogates/{name}/sessions", json=asked)
-    assert (refused.status_code, "shares of 1 in all, got 1.1" in refused.text) == (422, True)
+    assert (refused.status_code, "got 1.1" in refused.text) == (422, True)
 
 
 @pytest.mark.parametrize("functions", [0, 2])

@@ -46,7 +46,7 @@ def test_a_taken_port_is_one_sentence(server_process: Any, tmp_path: Path):
         (["--database", "mysql://x/y"], {}, "mysql"),
         (["--ray-hosts", "1"], {}, "--ray-hosts: expected --engine ray with it, got the engine local"),
         (["--ray-address", "auto"], {"SURROGYM_ENGINE": "local"}, "--ray-address: expected --engine ray with it"),
-        (["--device", "tpu"], {}, "setting device: Input should be 'cpu' or 'cuda'"),
+        (["--device", "tpu"], {}, "setting device: expected 'cpu' or 'cuda'"),
         pytest.param([], {"SURROGYM_DEVICE": "cuda"}, "setting device: expected cpu, got cuda", marks=WITHOUT_CUDA),
     ],
 )

@@ -70,7 +70,7 @@ def test_a_reset_moves_its_lanes_alone(opened: Open):
 def test_a_mask_of_another_length_is_refused(opened: Open, fitted: Fitted):
     session, _ = reset_session(opened(), None, None, 1)
     session = replace(session, versions=np.array([1, 2, 1, 2]))
-    with pytest.raises(InvalidInput, match="expected 4 entries, one a lane, got 3"):
+    with pytest.raises(InvalidInput, match="expected 4 entries, one for each lane, got 3"):
         step_session(session, np.zeros((4, 1)), np.ones(3, dtype=bool), False, fitted, 2)
 
 

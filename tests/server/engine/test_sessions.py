@@ -217,12 +217,12 @@ def test_all_sessions_together_have_a_limit_of_memory(live: LiveSessions, opened
     live.add(opened("a", **particles))
     with pytest.raises(Overloaded, match=r"at most 1\.0 MiB, got 0\.6 MiB and 0\.6 MiB more"):
         live.add(opened("b", **particles))
-    with pytest.raises(TooLarge, match=r"at most 1\.0 MiB, got 1\.1 MiB"):
+    with pytest.raises(TooLarge, match=r"at most 1\.0 MiB .* got 1\.1 MiB"):
         live.add(opened("c"), reserved=int(1.1 * MEBIBYTE))
     live.add(opened("small"))
     with pytest.raises(Overloaded, match="all sessions to take at most"):
         asyncio.run(live.advance("small", 1, Fingerprint("d"), work, steps=200))
-    with pytest.raises(TooLarge, match="lanes and answers"):
+    with pytest.raises(TooLarge, match="fewer steps"):
         asyncio.run(live.advance("small", 1, Fingerprint("d"), work, steps=10_000))
     asyncio.run(live.advance("small", 1, Fingerprint("d"), work, steps=10))
     assert {session.id for session in live} == {"a", "small"}
@@ -257,7 +257,7 @@ def test_a_request_that_would_be_late_is_never_begun(live: LiveSessions, opened:
 
     async def run() -> None:
         await live.advance("known", None, Fingerprint("d"), lasting)
-        with pytest.raises(DeadlineExceeded, match=r"within 20 ms, but it would take [5-9]"):
+        with pytest.raises(DeadlineExceeded, match=r"would take [5-9]\d* ms, and 20 ms are left"):
             await live.advance("known", None, Fingerprint("d"), lasting, deadline=clock.now + 0.02)
         await live.advance("known", None, Fingerprint("d"), lasting, deadline=clock.now + 60)
         before = asyncio.create_task(live.advance("waiting", 1, Fingerprint("d"), slow))
@@ -266,7 +266,7 @@ def test_a_request_that_would_be_late_is_never_begun(live: LiveSessions, opened:
             await asyncio.sleep(0.001)
         clock.now += 2
         slow.go.set()
-        with pytest.raises(DeadlineExceeded, match="within 0 ms"):
+        with pytest.raises(DeadlineExceeded, match="and 0 ms are left"):
             await late
         assert (await before).seq == 1, "a kept answer has no deadline"
         assert (await live.advance("waiting", 1, Fingerprint("d"), slow, deadline=clock.now)).seq == 1

@@ -141,7 +141,7 @@ def test_a_logged_sample_of_a_query_is_refused_by_its_index(
 ) -> None:
     name = make(queries=1)
     [leased] = storage.queries.claim(name, "a", 1, SECONDS)
-    with pytest.raises(InvalidInput, match=r"samples\.1: expected a logged sample without a query_id"):
+    with pytest.raises(InvalidInput, match=r"samples\.1: expected no query_id"):
         storage.samples.add(name, "log", [by_hand(), answer(leased)], log=LogPart())
     assert storage.samples.count(name) == 0
 

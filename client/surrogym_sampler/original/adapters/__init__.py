@@ -14,8 +14,8 @@ from pydantic import ValidationError
 
 from surrogym_sampler.original.errors import RAISED, UnknownEnvironment, sentence
 from surrogym_sampler.original.simulator import Simulator
-from surrogym_shared.checks import first_fault
 from surrogym_shared.environments import GYMNASIUM_ID
+from surrogym_shared.faults import first_fault
 
 WITH_SPECIFICATION = re.compile(r"exec:.*|[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # a program, or package.module:factory
 

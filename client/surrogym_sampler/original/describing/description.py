@@ -22,7 +22,7 @@ from surrogym_sampler.original.errors import UnknownEnvironment
 from surrogym_sampler.original.protocol import Array
 from surrogym_sampler.original.simulator import Variable
 from surrogym_sampler.original.state_parts import VELOCITY
-from surrogym_shared.checks import first_fault
+from surrogym_shared.faults import first_fault
 from surrogym_shared.spec import (
     MAX_DIMENSIONS,
     DeclaredReward,

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from surrogym_sampler.original.errors import RequestRefused, StepFailed, StepRefused, UnknownEnvironment
 from surrogym_sampler.original.protocol import Array
-from surrogym_shared.checks import first_fault
+from surrogym_shared.faults import first_fault
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.spec.actions import Action
 

@@ -15,7 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from surrogym_sampler.original.errors import UnknownEnvironment
 from surrogym_sampler.original.fmus.archive import Archive, Declared
-from surrogym_shared.checks import Number, first_fault
+from surrogym_shared.checks import Number
+from surrogym_shared.faults import first_fault
 
 PREFIX = "fmu:"
 Value = bool | int | float | str

@@ -136,7 +136,9 @@ def source_of(controller: Controller, real: str, name: str) -> str:
     for one in controller.measurements:
         if one.angle and max(-one.lowest, one.highest) > 2 * np.pi * MOST_TURNS:
             raise NotDeployable(
-                f"expected an angle {one.name} of at most {MOST_TURNS:g} turns, for TRUNC: narrow --range"
+                f"expected --range of the angle {one.name} to span at most {MOST_TURNS:g} turns, which is what "
+                "TRUNC can count: "
+                "narrow it"
             )
     sizes, decision = _sizes(controller.decision), controller.decision
     last = {

@@ -231,7 +231,7 @@ class Learner:
         shapes = {**dict.fromkeys(VECTORS, self.parameters.shape), "updates": ()}
         found = {name: header.shape for name, header in headers.items()}
         if found != shapes:
-            raise ValueError(f"expected a network of {self.parameters.size} parameters, got arrays of shapes {found}")
+            raise ValueError(f"expected the state of a training of {self.parameters.size} parameters, got {found}")
 
 
 @dataclass(frozen=True)
@@ -277,7 +277,7 @@ def noisy(path: Path) -> Predict:
 
 def _require_parameters(headers: Mapping[str, Header]) -> None:
     if "parameters" not in headers or len(headers["parameters"].shape) != 1:
-        raise ValueError("expected a vector of parameters")
+        raise ValueError("expected an array 'parameters' of shape (n,), got none")
 
 
 def _state(path: Path, require: Callable[[Mapping[str, Header]], None]) -> dict[str, NDArray[Any]]:
@@ -285,7 +285,7 @@ def _state(path: Path, require: Callable[[Mapping[str, Header]], None]) -> dict[
         entries = read_entries(path, MAX_BYTES)
         if LEARNER not in entries:
             raise ValueError(
-                "expected a file that this algorithm saved, got a policy without the state of its training"
+                "it has no state of a training by fastppo; give a policy that surrogym train saved with this algorithm"
             )
         return read_arrays(entries[LEARNER], MAX_BYTES, require)
     except (OSError, ValueError) as error:

@@ -16,6 +16,7 @@ from surrogym_server.feature import part
 from surrogym_server.features.policies import forms
 from surrogym_server.features.policies.service import PolicyService
 from surrogym_shared.codes import Code
+from surrogym_shared.patterns import DIGEST
 from surrogym_shared.wire import (
     AddEvaluation,
     AddPolicy,
@@ -123,7 +124,7 @@ async def put_file(
     name: str,
     version: Version,
     form: PolicyForm,
-    digest: Annotated[str, Query(pattern=r"^[0-9a-f]{64}$", description="SHA-256 of the body, as hex")],
+    digest: Annotated[str, Query(pattern=DIGEST, description="SHA-256 of the body, as hex")],
     request: Request,
     policies: Policies,
 ) -> PolicyView:

@@ -294,7 +294,7 @@ def _require_lengths(episodes: Episodes, spec: JSON) -> None:
     for what in ("lengths", "success"):
         values = getattr(episodes, what)
         if values is not None and len(values) != count:
-            raise InvalidInput(f"{what}: expected one entry for each of {count} returns, got {len(values)}")
+            raise InvalidInput(f"{what}: expected {count} entries, one for each return, got {len(values)}")
     action = spec["action"]
     sizes = {"c": len(spec["coordinates"]), "f": len(action.get("low") or action.get("nvec") or (0,))}
     for number, trace in enumerate(episodes.traces):

@@ -106,7 +106,7 @@ def _regression(name: str, arrays: Arrays, inputs: int, outputs: int, *, quadrat
     centre, scale = arrays[f"{name}.centre"], arrays[f"{name}.scale"]
     _require_shapes(name, {"centre": centre, "scale": scale}, {"centre": (outputs,), "scale": (outputs,)})
     if bool((scale < 0).any()):
-        raise InvalidInput(f"{name}: expected scales of at least 0, got {float(scale.min()):g}")
+        raise InvalidInput(f"{name}: expected each entry of scale to be at least 0, got {float(scale.min()):g}")
     return Regression(_networks(name, arrays, inputs, outputs, quadratic=quadratic), centre, scale)
 
 
@@ -114,7 +114,7 @@ def _noise(name: str, arrays: Arrays, inputs: int, outputs: int) -> Noise:
     size = arrays[f"{name}.size"]
     _require_shapes(name, {"size": size}, {"size": (outputs,)})
     if bool((size < 0).any()):
-        raise InvalidInput(f"{name}: expected sizes of at least 0, got {float(size.min()):g}")
+        raise InvalidInput(f"{name}: expected each entry of size to be at least 0, got {float(size.min()):g}")
     return Noise(_networks(name, arrays, inputs, outputs, quadratic=False), size)
 
 
@@ -122,7 +122,9 @@ def _networks(name: str, arrays: Arrays, d: int, p: int, *, quadratic: bool) -> 
     networks = Networks(*(arrays[f"{name}.{field.name}"] for field in fields(Networks)))
     k, h = len(networks.skip), networks.last.shape[1]
     if not (2 <= k <= MAX_MEMBERS and 1 <= h <= MAX_UNITS):
-        raise InvalidInput(f"{name}: expected 2 to {MAX_MEMBERS} members of 1 to {MAX_UNITS} units, got {k} of {h}")
+        raise InvalidInput(
+            f"{name}: expected 2 to {MAX_MEMBERS} networks with 1 to {MAX_UNITS} units in a layer, got {k} with {h}"
+        )
     shapes = {
         "skip": (k, 1 + (2 if quadratic else 1) * d, p),
         "first": (k, d, h),
@@ -144,13 +146,16 @@ def _checked_header(definition: EnvironmentDefinition, stored: StoredModel) -> H
     header, outputs = stored.header, tuple(stored.header["outputs"])
     require_format(header["format"], FORMAT)
     if outputs != definition.outputs:
-        raise InvalidInput(f"expected a model with outputs {definition.outputs}, got {outputs}")
+        raise InvalidInput(f"expected a model with the outputs {definition.outputs}, got one with {outputs}")
     terminal_reward, samples = float(header["terminal_reward"]), int(header["samples"])
     if not math.isfinite(terminal_reward) or samples < 1:
-        raise InvalidInput(f"expected a finite terminal reward and samples, got {terminal_reward} and {samples}")
+        raise InvalidInput(
+            f"expected a finite terminal_reward and at least 1 in samples, got {terminal_reward} and {samples}"
+        )
     for name, array in stored.tensors.items():
         if array.dtype != torch.float64 or not bool(torch.isfinite(array).all()):
-            raise InvalidInput(f"expected finite numbers of torch.float64 as {name}, got {array.dtype}")
+            came = "NaN or infinity" if array.dtype == torch.float64 else array.dtype
+            raise InvalidInput(f"expected the array {name} as finite numbers in torch.float64, got {came}")
     return Header(terminal_reward, samples, str(header["digest"]), header["ending"])
 
 
@@ -164,5 +169,8 @@ def _require_shapes(name: str, arrays: Mapping[str, Tensor], shapes: Mapping[str
 def _only_label(label: object) -> float:
     """The label of an ending whose samples have no other one. Raises ``InvalidInput`` if it is neither 0 nor 1."""
     if label not in (0.0, 1.0):
-        raise InvalidInput(f"expected the only label of an ending to be 0 or 1, got {str(label)[:80]}")
+        raise InvalidInput(
+            "expected ending as 0 or 1, because all samples agree whether a step ends the episode, got "
+            f"{str(label)[:80]}"
+        )
     return float(bool(label))

@@ -180,8 +180,9 @@ def _to_raise(connection: Connection, record: SurrogateRecord, queries: int, *, 
     missing = max(0, queries - unspoken)
     if missing and not allowed:
         raise BeyondBudget(
-            f"expected at most {max(0, unspoken)} more queries, because the budget of {record.budget} real steps "
-            f"of {record.name!r} has no more left, got {queries}: a token of role admin may raise it "
+            f"expected at most {max(0, unspoken)} more queries, because {record.name!r} has a budget of "
+            f"{record.budget} real "
+            f"steps, got {queries}: a token of role admin may raise it "
             f"(surrogym change {record.name} --budget {record.budget + missing})"
         )
     return missing

@@ -314,7 +314,9 @@ def _lease_of(
 ) -> Answered | None:
     if sample.query_id is None:
         if sample.lease_token is not None:
-            raise InvalidInput("expected a query_id beside lease_token, got none")
+            raise InvalidInput(
+                "expected query_id together with lease_token, got lease_token alone: send both, as the claim gave them"
+            )
         return None
     if sample.query_id not in by_id:
         raise unknown_query(sample.query_id)

@@ -89,7 +89,10 @@ def recall(connection: Connection, surrogate: Row[Any], operation: str, key: str
     if row is None:
         return None
     if row.fingerprint != body:
-        raise IdempotencyConflict(f"expected the same body as in the first request with key {key!r}, got another")
+        raise IdempotencyConflict(
+            f"expected the same body as in the first request with the idempotency key {key!r}, got another: use a "
+            "new key"
+        )
     return row.result
 
 

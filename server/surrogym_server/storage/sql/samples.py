@@ -219,7 +219,9 @@ def store_logged(
     """
     for index, sample in enumerate(batch):
         if sample.query_id is not None:
-            raise InvalidInput(f"samples.{index}: expected a logged sample without a query_id, got {sample.query_id}")
+            raise InvalidInput(
+                f"samples.{index}: expected no query_id, because the sample comes from a log, got {sample.query_id}"
+            )
     rows = [row_of(surrogate, sampler, sample, logged=True) for sample in batch]
     before = after or ""
     while True:

@@ -82,5 +82,5 @@ def test_another_shape_is_refused(definition, model, drift):
         for o in model.transitions
     ]
     data = to_bytes(replace(model, transitions=tuple(changed)))
-    with pytest.raises(InvalidInput, match="expected a drift of shape"):
+    with pytest.raises(InvalidInput, match="expected the drift as"):
         from_bytes(definition, data)

@@ -91,7 +91,7 @@ def test_a_missing_tensor_is_refused(pendulum_definition, data):
 
 def test_a_tensor_of_another_precision_is_refused(pendulum_definition, data):
     single = load(data)["0.x"].float()
-    with pytest.raises(InvalidInput, match=r"expected x of torch\.float64"):
+    with pytest.raises(InvalidInput, match=r"expected x as torch\.float64"):
         from_bytes(pendulum_definition, rewritten(data, **{"0_x": single}))
 
 

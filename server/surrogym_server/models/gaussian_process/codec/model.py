@@ -46,7 +46,7 @@ class GaussianProcessCodec(ModelCodec):
         for region in (*(jump.region for jump in model.jumps), *([] if model.ending is None else [model.ending])):
             require_region(region)
         if not all(math.isfinite(jump.size) for jump in model.jumps):
-            raise InvalidInput(f"expected jumps of finite sizes, got {[jump.size for jump in model.jumps][:4]}")
+            raise InvalidInput(f"expected finite sizes of the jumps, got {[jump.size for jump in model.jumps][:4]}")
         return model
 
 
@@ -81,7 +81,7 @@ def _read(definition: EnvironmentDefinition, stored: StoredModel) -> GaussianPro
     jumps = read_jumps(definition, header["jumps"], tensors, JUMP)
     names = tuple(output.name for output in outputs)
     if names != definition.outputs:
-        raise InvalidInput(f"expected a model with outputs {definition.outputs}, got {names}")
+        raise InvalidInput(f"expected a model with the outputs {definition.outputs}, got one with {names}")
     return GaussianProcessModel(definition, outputs[:-1], outputs[-1], terminal_reward, samples, digest, ending, jumps)
 
 
@@ -89,8 +89,10 @@ def _require_consistent(model: GaussianProcessModel) -> None:
     """Check that the numbers can come from a fit, and fit the definition. Raises ``InvalidInput``."""
     definition, reward = model.definition, model.reward
     if not math.isfinite(model.terminal_reward) or model.samples < 1:
-        got = f"{model.terminal_reward} and {model.samples}"
-        raise InvalidInput(f"expected a finite terminal reward and samples, got {got}")
+        raise InvalidInput(
+            f"expected a finite terminal_reward and at least 1 in samples, got {model.terminal_reward} and "
+            f"{model.samples}"
+        )
     if any(output.feature_map.after for output in model.transitions):
         raise InvalidInput(
             "expected transition outputs that read the state before the step, got one that reads the state after it"

@@ -88,10 +88,10 @@ def read_output(
     shorter = (None, *range(max(definition.ages)))
     plain = replace(feature_map, drift=(), history=None, rates=(), dropped=())
     if plain not in KNOWN_MAPS or feature_map.history not in shorter:
-        raise ValueError(f"unknown feature map {feature_map}")
+        raise ValueError(f"expected inputs of a process that this version knows, got {feature_map}")
     mirror = reflection(definition, feature_map)
     if feature_map.parity and mirror is None:
-        raise ValueError(f"feature map {feature_map}: the environment's inputs have no mirror image")
+        raise ValueError(f"expected inputs without mirror images, because the environment has none, got {feature_map}")
     posterior = None
     if (stored := entry["posterior"]) is not None:
         arrays = {n: tensors[f"{prefix}.{n}"] for n in ("x", "y", "factor", "weights", "lengthscale")}
@@ -141,7 +141,9 @@ def _require_drift(definition: EnvironmentDefinition, output: OutputModel) -> No
         return
     shape = (len(definition.angles), len(definition.coordinates))
     if len(drift) != shape[0] or any(len(row) != shape[1] or not all(map(math.isfinite, row)) for row in drift):
-        raise InvalidInput(f"output {output.name!r}: expected a drift of shape {shape}, finite, got {drift}")
+        raise InvalidInput(
+            f"output {output.name!r}: expected the drift as finite numbers of shape {shape}, got {drift}"
+        )
 
 
 def _require_dropped(definition: EnvironmentDefinition, output: OutputModel) -> None:
@@ -156,7 +158,11 @@ def _require_dropped(definition: EnvironmentDefinition, output: OutputModel) -> 
         or len(dropped) >= count
         or not 0 <= min(dropped) <= max(dropped) < count
     ):
-        raise InvalidInput(f"output {output.name!r}: expected some of {count} features left out, got {dropped}")
+        raise InvalidInput(
+            f"output {output.name!r}: expected the numbers of the inputs that are left out (dropped) to be some, "
+            "not all, "
+            f"of 0 to {count - 1} in rising order, got {dropped}"
+        )
 
 
 def _require_warp(output: OutputModel) -> None:
@@ -164,7 +170,11 @@ def _require_warp(output: OutputModel) -> None:
     if output.warp is None:
         return
     if output.name != REWARD or output.posterior is None or not output.warp.finite:
-        raise InvalidInput(f"output {output.name!r}: expected a warp of a learned reward, finite, got {output.warp}")
+        raise InvalidInput(
+            f"output {output.name!r}: expected a transformation (warp) of a learned reward alone, with finite "
+            "numbers, got "
+            f"{output.warp}"
+        )
 
 
 def _require_rates(definition: EnvironmentDefinition, output: OutputModel) -> None:
@@ -182,9 +192,15 @@ def _require_rates(definition: EnvironmentDefinition, output: OutputModel) -> No
         or len(rates) != len(may)
         or not all(abs(rate) <= STEEPEST and (able or rate == 0) for rate, able in zip(rates, may, strict=True))
     ):
-        raise InvalidInput(f"output {output.name!r}: expected rates of a transition's features, got {rates}")
+        raise InvalidInput(
+            f"output {output.name!r}: expected a rate of growth for each input of a next state, at most "
+            f"{STEEPEST:g} in "
+            f"size, and 0 where the input can't grow, got {rates}"
+        )
     if not bool((1 + output.posterior.x * torch.tensor(rates, dtype=torch.float64) > 0).all()):
-        raise InvalidInput(f"output {output.name!r}: expected an amplitude above 0 at all points")
+        raise InvalidInput(
+            f"output {output.name!r}: expected rates of growth with which the amplitude is above 0 at all samples"
+        )
 
 
 def _require_at_limit(definition: EnvironmentDefinition, output: OutputModel) -> None:
@@ -193,14 +209,17 @@ def _require_at_limit(definition: EnvironmentDefinition, output: OutputModel) ->
         return
     count = 0 if output.posterior is None else len(output.posterior.y)
     if output.name not in definition.outputs[:-1] or len(sides) != count or not set(sides) <= {-1, 0, 1}:
-        raise InvalidInput(f"output {output.name!r}: expected a side, -1, 0 or 1, for each of {count} points")
+        raise InvalidInput(f"output {output.name!r}: expected at_limit with -1, 0 or 1 for each of {count} samples")
 
 
 def _require_shared(definition: EnvironmentDefinition, output: OutputModel) -> None:
     """Check that only a transition shares samples, with other transitions."""
     transitions = definition.outputs[:-1]
     if output.shared and not {output.name, *output.shared} <= set(transitions):
-        raise InvalidInput(f"output {output.name!r}: expected to share samples with transitions, got {output.shared}")
+        raise InvalidInput(
+            f"output {output.name!r}: expected to share samples with some of {', '.join(transitions)}, got "
+            f"{output.shared}"
+        )
 
 
 def _require_numbers(output: OutputModel) -> None:
@@ -223,7 +242,9 @@ def _require_numbers(output: OutputModel) -> None:
         and min(least_zero) >= 0
         and all(bool(torch.isfinite(t).all()) for t in tensors)
     ):
-        raise InvalidInput(f"output {output.name!r}: expected finite numbers, scales and variances above 0")
+        raise InvalidInput(
+            f"output {output.name!r}: expected finite numbers, with scales and variances above 0, got others"
+        )
 
 
 def _require_shapes(definition: EnvironmentDefinition, output: OutputModel) -> None:
@@ -243,4 +264,4 @@ def _require_shapes(definition: EnvironmentDefinition, output: OutputModel) -> N
     for name, (tensor, shape) in expected.items():
         if tuple(tensor.shape) != shape or tensor.dtype != torch.float64:
             got = f"{tensor.dtype} {tuple(tensor.shape)}"
-            raise InvalidInput(f"output {output.name!r}: expected {name} of torch.float64 {shape}, got {got}")
+            raise InvalidInput(f"output {output.name!r}: expected {name} as torch.float64 of shape {shape}, got {got}")

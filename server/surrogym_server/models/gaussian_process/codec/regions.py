@@ -72,7 +72,7 @@ def require_region(region: Region) -> None:
     """Check weights, processes, axes and widths of gaps of a region. Raises ``InvalidInput``."""
     weights = [weight for weight, _ in region.forms]
     if not weights or min(weights) <= 0 or not math.isclose(sum(weights), 1, abs_tol=1e-6):
-        raise InvalidInput(f"expected forms of a region with weights that add up to 1, got {weights[:4]}")
+        raise InvalidInput(f"expected weights of a region's forms above 0 that add up to 1, got {weights[:4]}")
     for _, form in region.forms:
         if isinstance(form, Classifier):
             _require_classifier(form)
@@ -97,7 +97,9 @@ def _read_form(definition: EnvironmentDefinition, entry: Any, tensors: Mapping[s
 
 def _require_classifier(classifier: Classifier) -> None:
     if classifier.process.feature_map.lead:
-        raise InvalidInput("expected a classifier of states, got one that also reads the lead")
+        raise InvalidInput(
+            "expected a classifier that reads the state alone, got one that also reads the change of the state"
+        )
     require_output(classifier.definition, classifier.process)
 
 
@@ -113,7 +115,10 @@ def _require_thresholds(thresholds: Thresholds) -> None:
         for cut in cuts
     )
     if not (sound and thresholds.rules and all(thresholds.rules)):
-        raise InvalidInput(f"expected thresholds on axes 0 to {axes - 1} with gaps and weights above 0, got {cuts[:4]}")
+        raise InvalidInput(
+            f"expected thresholds on the axes 0 to {axes - 1}, each with outside < inside and a weight above 0 and at "
+            f"most 1, got {cuts[:4]}"
+        )
 
 
 def _cut(axis: Any, outside: Any, inside: Any, weight: Any) -> Cut:

@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from support.moody import SPEC
-from surrogym_shared.checks import first_fault
+from surrogym_shared.faults import first_fault
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.spec.environment import ModelChoice
 
@@ -17,9 +17,9 @@ from surrogym_shared.spec.environment import ModelChoice
     ("fields", "says"),
     [
         ({"coordinates": []}, "coordinates: expected 1 or more entries, got 0"),
-        ({"coordinates": 70 * [{}]}, "coordinates.0.name: Field required"),
+        ({"coordinates": 70 * [{}]}, "coordinates.0.name: expected a value, got nothing"),
         ({"starts": 257 * [[0.0]]}, "starts: expected at most 256 entries, got 257"),
-        ({"time_limit": "long"}, "time_limit: Input should be a valid integer"),
+        ({"time_limit": "long"}, "time_limit: expected a whole number"),
         ({"action": {"kind": "box", "low": [1.0], "high": [0.0]}}, "action.box: action 0 crosses: expected low < high"),
     ],
 )
@@ -34,7 +34,7 @@ def test_the_value_that_came_is_cut():
     with pytest.raises(ValidationError) as found:
         EnvironmentSpec.model_validate(SPEC.model_dump() | {"time_limit": 1_000 * "x"})
     said = first_fault(found.value, got=True)
-    assert said.startswith("time_limit: Input should be a valid integer, got 'xxx")
+    assert said.startswith("time_limit: expected a whole number, got 'xxx")
     assert len(said) < 120
 
 

@@ -1,0 +1,116 @@
+"""The faults that a validation found, in words for a person who does not know pydantic."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
+from typing import Any, Literal, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from surrogym_shared.checks import SHOWN
+from surrogym_shared.patterns import IN_WORDS
+
+REWORDED = (  # what pydantic says, and what a person reads instead
+    (r"^Value error, ", ""),
+    (r"^Field required$", "expected a value, got nothing"),
+    (r"^Extra inputs are not permitted$", "expected no entry of this name"),
+    (r"^(Input|String|Bytes|URL) should (be |have )?", "expected "),
+    (r"^expected (greater|less) ", r"expected a number \1 "),
+    (r"a valid (dictionary|object)( or .*)?$", "an object with named entries"),
+    (r"a valid (list|tuple|array)\b", "a list"),
+    (r"a valid boolean\b", "true or false"),
+    (r"a valid integer\b", "a whole number"),
+    (r"a valid string\b", "a text"),
+    (r"a valid ", "a "),
+)
+
+
+def first_fault(error: ValidationError, *, got: bool = False, of: type[BaseModel] | None = None) -> str:
+    """Describe the first thing that is wrong, with its place.
+
+    Args:
+        error: the error.
+        got: whether to add the value that came to this place.
+        of: model of the input. An unknown entry is then described by the allowed ones, and precedes a missing entry,
+            because it may be that one with a wrong name.
+    """
+    faults = error.errors()
+    unknown = next((fault for fault in faults if fault["type"] == "extra_forbidden"), None)
+    first = unknown if of is not None and unknown is not None and faults[0]["type"] == "missing" else faults[0]
+    where = ".".join(str(part) for part in first["loc"])
+    unknown_entry = first["type"] == "extra_forbidden"
+    said = of_unknown(of, first["loc"]) if of is not None and unknown_entry else in_words(first)
+    came = f", got {repr(first['input'])[:SHOWN]}" if got and where and ", got " not in said else ""
+    return f"{where}{': ' if where else ''}{said}{came}"
+
+
+def in_words(fault: ErrorDetails) -> str:
+    """Say what a validation expected, without words of Python."""
+    context = fault.get("ctx", {})
+    match fault["type"]:
+        case "too_short":
+            return f"expected {context['min_length']} or more entries, got {context['actual_length']}"
+        case "too_long" if context["actual_length"] is not None:
+            return f"expected at most {context['max_length']} entries, got {context['actual_length']}"
+        case "string_pattern_mismatch":
+            pattern = context["pattern"]
+            return f"expected {IN_WORDS.get(pattern, f'text that matches the regular expression {pattern}')}"
+        case "union_tag_invalid":
+            return f"expected {context['discriminator']} to be one of {context['expected_tags']}"
+        case "union_tag_not_found":
+            return f"expected an entry {context['discriminator']}, which says of which kind it is"
+    said = fault["msg"]
+    for pydantic, ours in REWORDED:
+        said = re.sub(pydantic, ours, said)
+    return said
+
+
+def of_unknown(model: type[BaseModel], place: Sequence[int | str]) -> str:
+    """Describe an unknown entry of an input: the allowed ones at its place, and the one that is meant perhaps.
+
+    Args:
+        model: model of the whole input.
+        place: place of the entry, as pydantic gives it.
+    """
+    *above, name = place
+    fields = list(dict.fromkeys(field for model in _models_at(model, above) for field in model.model_fields))
+    close = get_close_matches(str(name), fields, n=1)
+    meant = f"; did you mean {close[0]!r}?" if close else ""
+    return f"unknown entry; expected some of {', '.join(fields)}{meant}" if fields else "unknown entry"
+
+
+def _models_at(model: type[BaseModel], place: Sequence[int | str]) -> list[type[BaseModel]]:
+    """Return the models that the input at a place may be of. A place also has the tags of unions."""
+    models = [model]
+    inner: list[Any] = [model]
+    for part in place:
+        fields = [one.model_fields[part].annotation for one in models if part in one.model_fields]
+        if fields:
+            inner = fields
+        models = [one for annotation in inner for one in _models_in(annotation)]
+        if not fields and (tagged := [one for one in models if _has_tag(one, str(part))]):
+            models = tagged
+        inner = list(models)
+    return models
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the models of an annotation, within unions and collections too."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _models_in(inner)
+
+
+def _has_tag(model: type[BaseModel], tag: str) -> bool:
+    """Whether a union names a model by ``tag``: its class, or a value of a literal field."""
+    values = (
+        value
+        for field in model.model_fields.values()
+        if get_origin(field.annotation) is Literal
+        for value in get_args(field.annotation)
+    )
+    return model.__name__ == tag or tag in values

@@ -1,0 +1,17 @@
+"""Regular expressions of the texts that requests and specifications have, each with its words for an error message."""
+
+from __future__ import annotations
+
+NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+VISIBLE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"  # no control characters, because people see the text
+ALIAS = r"^[a-z][a-z0-9_-]{0,31}$"
+POLICY = r"^[a-z0-9][a-z0-9_-]{0,31}$"
+DIGEST = r"^[0-9a-f]{64}$"
+
+IN_WORDS = {
+    NAME: "1 to 64 letters, digits, '.', '_' or '-', the first a letter or a digit",
+    VISIBLE: "text in one line without control characters",
+    ALIAS: "1 to 32 lower-case letters, digits, '_' or '-', the first a letter",
+    POLICY: "the version or the alias of a policy, in lower case",
+    DIGEST: "a SHA-256 as 64 hexadecimal digits in lower case",
+}
