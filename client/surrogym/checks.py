@@ -20,6 +20,7 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.services.definitions import check_coordinates
 from surrogym_shared.checks import LARGEST
 from surrogym_shared.nouns import RealStep
+from surrogym_shared.spec import EnvironmentSpec
 
 Floats = NDArray[np.float64]
 
@@ -27,6 +28,14 @@ MOST_STEPS = 100_000  # as in a specification
 MOST_THREADS = 1_024
 FARTHEST = 1e6  # distance from the middle of a sampling range, in its widths; a fit loses all digits beyond
 SHOWN = 80  # characters of the given value in an error message
+
+
+def require_specification(given: object) -> None:
+    """Raise ``InvalidInput`` for anything but a specification, for example for the environment that gives it."""
+    if not isinstance(given, EnvironmentSpec):
+        kind = type(given).__name__
+        hint = f": give {kind}.spec()" if callable(getattr(given, "spec", None)) else ""
+        raise InvalidInput(f"spec: expected an EnvironmentSpec, got {kind}{hint}")
 
 
 def whole(what: str, value: Any, low: int, high: int, why: str = "") -> int:

@@ -79,8 +79,7 @@ class Design:
     def __init__(
         self, spec: EnvironmentSpec, *, budget: int | None = None, target: float | None = None, threads: int = 1
     ) -> None:
-        if not isinstance(spec, EnvironmentSpec):
-            raise InvalidInput(f"spec: expected an EnvironmentSpec, got {type(spec).__name__}")
+        checks.require_specification(spec)
         self.spec = spec
         self.budget = default_budget(spec) if budget is None else checks.whole("budget", budget, 2, checks.MOST_STEPS)
         self.target = spec.design.target if target is None else checks.share("target", target)
@@ -100,6 +99,11 @@ class Design:
         self._state: dict[str, Any] = {}
         self._snapshots: dict[str, nouns.Vector] = {}  # coordinates (C,) by name
         self._queue = deque(self._numbered("initial", initial_queries(self._definition, self.budget)))
+
+    def __repr__(self) -> str:
+        name = self.spec.environment or "own environment"
+        steps = f"{self.steps} of {self.budget} real steps"
+        return f"<Design of {name}: {self.phase}, {steps}, {len(self._open)} open queries>"
 
     @property
     def phase(self) -> Phase:

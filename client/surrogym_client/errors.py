@@ -46,13 +46,24 @@ from surrogym_shared.codes import STATUS, Code, Problem
 class SurrogymClientError(Exception):
     """Base class of all errors of the client. ``str(error)`` is one sentence for a person."""
 
+    way_out = ""  # what to do; a traceback shows it as a note
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)
+        if self.way_out:
+            self.add_note(f"What to do: {self.way_out}.")
+
 
 class ServerUnreachable(SurrogymClientError):
     """The server did not answer within the retry budget. Check the address, and that the server runs."""
 
+    way_out = "start one with surrogym serve, or give another address by SURROGYM_URL, --server or url in Python"
+
 
 class RequestTimeout(ServerUnreachable):
     """The server did not answer in time. The connection was dropped, so a late answer is never read."""
+
+    way_out = "surrogym doctor measures how long it takes to answer"
 
 
 class UnusableToken(SurrogymClientError):
@@ -61,6 +72,8 @@ class UnusableToken(SurrogymClientError):
 
 class ProtocolMismatch(SurrogymClientError):
     """The address does not belong to a Surrogym server, or its protocol version differs."""
+
+    way_out = "surrogym doctor shows more"
 
 
 class ProblemError(SurrogymClientError):
@@ -93,6 +106,8 @@ class NotThere(ProblemError):
 
 class UnknownSurrogate(NotThere):
     """There is no surrogate of this name. Register it first."""
+
+    way_out = "surrogym status lists the existing ones"
 
 
 class UnknownQuery(NotThere):
@@ -166,9 +181,13 @@ class Refused(ProblemError):
 class Unauthenticated(Refused):
     """The request has no token, or an unknown one. Set SURROGYM_TOKEN."""
 
+    way_out = "give a token of this server by SURROGYM_TOKEN or --token-file"
+
 
 class Forbidden(Refused):
     """The token's role does not allow this."""
+
+    way_out = "surrogym doctor shows what this token may do"
 
 
 class BeyondBudget(Refused):

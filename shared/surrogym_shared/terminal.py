@@ -88,6 +88,8 @@ def on_interrupt(words: Callable[[], str]) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
+        if sys.stderr.isatty():
+            typer.echo(err=True)  # the terminal has shown ^C, perhaps behind a progress bar
         say(words())
         raise
 

@@ -52,6 +52,7 @@ def test_an_invalid_address_is_refused(surrogym):
         (("register", "nothing.at_all:here"), "No module named 'nothing'"),
         (("register", "CartPole-v1", "--bins", "3"), "bins need a continuous action, got a discrete one"),
         (("register", "Pendulum-v1", "--budget", "5", "--initial", "9"), "initial 9 exceeds the budget 5"),
+        (("register", "tank.Tank"), "did you mean tank:Tank?"),
         (("register",), "expected an environment or --spec FILE, got neither"),
         (("register", "--spec", "missing.json"), "missing.json: No such file or directory"),
         (("register", "--spec", "broken.json"), "broken.json is not a specification: "),

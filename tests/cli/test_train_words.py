@@ -13,7 +13,8 @@ from surrogym.cli import train
 from surrogym_sampler.original.classic import pendulum
 from surrogym_sampler.original.loading import env_option
 from surrogym_trainer.training import TrainProgress, TrainResult, TrainSettings
-from surrogym_trainer.training.words import words_of, words_of_interruption, words_of_result
+from surrogym_trainer.training.handover import Handover
+from surrogym_trainer.training.words import words_of, words_of_interruption, words_of_no_sampler, words_of_result
 
 RESULT = TrainResult(Path("p.zip"), "PPO", 512, 1.0, -150.0, 0, {})
 
@@ -56,6 +57,13 @@ def test_fewer_steps_than_asked_for_are_explained():
 )
 def test_a_suggested_command_names_an_environment_that_is_not_known(name: str, option: str):
     assert env_option(name) == option
+
+
+@pytest.mark.parametrize(("reason", "told"), [("no sampler is connected", True), ("the audit passed", False)])
+def test_a_training_without_a_sampler_names_the_commands_of_an_audit(reason: str, told: bool):
+    handover = Handover(None, None, False, reason)
+    text = words_of_no_sampler(RESULT, handover, "surrogym sample tank --env tank:Tank")
+    assert ("surrogym sample tank --env tank:Tank" in text and f"surrogym audit {RESULT.path}" in text) is told
 
 
 def test_the_closed_loop_says_how_well_the_policys_region_is_known():

@@ -89,19 +89,19 @@ def test_a_policy_leaves_for_other_programs(server: ServerProcess, tmp_path: Pat
     assert json.loads(run(tmp_path, "-m", "surrogym", *evaluate))["episodes"] == 2
 
 
-def test_the_cart_that_can_only_be_reset_is_registered_and_sampled(server: ServerProcess, tmp_path: Path) -> None:
-    (program,) = programs("no-teleport.md")
-    (tmp_path / "cart.py").write_text(program, encoding="utf-8")
+def test_the_wagon_that_can_only_be_reset_is_registered_and_sampled(server: ServerProcess, tmp_path: Path) -> None:
+    program, _ = programs("no-teleport.md")
+    (tmp_path / "wagon.py").write_text(program, encoding="utf-8")
     common = ["--server", server.url, "--json", "--quiet"]
-    run(tmp_path, "-m", "surrogym", "register", "cart:Cart", "--name", "cart", "--budget", "14", *common)
-    sample = ["sample", "cart", "--env", "cart:Cart", "--until-done"]
+    run(tmp_path, "-m", "surrogym", "register", "wagon:Wagon", "--name", "wagon", "--budget", "14", *common)
+    sample = ["sample", "wagon", "--env", "wagon:Wagon", "--until-done"]
     report = json.loads(run(tmp_path, "-m", "surrogym", *sample, *common))
     assert report["failed"] == 0
     assert 12 <= report["steps"] <= 14
 
 
 def test_a_design_returns_to_saved_states_in_one_process(tmp_path: Path) -> None:
-    (program,) = programs("snapshots.md")
+    _, program = programs("no-teleport.md")
     steps, phase = run(tmp_path, "-c", program).split()
     assert (int(steps) <= 100, phase) == (True, "ready")
 

@@ -82,7 +82,6 @@ OTHERWISE = {
     "docs/how-to/deploy.md": "tests/deployment runs its commands and compiles its controllers",
     "docs/how-to/controller-c.md": "tests/deployment compiles its program and runs the vectors",
     "docs/how-to/history.md": "tests/docs/test_how_to.py runs its programs",
-    "docs/how-to/snapshots.md": "tests/docs/test_how_to.py runs its program",
     "docs/how-to/rounds.md": "tests/cli/test_commands.py, as its rounds take an hour",
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
 }

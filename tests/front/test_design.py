@@ -353,3 +353,17 @@ def test_where_no_state_can_be_set_it_asks_for_rollouts():
 def test_an_invalid_budget_is_refused():
     with pytest.raises(InvalidInput, match="budget: expected a whole number from 2 to 100000, got 1"):
         surrogym.Design(pendulum(), budget=1)
+
+
+def test_a_machine_in_place_of_its_specification_is_refused_with_the_call_that_gives_it():
+    class Machine:
+        def spec(self) -> None: ...
+
+    with pytest.raises(InvalidInput, match=r"got Machine: give Machine\.spec\(\)"):
+        surrogym.Design(Machine())  # type: ignore[arg-type]
+
+
+def test_a_printed_design_shows_its_phase_and_its_steps():
+    shown = repr(surrogym.Design(pendulum(), budget=20))
+    assert "collecting" in shown
+    assert "0 of 20 real steps" in shown

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import errno
-from typing import TYPE_CHECKING
 
-from surrogym_client.runtime.ways_out import GIVE_TOKEN, START_SERVER, missing
-
-if TYPE_CHECKING:
-    from surrogym_client.errors import SurrogymClientError
+from surrogym_client.runtime.ways_out import missing
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # from a file that is open: such an error does not have its name
 
@@ -31,7 +27,7 @@ def sentence(error: Exception) -> str | None:
 
     match error:
         case SurrogymClientError():
-            return f"{error}{_way_out(error)}"
+            return f"{error}{f'; {error.way_out}' if error.way_out else ''}"
         case CommandError() | OriginalError() | NotRenderable() | NotASurrogateFile() | UnusableLog() | NoCluster():
             return str(error)
         case CannotCompile():
@@ -46,27 +42,6 @@ def sentence(error: Exception) -> str | None:
             return f"a file can't be written: {reason}"
         case _:
             return None
-
-
-def _way_out(error: SurrogymClientError) -> str:
-    """Return advice on what to do about an error of the server or the connection."""
-    from surrogym_client import errors
-
-    match error:
-        case errors.RequestTimeout():
-            return "; surrogym doctor measures how long it takes to answer"
-        case errors.ServerUnreachable():
-            return f"; {START_SERVER}"
-        case errors.ProtocolMismatch():
-            return "; surrogym doctor shows more"
-        case errors.Unauthenticated():
-            return f"; {GIVE_TOKEN}"
-        case errors.Forbidden():
-            return "; surrogym doctor shows what this token may do"
-        case errors.UnknownSurrogate():
-            return "; surrogym status lists the existing ones"
-        case _:
-            return ""
 
 
 def invalid(error: Exception) -> str:

@@ -152,8 +152,11 @@ def command(
     if print_spec:
         typer.echo(chosen.model_dump_json(indent=2))
         return
+    name = name or default_name(chosen.environment or environment or "")
+    if environment is not None:
+        chosen = _opened_by(environment, chosen)
     with service.connect(context, wait, quiet=output.quiet) as api:
-        view = api.create_surrogate(name or default_name(chosen.environment or environment or ""), chosen)
+        view = api.create_surrogate(name, chosen)
         if steps:
             key = None if read is None else _key(view.name, read.content)
             api.report_steps(view.name, steps, note="description", idempotency_key=key)
@@ -252,6 +255,17 @@ def _specification(environment: str | None, spec: EnvironmentSpec | None, **choi
     except ValueError as error:
         raise CommandError(invalid(error)) from error
     raise CommandError("expected an environment or --spec FILE, got neither: for example surrogym register Pendulum-v1")
+
+
+def _opened_by(environment: str, spec: EnvironmentSpec) -> EnvironmentSpec:
+    """Return the specification with the name that opens its environment in place of free text, so that the commands
+    that are suggested later contain it."""
+    from surrogym_sampler.original.executables import is_executable
+    from surrogym_shared.environments import is_name
+
+    if is_name(spec.environment) or is_executable(environment):  # a program's command stays on this machine
+        return spec
+    return spec.model_copy(update={"environment": environment})
 
 
 def _with_tolerances(spec: EnvironmentSpec, tolerances: dict[str, float]) -> EnvironmentSpec:

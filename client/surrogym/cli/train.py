@@ -70,10 +70,10 @@ def command(
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_client.surrogates.budget import words_of_rounds
     from surrogym_sampler.original.fitting import check_shape
-    from surrogym_sampler.original.loading import env_option
+    from surrogym_sampler.original.loading import env_option, sample_command
     from surrogym_shared.terminal import say
     from surrogym_trainer.training.search import with_algorithm
-    from surrogym_trainer.training.words import words_of_result
+    from surrogym_trainer.training.words import words_of_no_sampler, words_of_result
 
     if exit_with_parent:
         watch_parent()
@@ -103,7 +103,8 @@ def command(
         server=named,
         env_option=env_option(spec.environment),
     )
-    output.give(summary, lambda: shown(result, handover))
+    audit = words_of_no_sampler(result, handover, sample_command(surrogate, spec.environment))
+    output.give(summary, lambda: f"{shown(result, handover)}{audit}")
 
 
 def _settings(search: SearchOptions, session: SessionOptions, start: StartOptions, log: LogOptions) -> TrainSettings:

@@ -1,4 +1,4 @@
-"""Advice for a person about missing things: servers, tokens and packages."""
+"""Advice for a person about missing packages."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ EXTRAS = {  # their packages
     "pcgym": ("pcgym",),
     "fmu": ("fmpy",),
 }
-START_SERVER = "start one with surrogym serve, or give another address by --server or SURROGYM_URL"
-GIVE_TOKEN = "give a token of this server by SURROGYM_TOKEN or --token-file"
 
 
 def missing(module: str) -> str | None:

@@ -202,7 +202,7 @@ class Connection:
                 delays = (retries or self.retries).delays() if delays is None else delays
                 pause = next(delays, None) if _may_repeat(failure, repeatable) else None
                 if pause is None:
-                    raise _given_up(failure, self.url) from failure
+                    raise _given_up(failure, self.url) from None
                 time.sleep(pause)
 
     @property
@@ -232,7 +232,7 @@ class Connection:
                     _body(response)
                 yield response.iter_lines()
         except httpx.TransportError as failure:
-            raise _given_up(failure, self.url) from failure
+            raise _given_up(failure, self.url) from None
 
     def _open_client(self) -> httpx.Client:
         if self._client.is_closed:

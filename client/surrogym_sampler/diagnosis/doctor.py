@@ -15,9 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_client.errors import ProblemError, ProtocolMismatch, Refused, ServerUnreachable, SurrogymClientError
+from surrogym_client.errors import (
+    ProblemError,
+    ProtocolMismatch,
+    Refused,
+    ServerUnreachable,
+    SurrogymClientError,
+    Unauthenticated,
+)
 from surrogym_client.runtime.versions import versions
-from surrogym_client.runtime.ways_out import EXTRAS, GIVE_TOKEN, START_SERVER
+from surrogym_client.runtime.ways_out import EXTRAS
 from surrogym_client.transport.api import Api
 from surrogym_sampler.diagnosis.access import EXACT, Access, CheckFailed, examine
 from surrogym_sampler.diagnosis.history import History, declared, look_back
@@ -88,7 +95,7 @@ def service(api: Api) -> Iterator[Finding]:
         yield Finding("server", str(error), f"install a surrogym of protocol {PROTOCOL} on both sides")
         return
     except ServerUnreachable as error:
-        yield Finding("server", str(error), START_SERVER)
+        yield Finding("server", str(error), ServerUnreachable.way_out)
         return
     ours = version("surrogym")
     same = "" if health.version == ours else f"; this client is {ours}"
@@ -213,7 +220,7 @@ def _access(api: Api) -> Finding:
     try:
         access = api.access()
     except Refused as error:
-        return Finding("token", str(error), GIVE_TOKEN)
+        return Finding("token", str(error), Unauthenticated.way_out)
     except SurrogymClientError as error:
         return Finding("token", str(error), "bring server and client to the same version")
     return Finding("token", f"role {access.role}" if access.tokens else "none needed: everybody is admin here")
@@ -223,7 +230,7 @@ def _round_trip(api: Api) -> Finding:
     try:
         seconds = sorted(_timed(api) for _ in range(ROUND_TRIPS))
     except SurrogymClientError as error:
-        return Finding("round trip", str(error), START_SERVER)
+        return Finding("round trip", str(error), ServerUnreachable.way_out)
     median, worst = 1_000 * statistics.median(seconds), 1_000 * seconds[-1]
     return Finding("round trip", f"median {median:.2g} ms, longest {worst:.2g} ms of {ROUND_TRIPS}")
 

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from surrogym_sampler.original.actions import require_same_action
-from surrogym_sampler.original.adapters import adapter_of, is_trusted, open_simulator
+from surrogym_sampler.original.adapters import adapter_of, is_trusted, open_simulator, with_colon
 from surrogym_sampler.original.classic import TASKS
 from surrogym_sampler.original.errors import UnknownEnvironment, sentence
 from surrogym_sampler.original.executables import Executable, is_executable, open_executable
@@ -149,7 +149,7 @@ def specification(name: str) -> EnvironmentSpec:
     if adapter_of(name) is None:
         raise UnknownEnvironment(
             f"no adapter knows the environment {name!r}: expected one of {known}, another Gymnasium id, "
-            "dm_control:DOMAIN-TASK, pcgym:MODEL, fmu:PLANT.fmu, or package.module:factory"
+            f"dm_control:DOMAIN-TASK, pcgym:MODEL, fmu:PLANT.fmu, or package.module:factory{with_colon(name)}"
         )
     open_simulator(name).close()
     raise UnknownEnvironment(

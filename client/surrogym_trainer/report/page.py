@@ -144,14 +144,18 @@ def _on_controller(check: StoredCheck) -> str:
     )
     facts = [
         ("controller", f"target {check.target}, made from the policy's file {check.policy[:12]}"),
-        ("checked in", f"{check.environment}, {check.episodes} episodes of each"),
+        ("checked in", f"{check.environment}, {check.episodes} episodes of the controller and as many of the policy"),
         ("mean return", f"{check.mean_return:.6g}, of the policy {check.mean_return_of_policy:.6g}"),
         ("largest difference of actions", f"{check.largest_difference:.1g} of their range"),
         ("steps with another action", f"{check.different_actions} of {check.steps}"),
         ("steps with the fallback", check.faults),
         ("a decision takes", latency),
     ]
-    return section("On the controller", rows(facts))
+    note = (
+        "<p>The check ran the controller and the policy in the same environment from the same starts. "
+        "A difference of actions is rounding, if it is small beside the range.</p>"
+    )
+    return section("On the controller", note + rows(facts))
 
 
 def _structure(model: ModelView, spec: EnvironmentSpec) -> str:

@@ -65,6 +65,16 @@ def words_of_handover(handover: Handover) -> str:
     )
 
 
+def words_of_no_sampler(result: TrainResult, handover: Handover | None, sample: str) -> str:
+    """Describe how to audit a policy that was not audited for want of a sampler, in a line of its own; empty for
+    others. ``sample`` is the command that starts a sampler."""
+    from surrogym_trainer.training.handover import NO_SAMPLER
+
+    if handover is None or not handover.reason.endswith(NO_SAMPLER):
+        return ""
+    return f"\nto audit it: start {sample} in another terminal, then surrogym audit {shlex.quote(str(result.path))}"
+
+
 def words_of_range(left: RangeLeft) -> str:
     """Describe where a policy's way leaves a sampling range, and what to do."""
     beyond, way = ("above", "up") if left.side == "upper" else ("below", "down")

@@ -51,10 +51,7 @@ class Gate:
         if self.open:
             return
         if token is None:
-            raise Unauthenticated(
-                "expected the header 'Authorization: Bearer <token>', got none: set SURROGYM_TOKEN, or ask the "
-                "server's admin"
-            )
+            raise Unauthenticated("expected the header 'Authorization: Bearer <token>', got none")
         role = self.role_of(token)
         if role not in (*allowed, "admin"):
             raise Forbidden(f"expected a token with role {' or '.join((*allowed, 'admin'))}, got {role}")

@@ -72,6 +72,13 @@ def is_trusted(name: str) -> bool:
     return any(adapter.trusted.fullmatch(name) for adapter in ADAPTERS)
 
 
+def with_colon(name: str) -> str:
+    """Suggest ``module:Class`` for ``module.Class``, as the end of a message; empty for other names."""
+    module, _, attribute = name.rpartition(".")
+    is_dotted = all(part.isidentifier() for part in (*module.split("."), attribute))
+    return f"; did you mean {module}:{attribute}?" if is_dotted else ""
+
+
 def open_simulator(name: str) -> Simulator:
     """Open the simulator of a name.
 
@@ -88,7 +95,7 @@ def open_simulator(name: str) -> Simulator:
     if adapter is None:
         raise UnknownEnvironment(
             f"no adapter knows the environment {name!r}: expected a Gymnasium id such as Pendulum-v1, package:Id-v0, "
-            "dm_control:DOMAIN-TASK, pcgym:cstr, pcgym:FILE.json, fmu:PLANT.fmu or fmu:PLANT.json"
+            f"dm_control:DOMAIN-TASK, pcgym:cstr, pcgym:FILE.json, fmu:PLANT.fmu or fmu:PLANT.json{with_colon(name)}"
         )
     try:
         opened: Simulator = import_module(adapter.module).open_simulator(name)
