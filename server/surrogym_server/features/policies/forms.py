@@ -6,17 +6,20 @@ from datetime import UTC, datetime
 from typing import Any
 
 from surrogym_server.convert.stored import read_stored
-from surrogym_server.features.policies.records import DRIFT, PUSHED_BY, EvaluationRecord, PolicyFile, PolicyRecord
+from surrogym_server.features.policies.records import (
+    DRIFT,
+    OLDER,
+    PUSHED_BY,
+    EvaluationRecord,
+    PolicyFile,
+    PolicyRecord,
+    judges,
+)
 from surrogym_server.features.policies.service import Episodes
 from surrogym_server.storage.records import JSON
 from surrogym_shared import wire
 from surrogym_shared.wire.drifts import AddDrift
 
-OLDER: JSON = {
-    "environment": "",
-    "own": True,
-    "seeded": True,
-}  # of evaluations that were stored before these fields existed
 CARD = "the card of a policy"  # name in the error if it is damaged
 
 
@@ -140,7 +143,5 @@ def _latest(evaluations: list[dict[str, Any]]) -> dict[str, Any] | None:
 
 def _evaluation(record: EvaluationRecord, card: wire.PushedCard) -> dict[str, Any]:
     summary, promise = {**OLDER, **record.summary}, card.promise
-    about = summary.get("controller") == "policy" and summary.get("declared") and summary["own"]
-    judged = about and summary["episodes"] >= wire.FEWEST_TO_JUDGE
-    kept = bool(summary["mean"] >= promise.low) if promise is not None and judged else None
+    kept = bool(summary["mean"] >= promise.low) if promise is not None and judges(summary) else None
     return {"id": record.id, "created_at": record.created_at, **summary, "promise_kept": kept}

@@ -11,11 +11,17 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
 from surrogym_server.storage.records import JSON
+from surrogym_shared.wire import FEWEST_TO_JUDGE
 
 MAX_POLICIES = 200  # of a surrogate
 MAX_EVALUATIONS = 100  # of a policy
 PUSHED_BY = "pushed_by"  # entry of a card: who stored it
 DRIFT = "drift"  # entry of the summary of a report that the plant has drifted; other summaries are of episodes
+OLDER: JSON = {
+    "environment": "",
+    "own": True,
+    "seeded": True,
+}  # of evaluations that were stored before these fields existed
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,13 @@ class EvaluationRecord:
     bytes: int
     digest: str
     blob: str | None  # of its episodes
+
+
+def judges(summary: JSON) -> bool:
+    """Return whether episodes can judge a promise: enough of them, by the policy, as declared, in its own plant."""
+    there = OLDER | summary
+    declared = there.get("controller") == "policy" and there.get("declared") and there["own"]
+    return bool(declared) and int(there["episodes"]) >= FEWEST_TO_JUDGE
 
 
 @dataclass(frozen=True)

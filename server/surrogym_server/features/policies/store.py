@@ -21,6 +21,7 @@ from surrogym_server.features.policies.records import (
     NewEvaluation,
     PolicyFile,
     PolicyRecord,
+    judges,
 )
 from surrogym_server.storage.records import JSON
 from surrogym_server.storage.sql.database import Database, conflict_insert
@@ -129,8 +130,8 @@ class Policies:
             return (*replaced, *freed)
 
     def evaluate(self, name: str, version: int, new: NewEvaluation, most: int) -> tuple[EvaluationRecord, bool, Freed]:
-        """Store an evaluation, once for each key. Returns whether it is new. Beyond ``MAX_EVALUATIONS`` the policy's
-        oldest evaluation is removed. ``most`` is that of ``attach``."""
+        """Store an evaluation, once for each key. Returns whether it is new. Beyond ``MAX_EVALUATIONS`` of the policy,
+        see ``_displaced``. ``most`` is that of ``attach``."""
         table = policy_evaluations
         with self._database.write() as connection:
             held = hold(connection, name)
@@ -141,8 +142,9 @@ class Policies:
                 return _evaluation(known), False, ()
             values = {"surrogate_id": held.id, "version": version, "created_at": held.now, **vars(new)}
             connection.execute(sa.insert(table).values(**values))
-            kept = sa.select(table.c.id).where(own).order_by(table.c.id.desc()).limit(MAX_EVALUATIONS)
-            beyond = sa.delete(table).where(own, table.c.id.not_in(kept)).returning(table.c.blob)
+            stored = connection.execute(sa.select(table.c.id, table.c.summary).where(own).order_by(table.c.id))
+            gone_ids = _displaced({row.id: row.summary for row in stored})
+            beyond = sa.delete(table).where(own, table.c.id.in_(gone_ids)).returning(table.c.blob)
             gone = tuple(blob for blob in connection.execute(beyond).scalars() if blob is not None)
             freed = _within(connection, held.id, version, most, name)
             what = DRIFT if DRIFT in new.summary else "evaluation"
@@ -358,6 +360,23 @@ def _by_version(rows: Iterable[Row[Any]]) -> defaultdict[int, list[Row[Any]]]:
     for row in rows:
         found[row.version].append(row)
     return found
+
+
+def _displaced(summaries: Mapping[int, JSON]) -> list[int]:
+    """Ids of rows beyond ``MAX_EVALUATIONS``: the oldest of the kind that has most.
+
+    Reports of drift and episodes that judge the promise decide whether a policy is trusted. So a flood of other
+    episodes removes none of them.
+
+    Args:
+        summaries: by id, oldest first.
+    """
+    kinds: defaultdict[tuple[bool, bool], deque[int]] = defaultdict(deque)
+    for id, summary in summaries.items():
+        drift = DRIFT in summary
+        kinds[drift, not drift and judges(summary)].append(id)
+    beyond = max(0, len(summaries) - MAX_EVALUATIONS)
+    return [max(kinds.values(), key=len).popleft() for _ in range(beyond)]
 
 
 def _told_apart(rows: Iterable[EvaluationRecord]) -> tuple[tuple[EvaluationRecord, ...], tuple[EvaluationRecord, ...]]:

@@ -6,7 +6,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -43,8 +43,19 @@ def pushed(stored: Stored, name: str, content: bytes, most: int = PLENTY) -> tup
     return version, freed
 
 
-def evaluated(stored: Stored, name: str, version: int, key: str, content: bytes = b"{}", most: int = PLENTY) -> bool:
-    new = NewEvaluation(key, {"mean": -1.5}, len(content), "digest", stored.blobs.put(content))
+EPISODES = {"mean": -1.5, "episodes": 100, "controller": "policy", "declared": False}
+
+
+def evaluated(
+    stored: Stored,
+    name: str,
+    version: int,
+    key: str,
+    content: bytes = b"{}",
+    most: int = PLENTY,
+    summary: dict[str, Any] = EPISODES,
+) -> bool:
+    new = NewEvaluation(key, summary, len(content), "digest", stored.blobs.put(content))
     return stored.policies.evaluate(name, version, new, most)[1]
 
 
@@ -119,7 +130,25 @@ def test_an_evaluation_is_stored_once_a_key_and_the_oldest_goes(
         evaluated(stored, name, version, key)
     (policy,) = stored.policies.list(name)
     assert len(policy.evaluations) == 2
-    assert policy.evaluations[0].summary == {"mean": -1.5}
+    assert policy.evaluations[0].summary == EPISODES
+
+
+@pytest.mark.parametrize("flood", [EPISODES, EPISODES | {"declared": True, "own": False}])
+def test_a_flood_of_other_evaluations_removes_none_that_decides_trust(
+    stored: Stored, make: Make, monkeypatch: pytest.MonkeyPatch, flood: dict[str, Any]
+) -> None:
+    """A hundred of another plant removed a broken promise and a drift, and the policy was trusted again."""
+    name = make()
+    version, _ = pushed(stored, name, b"one")
+    broken, drift = EPISODES | {"mean": -900, "declared": True, "own": True}, {"drift": {}}
+    evaluated(stored, name, version, "broken", summary=broken)
+    evaluated(stored, name, version, "drift", summary=drift)
+    monkeypatch.setattr("surrogym_server.features.policies.store.MAX_EVALUATIONS", 5)
+    for key in range(9):
+        evaluated(stored, name, version, str(key), summary=flood)
+    (policy,) = stored.policies.list(name)
+    assert [one.summary for one in policy.evaluations] == [broken, flood, flood, flood]
+    assert [one.summary for one in policy.drifts] == [drift]
 
 
 def test_beyond_the_bound_the_oldest_files_without_an_alias_go(stored: Stored, make: Make) -> None:
@@ -131,7 +160,7 @@ def test_beyond_the_bound_the_oldest_files_without_an_alias_go(stored: Stored, m
     assert len(freed) == 2  # the second version's file and episodes
     there = {p.version: [file.blob is not None for file in p.files] for p in stored.policies.list(name)}
     assert there == {1: [True], 2: [False], 3: [True], 4: [True]}
-    assert stored.policies.get(name, "2").evaluations[0].summary == {"mean": -1.5}  # what describes it stays
+    assert stored.policies.get(name, "2").evaluations[0].summary == EPISODES  # what describes it stays
 
 
 def test_a_file_that_aliased_ones_leave_no_room_for_changes_nothing(stored: Stored, make: Make) -> None:
