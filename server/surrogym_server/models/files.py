@@ -17,6 +17,7 @@ from surrogym_server.models.registry import learner_of
 
 METADATA = "surrogym"
 FAMILY, CHECKSUM = "family", "checksum"
+AGAIN = "export it again"
 SHOWN = 80  # largest number of characters of a name from a file
 MALFORMED = (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError)
 
@@ -25,8 +26,12 @@ def to_bytes(model: DynamicsModel) -> bytes:
     """Write the whole model, serving arrays included."""
     family = model.definition.learning.model
     stored = learner_of(family).codec.encode(model)
-    header = {FAMILY: family.name, **stored.header}
-    return save(stored.tensors, {METADATA: json.dumps(header | {CHECKSUM: _checksum(header, stored.tensors)})})
+    return with_checksum({FAMILY: family.name, **stored.header}, stored.tensors)
+
+
+def with_checksum(header: dict[str, Any], tensors: dict[str, Tensor]) -> bytes:
+    """Write a header that JSON can represent, and named tensors, with the checksum of both."""
+    return save(tensors, {METADATA: json.dumps(header | {CHECKSUM: _checksum(header, tensors)})})
 
 
 def from_bytes(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
@@ -36,17 +41,33 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
         InvalidInput: not such a file, or a damaged one, or one of another family than the definition's, or of an
             environment with other outputs.
     """
+    header, tensors = _content(data)
     try:
-        return _read(definition, data)
+        return _model(definition, header, tensors)
+    except KeyError as error:
+        raise InvalidInput(f"expected a model with the entry {str(error)[:SHOWN]}, got one without: {AGAIN}") from error
     except MALFORMED as error:
-        raise InvalidInput(f"expected a Surrogym model in safetensors form, got {len(data)} bytes: {error}") from error
+        raise InvalidInput(f"expected a model whose entries fit together, got others: {AGAIN}") from error
 
 
-def _read(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
+def _content(data: bytes) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return header and tensors of a file. Raises ``InvalidInput`` unless they are as they were written."""
     length = int.from_bytes(data[:8], "little")
-    header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"][METADATA])
-    tensors = load(data)
-    _require_whole(header, tensors)
+    try:
+        header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"][METADATA])
+        tensors = load(data)
+        written = header.pop(CHECKSUM)
+    except MALFORMED as error:
+        raise InvalidInput(
+            f"expected a Surrogym model in safetensors form with a checksum, got {len(data)} bytes of another "
+            f"form: {AGAIN}"
+        ) from error
+    if written != _checksum(header, tensors):
+        raise InvalidInput(f"the model is damaged: its checksum differs from the one that it was written with; {AGAIN}")
+    return header, tensors
+
+
+def _model(definition: EnvironmentDefinition, header: dict[str, Any], tensors: dict[str, Tensor]) -> DynamicsModel:
     expected, got = definition.learning.model, header.pop(FAMILY)
     if got != expected.name:
         raise InvalidInput(
@@ -62,10 +83,3 @@ def _checksum(header: dict[str, Any], tensors: dict[str, Tensor]) -> str:
         total.update(f"{name} {tensors[name].dtype} {list(tensors[name].shape)}".encode())
         total.update(tensors[name].contiguous().numpy().tobytes())
     return total.hexdigest()
-
-
-def _require_whole(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
-    """Raise ``InvalidInput`` if the content has changed. A file without a checksum is not checked."""
-    written = header.pop(CHECKSUM, None)
-    if written is not None and written != _checksum(header, tensors):
-        raise InvalidInput("the model is damaged: its checksum differs from the one that it was written with")

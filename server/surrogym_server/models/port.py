@@ -11,6 +11,7 @@ Shapes: m points, n samples, C coordinates, F action entries, M transition outpu
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.tensors import to_device
 
 Warm = Mapping[str, NDArray[np.float64]]  # named arrays that one fit leaves for a warm start of the next
+MOST_SAMPLES = 2**31 - 1  # of a model, as databases store them
 
 
 @dataclass(frozen=True)
@@ -149,6 +151,13 @@ def require_format(got: object, expected: int) -> None:
             f"expected a model of format {expected}, got format {str(got)[:80]}, which another version wrote: "
             "export its samples with that version, and learn from them again"
         )
+
+
+def require_sums(terminal_reward: float, samples: int) -> None:
+    """Raise ``InvalidInput`` if no fit gives this reward of terminal states and this number of samples."""
+    if not math.isfinite(terminal_reward) or not 1 <= samples <= MOST_SAMPLES:
+        got = f"{terminal_reward} and {samples if abs(samples) <= MOST_SAMPLES else 'more'}"
+        raise InvalidInput(f"expected a finite terminal_reward and 1 to {MOST_SAMPLES} in samples, got {got}")
 
 
 class ModelCodec(ABC):

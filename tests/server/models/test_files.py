@@ -7,9 +7,9 @@ import pytest
 from safetensors.torch import load, save
 
 from support.exact_models import exact_pendulum
-from support.models import learn
+from support.models import header_of, learn, with_header
 from surrogym_server.errors import InvalidInput
-from surrogym_server.models.files import from_bytes, to_bytes
+from surrogym_server.models.files import from_bytes, to_bytes, with_checksum
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.plugins import Choice
 
@@ -19,34 +19,66 @@ def model(pendulum_samples) -> DynamicsModel:
     return learn(exact_pendulum().definition, pendulum_samples).model
 
 
-def header_of(data: bytes) -> dict:
-    metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]
-    return json.loads(metadata["surrogym"])
-
-
-def rewritten(data: bytes, header: dict) -> bytes:
-    return save(load(data), {"surrogym": json.dumps(header)})
-
-
 def test_a_file_names_its_family(model):
     assert header_of(to_bytes(model))["family"] == "gaussian_process"
 
 
 def test_a_file_without_a_family_is_refused(model):
     header = header_of(to_bytes(model))
-    del header["family"], header["checksum"]
+    del header["family"]
     with pytest.raises(InvalidInput, match="'family'"):
-        from_bytes(model.definition, rewritten(to_bytes(model), header))
+        from_bytes(model.definition, with_checksum(header, load(to_bytes(model))))
+
+
+@pytest.mark.parametrize("checksum", [None, "", 7])
+def test_a_file_without_its_checksum_is_refused(model, checksum):
+    """It was not checked, so that another number in it was served."""
+    data = to_bytes(model)
+    header = header_of(data) | ({} if checksum is None else {"checksum": checksum})
+    with pytest.raises(InvalidInput, match="checksum"):
+        from_bytes(model.definition, save(load(data), {"surrogym": json.dumps(header)}))
+
+
+FOREIGN = ("Header", "object", "deserializ", "Error", "int ", "Infinity", "NaN")  # words of libraries and of Python
+
+
+def forgeries(data: bytes) -> dict[str, bytes]:
+    """Files that are no models, by what is wrong with them."""
+    header, tensors = header_of(data), load(data)
+    return {
+        "nothing": b"",
+        "text": b"PK\x03\x04 not a model",
+        "cut off": data[: len(data) // 2],
+        "a header beyond the file": (2**63).to_bytes(8, "little") + data[8:],
+        "a header that is a list": (2).to_bytes(8, "little") + b"[]",
+        "deep nesting": (200_000).to_bytes(8, "little") + b"[" * 200_000,
+        "no outputs": with_checksum(header | {"outputs": []}, tensors),
+        "text for outputs": with_checksum(header | {"outputs": "abc"}, tensors),
+        "a number for outputs": with_checksum(header | {"outputs": 3}, tensors),
+        "no arrays": with_checksum(header, {}),
+        "a huge number": with_checksum(header | {"samples": 10**400}, tensors),
+        "a number that is none": with_checksum(header | {"samples": float("nan")}, tensors),
+    }
+
+
+def test_forged_files_are_refused_in_words_of_this_program(model):
+    """The messages were those of safetensors and of Python: HeaderTooLarge, 'int' object is not iterable."""
+    for what, forged in forgeries(to_bytes(model)).items():
+        with pytest.raises(InvalidInput, match=r"^expected") as refused:
+            from_bytes(model.definition, forged)
+        words = str(refused.value)
+        assert not any(
+            foreign in words for foreign in ("Header", "object", "deserializ", "Error", "int ", "Infinity")
+        ), what
+        assert len(words) < 300, what
 
 
 @pytest.mark.parametrize("family", ["os", "ensemble", "", 7, None, "x" * 10_000])
 def test_a_file_of_another_family_than_the_specifications_is_refused(model, family):
-    header = header_of(to_bytes(model)) | {"family": family}
-    del header["checksum"]
     with pytest.raises(
         InvalidInput, match="family 'gaussian_process', as the specification says, got one of"
     ) as refused:
-        from_bytes(model.definition, rewritten(to_bytes(model), header))
+        from_bytes(model.definition, with_header(model, family=family))
     assert len(str(refused.value)) < 300
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -15,7 +14,7 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.models.ensemble.inputs import Inputs
 from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Noise, Regression
 from surrogym_server.models.ensemble.networks import Networks
-from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel, require_format
+from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel, require_format, require_sums
 
 FORMAT = 2
 TRANSITIONS, REWARD, ENDING = "transitions", "reward", "ending"
@@ -148,10 +147,7 @@ def _checked_header(definition: EnvironmentDefinition, stored: StoredModel) -> H
     if outputs != definition.outputs:
         raise InvalidInput(f"expected a model with the outputs {definition.outputs}, got one with {outputs}")
     terminal_reward, samples = float(header["terminal_reward"]), int(header["samples"])
-    if not math.isfinite(terminal_reward) or samples < 1:
-        raise InvalidInput(
-            f"expected a finite terminal_reward and at least 1 in samples, got {terminal_reward} and {samples}"
-        )
+    require_sums(terminal_reward, samples)
     for name, array in stored.tensors.items():
         if array.dtype != torch.float64 or not bool(torch.isfinite(array).all()):
             came = "NaN or infinity" if array.dtype == torch.float64 else array.dtype

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load, save
+from safetensors.torch import load
 
-from support.models import learn
+from support.models import header_of, learn
 from support.rail import SPEC, Rail
 from surrogym_sampler.original.protocol import RealStep
 from surrogym_sampler.original.rollouts import FromReset
@@ -18,7 +18,7 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
 from surrogym_server.errors import InvalidInput
-from surrogym_server.models.files import METADATA, from_bytes, to_bytes
+from surrogym_server.models.files import from_bytes, to_bytes, with_checksum
 from surrogym_server.models.gaussian_process.feature_maps import candidates
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_shared.spec import with_history
@@ -99,11 +99,9 @@ def test_a_stored_model_keeps_its_history(definition, model):
 
 def test_a_stored_history_that_the_environment_does_not_have_is_refused(definition, model):
     data = to_bytes(replace(model))
-    header = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"][METADATA])
-    del header["checksum"]
-    text = json.dumps(header)
+    text = json.dumps(header_of(data))
     assert '"history": 2' in text
     for wrong in (str(LONGEST), "-1", '"2"'):
         other = text.replace('"history": 2', f'"history": {wrong}', 1)
         with pytest.raises(InvalidInput):
-            from_bytes(definition, save(load(data), {METADATA: other}))
+            from_bytes(definition, with_checksum(json.loads(other), load(data)))

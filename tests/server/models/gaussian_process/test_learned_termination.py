@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from safetensors.torch import load, save
+from safetensors.torch import load
 
-from support.models import learn
+from support.models import header_of, learn
 from support.real_steps import random_steps
 from surrogym_sampler.original.classic import acrobot, cartpole
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
-from surrogym_server.models.files import from_bytes, to_bytes
+from surrogym_server.models.files import from_bytes, to_bytes, with_checksum
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.region import learn_termination
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
@@ -109,12 +109,10 @@ def test_a_model_of_the_other_kind_of_termination_is_refused(model, cartpole_mod
 )
 def test_thresholds_that_cannot_be_are_refused(model, rules):
     data = to_bytes(model)
-    length = int.from_bytes(data[:8], "little")
-    header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["surrogym"])
-    del header["checksum"]  # what it refuses first
+    header = header_of(data)
     header["termination"]["forms"] = [[1.0, {"rules": rules, "complement": False}]]
     with pytest.raises(InvalidInput):
-        from_bytes(model.definition, save(load(data), {"surrogym": json.dumps(header)}))
+        from_bytes(model.definition, with_checksum(header, load(data)))
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.5, -1.0, float("nan")])

@@ -24,7 +24,7 @@ from surrogym_server.models.gaussian_process.codec.regions import (
 )
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.regions import TERMINATION
-from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel, require_format
+from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel, require_format, require_sums
 
 FORMAT = 7
 JUMP = "jump"  # prefix of the names of its arrays
@@ -88,11 +88,7 @@ def _read(definition: EnvironmentDefinition, stored: StoredModel) -> GaussianPro
 def _require_consistent(model: GaussianProcessModel) -> None:
     """Check that the numbers can come from a fit, and fit the definition. Raises ``InvalidInput``."""
     definition, reward = model.definition, model.reward
-    if not math.isfinite(model.terminal_reward) or model.samples < 1:
-        raise InvalidInput(
-            f"expected a finite terminal_reward and at least 1 in samples, got {model.terminal_reward} and "
-            f"{model.samples}"
-        )
+    require_sums(model.terminal_reward, model.samples)
     if any(output.feature_map.after for output in model.transitions):
         raise InvalidInput(
             "expected transition outputs that read the state before the step, got one that reads the state after it"
