@@ -6,6 +6,7 @@ import io
 import math
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,7 @@ INFLATED = (
     zipfile.ZIP_DEFLATED,
 )  # methods that numpy and torch write; others can't be limited while they decompress
 ARRAY = ".npy"
+SHOWN = 80  # largest number of characters of a name from a file
 MALFORMED = (
     ValueError,
     LookupError,
@@ -85,15 +87,24 @@ def read_arrays(
 
 @contextmanager
 def _opened(zipped: Path | bytes, limit: int) -> Iterator[zipfile.ZipFile]:
-    """Open a zip whose entries have at most ``limit`` bytes together. Its errors become ValueError."""
+    """Open a zip with names that differ, whose entries have at most ``limit`` bytes together. Its errors become
+    ValueError."""
     try:
         with zipfile.ZipFile(io.BytesIO(zipped) if isinstance(zipped, bytes) else zipped) as archive:
+            _require_once(archive.namelist())
             size = sum(entry.file_size for entry in archive.infolist())
             if size > limit:
                 raise ValueError(f"expected at most {limit} bytes after decompression, got {size}")
             yield archive
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
         raise ValueError(f"expected a zip file, got content that can't be read as one: {error}") from error
+
+
+def _require_once(names: list[str]) -> None:
+    """Raise ValueError if a name stands twice: one reader would take the first entry, another the last."""
+    if len(names) > len(set(names)):
+        twice = next(name for name, count in Counter(names).items() if count > 1)
+        raise ValueError(f"expected each entry once, got {twice[:SHOWN]!r} twice")
 
 
 def _stream(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> IO[bytes]:

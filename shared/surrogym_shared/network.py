@@ -202,7 +202,7 @@ def _read_head(content: bytes) -> _Head:
     except ValidationError as error:
         from surrogym_shared.faults import first_fault  # only a fault needs it
 
-        raise ValueError(f"{HEAD}: {first_fault(error)}; save or download the policy again") from error
+        raise ValueError(f"{HEAD}: {first_fault(error)}") from error
 
 
 def _require_chain(head: _Head, headers: Mapping[str, Header]) -> None:

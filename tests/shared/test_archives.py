@@ -56,6 +56,24 @@ def array_file(header: str, body: bytes) -> bytes:
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(padded)) + padded + body
 
 
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_a_name_that_stands_twice_is_refused():
+    """The last entry was read, where another program that reads the same policy takes the first."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for content in (array_of(1.0), array_of(2.0)):
+            archive.writestr("mean.npy", content)
+    for read in (read_entries, read_arrays):
+        with pytest.raises(ValueError, match=r"'mean\.npy' twice"):
+            read(file.getvalue(), MEBIBYTE)
+
+
+def array_of(value: float) -> bytes:
+    file = io.BytesIO()
+    np.save(file, np.array([value]))
+    return file.getvalue()
+
+
 def test_what_is_stored_is_read(tmp_path: Path):
     entries = {"a": b"1", "folder/b": b"", "c": bytes(1_000)}
     (tmp_path / "a.zip").write_bytes(stored(entries))
