@@ -85,6 +85,14 @@ def read_arrays(
         return {name: _array(archive, entry, name) for name, entry in entries.items()}
 
 
+def require_finite(arrays: Mapping[str, NDArray[Any]], positive: str) -> None:
+    """Raise ValueError if an array has a number that is not finite, or that named ``positive`` one of 0 or less."""
+    for name, array in arrays.items():
+        if not np.isfinite(array).all() or (name == positive and (array <= 0).any()):
+            kind = "finite numbers above 0" if name == positive else "finite numbers"
+            raise ValueError(f"expected {name} as {kind}, got others")
+
+
 @contextmanager
 def _opened(zipped: Path | bytes, limit: int) -> Iterator[zipfile.ZipFile]:
     """Open a zip with names that differ, whose entries have at most ``limit`` bytes together. Its errors become

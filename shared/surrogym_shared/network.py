@@ -126,12 +126,13 @@ class Network:
         Raises:
             ValueError: the file has another form, or more than ``MAX_BYTES``.
         """
-        from surrogym_shared.archives import read_arrays, read_entries  # only reading a file needs this import
+        from surrogym_shared.archives import read_arrays, read_entries, require_finite  # only reading needs it
 
         try:
             entries = read_entries(path, MAX_BYTES)
             head = _read_head(entries[HEAD])
             arrays = read_arrays(entries[ARRAYS], MAX_BYTES, partial(_require_chain, head))
+            require_finite(arrays, positive="deviation")
         except (LookupError, TypeError, OSError, ValueError, RecursionError, MemoryError) as error:
             raise ValueError(
                 f"{path} is not a policy of surrogym train: {error}; save or download the policy again"

@@ -108,3 +108,22 @@ def test_another_file_is_refused(tmp_path: Path, content):
     assert not Network.is_at(path)
     with pytest.raises(ValueError, match="not a policy of"):
         Network.load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("mean", np.nan), ("low", -np.inf), ("deviation", 0.0), ("deviation", -1.0)]
+)
+def test_numbers_that_no_training_gives_are_refused(tmp_path: Path, name, value):
+    """Such a policy was loaded, and its actions were NaN."""
+    made = network(pendulum())
+    replace(made, **{name: np.full_like(getattr(made, name), value)}).save(tmp_path / "policy.zip")
+    with pytest.raises(ValueError, match=f"expected {name} as finite numbers"):
+        Network.load(tmp_path / "policy.zip")
+
+
+def test_a_weight_that_is_not_finite_is_refused(tmp_path: Path):
+    made = network(pendulum())
+    made.layers[-1].weights[0] = np.inf
+    made.save(tmp_path / "policy.zip")
+    with pytest.raises(ValueError, match="expected weights1 as finite numbers"):
+        Network.load(tmp_path / "policy.zip")
