@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from surrogym.design import Design, QueriesOpen, Query
     from surrogym.environments import make, make_sb3, make_vec
+    from surrogym.prior import Prior
     from surrogym_client.transport.api import Api as Client
     from surrogym_sampler.logs import Imported, UnusableLog, import_log
     from surrogym_sampler.original.errors import StepRefused
@@ -72,6 +73,7 @@ __all__ = [
     "Normal",
     "ObservationEntry",
     "Part",
+    "Prior",
     "Quantity",
     "QueriesOpen",
     "Query",
@@ -94,6 +96,7 @@ _LAZY = {  # name: module, its name there, the extra that brings what the module
     "Design": ("surrogym.design", "Design", "server"),
     "Query": ("surrogym.design", "Query", "server"),
     "QueriesOpen": ("surrogym.design", "QueriesOpen", "server"),
+    "Prior": ("surrogym.prior", "Prior", "server"),
     "make": ("surrogym.environments", "make", ""),
     "make_sb3": ("surrogym.environments", "make_sb3", ""),
     "make_vec": ("surrogym.environments", "make_vec", ""),

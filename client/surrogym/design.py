@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Protocol, Self
 from uuid import uuid4
 
 import numpy as np
@@ -55,6 +55,16 @@ class Query(nouns.Query):
     design: str = field(default="", repr=False)  # identifies the design: equal specifications begin with equal queries
 
 
+class CalibratedPrior(Protocol):
+    """What a design needs of a simulator as a prior, see ``surrogym.Prior``."""
+
+    file: SurrogateFile | None  # the simulator's model; None before the first update
+
+    def update(self, real: Sequence[RealStep], /) -> bool:
+        """Calibrate the simulator on all real steps so far."""
+        ...
+
+
 class Design:
     """Choose real steps until the model is ready, or the budget is spent.
 
@@ -63,6 +73,8 @@ class Design:
         budget: maximum number of real steps, 2 or more; None takes that of the specification.
         target: confidence index to reach for each output, above 0.5 and below 1; None takes that of the specification.
         threads: number of threads of a fit.
+        prior: what is known beforehand: a ``Prior``, whose parameters are calibrated before each fit, or the file of
+            another surrogate with the same coordinates and actions.
 
     Raises:
         InvalidInput: ``spec`` is not a specification; or another argument is out of its range; or the specification
@@ -77,7 +89,13 @@ class Design:
     """
 
     def __init__(
-        self, spec: EnvironmentSpec, *, budget: int | None = None, target: float | None = None, threads: int = 1
+        self,
+        spec: EnvironmentSpec,
+        *,
+        budget: int | None = None,
+        target: float | None = None,
+        threads: int = 1,
+        prior: CalibratedPrior | SurrogateFile | None = None,
     ) -> None:
         checks.require_specification(spec)
         self.spec = spec
@@ -85,6 +103,7 @@ class Design:
         self.target = spec.design.target if target is None else checks.share("target", target)
         self._threads = checks.whole("threads", threads, 1, checks.MOST_THREADS)
         self._definition = definition_from_spec(spec)
+        self._prior = prior
         self._name = uuid4().hex
         self._ids = itertools.count(1)
         self._samples: list[RealStep] = []
@@ -221,14 +240,17 @@ class Design:
             InvalidInput: there is no model yet.
             OSError: the file can't be written.
         """
+        Path(path).write_bytes(self.to_file(name).to_bytes())
+
+    def to_file(self, name: str = "surrogate") -> SurrogateFile:
+        """Return what ``save`` writes. Raises ``InvalidInput``."""
         result, steps = self._last(), self._steps()
         truncated = np.array([step.truncated for step in self._samples], dtype=np.bool_)
         columns = (steps.coordinates, steps.action, steps.next_coordinates, steps.reward, steps.terminated)
         samples = RealSamples(*columns, truncated)
         tolerances = {output["name"]: output["tolerance"] for output in result.fidelity["outputs"]}
         predictions = self._state.get("predictions", [])
-        file = SurrogateFile(name, self._spec_to_save(), result.model, samples, tolerances, predictions=predictions)
-        Path(path).write_bytes(file.to_bytes())
+        return SurrogateFile(name, self._spec_to_save(), result.model, samples, tolerances, predictions=predictions)
 
     @classmethod
     def load(cls, path: str | Path, **options: Any) -> Self:
@@ -286,6 +308,8 @@ class Design:
         return self.spec.model_copy(update={"design": self.spec.design.model_copy(update=changed)})
 
     def _fit(self) -> None:
+        if self._prior is not None and not isinstance(self._prior, SurrogateFile):
+            self._prior.update(self._samples)
         threads = torch.get_num_threads()
         try:
             result = run_design_job(self._job())
@@ -309,7 +333,12 @@ class Design:
             occupancy=self._visited,
             threads=self._threads,
             previous=None if self._result is None else self._result.model,
+            prior=self._prior_model(),
         )
+
+    def _prior_model(self) -> bytes | None:
+        file = self._prior if self._prior is None or isinstance(self._prior, SurrogateFile) else self._prior.file
+        return None if file is None else file.model
 
     def _steps(self) -> nouns.RealSteps:
         return nouns.RealSteps.of(self._samples, "manual")

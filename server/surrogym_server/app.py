@@ -50,6 +50,7 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.feature import Cluster, Core, Feature, Parts
 from surrogym_server.features.jobs import FEATURE as jobs
 from surrogym_server.features.policies import FEATURE as policies
+from surrogym_server.features.priors import FEATURE as priors
 from surrogym_server.features.ray.pool import CLUSTER as ray
 from surrogym_server.models.registry import MODELS
 from surrogym_server.private import keep_private
@@ -75,6 +76,7 @@ from surrogym_shared.spec import EnvironmentSpec
 FEATURES: tuple[Feature, ...] = (  # a server without one has no folder for it, and no line here
     policies,
     jobs,
+    priors,
 )
 CLUSTERS: dict[str, Cluster] = {  # by the setting ``engine``
     "ray": ray,

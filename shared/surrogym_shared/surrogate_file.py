@@ -81,6 +81,7 @@ class SurrogateFile:
     predictions: list[list[list[float]]] = field(
         default_factory=list
     )  # [error, deviation] of each new sample, by output
+    about: dict[str, Any] = field(default_factory=dict)  # of a prior: what it was made from, see ``wire.priors``
 
     def to_bytes(self) -> bytes:
         """Return the contents of the file.
@@ -104,6 +105,7 @@ class SurrogateFile:
             "tolerances": self.tolerances,
             "ledger": self.ledger,
             "predictions": self.predictions,
+            "about": self.about,
         }
         header[METADATA] = header.get(METADATA, {}) | {OWN: json.dumps(own)}
         return _joined(header, b"".join(parts))
@@ -135,6 +137,7 @@ class SurrogateFile:
             name = _name(own["name"])
             tolerances = {str(output): float(value) for output, value in own.get("tolerances", {}).items()}
             ledger = {str(purpose): int(steps) for purpose, steps in own.get("ledger", {}).items()}
+            about = dict(own.get("about", {}))
             predictions = [[_pair(pair) for pair in output] for output in own.get("predictions", [])]
         except NotASurrogateFile:
             raise
@@ -149,7 +152,11 @@ class SurrogateFile:
                 "surrogym export"
             ) from error
         _require_shapes(spec, samples)
-        return cls(name, spec, model, samples, tolerances, ledger, predictions)
+        return cls(name, spec, model, samples, tolerances, ledger, predictions, about)
+
+    def about_as_json(self) -> str:
+        """Return what a prior was made from; without a description, that it is this surrogate."""
+        return json.dumps(self.about or {"source": self.name})
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

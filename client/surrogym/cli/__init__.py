@@ -30,6 +30,7 @@ COMMANDS = (
     "status",
     "report",
     "improve",
+    "prior",
     "change",
     "export",
     "import",

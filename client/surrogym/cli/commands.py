@@ -12,7 +12,7 @@ from surrogym_shared.removed import remark
 
 GROUPS: Mapping[str, tuple[str, ...]] = {
     "Start": ("demo", "serve", "doctor"),
-    "Loop": ("describe", "register", "sample", "train", "audit", "evaluate", "status"),
+    "Loop": ("describe", "register", "sample", "prior", "train", "audit", "evaluate", "status"),
     "After": (
         *("report", "policies", "policy", "improve", "change", "export", "import", "export-policy", "deploy", "delete"),
     ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -91,6 +92,17 @@ class GymnasiumEnvironment:
         self._task.write(self._env, state)
         self._env.state = state
         return wrapped(self._spec, self._task.read(self._env))
+
+    def parameters(self) -> dict[str, float]:
+        """The task's physical attributes, by name."""
+        return {name: float(getattr(self._env, name)) for name in self._task.perturbable}
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        """Change physical attributes, and those that depend on them."""
+        for name, value in values.items():
+            setattr(self._env, name, value)
+        if self._task.settle is not None:
+            self._task.settle(self._env)
 
     def close(self) -> None:
         self._env.close()

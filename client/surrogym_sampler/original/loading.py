@@ -254,6 +254,7 @@ class _Respecified:
 
     def __init__(self, environment: object, spec: EnvironmentSpec) -> None:
         self._spec = spec
+        self.wrapped = environment
         for name in ATTRIBUTES:
             if hasattr(environment, name):
                 setattr(self, name, getattr(environment, name))

@@ -53,6 +53,7 @@ class DesignJob:
     occupancy: Array | None = None  # (m, C) states that policies visited
     threads: int = 1
     previous: bytes | None = None  # model of the round before, to predict the samples that are new
+    prior: bytes | None = None  # model of what is known beforehand, such as one of a simulator
 
 
 @dataclass(frozen=True)
@@ -177,4 +178,5 @@ def _request(job: DesignJob) -> Request:
         audited=job.samples.purpose.count("audit"),
         unlearned=int((~_known(job)).sum()),
         open=job.open_steps,
+        prior=None if job.prior is None else from_bytes(job.definition, job.prior),
     )

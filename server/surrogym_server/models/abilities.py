@@ -19,7 +19,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.port import DynamicsModel, Transition
+from surrogym_server.models.port import DynamicsModel, Learned, Transition, Warm
 
 A = TypeVar("A")
 
@@ -27,6 +27,25 @@ A = TypeVar("A")
 def offers(model: DynamicsModel, ability: type[A]) -> A | None:
     """Return the model as an object with this ability; None if the model lacks the ability."""
     return model if isinstance(model, ability) else None
+
+
+class TakesPrior(ABC):
+    """Ability of a ``Learner`` to learn beside a prior: a model of the same family and definition, of what is known
+    beforehand, such as one of a simulator.
+
+    Fallback of ``services``: a prior is refused.
+    """
+
+    @abstractmethod
+    def learn_beside(
+        self, prior: DynamicsModel, definition: EnvironmentDefinition, samples: Samples, warm: Warm | None = None
+    ) -> Learned:
+        """Fit as ``Learner.learn`` does. Each output uses the prior only if it then predicts left-out samples better.
+
+        Raises:
+            TypeError: the prior is of another family.
+            InvalidInput, NumericalFailure: as ``Learner.learn``.
+        """
 
 
 class FunctionDraws(ABC):

@@ -15,6 +15,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
 from surrogym_server.errors import PluginFailed, SurrogymError
+from surrogym_server.models.abilities import TakesPrior
 from surrogym_server.models.port import DynamicsModel, Learned, Transition, Warm
 from surrogym_server.models.registry import learner_of
 from surrogym_server.plugins import failed, guarded, in_one_line
@@ -33,7 +34,9 @@ def plugin_calls(definition: EnvironmentDefinition, *, interrupts: bool = False)
     return guarded(_family(definition), PluginFailed, interrupts=interrupts)
 
 
-def learn(definition: EnvironmentDefinition, samples: Samples, warm: Warm | None) -> Learned:
+def learn(
+    definition: EnvironmentDefinition, samples: Samples, warm: Warm | None, prior: DynamicsModel | None = None
+) -> Learned:
     """Learn a model of the specified family, and try it at a few of its own samples.
 
     Raises:
@@ -41,7 +44,11 @@ def learn(definition: EnvironmentDefinition, samples: Samples, warm: Warm | None
         PluginFailed: the family's code raised another error, or returned something that is not a model.
     """
     with plugin_calls(definition):
-        learned = learner_of(definition.learning.model).learn(definition, samples, warm)
+        learner = learner_of(definition.learning.model)
+        if prior is not None and isinstance(learner, TakesPrior):
+            learned = learner.learn_beside(prior, definition, samples, warm)
+        else:
+            learned = learner.learn(definition, samples, warm)
         model: object = getattr(learned, "model", learned)
         if not isinstance(model, DynamicsModel):
             raise _wrong(definition, "expected learn to return a Learned with a DynamicsModel", type(model).__name__)

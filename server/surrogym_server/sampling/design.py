@@ -91,7 +91,7 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         ChoiceFailed: the acquisition returned values of a wrong shape, or that are not finite.
     """
     # Lines 3, 4 and 12: fit the processes of all outputs, transitions and reward, to all samples.
-    fit = learn(definition, samples, state.warm)
+    fit = learn(definition, samples, state.warm, request.prior)
 
     # CI needs a tolerance for each output, (O,): the declared one, or else the preset's, which is 1 in "paper" and else
     # 5 % of the output's standard deviation. Later rounds keep it, unless the range of the samples grows far.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.prequential import Predictions, from_pairs, pairs_of
 from surrogym_server.sampling.tolerances import DefaultTolerances
 from surrogym_shared.nouns import Query, Vector
@@ -93,6 +94,7 @@ class Request:
     audited: int = 0  # number of the samples that are steps of audits
     unlearned: int = 0  # real steps that are no samples here, because their lags were not known
     open: int = 0  # real steps of the pending queries that may still be answered
+    prior: DynamicsModel | None = None  # model of what is known beforehand
     surprises: Predictions = ()  # predictions, by the last model, of the samples that are new in this round
 
     def cost(self, samples: int) -> int:

@@ -302,6 +302,7 @@ class Designer:
             ),  # the budget may have been lowered since
             occupancy=None if visited is None else visited.states,
             threads=self._settings.threads,
+            prior=self._storage.priors.blob(name),
             previous=self._previous(name) if set(samples.purpose).difference(UNCHOSEN) else None,
         )
 

@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 
 from surrogym_server.storage.announcements import Announcements
 from surrogym_server.storage.records import (
+    JSON,
     AddedSamples,
     Array,
     EventRecord,
@@ -36,6 +37,7 @@ from surrogym_server.storage.records import (
     NewSample,
     NewSurrogate,
     OccupancyRecord,
+    PriorRecord,
     QueryCounts,
     QueryRecord,
     SampleRecord,
@@ -414,6 +416,33 @@ class Models(ABC):
         """Store an imported model as the newest version, and return it. The design is not changed."""
 
 
+class Priors(ABC):
+    """Part of the storage for priors: models of what is known of an environment beforehand, such as of a simulator.
+
+    Each surrogate has at most one. While its design waits for a prior, no fit is due.
+    """
+
+    @abstractmethod
+    def get(self, name: str) -> PriorRecord | None:
+        """Return the description of the prior, also of one that is awaited; None if there is none."""
+
+    @abstractmethod
+    def blob(self, name: str) -> bytes | None:
+        """Return the prior's model; None if there is none yet. Raises ``Damaged`` if it has changed since then."""
+
+    @abstractmethod
+    def put(self, name: str, blob: bytes, about: JSON) -> None:
+        """Store a prior in place of any other. Queries that no sampler has begun are withdrawn, and a fit is due."""
+
+    @abstractmethod
+    def wait(self, name: str) -> None:
+        """Let the design wait for a prior. If there is one, nothing changes."""
+
+    @abstractmethod
+    def drop(self, name: str) -> bool:
+        """Remove the prior, or stop waiting for it, and return whether there was one. A fit without it is due."""
+
+
 class Occupancy(ABC):
     """Part of the storage for occupancies: the states that policies visited, by training checkpoint."""
 
@@ -489,6 +518,7 @@ class Storage(ABC):
     snapshots: Snapshots
     ledger: Ledger
     models: Models
+    priors: Priors
     occupancy: Occupancy
     sessions: Sessions
     events: Events

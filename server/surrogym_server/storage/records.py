@@ -285,6 +285,15 @@ class SurrogateSummary:
 
 
 @dataclass(frozen=True)
+class PriorRecord:
+    """Description of a prior. ``awaited``: the design waits for it."""
+
+    created_at: float
+    about: JSON
+    awaited: bool
+
+
+@dataclass(frozen=True)
 class OccupancyRecord:
     checkpoint: str
     round: int  # round of the design in which the occupancy was submitted

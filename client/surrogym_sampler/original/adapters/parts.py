@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,12 +45,48 @@ class OfParts(Simulator):
     def touches(self) -> bool:
         return self._data is not None and int(self._data.ncon) > 0
 
+    def parameters(self) -> dict[str, float]:
+        """The parameters of a MuJoCo model: ``mass.BODY``, ``damping.JOINT``, ``friction.GEOM`` (sliding), and
+        ``gear.ACTUATOR``. Names are those of the model; parts without a name or with a value of 0 have none."""
+        return {} if self._model is None else {name: float(rows[at]) for name, rows, at in _parameters(self._model)}
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        """Change parameters. A body's inertia grows with its mass."""
+        import mujoco
+
+        places = {name: (rows, at) for name, rows, at in _parameters(self._model)}
+        for name, value in values.items():
+            rows, at = places[name]
+            if name.startswith("mass."):
+                self._model.body_inertia[at] *= value / float(rows[at])
+            rows[at] = value
+        qpos, qvel = self._data.qpos.copy(), self._data.qvel.copy()
+        mujoco.mj_setConst(self._model, self._data)
+        self._data.qpos[:], self._data.qvel[:] = qpos, qvel
+
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
         if self._model is None or self._masses is None:
             super().perturb(rng, sigma)
             return
         for body, mass in enumerate(self._masses):
             self._model.body_mass[body] = mass * random_factor(rng, sigma)
+
+
+def _parameters(model: Any) -> list[tuple[str, Any, Any]]:
+    """Name, array and place of each parameter of a MuJoCo model."""
+    found: list[tuple[str, Any, Any]] = []
+    for kind, count, read, rows, entry in (
+        ("mass", model.nbody, model.body, model.body_mass, None),
+        ("damping", model.njnt, model.joint, model.dof_damping, "dof"),
+        ("friction", model.ngeom, model.geom, model.geom_friction, 0),
+        ("gear", model.nu, model.actuator, model.actuator_gear, 0),
+    ):
+        for index in range(count):
+            name = read(index).name
+            at = int(model.jnt_dofadr[index]) if entry == "dof" else index if entry is None else (index, entry)
+            if name and float(rows[at]) > 0:
+                found.append((f"{kind}.{name}", rows, at))
+    return found
 
 
 def action_of(name: str, space: Any) -> Action:

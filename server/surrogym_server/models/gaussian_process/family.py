@@ -6,14 +6,16 @@ from dataclasses import dataclass
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
+from surrogym_server.models.abilities import TakesPrior
 from surrogym_server.models.gaussian_process.codec.model import GaussianProcessCodec
 from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.settings import Settings
-from surrogym_server.models.port import Learned, Learner, ModelCodec, Warm
+from surrogym_server.models.port import DynamicsModel, Learned, Learner, ModelCodec, Warm
 
 
 @dataclass(frozen=True)
-class GaussianProcesses(Settings, Learner):
+class GaussianProcesses(Settings, Learner, TakesPrior):
     """One process for each output, with a structure chosen by evidence. The warm start is hyperparameters."""
 
     @property
@@ -22,3 +24,10 @@ class GaussianProcesses(Settings, Learner):
 
     def learn(self, definition: EnvironmentDefinition, samples: Samples, warm: Warm | None = None) -> Learned:
         return learn(self, definition, samples, warm or {})
+
+    def learn_beside(
+        self, prior: DynamicsModel, definition: EnvironmentDefinition, samples: Samples, warm: Warm | None = None
+    ) -> Learned:
+        if not isinstance(prior, GaussianProcessModel):
+            raise TypeError(f"expected a prior of Gaussian processes, got {type(prior).__name__}")
+        return learn(self, definition, samples, warm or {}, prior)

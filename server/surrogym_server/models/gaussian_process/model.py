@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -50,6 +50,9 @@ from surrogym_server.models.port import DynamicsModel, Transition
 from surrogym_server.tensors import CPU, cached, to_device
 from surrogym_shared import compiled
 
+if TYPE_CHECKING:
+    from surrogym_server.models.gaussian_process.prediction.compiled.step import StepsOfModel
+
 COMPILED_SOLVES = 300  # points; with more of them a library of linear algebra solves triangular systems faster
 
 
@@ -77,6 +80,7 @@ class GaussianProcessModel(
     digest: str
     ending: Region | None = None  # region in which episodes end, if that is learned
     jumps: tuple[Jump, ...] = ()  # of the reward, in addition to its process
+    prior: GaussianProcessModel | None = None  # its mean is added to the outputs that have a ``size_with_prior``
 
     @property
     def outputs(self) -> tuple[OutputModel, ...]:
@@ -100,6 +104,11 @@ class GaussianProcessModel(
         reward = paid(self.terminal_reward, reward, self.terminated(q_next))
         return torch.cat([change, reward[:, None]], -1)
 
+    def means_before_end(self, q: Tensor, u: Tensor) -> Tensor:
+        """Predict as ``means`` does, (m, O), with a reward without the terminal reward."""
+        change, _, reward = self._predictor.means(q, u)
+        return torch.cat([change, reward[:, None]], -1)
+
     def learned_termination(self, q: Tensor) -> Tensor:
         assert self.ending is not None
         return self.ending.probability(q)
@@ -120,7 +129,9 @@ class GaussianProcessModel(
             outputs[-1]["kernel"] = "declared"
         ending = {} if self.ending is None else {"termination": self.ending.description}
         jumps = [{"size": jump.size, **jump.region.description} for jump in self.jumps]
-        beyond = {"terminal_reward": self.terminal_reward, "jumps": jumps}
+        beyond: dict[str, Any] = {"terminal_reward": self.terminal_reward, "jumps": jumps}
+        if self.prior is not None:
+            beyond["prior"] = {"samples": self.prior.samples, "digest": self.prior.digest}
         return {"outputs": outputs, **beyond, "samples": self.samples, **ending}
 
     @property
@@ -166,6 +177,8 @@ class GaussianProcessModel(
         x, hyper = process_inputs(self.definition, output, steps), output.posterior.hyper
         scale = output.scale * output.amplitude(x)
         targets = increments(self.definition, samples)[rows, column] - output.centre
+        if self.prior is not None and output.size_with_prior is not None:
+            targets = targets - self.prior.means_before_end(steps.q, steps.u)[:, column]
         function = scale[:, None] * covariance(hyper, x, x) * scale
         return AtSamples(rows, targets, function, float(scale.square().mean()) * hyper.noise_variance)
 
@@ -223,7 +236,7 @@ class GaussianProcessModel(
         return not stds or points <= COMPILED_SOLVES
 
     def step_source(self) -> StepSource | None:
-        if self._compiled is None:
+        if self._compiled is None or self.prior is not None:
             return None
         from surrogym_server.models.gaussian_process.prediction.compiled.source import step_source
         from surrogym_server.models.gaussian_process.prediction.compiled.step import tables_of
@@ -238,12 +251,13 @@ class GaussianProcessModel(
         return usable(self.definition, column, q_next, output.feature_map, past_limits=output.past_limits)
 
     @cached_property
-    def _compiled(self) -> ArraySteps | None:
+    def _compiled(self) -> StepsOfModel | None:
         if self.definition.device != CPU or not compiled.available():
             return None
         from surrogym_server.models.gaussian_process.prediction.compiled.step import StepsOfModel
 
-        return StepsOfModel.of(self._predictor, self.ending)
+        prior = None if self.prior is None else self.prior._compiled
+        return StepsOfModel.of(self._predictor, self.ending, prior)
 
     @cached
     def _uncertain_functions(self) -> FunctionDraws:
@@ -256,4 +270,5 @@ class GaussianProcessModel(
 
     @cached
     def _predictor(self) -> Predictor:
-        return Predictor(self.definition, self.transitions, self.reward, self.jumps)
+        prior = None if self.prior is None else self.prior._predictor
+        return Predictor(self.definition, self.transitions, self.reward, self.jumps, prior)

@@ -26,7 +26,7 @@ from surrogym_server.storage.sql.models import insert_model
 from surrogym_server.storage.sql.queries import IS_INCOMPLETE, begin_initial, queue_initial
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, recall, remember, touch
 from surrogym_server.storage.sql.surrogates import NO_RIGHT
-from surrogym_server.storage.sql.tables import queries, samples, surrogates
+from surrogym_server.storage.sql.tables import priors, queries, samples, surrogates
 from surrogym_shared.nouns import Query
 from surrogym_shared.states import Phase
 
@@ -36,6 +36,9 @@ OWN_QUERIES = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogates
 OWN_SAMPLES = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogates.c.id)
 # The statuses are constants in the statement: with parameters, PostgreSQL would read all queries, not use an index.
 OPEN = [constant(status) for status in OPEN_STATUSES]
+AWAITS_PRIOR = sa.exists(
+    sa.select(priors.c.surrogate_id).where(priors.c.surrogate_id == surrogates.c.id, priors.c.blob.is_(None))
+)
 OPEN_QUERY = sa.exists(OWN_QUERIES.where(queries.c.status.in_(OPEN)))
 
 
@@ -48,6 +51,7 @@ IS_DUE = sa.and_(
     surrogates.c.revision > surrogates.c.fitted_revision,
     _EXPIRES.is_(None) | (_EXPIRES <= NOW) | _SET_BACK,
     sa.exists(OWN_SAMPLES),
+    ~AWAITS_PRIOR,
     ~OPEN_QUERY | (surrogates.c.logged_revision > surrogates.c.fitted_revision),
     ~IS_INCOMPLETE,
 )

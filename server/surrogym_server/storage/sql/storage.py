@@ -22,6 +22,7 @@ from surrogym_server.storage.sql.designs import SqlDesigns
 from surrogym_server.storage.sql.ledger import CountedSamples, SqlLedger
 from surrogym_server.storage.sql.memory import SqlEvents, SqlOccupancy, SqlSessions
 from surrogym_server.storage.sql.models import SqlModels, SqlPolicyNames
+from surrogym_server.storage.sql.priors import SqlPriors
 from surrogym_server.storage.sql.queries import SqlQueries, SqlSnapshots
 from surrogym_server.storage.sql.samples import SqlSamples
 from surrogym_server.storage.sql.surrogates import SqlSurrogates
@@ -41,6 +42,7 @@ class SqlStorage(Storage):
         self.snapshots = SqlSnapshots(database)
         self.ledger = SqlLedger(database, counts)
         self.models = SqlModels(database)
+        self.priors = SqlPriors(database)
         self.occupancy = SqlOccupancy(database)
         self.sessions = SqlSessions(database)
         self.events = SqlEvents(database)

@@ -126,7 +126,7 @@ class SqlSurrogates(port.Surrogates):
             if smaller is not None:
                 end_initial(connection, surrogate)
             if smaller is not None or changes.keys() & {"target", "tolerances"}:
-                changes |= _withdraw_unbegun(connection, surrogate, before, smaller)
+                changes |= withdraw_unbegun(connection, surrogate, before, smaller)
             if changes:
                 _apply(connection, surrogate, changes)
             requeued = {"asked_again": again} if again else {}
@@ -198,7 +198,7 @@ def _set_or_taken_back(before: dict[str, float], changes: dict[str, float | None
     return others | {name: value for name, value in changes.items() if value is not None}
 
 
-def _withdraw_unbegun(
+def withdraw_unbegun(
     connection: Connection, surrogate: Row[Any], before: SurrogateRecord, budget: int | None
 ) -> dict[str, Any]:
     """Withdraw what a design planned for another target, tolerance or budget.

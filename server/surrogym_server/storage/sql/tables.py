@@ -291,6 +291,16 @@ models = sa.Table(
     sa.Column("damage", sa.Text),  # description of the damage; NULL: none was found
 )
 
+priors = sa.Table(  # what is known of a surrogate's environment beforehand; NULL: the design waits for it
+    "priors",
+    metadata,
+    owner(primary_key=True),
+    sa.Column("created_at", sa.Double, nullable=False),
+    sa.Column("about", Json("priors.about"), nullable=False),
+    sa.Column("blob", sa.LargeBinary),
+    sa.Column("checksum", sa.Text, nullable=False),  # SHA-256 of the blob
+)
+
 occupancies = sa.Table(
     "occupancies",
     metadata,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from torch import Tensor
@@ -26,8 +27,9 @@ from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.regions import TERMINATION
 from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel, require_format, require_sums
 
-FORMAT = 7
+FORMAT = 8
 JUMP = "jump"  # prefix of the names of its arrays
+PRIOR = "prior."  # the same of a model's prior
 
 
 class GaussianProcessCodec(ModelCodec):
@@ -56,6 +58,8 @@ def _tensors(model: GaussianProcessModel) -> dict[str, Tensor]:
         tensors |= region_tensors(jump.region, f"{JUMP}.{index}")
     for index, output in enumerate(model.outputs):
         tensors |= output_tensors(output, str(index))
+    if model.prior is not None:
+        tensors |= {PRIOR + name: tensor for name, tensor in _tensors(model.prior).items()}
     return tensors
 
 
@@ -68,6 +72,7 @@ def _header(model: GaussianProcessModel) -> dict[str, Any]:
         "digest": model.digest,
         "jumps": [[jump.size, region_header(jump.region)] for jump in model.jumps],
         "termination": None if model.ending is None else region_header(model.ending),
+        "prior": None if model.prior is None else _header(model.prior),
     }
 
 
@@ -82,12 +87,26 @@ def _read(definition: EnvironmentDefinition, stored: StoredModel) -> GaussianPro
     names = tuple(output.name for output in outputs)
     if names != definition.outputs:
         raise InvalidInput(f"expected a model with the outputs {definition.outputs}, got one with {names}")
-    return GaussianProcessModel(definition, outputs[:-1], outputs[-1], terminal_reward, samples, digest, ending, jumps)
+    prior = _read_prior(definition, header["prior"], tensors)
+    return GaussianProcessModel(
+        definition, outputs[:-1], outputs[-1], terminal_reward, samples, digest, ending, jumps, prior
+    )
+
+
+def _read_prior(
+    definition: EnvironmentDefinition, header: dict[str, Any] | None, tensors: Mapping[str, Tensor]
+) -> GaussianProcessModel | None:
+    if header is None:
+        return None
+    own = {name.removeprefix(PRIOR): tensor for name, tensor in tensors.items() if name.startswith(PRIOR)}
+    return GaussianProcessCodec().decode(definition, StoredModel(header, own))
 
 
 def _require_consistent(model: GaussianProcessModel) -> None:
     """Check that the numbers can come from a fit, and fit the definition. Raises ``InvalidInput``."""
     definition, reward = model.definition, model.reward
+    if model.prior is None and any(output.size_with_prior is not None for output in model.outputs):
+        raise InvalidInput("expected a model with its prior, because outputs are learned beside it, got none")
     require_sums(model.terminal_reward, model.samples)
     if any(output.feature_map.after for output in model.transitions):
         raise InvalidInput(

@@ -46,6 +46,7 @@ def require_output(definition: EnvironmentDefinition, output: OutputModel) -> No
     _require_rates(definition, output)
     _require_at_limit(definition, output)
     _require_shared(definition, output)
+    _require_size(output)
     _require_shapes(definition, output)
     _require_numbers(output)
 
@@ -64,6 +65,7 @@ def output_header(output: OutputModel) -> dict[str, Any]:
         "past_limits": output.past_limits,
         "at_limit": output.at_limit,
         "shared": output.shared,
+        "size_with_prior": output.size_with_prior,
     }
     if (posterior := output.posterior) is not None:
         hyper = posterior.hyper
@@ -112,8 +114,9 @@ def read_output(
     past_limits = bool(entry["past_limits"])
     at_limit = tuple(int(side) for side in entry["at_limit"])
     shared = tuple(str(other) for other in entry["shared"])
+    size = None if (size := entry["size_with_prior"]) is None else float(size)
     return OutputModel(
-        name, feature_map, posterior, centre, scale, left_out, scores, warp, past_limits, at_limit, shared
+        name, feature_map, posterior, centre, scale, left_out, scores, warp, past_limits, at_limit, shared, size
     )
 
 
@@ -163,6 +166,13 @@ def _require_dropped(definition: EnvironmentDefinition, output: OutputModel) -> 
             "not all, "
             f"of 0 to {count - 1} in rising order, got {dropped}"
         )
+
+
+def _require_size(output: OutputModel) -> None:
+    """Check that an output beside a prior has a size, and no warp."""
+    size = output.size_with_prior
+    if size is not None and (not 0 < size < math.inf or output.warp is not None):
+        raise InvalidInput(f"output {output.name!r}: expected a finite size beside a prior and no warp, got {size}")
 
 
 def _require_warp(output: OutputModel) -> None:

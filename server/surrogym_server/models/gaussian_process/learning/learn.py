@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import partial
+
 import torch
+from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.environment.features import encode, leading
+from surrogym_server.environment.features import FeatureMap, encode, leading
 from surrogym_server.environment.samples import Samples, increments, limit_sides, saturated
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.gaussian_process.censoring import saturates, stopped
@@ -15,6 +19,7 @@ from surrogym_server.models.gaussian_process.learning.dropping import without_in
 from surrogym_server.models.gaussian_process.learning.limits import held, past_limits
 from surrogym_server.models.gaussian_process.learning.many import ByBound, BySubsets
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
+from surrogym_server.models.gaussian_process.learning.prior import Known, better_of
 from surrogym_server.models.gaussian_process.learning.rates import output_with_rates
 from surrogym_server.models.gaussian_process.learning.region import learn_termination
 from surrogym_server.models.gaussian_process.learning.repeats import with_samples_of_others
@@ -27,7 +32,13 @@ from surrogym_server.models.port import Learned, Warm
 MIN_POINTS = 2
 
 
-def learn(settings: Settings, definition: EnvironmentDefinition, samples: Samples, warm: Warm) -> Learned:
+def learn(
+    settings: Settings,
+    definition: EnvironmentDefinition,
+    samples: Samples,
+    warm: Warm,
+    prior: GaussianProcessModel | None = None,
+) -> Learned:
     """Learn as ``Learner.learn`` says.
 
     Raises:
@@ -37,24 +48,42 @@ def learn(settings: Settings, definition: EnvironmentDefinition, samples: Sample
         raise InvalidInput(f"a model needs at least {MIN_POINTS} samples, got {len(samples)}")
     many = ByBound(settings.inducing) if settings.inducing else BySubsets()
     learner = OutputLearner(definition, settings, warm, {}, many)
-    transitions = _transitions(learner, samples)
-    paying, terminal_reward, jumps = learn_reward(learner, samples)
-    ends = learn_termination(learner, samples) if definition.learns_termination else None
+    known = None if prior is None else Known.of(prior, samples)
+    transitions = _transitions(learner, samples, None if known is None else known.change)
+    paying, terminal_reward, jumps = learn_reward(learner, samples, known)
+    ends = learn_termination(learner, samples, prior) if definition.learns_termination else None
     model = GaussianProcessModel(
-        definition, transitions, paying, terminal_reward, len(samples), samples.digest, ends, jumps
+        definition, transitions, paying, terminal_reward, len(samples), samples.digest, ends, jumps, prior
     )
     return Learned(model, learner.thetas)
 
 
-def _transitions(learner: OutputLearner, samples: Samples) -> tuple[OutputModel, ...]:
+@dataclass(frozen=True)
+class _Among:
+    """The n samples among which an output learns: masks (n,) and inputs of each candidate map."""
+
+    inputs: dict[FeatureMap, Tensor]
+    keep: Tensor  # those that count
+    keep_lead: Tensor  # those that count for maps that read the lead
+    past: Tensor  # those that count if the limits of others don't matter
+    side: Tensor  # see ``OutputLearner.output``
+
+
+def _transitions(learner: OutputLearner, samples: Samples, known: Tensor | None) -> tuple[OutputModel, ...]:
+    """Learn the transition outputs. ``known`` (n, M) is what the prior predicts, if there is one."""
     definition = learner.definition
     everything, change = torch.ones(len(samples), dtype=torch.bool), increments(definition, samples)
+    columns = [None] * change.shape[1] if known is None else list(known.T)
     if definition.moves_observation:
         (feature_map,) = candidates(definition, follows=False)
         inputs = {feature_map: encode(definition, feature_map, samples.q, samples.u)}
+
+        def of_observation(name: str, target: Tensor) -> OutputModel:
+            return learner.output(name, target, inputs, everything, everything)
+
+        names = definition.observation_names
         return tuple(
-            learner.output(name, change[:, i], inputs, everything, everything)
-            for i, name in enumerate(definition.observation_names)
+            better_of(of_observation, name, change[:, i], columns[i], everything) for i, name in enumerate(names)
         )
     keep = ~saturated(definition, samples.q_next)
     keep = keep if int(keep.sum()) >= MIN_POINTS else everything
@@ -66,12 +95,18 @@ def _transitions(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
         maps = learner.allowed(candidates(definition, follows=index not in lead, drift=drift))
         inputs = {m: encode(definition, m, samples.q, samples.u, samples.q_next[:, lead]) for m in maps}
         keep_lead = ~saturates(definition, index, samples.q_next) | keep
+        past = ~stopped(definition, index, samples.q_next)
+        learn_coordinate = partial(_coordinate, learner, _Among(inputs, keep, keep_lead, past, sides[:, index]))
         name = definition.coordinates[index].name
-        target, side = change[:, column], sides[:, index]
-        output = output_with_rates(learner, name, target, inputs, keep, keep_lead, side)
-        more = ~stopped(definition, index, samples.q_next)
-        output = past_limits(learner, output, target, inputs, keep, keep_lead, more, side)
-        used = more if output.past_limits else keep
-        output = held(learner, output, target, inputs, used, side)
-        outputs.append(without_inputs(learner, output, target, inputs, used))
+        outputs.append(better_of(learn_coordinate, name, change[:, column], columns[column], keep))
     return with_samples_of_others(learner, outputs)
+
+
+def _coordinate(learner: OutputLearner, among: _Among, name: str, target: Tensor) -> OutputModel:
+    """Learn the output of one coordinate from targets (n,)."""
+    inputs, keep, side = among.inputs, among.keep, among.side
+    output = output_with_rates(learner, name, target, inputs, keep, among.keep_lead, side)
+    output = past_limits(learner, output, target, inputs, keep, among.keep_lead, among.past, side)
+    used = among.past if output.past_limits else keep
+    output = held(learner, output, target, inputs, used, side)
+    return without_inputs(learner, output, target, inputs, used)

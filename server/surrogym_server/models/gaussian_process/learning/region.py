@@ -12,14 +12,22 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.models.gaussian_process.feature_maps import candidates
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.thresholds import log_probability, thresholds
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.regions import TERMINATION, Classifier, Form, Region, likely
 
 HANDICAP = 3.0  # log odds against the classifier, whose hyperparameters were fitted to the left-out labels too
 FAINT = 0.05  # a form is dropped if its weight is a smaller share of the best one's
 
 
-def learn_termination(learner: OutputLearner, samples: Samples) -> Region:
-    """Learn the region in which episodes end. It is empty while no sample has ended an episode."""
+def learn_termination(learner: OutputLearner, samples: Samples, prior: GaussianProcessModel | None = None) -> Region:
+    """Learn the region in which episodes end. It is empty while no sample has ended an episode.
+
+    The region of a prior is used as long as all samples agree with it.
+    """
+    if prior is not None and prior.ending is not None:
+        agrees = (prior.ending.probability(samples.q_next) > 0.5) == samples.terminated
+        if bool(agrees.all()):
+            return prior.ending
     return learn_region(learner, TERMINATION, samples.q_next, samples.terminated)
 
 

@@ -61,6 +61,8 @@ def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Cand
     posterior, selection, chosen = output.posterior, learner.selections.get(output.name), output.feature_map
     if posterior is None or posterior.sparse is not None or chosen.rates or output.at_limit:
         return None
+    if output.size_with_prior is not None:
+        return None
     if selection is None and not chosen.dropped:
         return None
     mirror = reflection(learner.definition, replace(chosen, parity="odd"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -15,14 +16,20 @@ from surrogym_server.models.gaussian_process.feature_maps import reward_candidat
 from surrogym_server.models.gaussian_process.learning.jumps import with_jumps
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.peaks import with_peak
+from surrogym_server.models.gaussian_process.learning.prior import Known, beside
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.regions import Jump, jumped
 
 FEW = 2  # non-terminating steps; fewer are useless without the terminating ones
 
 
-def learn_reward(learner: OutputLearner, samples: Samples) -> tuple[OutputModel, float, tuple[Jump, ...]]:
-    """The reward process of non-terminating steps, the additional reward of terminating steps, and the jumps."""
+def learn_reward(
+    learner: OutputLearner, samples: Samples, prior: Known | None = None
+) -> tuple[OutputModel, float, tuple[Jump, ...]]:
+    """The reward process of non-terminating steps, the additional reward of terminating steps, and the jumps.
+
+    The reward of a prior is used if what it leaves has smaller leave-one-out errors.
+    """
     definition = learner.definition
     if (known := definition.declared_reward) is not None:
         return _declared(known, samples), known.terminal, ()
@@ -37,12 +44,23 @@ def learn_reward(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
         output = with_peak(learner, samples.reward, inputs | _without_action(definition, samples), going, output)
     if learner.settings.reward_jumps and output.warp is None:
         output, jumps = with_jumps(learner, samples, inputs, going, output)
+    by_prior = torch.zeros_like(samples.reward)
+    if prior is not None:
+        found = beside(partial(_plain, learner, inputs, going), REWARD, samples.reward, prior.reward, going)
+        if found.leave_one_out().error <= output.leave_one_out().error:
+            output, jumps, by_prior = found, (), prior.reward
     ended = ~going
     if not bool(ended.any()):
-        return output, 0.0, jumps
+        return output, 0.0 if prior is None else prior.terminal, jumps
     state = samples.q_next if output.feature_map.after else samples.q
-    bonus = (samples.reward - output.mean(inputs[output.feature_map]) - jumped(jumps, state)[0])[ended]
+    bonus = (samples.reward - by_prior - output.mean(inputs[output.feature_map]) - jumped(jumps, state)[0])[ended]
     return output, float(bonus.mean()), jumps
+
+
+def _plain(
+    learner: OutputLearner, inputs: dict[FeatureMap, Tensor], going: Tensor, name: str, target: Tensor
+) -> OutputModel:
+    return learner.output(name, target, inputs, going, going)
 
 
 def _without_action(definition: EnvironmentDefinition, samples: Samples) -> dict[FeatureMap, Tensor]:

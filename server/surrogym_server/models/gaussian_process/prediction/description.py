@@ -22,6 +22,8 @@ def describe(definition: EnvironmentDefinition, output: OutputModel) -> dict[str
         "left_out": output.left_out,
         "scores": dict(output.scores),
     }
+    if output.size_with_prior is not None:
+        described["beside"] = "prior"
     if output.warp is not None:
         described["learned"] = str(output.warp)
     if output.posterior is not None:
@@ -58,8 +60,9 @@ def _inputs(definition: EnvironmentDefinition, feature_map: FeatureMap) -> dict[
 
 def structure(output: OutputModel) -> str:
     """Kernel and inputs of an output, in a few words."""
+    learned = "" if output.size_with_prior is None else "prior + "
     if output.posterior is None:
-        return "constant"
-    learned = "" if output.warp is None else f"{output.warp}: "
+        return f"{learned}constant"
+    learned += "" if output.warp is None else f"{output.warp}: "
     shared = f", with samples of {', '.join(output.shared)}" if output.shared else ""
     return f"{learned}{output.posterior.hyper.kernel} on {output.feature_map}{shared}"

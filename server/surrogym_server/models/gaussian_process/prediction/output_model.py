@@ -35,6 +35,7 @@ class OutputModel:
     past_limits: bool = False  # whether it was learned from samples that ended at a limit of another coordinate
     at_limit: tuple[int, ...] = ()  # for each point: 1 or -1 if it observes the upper or lower limit; () if none does
     shared: tuple[str, ...] = ()  # outputs whose samples it learned from as well, see ``gp.pooling``
+    size_with_prior: float | None = None  # size of the output, if its process is what the model's prior leaves
 
     def mean(self, x: Tensor) -> Tensor:
         """Posterior mean at features x (m, d), in the output's unit, (m,)."""
@@ -67,6 +68,8 @@ class OutputModel:
     @property
     def size(self) -> float:
         """Standard deviation of the output over the samples, in its unit; 1 for one that never varied."""
+        if self.size_with_prior is not None:
+            return self.size_with_prior
         return self.scale if self.warp is None else self.warp.size
 
     @property

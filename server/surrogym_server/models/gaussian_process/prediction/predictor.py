@@ -33,6 +33,7 @@ class Predictor:
     transitions: tuple[OutputModel, ...]  # M, in the order of definition.outputs
     reward: OutputModel
     jumps: tuple[Jump, ...]  # of the reward, in addition to its process
+    prior: Predictor | None = None  # its mean is added to the outputs that have a ``size_with_prior``
 
     def transition(
         self,
@@ -91,6 +92,8 @@ class Predictor:
         kick, shake = self._in_columns(noise), self._in_columns(process)
         x = first.encoder(q, u)
         mean, spread = first.predict(x, wanted, kick, shake, paths)
+        if self.prior is not None:
+            mean = mean + self._by_prior(self.prior, q, u)
         if second is not None:
             lead = clip(self.definition, q + mean[:, :-1])[:, leading(self.definition)]
             following = second.predict(first.encoder.with_lead(x, lead), wanted, kick, shake, paths)
@@ -100,6 +103,22 @@ class Predictor:
             reward = after.predict(after.encoder(q_next, u), wanted, None, None, paths)
             mean, spread = _sum((mean, spread), reward)
         return q_next, mean, spread
+
+    def _by_prior(self, prior: Predictor, q: Tensor, u: Tensor) -> Tensor:
+        """What the prior adds to each column for steps from q (m, C) under u (m, F), (m, columns)."""
+        change, _, reward = prior.means(q, u)
+        added = change.new_zeros(len(q), self._reward_column + 1)
+        added[:, [*self._columns, self._reward_column]] = torch.cat([change, reward[:, None]], 1)
+        return added * self.uses_prior
+
+    @cached
+    def uses_prior(self) -> Tensor:
+        """1 for a column to which the prior's mean is added, else 0, (columns,)."""
+        uses = torch.zeros(self._reward_column + 1, dtype=torch.float64, device=self.definition.device)
+        outputs = (*self.transitions, self.reward)
+        for column, output in zip((*self._columns, self._reward_column), outputs, strict=True):
+            uses[column] = output.size_with_prior is not None
+        return uses
 
     def _rewarded(self, q: Tensor, u: Tensor, q_next: Tensor, mean: Tensor) -> tuple[Tensor, Tensor | float]:
         """Rewards (m,) of steps from q (m, C) under u (m, F) to q_next (m, C): the process' mean, the jumps and the

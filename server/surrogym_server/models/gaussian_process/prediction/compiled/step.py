@@ -170,12 +170,13 @@ def _predict_stage(
     noise: Floats,
     process: Floats,
     paths: Floats,
+    known: Floats,
     stds: bool,
     reward_std: bool,
     mean: Floats,
     spread: Floats,
 ) -> None:
-    """Outputs of one stage at features x (d, B)."""
+    """Outputs of one stage at features x (d, B). If it has rows, ``known`` (B, columns) is added to the means."""
     columns = matrix(numbers, places, int(head[0, OUTPUTS]))
     for column in range(len(columns)):
         if columns[column, STAGE] == stage:
@@ -197,6 +198,11 @@ def _predict_stage(
                 mean[column, b] += columns[column, NOISE] * process[b, number]
         if processes[p, 5] != NONE:
             _grow(numbers, places, int(processes[p, 5]), x, mean[column], spread[number])
+    if len(known):
+        for column in range(len(columns)):
+            if columns[column, STAGE] == stage:
+                for b in range(x.shape[1]):
+                    mean[column, b] += known[b, column]
 
 
 @inlined
@@ -251,12 +257,14 @@ def _ended(numbers: Floats, places: Ints, head: Floats, arrived: Floats) -> Bool
     types.float64[:, ::1],
     types.float64[:, ::1],
     types.float64[:, ::1],
+    types.float64[:, ::1],
     types.boolean,
     types.boolean,
     types.float64[:, ::1],
     types.float64[::1],
     types.float64[:, ::1],
     types.boolean[::1],
+    types.float64[:, ::1],
 )
 def step(
     numbers: Floats,
@@ -266,18 +274,21 @@ def step(
     noise: Floats,
     process: Floats,
     paths: Floats,
+    known: Floats,
     stds: bool,
     reward_std: bool,
     q_next: Floats,
     reward: Floats,
     std: Floats,
     terminated: Bools,
+    change: Floats,
 ) -> None:
     """Compute steps from q (N, C) under u (N, F).
 
-    Unless empty, ``noise`` (N, M) moves the outputs by latent standard deviations, ``process`` (N, M) moves them by
-    standard deviations of the learned noise, and ``paths`` (N, W) are the functions that the outputs follow. Results
-    are written to ``q_next`` (N, C), ``reward`` (N,), ``std`` (N, O) as far as requested, and ``terminated`` (N,).
+    If they have rows, ``noise`` (N, M) moves the outputs by latent standard deviations, ``process`` (N, M) moves them
+    by standard deviations of the learned noise, the outputs follow the functions ``paths`` (N, W), and ``known`` (N,
+    columns) is added to them. Results are written to ``q_next`` (N, C), ``reward`` (N,), ``std`` (N, O) as far as
+    requested, and ``terminated`` (N,). Changes before any limit are written to ``change`` (N, columns) if it has rows.
     """
     head, size, actions = matrix(numbers, places, HEAD), q.shape[1], u.shape[1]
     columns, leads = len(matrix(numbers, places, int(head[0, OUTPUTS]))), int(head[0, LEADS])
@@ -292,13 +303,27 @@ def step(
                 raw[size + f, b] = u[begin + b, f]
         mean, spread = np.zeros((columns, lanes)), np.zeros((std.shape[1], lanes))
         x, end = np.empty((width, lanes)), begin + lanes
-        kick, shake, drawn = noise[begin:end], process[begin:end], paths[begin:end]
+        kick, shake, drawn, added = noise[begin:end], process[begin:end], paths[begin:end], known[begin:end]
         for stage in range(STAGES):
             if stage == AFTER:
                 _arrive(numbers, places, head, raw, mean, arrived)
             if head[0, HAS_STAGE + stage]:
                 _encode_stage(numbers, places, head, stage, raw, arrived, mean, x)
-                _predict_stage(numbers, places, head, stage, x, kick, shake, drawn, stds, reward_std, mean, spread)
+                _predict_stage(
+                    numbers,
+                    places,
+                    head,
+                    stage,
+                    x,
+                    kick,
+                    shake,
+                    drawn,
+                    added,
+                    stds,
+                    reward_std,
+                    mean,
+                    spread,
+                )
         if head[0, WARP] != NONE:
             _unwarp(matrix(numbers, places, int(head[0, WARP])), mean[columns - 1], spread[len(spread) - 1])
         if head[0, DECLARED] != NONE:
@@ -311,6 +336,10 @@ def step(
             for o in range(len(spread)):
                 std[begin + b, o] = spread[o, b]
             reward[begin + b], terminated[begin + b] = mean[columns - 1, b], over[b]
+        if len(change):
+            for b in range(lanes):
+                for c in range(columns):
+                    change[begin + b, c] = mean[c, b]
 
 
 NO_ROWS = np.zeros((0, 0))
@@ -326,13 +355,17 @@ class StepsOfModel(ArraySteps):
     outputs: int
     has_regions: bool  # whether an ending or a jump of the reward is learned
     points: int  # of all processes, mirror images included
+    prior: StepsOfModel | None  # its mean is added to the columns of ``uses``
+    uses: Floats  # (columns,) 1 for a column that uses the prior, else 0
 
     @classmethod
-    def of(cls, predictor: Predictor, ending: Region | None) -> Self:
-        """Compile a model. ``ending`` is the region in which episodes end, if that is learned."""
+    def of(cls, predictor: Predictor, ending: Region | None, prior: StepsOfModel | None) -> Self:
+        """Compile a model, given its compiled prior if it has one. ``ending`` is the region in which episodes end, if
+        that is learned."""
         regions = ending is not None or bool(predictor.jumps)
         points = sum(group.serving.exponents.shape[1] for group in predictor._groups if group)
-        return cls(predictor.definition, tables_of(predictor, ending), len(predictor.transitions) + 1, regions, points)
+        outputs, tables = len(predictor.transitions) + 1, tables_of(predictor, ending)
+        return cls(predictor.definition, tables, outputs, regions, points, prior, predictor.uses_prior.cpu().numpy())
 
     def __call__(
         self,
@@ -345,11 +378,32 @@ class StepsOfModel(ArraySteps):
         stds: bool,
         reward_std: bool,
     ) -> ArrayTransition:
+        return self._steps(q, u, noise, process, paths, stds, reward_std, NO_ROWS)
+
+    def _by_prior(self, prior: StepsOfModel, q: Floats, u: Floats) -> Floats:
+        """What the prior adds to each column for steps from q (N, C) under u (N, F), (N, columns)."""
+        added = np.empty((len(q), len(self.uses)))
+        added[:, -1] = prior._steps(q, u, None, None, None, False, False, added).reward
+        return added * self.uses
+
+    def _steps(  # eight parameters: those of a step, which numba takes one by one, and where to write changes
+        self,
+        q: Floats,
+        u: Floats,
+        noise: Floats | None,
+        process: Floats | None,
+        paths: Floats | None,
+        stds: bool,
+        reward_std: bool,
+        change: Floats,
+    ) -> ArrayTransition:
+        """Predict as ``__call__`` does. The changes before any limit go to ``change`` (N, columns) if it has rows."""
         count = len(q)
         moved = ArrayTransition(
             np.empty_like(q), np.empty(count), np.empty((count, self.outputs)), np.empty(count, dtype=np.bool_)
         )
         noise, process, paths = (NO_ROWS if given is None else given for given in (noise, process, paths))
+        known = NO_ROWS if self.prior is None else self._by_prior(self.prior, q, u)
 
         def rows(at: slice) -> None:
             step(
@@ -359,12 +413,14 @@ class StepsOfModel(ArraySteps):
                 noise[at],
                 process[at],
                 paths[at],
+                known[at],
                 stds,
                 reward_std,
                 moved.q_next[at],
                 moved.reward[at],
                 moved.std[at],
                 moved.terminated[at],
+                change[at],
             )
 
         if count * self.points < SPLIT:

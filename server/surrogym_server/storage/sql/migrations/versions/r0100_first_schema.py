@@ -34,6 +34,7 @@ def upgrade() -> None:
     _models()
     _occupancies()
     _policies()
+    _priors()
     _queries()
     _requests()
     _snapshots()
@@ -225,6 +226,19 @@ def _policies() -> None:
         sa.Column("curve", sa.Text(), nullable=False),
         _owner("policies"),
         sa.PrimaryKeyConstraint("surrogate_id", "version", name="pk_policies"),
+    )
+
+
+def _priors() -> None:
+    op.create_table(
+        "priors",
+        sa.Column("surrogate_id", ID, nullable=False),
+        sa.Column("created_at", sa.Double(), nullable=False),
+        sa.Column("about", sa.Text(), nullable=False),
+        sa.Column("blob", sa.LargeBinary(), nullable=True),
+        sa.Column("checksum", sa.Text(), nullable=False),
+        _owner("priors"),
+        sa.PrimaryKeyConstraint("surrogate_id", name="pk_priors"),
     )
 
 

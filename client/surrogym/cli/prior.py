@@ -1,0 +1,228 @@
+"""``surrogym prior``: let a design learn beside a simulator, or beside another surrogate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.options import NAMES, Surrogate
+
+if TYPE_CHECKING:
+    from surrogym_client.transport.api import Api
+    from surrogym_client.transport.priors import PriorCalls
+    from surrogym_sampler.priors.on_server import ServerPrior
+    from surrogym_shared.nouns import RealStep
+    from surrogym_shared.terminal import Update
+    from surrogym_shared.wire import SurrogateView
+    from surrogym_shared.wire.priors import PriorAbout, PriorView
+
+LOOK_SECONDS = 1.0
+OTHER = "surrogate:"  # prefix of the name of another surrogate
+LEAST = 2  # real steps
+LACKING = 0.01  # of the changes: with a larger error, calibrated values are not those of the plant
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``surrogym prior`` to the app."""
+    add(app, "prior", command)
+
+
+def command(
+    context: typer.Context,
+    surrogate: Surrogate,
+    simulator: Annotated[
+        str | None,
+        typer.Argument(
+            help=f"Simulator that can be set to any state: {NAMES}. Or surrogate:NAME on the same server, or a file "
+            "from surrogym export. Leave it out with --drop."
+        ),
+    ] = None,
+    parameter: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--parameter",
+            "-p",
+            help="Parameter of the simulator to calibrate on the real steps, as NAME or NAME=LOW..HIGH. Without a "
+            "range it is half to twice the simulator's own value. May be given several times.",
+        ),
+    ] = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            min=10,
+            max=2_000,
+            help="Steps of the simulator from which its model is learned. [default: 50 for each coordinate and action "
+            "entry, 100 to 400]",
+        ),
+    ] = None,
+    drop: Annotated[bool, typer.Option("--drop", help="Remove the prior, or stop waiting for one.")] = False,
+    *,
+    service: Service,
+    output: Output,
+) -> None:
+    """Learn beside a rough simulator, or another surrogate.
+
+    The design waits after its initial queries. The command calibrates the named parameters on these real steps, learns
+    a model of the simulator, and sends it to the server. From then on the design learns only what the simulator gets
+    wrong, output by output, and ignores it where that predicts better. The command follows the design until it ends,
+    and calibrates again if new real steps contradict the values. The simulator runs in this process alone, and its
+    steps are not counted as real ones.
+
+    Example: surrogym prior arm textbook:Arm --parameter mass=0.5..2 --parameter length
+
+    Example: surrogym prior arm surrogate:arm-of-last-year
+    """
+    from surrogym.cli.errors import CommandError
+    from surrogym_client.transport.priors import PriorCalls
+    from surrogym_shared.terminal import on_interrupt, progress
+
+    if drop == (simulator is not None):
+        raise CommandError("expected a simulator or --drop, got both" if drop else "expected a simulator, got none")
+    with service.connect(context) as api:
+        view, calls = api.surrogate(surrogate), PriorCalls(api.connection)
+        if simulator is None:
+            calls.drop(surrogate)
+            output.give({"surrogate": surrogate, "prior": None}, lambda: f"{surrogate} learns without a prior")
+            return
+        target = _Target(api, calls, view)
+        if _is_model(simulator) and (parameter or steps):
+            raise CommandError(f"expected no --parameter and no --steps with {simulator}: a model has no parameters")
+        if (file := _file_of(api, simulator)) is not None:
+            stored = calls.put(surrogate, file)
+            _give(output, target.api.surrogate(surrogate), stored)
+            return
+        with (
+            _opened(api, view, simulator, parameter or [], steps) as prior,
+            progress("prior", quiet=output.quiet) as update,
+            on_interrupt(lambda: _interrupted(surrogate, calls.get(surrogate))),
+        ):
+            stored = target.follow(prior, update)
+        _give(output, api.surrogate(surrogate), stored)
+
+
+@dataclass(frozen=True)
+class _Target:
+    """The surrogate that gets a prior."""
+
+    api: Api
+    calls: PriorCalls
+    view: SurrogateView
+
+    def follow(self, prior: ServerPrior, update: Update) -> PriorView:
+        """Set the prior as soon as the initial queries are answered, and anew whenever it has changed, until the design
+        ends."""
+        import time
+
+        from surrogym.cli.errors import CommandError
+        from surrogym_client.surrogates.waiting import share_of_design, words_of_design
+        from surrogym_shared.states import COMPLETED
+
+        name, used = self.view.name, 0
+        stored = self.calls.wait(name)
+        while True:
+            view = self.api.surrogate(name)
+            if view.phase == "failed":
+                raise CommandError(f"the design of {name!r} failed: {view.error}")
+            is_new = view.samples > used and view.samples >= LEAST
+            if is_new and (used or not _asked(view)):
+                real, used = self._real_steps(), view.samples
+                if prior.update(real, update) and prior.file is not None:
+                    stored = self.calls.put(name, prior.file.to_bytes())
+                continue
+            if used and view.phase in COMPLETED and not _asked(view):
+                return stored
+            update(share_of_design(view), words_of_design(view) if used else _waiting(view))
+            time.sleep(LOOK_SECONDS)
+
+    def _real_steps(self) -> list[RealStep]:
+        from surrogym_shared.nouns import RealStep
+
+        return [
+            RealStep(one.coordinates, one.action, one.next_coordinates, one.reward, one.terminated, one.truncated)
+            for one in self.api.samples(self.view.name)
+        ]
+
+
+def _opened(api: Api, view: SurrogateView, simulator: str, parameters: list[str], steps: int | None) -> ServerPrior:
+    from surrogym.cli.errors import CommandError
+    from surrogym.cli.printing import prints_aside
+    from surrogym_sampler.priors.on_server import ServerPrior
+
+    try:
+        with prints_aside():
+            return ServerPrior(api, view.name, simulator, view.spec, parameters, steps=steps)
+    except ValueError as error:
+        raise CommandError(f"{simulator}: {error}") from error
+
+
+def _is_model(source: str) -> bool:
+    from surrogym.files import SUFFIX
+
+    return source.startswith(OTHER) or Path(source).suffix == SUFFIX
+
+
+def _file_of(api: Api, source: str) -> bytes | None:
+    """Return the file of another surrogate; None if the source is a simulator."""
+    from surrogym.cli.errors import CommandError
+    from surrogym.files import SUFFIX, existing
+    from surrogym_client.surrogates.transfer import export_surrogate
+
+    if source.startswith(OTHER):
+        return export_surrogate(api, source.removeprefix(OTHER)).to_bytes()
+    try:
+        return existing(source).read_bytes() if Path(source).suffix == SUFFIX else None
+    except FileNotFoundError as error:
+        raise CommandError(str(error)) from error
+
+
+def _asked(view: SurrogateView) -> int:
+    """Number of queries that wait for a sampler, or for its answer."""
+    return view.queries.pending + view.queries.leased
+
+
+def _waiting(view: SurrogateView) -> str:
+    from surrogym_sampler.original.loading import sample_command
+
+    awaited = "its answers" if view.samplers else f"a sampler ({sample_command(view.name, view.environment)})"
+    return f"{view.samples} real steps; {_asked(view)} initial queries wait for {awaited}"
+
+
+def _interrupted(name: str, stored: PriorView) -> str:
+    if stored.awaited:
+        return f"the design of {name} waits for its prior: run the command again, or surrogym prior {name} --drop"
+    return f"{name} keeps its prior; it is not calibrated again"
+
+
+def _give(output: Output, view: SurrogateView, stored: PriorView) -> None:
+    result = {"surrogate": view.name, "phase": view.phase, "prior": stored.model_dump(mode="json")}
+    output.give(result, lambda: "\n".join([*(words_of_prior(stored.about) if stored.about else ()), *_uses(view)]))
+
+
+def words_of_prior(about: PriorAbout) -> list[str]:
+    """Describe what a prior was made from, a line each."""
+    lines = [f"prior: {about.source}"]
+    for one in about.parameters:
+        known = f"{one.low:.4g} to {one.high:.4g}" if one.determined else "not determined by these steps"
+        lines.append(f"  {one.name:<16} {one.value:<10.4g} {known}")
+    if about.error is not None and about.error_before is not None:
+        steps = f"on {about.real_steps} real steps"
+        lines.append(
+            f"  error {about.error_before:.2%} of the changes as it was, {about.error:.2%} calibrated, {steps}"
+        )
+    if about.parameters and about.error is not None and about.error > LACKING:
+        lines.append("  the simulator lacks something: its calibrated values may stand for what it lacks")
+    return lines
+
+
+def _uses(view: SurrogateView) -> list[str]:
+    """Say which outputs use the prior."""
+    if view.fidelity is None:
+        return []
+    uses = [one.name for one in view.fidelity.outputs if one.structure.startswith("prior + ")]
+    others = [one.name for one in view.fidelity.outputs if one.name not in uses]
+    said = f"outputs that use it: {', '.join(uses) or 'none'}"
+    return [said + (f"; without it {', '.join(others)} are predicted better" if others else "")]

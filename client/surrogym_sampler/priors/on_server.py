@@ -1,0 +1,74 @@
+"""A simulator as a prior of a surrogate on a server, which also learns the simulator's model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+
+from surrogym_client.errors import UnknownSurrogate
+from surrogym_client.surrogates.transfer import export_surrogate
+from surrogym_client.surrogates.waiting import wait_for_design
+from surrogym_client.transport.api import Api
+from surrogym_sampler.priors.prior import Progress, SimulatorPrior
+from surrogym_sampler.queries.settings import SamplerSettings
+from surrogym_sampler.queries.worker import Sampler
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.surrogate_file import SurrogateFile
+from surrogym_shared.wire import SurrogateView
+
+BATCH = 64  # queries of one claim
+LONGEST_FIT = 1_800.0  # seconds
+SUFFIX = ".simulator"  # of the name of the surrogate that the server learns the simulator's model in
+LONGEST_NAME = 64
+
+
+class ServerPrior(SimulatorPrior):
+    """A simulator whose model a server learns, in a surrogate of its own that is removed afterwards.
+
+    Args:
+        api: the server; the token needs the role admin.
+        name: name of the surrogate that gets the prior.
+        simulator, spec, parameters, steps: those of ``SimulatorPrior``, whose errors it raises.
+    """
+
+    def __init__(
+        self,
+        api: Api,
+        name: str,
+        simulator: str,
+        spec: EnvironmentSpec,
+        parameters: Sequence[str] = (),
+        *,
+        steps: int | None = None,
+    ) -> None:
+        super().__init__(simulator, spec, parameters, steps=steps)
+        self._api = api
+        self._name = name[: LONGEST_NAME - len(SUFFIX)] + SUFFIX
+
+    def learn(self, say: Progress) -> SurrogateFile:
+        """Learn the model as ``SimulatorPrior.learn`` says. Raises ``SurrogymClientError`` as every request."""
+        self._remove()
+        try:
+            self._api.create_surrogate(self._name, self.spec)
+            taken = 0
+
+            def count(*_: object) -> None:
+                nonlocal taken
+                taken += 1
+                say(0.5 * min(1.0, taken / self.steps), f"{taken} of {self.steps} steps of the simulator")
+
+            Sampler(
+                self._api, self._name, self.simulator, SamplerSettings(until_done=True, batch=BATCH), report=count
+            ).run()
+            wait_for_design(self._api, self._name, LONGEST_FIT, lambda view: say(0.75, _words(view)))
+            return export_surrogate(self._api, self._name)
+        finally:
+            self._remove()
+
+    def _remove(self) -> None:
+        with suppress(UnknownSurrogate):
+            self._api.delete_surrogate(self._name)
+
+
+def _words(view: SurrogateView) -> str:
+    return f"a model of the simulator is being fitted to {view.samples} of its steps"

@@ -1,0 +1,132 @@
+"""Named physical parameters of a simulator: their values, and ranges in which real steps may move them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, Self, runtime_checkable
+
+from surrogym_sampler.original.errors import UnknownEnvironment
+
+AROUND = 2.0  # factor of the default range, around the simulator's own value
+
+
+@runtime_checkable
+class Adjustable(Protocol):
+    """A simulator whose parameters can be read and changed. Changes hold from the next step on.
+
+    Examples:
+        A class that computes something from its parameters has the two methods itself::
+
+            class Cart:
+                def parameters(self):
+                    return {"mass": self.mass}
+
+                def set_parameters(self, values):
+                    self.mass = values["mass"]
+                    self.inverse = 1 / self.mass
+    """
+
+    def parameters(self) -> Mapping[str, float]:
+        """Return all parameters that can be changed, with their present values."""
+        ...
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        """Change some of the parameters."""
+        ...
+
+
+class Attributes:
+    """The parameters of an object that has no methods for them: its attributes that are numbers."""
+
+    def __init__(self, plant: object) -> None:
+        self._plant = plant
+
+    def parameters(self) -> dict[str, float]:
+        """Return the attributes that are numbers, also those of the class."""
+        names = [name for name in dir(self._plant) if not name.startswith("_")]
+        return {name: float(value) for name in names if _is_number(value := getattr(self._plant, name))}
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        """Set attributes of the object; those of its class stay as they are."""
+        for name, value in values.items():
+            setattr(self._plant, name, value)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter to be calibrated, and the range of its values."""
+
+    name: str
+    low: float
+    high: float
+
+    @classmethod
+    def parse(cls, text: str, present: Mapping[str, float]) -> Self:
+        """Read ``NAME`` or ``NAME=LOW..HIGH``. Without a range it is half to twice the simulator's own value.
+
+        Args:
+            text: the parameter.
+            present: values of the simulator by name.
+
+        Raises:
+            ValueError: the simulator has no such parameter, or the range is none, or lacks the present value.
+        """
+        name, equals, span = text.partition("=")
+        if name not in present:
+            known = ", ".join(sorted(present)) or "none"
+            raise ValueError(f"expected a parameter of the simulator ({known}), got {name!r}")
+        value = present[name]
+        if not equals:
+            if value == 0:
+                raise ValueError(f"{name}: expected NAME=LOW..HIGH, because the simulator's own value is 0")
+            return cls(name, *sorted((value / AROUND, value * AROUND)))
+        try:
+            low, high = (float(end) for end in span.split(".."))
+        except ValueError as error:
+            raise ValueError(f"expected NAME=LOW..HIGH, such as mass=0.5..2, got {text!r}") from error
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise ValueError(f"{name}: expected two finite numbers, the smaller one first, got {span}")
+        if not low <= value <= high:
+            raise ValueError(f"{name}: expected a range with the simulator's own value {value:g}, got {span}")
+        return cls(name, low, high)
+
+
+def adjustable(simulator: Any) -> Adjustable:
+    """Return the parameters of an original environment.
+
+    They are those that it offers by ``parameters`` and ``set_parameters``, or else its attributes that are numbers.
+
+    Raises:
+        UnknownEnvironment: it runs in another process, so that its parameters are out of reach.
+    """
+    for plant in _layers(simulator):
+        if isinstance(plant, Adjustable):
+            return plant
+    if getattr(simulator, "step_from", None) is None:
+        raise UnknownEnvironment("expected a simulator in this process, got one whose parameters are out of reach")
+    return Attributes(_layers(simulator)[-1])
+
+
+def read_parameters(texts: Sequence[str], plant: Adjustable) -> tuple[Parameter, ...]:
+    """Read the parameters to be calibrated, each as ``Parameter.parse``. Raises ``ValueError``, also if one is named
+    twice."""
+    present = plant.parameters()
+    read = tuple(Parameter.parse(text, present) for text in texts)
+    names = [parameter.name for parameter in read]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise ValueError(f"expected each parameter once, got {', '.join(sorted(twice))} several times")
+    return read
+
+
+def _layers(simulator: Any) -> list[Any]:
+    """The environment, and what it wraps, from the outside to the inside."""
+    layers = [simulator]
+    while (inner := getattr(layers[-1], "wrapped", None) or getattr(layers[-1], "simulator", None)) is not None:
+        layers.append(inner)
+    return layers
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

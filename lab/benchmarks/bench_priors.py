@@ -1,0 +1,218 @@
+"""How many real steps a prior saves: a plant whose parameters are off, beside the textbook's simulator of it.
+
+    python lab/benchmarks/bench_priors.py --task swingup acrobot --first-seed 1000 --seeds 8
+    python lab/benchmarks/bench_priors.py --task swingup --access reset --without friction --first-seed 1000 --seeds 8
+
+For each seed, the plant's parameters are the textbook's, times factors drawn evenly from 0.7 to 1.3. The arms are:
+
+- cold: a design without a prior;
+- rough: beside a model of the simulator as it is;
+- calibrated: beside a model of the simulator with calibrated parameters;
+- wrong: beside a model of the simulator whose actions are turned round, calibrated all the same;
+- alone: a model of the simulator as it is, in place of the plant, without a real step.
+
+A row has the design's phase and real steps, the largest error of a step (of the standard deviation of the changes,
+over 300 states drawn from the sampling range), and with ``--policy`` the mean real return of 50 episodes of a policy
+that was trained in the model. ``--without`` names a parameter that the simulator lacks: it is 0 there.
+Rows are kept in ``--out``/priors.csv, so that the same command goes on after Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+
+import numpy as np
+import torch
+from common import OUT
+
+import surrogym
+from surrogym_lab.reproduce.rows import read_records, write_records
+from surrogym_sampler import original
+from surrogym_sampler.original.episodes import SteppedEpisode
+from surrogym_sampler.original.protocol import RealStep
+from surrogym_sampler.priors.parameters import adjustable
+from surrogym_sampler.priors.prior import silent
+from surrogym_server.environment.actions import model_actions
+from surrogym_server.local import LocalSurrogate
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_trainer.policies import load_policy
+from surrogym_trainer.training import TrainSettings, train
+
+TASKS: dict[str, tuple[str, tuple[str, ...], int]] = {  # environment, its parameters, the budget of the cold design
+    "swingup": ("surrogym/CartPoleSwingUp-v0", ("masscart", "masspole", "length", "friction"), 120),
+    "acrobot": ("Acrobot-v1", ("LINK_LENGTH_1", "LINK_MASS_1", "LINK_MASS_2", "LINK_MOI"), 200),
+    "cartpole": ("CartPole-v1", ("masscart", "masspole", "length", "force_mag"), 60),
+    "pendulum": ("Pendulum-v1", ("m", "l"), 30),
+    "doublependulum": ("InvertedDoublePendulum-v5", ("mass.cart", "mass.pole", "mass.pole2", "gear.slide"), 250),
+}
+ARMS = ("cold", "rough", "calibrated", "wrong", "alone")
+OFF = 0.3  # largest share by which a parameter is off
+TESTS = 300
+SEARCH = "FASTPPO"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One design."""
+
+    task: str
+    access: str
+    without: str
+    arm: str
+    seed: int
+    phase: str
+    steps: int
+    error: float  # largest of the outputs' errors
+    uses: int  # outputs that use the prior
+    inside: int  # calibrated parameters whose 90 % interval holds the true value
+    parameters: int  # calibrated
+    value: float  # mean real return of the policy; nan without --policy
+
+
+class Turned:
+    """A simulator in which actions work the other way round."""
+
+    parallel = True
+
+    def __init__(self, inner: Any) -> None:
+        self.wrapped = inner
+
+    def spec(self) -> EnvironmentSpec:
+        return self.wrapped.spec()
+
+    def step_from(self, coordinates: Any, action: Any) -> RealStep:
+        space = self.spec().action
+        turned = -np.asarray(action) if isinstance(space, BoxAction) else space.n - 1 - np.asarray(action)
+        return replace(self.wrapped.step_from(coordinates, turned), action=action)
+
+    def close(self) -> None:
+        self.wrapped.close()
+
+
+def main() -> None:
+    options = _options()
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+    path: Path = options.out / "priors.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = read_records(path, Row)
+    done = {(row.task, row.access, row.without, row.arm, row.seed) for row in rows}
+    for task in options.task:
+        for seed in range(options.first_seed, options.first_seed + options.seeds):
+            for arm in options.arms:
+                if (task, options.access, options.without, arm, seed) in done:
+                    continue
+                rows.append(run(task, options.access, options.without, arm, seed, policy=options.policy))
+                write_records(path, Row, rows)
+                print(rows[-1])
+
+
+def run(task: str, access: str, without: str, arm: str, seed: int, *, policy: bool) -> Row:
+    name, names, budget = TASKS[task]
+    factors = np.random.default_rng([seed, 77]).uniform(1 - OFF, 1 + OFF, len(names))
+
+    def plant(access: Any = "any") -> Any:
+        made = original.make(name, budget=budget, seed=seed, access=access)
+        known = adjustable(made).parameters()
+        adjustable(made).set_parameters({one: known[one] * by for one, by in zip(names, factors.tolist(), strict=True)})
+        return made
+
+    spec, truth = plant(access).spec(), adjustable(plant()).parameters()
+    simulator: Any = original.make(name)
+    if without:
+        adjustable(simulator).set_parameters({without: 0.0})
+    if arm == "wrong":
+        simulator = Turned(simulator)
+    calibrated = [one for one in names if one != without] if arm in ("calibrated", "wrong") else []
+    prior = None if arm == "cold" else surrogym.Prior(simulator, spec, calibrated)
+    if arm == "alone" and prior is not None:
+        model, phase, steps = LocalSurrogate.from_bytes(spec, prior.learn(silent).model), "alone", 0
+    else:
+        design, machine = surrogym.Design(spec, budget=budget, prior=prior, threads=2), plant(access)
+        while (query := design.ask()) is not None:
+            design.tell(query, answered(machine, query, seed))
+        model, phase, steps = design.surrogate(), design.phase, design.steps
+    found = () if prior is None or prior.calibration is None else prior.calibration.parameters
+    return Row(
+        *(task, access, without, arm, seed, phase, steps, error_of(model, plant(), seed)),
+        sum(one.startswith("prior + ") for one in model.model.structures),
+        sum(one.low <= truth[one.name] <= one.high for one in found),
+        len(found),
+        value_of(model, plant, seed) if policy else float("nan"),
+    )
+
+
+def answered(plant: Any, query: surrogym.Query, seed: int) -> list[RealStep]:
+    if query.coordinates:
+        return [plant.step_from(np.array(query.coordinates), np.array(query.action))]
+    plant.begin(1_000 * seed + query.id)
+    taken = []
+    for action in query.actions:
+        taken.append(plant.act(np.array(action)))
+        if taken[-1].terminated:
+            break
+    return taken
+
+
+def error_of(model: LocalSurrogate, plant: Any, seed: int) -> float:
+    """Largest root mean square error of a transition output, in standard deviations of its changes."""
+    spec, rng = plant.spec(), np.random.default_rng([seed, 5])
+    starts = np.stack([_drawn(one.sampling, rng) for one in spec.coordinates], 1)
+    space = spec.action
+    actions = (
+        rng.uniform(space.low, space.high, (TESTS, space.size))
+        if isinstance(space, BoxAction)
+        else rng.integers(0, space.n, (TESTS, 1)).astype(float)
+    )
+    reached = np.array([plant.step_from(q, u).next_coordinates for q, u in zip(starts, actions, strict=True)])
+    taken = model_actions(model.model.definition.action, actions)
+    found = model.model.transition(torch.from_numpy(starts), torch.from_numpy(taken)).q_next.numpy()
+    angles = np.array([one.kind == "angle" for one in spec.coordinates])
+
+    def difference(one: Any, other: Any) -> Any:
+        return np.where(angles, (one - other + np.pi) % (2 * np.pi) - np.pi, one - other)
+
+    size = difference(reached, starts).std(0)
+    errors = np.sqrt((difference(found, reached) ** 2).mean(0))
+    return float((errors[size > 0] / size[size > 0]).max())
+
+
+def _drawn(sampling: Any, rng: np.random.Generator) -> Any:
+    if sampling.kind == "normal":
+        return rng.normal(sampling.mean, sampling.std, TESTS)
+    return rng.uniform(sampling.low, sampling.high, TESTS)
+
+
+def value_of(model: LocalSurrogate, plant: Callable[[], Any], seed: int) -> float:
+    """Mean real return of a policy that was trained in the model."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "policy.zip"
+        train(model, path, TrainSettings(SEARCH, seed=seed))
+        predict = load_policy(path, SEARCH)
+    return float(np.mean(evaluate(predict, lambda: SteppedEpisode(plant()), EvaluationSettings(50, 10_000)).returns))
+
+
+def _options() -> argparse.Namespace:
+    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--task", nargs="+", choices=TASKS, default=["swingup"])
+    made.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
+    made.add_argument("--access", choices=("any", "reset"), default="any")
+    made.add_argument("--without", default="", help="parameter that the simulator lacks")
+    made.add_argument("--first-seed", type=int, default=0)
+    made.add_argument("--seeds", type=int, default=1)
+    made.add_argument("--policy", action="store_true", help="train a policy, and measure its real return")
+    made.add_argument("--out", type=Path, default=OUT)
+    torch.set_num_threads(1)
+    return made.parse_args()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""Routes of priors: look at, store, wait for, remove."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import Response
+
+from surrogym_server.api.auth import ADMIN, READ
+from surrogym_server.api.door import DoorRoute
+from surrogym_server.api.problems import documented
+from surrogym_server.convert.stored import read_stored
+from surrogym_server.feature import part
+from surrogym_server.features.priors.service import PriorService
+from surrogym_server.storage.records import PriorRecord
+from surrogym_shared.codes import Code
+from surrogym_shared.wire.priors import PriorAbout, PriorView
+
+router = APIRouter(prefix="/v1/surrogates/{name}/prior", tags=["models"], route_class=DoorRoute)
+
+FILE: dict[str, Any] = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+Priors = Annotated[PriorService, part(PriorService)]
+THERE = (Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST)
+
+
+@router.get("", summary="The prior", dependencies=[READ], responses=documented(*THERE))
+def get(name: str, priors: Priors) -> PriorView:
+    """Return what the prior was made from, and how well its parameters were calibrated."""
+    return _view(priors.get(name))
+
+
+@router.put(
+    "",
+    summary="Set the prior",
+    dependencies=[ADMIN],
+    openapi_extra={"requestBody": {"required": True, "content": FILE}},
+    responses=documented(*THERE, Code.TOO_LARGE, Code.NOT_INSTALLED),
+)
+async def put(name: str, request: Request, priors: Priors) -> PriorView:
+    """Store the model of an exported surrogate with the same coordinates and actions as the prior. Each output of the
+    next fit learns what the prior leaves, if this predicts left-out samples better. Queries that no sampler has begun
+    are withdrawn, and chosen again."""
+    data = await request.body()
+    await run_in_threadpool(priors.put, name, data)
+    return _view(await run_in_threadpool(priors.get, name))
+
+
+@router.post(":await", summary="Wait for a prior", dependencies=[ADMIN], responses=documented(*THERE))
+def wait(name: str, priors: Priors) -> PriorView:
+    """Let the design wait after its initial queries until a prior is set. If there is one, nothing changes."""
+    priors.wait(name)
+    return _view(priors.get(name))
+
+
+@router.delete("", status_code=204, summary="Remove the prior", dependencies=[ADMIN], responses=documented(*THERE))
+def delete(name: str, priors: Priors) -> Response:
+    """Remove the prior, or stop waiting for one. The next fit learns without it."""
+    priors.drop(name)
+    return Response(status_code=204)
+
+
+def _view(record: PriorRecord | None) -> PriorView:
+    if record is None or record.awaited:
+        return PriorView(awaited=record is not None)
+    about = read_stored(PriorAbout, "the description of a prior", record.about)
+    return PriorView(awaited=False, created_at=record.created_at, about=about)

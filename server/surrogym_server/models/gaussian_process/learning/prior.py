@@ -1,0 +1,76 @@
+"""Choice by held-out samples whether an output learns what a prior leaves, or learns without the prior.
+
+A prior is another model of the same environment, such as one of a simulator. An output that uses it is the prior's mean
+plus a process: the discrepancy of Kennedy and O'Hagan (2001), Journal of the Royal Statistical Society B 63(3).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.samples import Samples
+from surrogym_server.gp import LeftOut
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+
+NOTHING = 1e-9  # of an output's standard deviation: what a prior leaves is rounding if it is smaller
+BY_PRIOR = "with the prior, mean log density of a left-out sample"
+BESIDE = " beside prior"  # suffix of an output's name, for its hyperparameters
+Learn = Callable[[str, Tensor], OutputModel]  # name and targets (n,): a learned output
+ALONE = "without the prior, mean log density of a left-out sample"
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a prior predicts at n samples."""
+
+    change: Tensor  # (n, M) of each transition output
+    reward: Tensor  # (n,) without the terminal reward
+    terminal: float  # terminal reward
+
+    @classmethod
+    def of(cls, prior: GaussianProcessModel, samples: Samples) -> Self:
+        """Predict the samples."""
+        means = prior.means_before_end(samples.q, samples.u)
+        return cls(means[:, :-1], means[:, -1], prior.terminal_reward)
+
+
+def better_of(learn: Learn, name: str, target: Tensor, known: Tensor | None, keep: Tensor) -> OutputModel:
+    """Learn an output's targets (n,) from samples ``keep`` (n,), with the prior's mean ``known`` (n,) or without.
+
+    The output that predicts the left-out samples better is returned, and the one with the prior if both are as good.
+    """
+    alone = learn(name, target)
+    if known is None or alone.posterior is None:
+        return alone
+    found = beside(learn, name, target, known, keep)
+    scores = (log_density(found), log_density(alone))
+    noted = tuple((name, score) for name, score in zip((BY_PRIOR, ALONE), scores, strict=True) if math.isfinite(score))
+    chosen = found if scores[0] >= scores[1] else alone
+    return replace(chosen, scores=(*chosen.scores, *noted))
+
+
+def beside(learn: Learn, name: str, target: Tensor, known: Tensor, keep: Tensor) -> OutputModel:
+    """Learn what the prior's mean ``known`` (n,) leaves of targets (n,), from samples ``keep`` (n,)."""
+    left, size = target - known, float(target[keep].std(correction=0))
+    is_rounding = float(left[keep].abs().max()) <= NOTHING * size
+    output = learn(name + BESIDE, torch.zeros_like(left) if is_rounding else left)
+    return replace(output, name=name, size_with_prior=size or 1.0)
+
+
+def log_density(output: OutputModel) -> float:
+    """Mean log density of a left-out sample, in the output's unit; infinite for an output without a process."""
+    if (posterior := output.posterior) is None:
+        return math.inf
+    if posterior.sparse is not None:
+        mean = posterior.left_out.log_density
+    else:
+        foretold, variance = posterior.leave_one_out()
+        mean = LeftOut.of(foretold - posterior.y, variance).log_density
+    return mean - float((output.scale * output.amplitude(posterior.x)).log().mean())

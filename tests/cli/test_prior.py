@@ -1,0 +1,70 @@
+"""``surrogym prior``: from a rough simulator to a design that needs few real steps; bad use changes nothing."""
+
+from __future__ import annotations
+
+import json
+import threading
+
+import pytest
+
+from support.hinge import Real, hinge_spec
+from surrogym_client.transport import Api
+from surrogym_client.transport.priors import PriorCalls
+from surrogym_sampler.queries.settings import SamplerSettings
+from surrogym_sampler.queries.worker import Sampler
+
+PARAMETERS = ("-p", "mass", "-p", "length", "-p", "friction=0.1..0.8")
+
+
+@pytest.fixture
+def hinge(server_process, name):
+    with Api(server_process.url) as api:
+        api.create_surrogate(name, hinge_spec(design={"budget": 30, "initial": 4}))
+        yield name
+        api.delete_surrogate(name)
+
+
+def test_a_simulator_is_calibrated_and_the_design_ends_after_few_real_steps(on_server, server_process, hinge):
+    with Api(server_process.url) as api:
+        PriorCalls(api.connection).wait(hinge)
+        sampler = Sampler(api, hinge, Real(), SamplerSettings(until_done=True, wait_seconds=1.0))
+        beside = threading.Thread(target=sampler.run)
+        beside.start()
+        said = on_server("prior", hinge, "support.hinge:Textbook", *PARAMETERS, "--steps", "60", "--json")
+        beside.join()
+        view, others = api.surrogate(hinge), [one.name for one in api.surrogates()]
+    assert said.code == 0
+    result = json.loads(said.out)
+    about = result["prior"]["about"]
+    found = {one["name"]: one["value"] for one in about["parameters"]}
+    assert found == pytest.approx({"mass": Real.mass, "length": Real.length, "friction": Real.friction}, rel=1e-3)
+    assert about["error"] < 1e-3 < about["error_before"]
+    assert (view.phase, result["phase"]) == ("ready", "ready")
+    assert view.ledger.total <= 10
+    assert not [name for name in others if name.endswith(".simulator")]
+
+
+def test_what_it_is_not_used_for_is_said_before_anything_changes(on_server, server_process, hinge):
+    refused = {
+        ("prior", hinge): "got none",
+        ("prior", hinge, "support.hinge:Textbook", "--drop"): "got both",
+        ("prior", hinge, "support.hinge:Textbook", "-p", "weight"): "friction, length, mass",
+        ("prior", hinge, "support.hinge:Nothing"): "support.hinge:Nothing",
+        ("prior", hinge, "nothing.surrogate"): "no file",
+        ("prior", hinge, f"surrogate:{hinge}", "-p", "mass"): "no parameters",
+        ("prior", hinge, "surrogate:nobody"): "nobody",
+        ("prior", "nobody", "support.hinge:Textbook"): "nobody",
+    }
+    for arguments, words in refused.items():
+        said = on_server(*arguments)
+        assert said.code != 0
+        assert words in said.err
+    with Api(server_process.url) as api:
+        assert not PriorCalls(api.connection).get(hinge).awaited
+
+
+def test_waiting_ends_with_drop(on_server, server_process, hinge):
+    with Api(server_process.url) as api:
+        PriorCalls(api.connection).wait(hinge)
+        assert on_server("prior", hinge, "--drop").code == 0
+        assert not PriorCalls(api.connection).get(hinge).awaited

@@ -1,0 +1,75 @@
+"""Calibration: the true parameters are found from few steps, with intervals that hold, and bad simulators are named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from support.hinge import Backwards, Broken, Real, Textbook, hinge_spec, steps_of
+from surrogym_sampler.priors.calibration import Calibration, NotCalibrated, RealTransitions, calibrate
+from surrogym_sampler.priors.parameters import Parameter
+
+RANGES = (Parameter("mass", 0.5, 2.0), Parameter("length", 0.5, 2.0), Parameter("friction", 0.1, 0.8))
+TRUE = {"mass": Real.mass, "length": Real.length, "friction": Real.friction}
+
+
+def calibrated(
+    count: int, noise: float = 0.0, seed: int = 0, parameters: tuple[Parameter, ...] = RANGES, plant: type = Textbook
+) -> Calibration:
+    simulator, steps = plant(), steps_of(Real(), count, seed)
+    q, u, q_next = (np.array([getattr(s, f) for s in steps]) for f in ("coordinates", "action", "next_coordinates"))
+    q_next = q_next + noise * np.random.default_rng(seed).standard_normal(q_next.shape)
+
+    def step(values, coordinates, action):
+        for parameter, value in zip(parameters, values, strict=True):
+            setattr(simulator, parameter.name, value)
+        return simulator.step_from(coordinates, action).next_coordinates
+
+    own = np.array([getattr(plant, parameter.name) for parameter in parameters])
+    return calibrate(hinge_spec(), RealTransitions(q, u, q_next), parameters, own, step)
+
+
+def test_four_steps_without_noise_determine_three_parameters():
+    found = calibrated(4)
+    assert found.values == pytest.approx(TRUE, rel=1e-5)
+    assert found.error < 1e-6 < 0.01 < found.error_before
+    assert all(one.determined and one.low <= TRUE[one.name] <= one.high for one in found.parameters)
+
+
+def test_nine_of_ten_intervals_hold_under_noise():
+    runs = [calibrated(12, noise=0.02, seed=seed) for seed in range(30)]
+    inside = [one.low <= TRUE[one.name] <= one.high for run in runs for one in run.parameters]
+    assert 0.8 <= np.mean(inside) <= 0.99
+
+
+def test_a_parameter_that_the_steps_say_nothing_of_keeps_its_value_and_is_not_determined():
+    class WithName(Textbook):
+        spare = 3.0
+
+    found = calibrated(8, parameters=(*RANGES, Parameter("spare", 1.0, 9.0)), plant=WithName)
+    (spare,) = (one for one in found.parameters if one.name == "spare")
+    assert not spare.determined
+    assert spare.value == pytest.approx(3.0, rel=0.05)
+    assert spare.high / spare.low > 3
+    assert {name: value for name, value in found.values.items() if name != "spare"} == pytest.approx(TRUE, rel=1e-4)
+
+
+def test_without_parameters_the_error_alone_is_measured():
+    found = calibrated(5, parameters=())
+    assert found.parameters == ()
+    assert found.error == found.error_before > 0.01
+
+
+def test_a_simulator_of_another_plant_keeps_a_large_error():
+    assert calibrated(12, plant=Backwards).error > 0.3
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_too_few_steps_are_refused_with_the_number_that_is_needed(count):
+    with pytest.raises(NotCalibrated, match="at least 2 real steps"):
+        calibrated(count)
+
+
+def test_a_simulator_that_fails_everywhere_is_refused_with_its_error():
+    with pytest.raises(NotCalibrated, match="the solver diverged"):
+        calibrated(6, plant=Broken)

@@ -1,0 +1,134 @@
+"""Models beside a prior: a rough simulator saves samples, a wrong one costs none, and every computation agrees."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from support.hinge import Backwards, Real, Stiff, Textbook, hinge_spec, steps_of
+from support.predictions import WAYS, check_compiled
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.samples import Samples
+from surrogym_server.errors import InvalidInput
+from surrogym_server.models.files import from_bytes, to_bytes
+from surrogym_server.models.gaussian_process.codec.model import GaussianProcessCodec
+from surrogym_server.models.gaussian_process.family import GaussianProcesses
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
+from surrogym_shared.nouns import RealSteps
+
+HINGE = definition_from_spec(hinge_spec())
+
+
+def samples(plant: Textbook, count: int, seed: int = 0) -> Samples:
+    return Samples.of(RealSteps.of(steps_of(plant, count, seed), "manual"))
+
+
+def learned(of: Samples, prior: GaussianProcessModel | None = None) -> GaussianProcessModel:
+    family = GaussianProcesses()
+    made = (family.learn(HINGE, of) if prior is None else family.learn_beside(prior, HINGE, of)).model
+    assert isinstance(made, GaussianProcessModel)
+    return made
+
+
+@pytest.fixture(scope="module")
+def textbook() -> GaussianProcessModel:
+    return learned(samples(Textbook(), 80, seed=1))
+
+
+def speed_error(model: GaussianProcessModel, plant: Textbook) -> float:
+    """Root mean square error of the speed's change, as a share of its standard deviation."""
+    test = samples(plant, 200, seed=99)
+    change = (test.q_next - test.q)[:, 1]
+    off = model.transition(test.q, test.u).q_next[:, 1] - test.q_next[:, 1]
+    return float(off.square().mean().sqrt() / change.std())
+
+
+@pytest.mark.parametrize(("plant", "most"), [(Real, 0.6), (Stiff, 1.0)])
+def test_a_rough_prior_saves_samples(textbook, plant, most):
+    few = [samples(plant(), 12, seed=seed) for seed in (3, 4, 5)]
+    beside, alone = ([learned(one, *prior) for one in few] for prior in ((textbook,), ()))
+    errors = [sum(speed_error(model, plant()) for model in models) for models in (beside, alone)]
+    assert errors[0] < most * errors[1]
+
+
+def test_an_output_says_that_it_uses_the_prior(textbook):
+    beside = learned(samples(Real(), 12, seed=3), textbook)
+    assert beside.transitions[1].size_with_prior is not None
+    assert beside.structures[1].startswith("prior + ")
+    assert beside.description["prior"]["samples"] == 80
+
+
+def test_a_right_prior_leaves_nothing_uncertain(textbook):
+    beside, test = learned(samples(Textbook(), 6, seed=3), textbook), samples(Textbook(), 50, seed=9)
+    found = beside.transition(test.q, test.u, stds=True)
+    assert found.std is not None
+    assert float(found.std[:, 1].max()) < 0.01 * float(beside.scales[1])
+    assert speed_error(beside, Textbook()) < 0.01
+
+
+def test_a_prior_of_another_plant_is_left_out_as_soon_as_samples_tell(textbook):
+    wrong = learned(samples(Backwards(), 80, seed=1))
+    many = samples(Real(), 30, seed=3)
+    beside, alone = learned(many, wrong), learned(many)
+    assert speed_error(beside, Real()) <= 1.1 * speed_error(alone, Real())
+
+
+def test_tolerances_follow_the_output_and_not_what_the_prior_leaves(textbook):
+    few = samples(Real(), 8, seed=3)
+    torch.testing.assert_close(learned(few, textbook).scales[:2], learned(few).scales[:2])
+
+
+def test_leave_one_out_and_noise_are_in_the_unit_of_the_output(textbook):
+    beside = learned(samples(Real(), 12, seed=3), textbook)
+    assert 0 < beside.leave_one_out()[1].error < 0.2 * float(beside.scales[1])
+
+
+@pytest.mark.parametrize("way", [way for way in WAYS if way != "in C"])
+def test_compiled_steps_are_the_same(textbook, way):
+    test = samples(Real(), 40, seed=5)
+    check_compiled(learned(samples(Real(), 10, seed=3), textbook), (test.q, test.u), way)
+
+
+def test_no_steps_in_c_are_written_without_the_prior(textbook):
+    assert learned(samples(Real(), 10, seed=3), textbook).step_source() is None
+
+
+def test_drawn_functions_pass_through_the_samples(textbook):
+    of = samples(Real(), 10, seed=3)
+    beside = learned(of, textbook)
+    paths = beside.draw(torch.randn(10, beside.path_size, generator=torch.Generator().manual_seed(1)).double())
+    off = beside.transition_along(paths, of.q, of.u).q_next[:, 1] - of.q_next[:, 1]
+    assert float(off.abs().max()) < 0.02 * float(beside.scales[1])
+
+
+def test_a_stored_model_has_its_prior_within(textbook):
+    beside = learned(samples(Real(), 8, seed=3), textbook)
+    again = from_bytes(HINGE, to_bytes(beside))
+    test = samples(Real(), 20, seed=5)
+    assert isinstance(again, GaussianProcessModel)
+    assert again.prior is not None
+    torch.testing.assert_close(again.means(test.q, test.u), beside.means(test.q, test.u), rtol=0, atol=0)
+
+
+def test_a_model_whose_prior_is_missing_is_refused(textbook):
+    codec = GaussianProcessCodec()
+    stored = codec.encode(learned(samples(Real(), 8, seed=3), textbook))
+    with pytest.raises(InvalidInput, match="with its prior"):
+        codec.decode(HINGE, replace(stored, header=stored.header | {"prior": None}))
+
+
+@pytest.mark.parametrize("size", [0.0, -1.0, math.inf, math.nan])
+def test_a_size_that_makes_no_sense_is_refused(textbook, size):
+    codec = GaussianProcessCodec()
+    stored = codec.encode(learned(samples(Real(), 8, seed=3), textbook))
+    stored.header["outputs"][1]["size_with_prior"] = size
+    with pytest.raises(InvalidInput, match="size"):
+        codec.decode(HINGE, stored)
+
+
+def test_the_family_takes_priors_of_its_own_kind_only():
+    with pytest.raises(TypeError, match="Gaussian processes"):
+        GaussianProcesses().learn_beside(object(), HINGE, samples(Real(), 4))  # type: ignore[arg-type]
