@@ -87,6 +87,18 @@ def test_single_spikes_are_no_drift():
     assert first(errors) is None
 
 
+@pytest.mark.parametrize("kind", ["laplace", "outliers"])
+def test_heavy_tails_of_the_noise_are_no_drift(kind: str):
+    """Bets on larger errors win often in such noise. What they won before counts against them."""
+    rng, alarms = np.random.default_rng(5), 0
+    errors = noise(8_000, 12) * np.where(rng.random((8_000, 2)) < 0.01, 20, 1)
+    if kind == "laplace":
+        errors = CLAIMED * rng.laplace(size=(8_000, 2)) / np.sqrt(2)
+    while (found := first(errors)) is not None:
+        alarms, errors = alarms + 1, errors[found[0] :]
+    assert alarms <= 3  # 0.8 are expected at the stated rate
+
+
 def test_errors_far_below_the_tolerance_mean_nothing():
     """An output that the model knows by a formula errs by rounding alone."""
     detector = Detector(np.array([1e-12]), np.array([1.0]))

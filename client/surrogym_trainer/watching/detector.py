@@ -19,7 +19,9 @@ Without a change the error e of a step has these parts, of which z = (e - m) / s
 - the uncertainty d of the model at this step;
 - noise of standard deviation s. The stream shows it, beginning with the model's error on left-out samples.
 
-A single error counts for at most ``MOST`` deviations, so that one spike is no alarm.
+A single error counts for at most ``MOST`` deviations, so that one spike is no alarm. Noise with heavier tails than a
+normal variable pays some bets more than 1 on average. What the stream has paid a bet, up to ``MOST_PAID``, divides its
+evidence. Errors that resemble those of the step before, beyond their mean, raise the rate of false alarms.
 
 Shapes: O outputs, B bets.
 """
@@ -39,6 +41,8 @@ SHARE = 1.5  # deviations of the model that count as one of the error
 MOST = 4.0  # deviations to which an error is limited
 OUTLYING = 3.0  # deviations to which an error is limited before mean and noise learn from it
 NOISE_STEPS = 20.0  # weight of the error on left-out samples, in steps
+PAID_STEPS = 100.0  # weight of "a bet pays 1 on average", in steps
+MOST_PAID = 1.5  # most that a healthy stream may pay a bet on average
 NEGLIGIBLE = 0.1  # share of the tolerance below which no error means anything
 
 Array = NDArray[np.float64]
@@ -74,6 +78,7 @@ class Detector:
         half = [1 / (4 * len(SHIFTS))] * (2 * len(SHIFTS)) + [1 / (2 * len(SPREADS))] * len(SPREADS)
         self._weights = np.array(half) / len(claimed)  # (B,): half of the stake is on shifts, half on spreads
         self._evidence = np.zeros((len(claimed), count))  # M of each bet
+        self._paid = np.full((len(claimed), count), PAID_STEPS)  # what each bet has paid in all steps
         self._run = np.zeros((len(claimed), count))  # logarithm of the evidence since the likeliest change
         self._begun = np.zeros((len(claimed), count), dtype=np.int64)  # step of that change
         self.steps = 0
@@ -96,7 +101,10 @@ class Detector:
         mean = self._sum / (self._known_steps + (noise / uncertain) ** 2)  # given the errors, with the prior N(0, d^2)
         mean = mean.clip(-BIAS * uncertain, BIAS * uncertain)
         beyond = np.where(known, error - mean, 0.0)
-        log_bets = np.where(known[:, None], _log_bets(beyond / np.hypot(noise, SHARE * uncertain)), 0.0)
+        paid = (self._paid / (PAID_STEPS + self._known_steps[:, None])).clip(1.0, MOST_PAID)
+        won = _log_bets(beyond / np.hypot(noise, SHARE * uncertain))
+        self._paid += np.where(known[:, None], np.exp(won), 0.0)
+        log_bets = np.where(known[:, None], won - np.log(paid), 0.0)
         self._evidence = (1 + self._evidence) * np.exp(log_bets)
         self._begun[self._run <= 0] = self.steps
         self._run = np.maximum(self._run, 0.0) + log_bets
