@@ -103,7 +103,7 @@ class Served:
     def query_uncertainty(self, _: str, q: Any, u: Any, **__: Any) -> SimpleNamespace:
         with torch.inference_mode():
             found = query_uncertainty(self._model, np.array(q), np.array(u), self._tolerances)
-        return SimpleNamespace(outputs=list(self._model.definition.outputs), deviation=found.deviation)
+        return SimpleNamespace(outputs=list(self._model.definition.outputs), deviation=found.std)
 
 
 class Case(NamedTuple):
