@@ -66,5 +66,7 @@ def test_what_it_is_not_used_for_is_said_before_anything_changes(on_server, serv
 def test_waiting_ends_with_drop(on_server, server_process, hinge):
     with Api(server_process.url) as api:
         PriorCalls(api.connection).wait(hinge)
+        assert "waits for its prior" in on_server("status", hinge).out
         assert on_server("prior", hinge, "--drop").code == 0
+        assert "prior" not in on_server("status", hinge).out
         assert not PriorCalls(api.connection).get(hinge).awaited

@@ -78,7 +78,20 @@ def _one(api: Api, name: str, form: Form) -> str:
     if form == "short":
         return _short(view)
     models = api.models(name) if view.phase in ("over_budget", "unsure") else ()
-    return "\n".join([_detail(view, models), *_untrusted(name, api.policies.list(name))])
+    return "\n".join([_detail(view, models), *_prior(api, name), *_untrusted(name, api.policies.list(name))])
+
+
+def _prior(api: Api, name: str) -> list[str]:
+    """Lines of the prior, if there is one or the design waits for one."""
+    from surrogym.cli.prior import words_of_prior
+    from surrogym_client.transport.priors import PriorCalls
+
+    stored = PriorCalls(api.connection).get(name)
+    if stored.awaited:
+        return [
+            f"the design waits for its prior; next: surrogym prior {name} SIMULATOR, or surrogym prior {name} --drop"
+        ]
+    return [] if stored.about is None else words_of_prior(stored.about)
 
 
 def _untrusted(name: str, policies: Sequence[PolicyView]) -> list[str]:
