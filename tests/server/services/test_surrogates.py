@@ -11,7 +11,7 @@ from surrogym_server.convert import resources
 from surrogym_server.errors import SpecConflict
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions
-from surrogym_server.services.surrogates import SurrogateService, check_same
+from surrogym_server.services.surrogates import READS, SurrogateService, check_same
 from surrogym_server.storage.port import Storage
 
 NAME = "pendulum"
@@ -37,6 +37,25 @@ def test_a_failure_between_two_reads_is_never_shown_without_its_error(
     monkeypatch.setattr(storage.surrogates, "get", fails_afterwards)
     view = resources.surrogate_view(service(storage, definitions).status(NAME))
     assert (view.phase, view.error) == ("failed", "no power")
+
+
+@pytest.mark.parametrize("changes", [1, READS - 1])
+def test_a_status_is_of_one_moment(
+    storage: Storage, definitions: Definitions, monkeypatch: pytest.MonkeyPatch, changes: int
+) -> None:
+    """Each of its first reads is followed by a change of the budget, as if another request came in between."""
+    read, budgets = storage.designs.left, [50 + change for change in range(changes)]
+
+    def changed_afterwards(name: str) -> int:
+        left = read(name)
+        if budgets:
+            storage.surrogates.change(name, budget=budgets.pop())
+        return left
+
+    monkeypatch.setattr(storage.designs, "left", changed_afterwards)
+    status = service(storage, definitions).status(NAME)
+    assert not budgets
+    assert (status.budget_left, status.summary.budget) == (read(NAME), 50)
 
 
 def service(storage: Storage, definitions: Definitions) -> SurrogateService:
