@@ -12,8 +12,12 @@ from support.server import ServerProcess
 from surrogym_client.transport import Api
 from surrogym_sampler.logs import importing
 from surrogym_sampler.original.classic import pendulum
+from surrogym_shared.logs.checking import ReadLog, check_log
+from surrogym_shared.logs.columns import roles_by_name
 from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.table import Table
 from surrogym_shared.logs.units import require_reward_unit, require_units
+from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 
 def states(speed: np.ndarray) -> np.ndarray:
@@ -36,6 +40,60 @@ def test_a_few_wild_rows_and_missing_ones_are_no_other_unit() -> None:
     speeds = np.linspace(-12, 12, 50)
     speeds[:5], speeds[5:8] = 1e6, np.nan
     require_units(states(speeds), pendulum())
+
+
+CONVERSIONS = {
+    "degrees Celsius to kelvin": (1.0, 273.15),
+    "degrees Celsius to Fahrenheit": (1.8, 32.0),
+    "metres to millimetres": (1e3, 0.0),
+    "millimetres to metres": (1e-3, 0.0),
+    "bar to pascal": (1e5, 0.0),
+    "pascal to bar": (1e-5, 0.0),
+    "radians to degrees": (57.2958, 0.0),
+    "degrees to radians": (1 / 57.2958, 0.0),
+    "shares to percent": (100.0, 0.0),
+    "percent to shares": (0.01, 0.0),
+    "metres a second to kilometres an hour": (3.6, 0.0),
+    "revolutions a minute to radians a second": (0.10472, 0.0),
+}
+
+
+@pytest.mark.parametrize("conversion", CONVERSIONS)
+def test_a_column_in_another_unit_is_never_taken_in_silence(conversion: str) -> None:
+    """Those that shrink a column were taken without a word, and so was a factor of 3.6."""
+    factor, zero = CONVERSIONS[conversion]
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        spec, x = drawn(rng)
+        assert checked(spec, x).notes == ()
+        try:
+            notes = checked(spec, factor * x + zero).notes
+        except UnusableLog as refused:
+            notes = (str(refused),)
+        assert any(note.startswith("x:") and "in another unit" in note for note in notes), seed
+
+
+def drawn(rng: np.random.Generator) -> tuple[EnvironmentSpec, np.ndarray]:
+    """A specification of one state, and states of a log that covers most of its range."""
+    half = float(rng.uniform(0.5, 5))
+    middle = float(rng.uniform(-half, half))
+    low, high = middle - half, middle + half
+    sampling = Uniform(low=low, high=high)
+    spec = EnvironmentSpec(
+        environment="drawn",
+        coordinates=(Coordinate(name="x", sampling=sampling),),
+        observation=(ObservationEntry(name="x", term=Term.linear(x=1)),),
+        action=BoxAction(low=(-1.0,), high=(1.0,)),
+        start={"x": sampling},
+        time_limit=20,
+    )
+    return spec, middle + half * rng.uniform(-0.9, 0.9, 80)
+
+
+def checked(spec: EnvironmentSpec, x: np.ndarray) -> ReadLog:
+    columns = {"x": x, "action_u": np.linspace(-1, 1, len(x)), "reward": -x}
+    table = Table(columns, np.arange(2, 2 + len(x)))
+    return check_log(table, roles_by_name(table.names), spec)
 
 
 CELSIUS = -273.15

@@ -20,7 +20,7 @@ from surrogym_shared.logs.rows import rows_of
 from surrogym_shared.logs.table import Bools, Floats, Table
 from surrogym_shared.logs.too_few import require_steps
 from surrogym_shared.logs.transitions import Transitions, transitions_of
-from surrogym_shared.logs.units import require_units
+from surrogym_shared.logs.units import require_units, unit_notes
 from surrogym_shared.logs.writing import spreadsheet_cell
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 from surrogym_shared.terms import terminates
@@ -83,14 +83,16 @@ def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
     if not table.evaluated:
         _require_choices(spec, roles, rows.u)
     steps = _shaped(spec, roles, transitions_of(rows))
+    units: list[str] = []
     if not table.evaluated:
         require_units(rows.q, spec)
+        units = unit_notes(rows.q, spec)
         if rows.following is not None:
             require_units(rows.following, spec, "next ")
         steps = _consistent(spec, steps)
     require_steps(table, steps, 1)
     lost = lost_ends(steps) if spec.termination == "learned" else []
-    return ReadLog(table, roles, steps, spec, (*table.remarks, *steps.notes, *lost))
+    return ReadLog(table, roles, steps, spec, (*table.remarks, *steps.notes, *lost, *units))
 
 
 def draft_log(table: Table, roles: Roles, name: str, budget: int = 0) -> ReadLog:

@@ -10,6 +10,7 @@ from surrogym_shared.logs.table import Floats
 from surrogym_shared.spec import EnvironmentSpec, limits
 
 BEYOND = 20.0  # distance outside a coordinate's range, in widths of the range, that no real plant reaches
+NARROW, MOST_OUTSIDE = 0.25, 0.1  # share of a range that a log covers, and of its rows outside, that are worth a note
 FEWEST = 8  # least number of known rewards that show how large rewards are
 
 
@@ -44,6 +45,28 @@ def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:
                 f"{half}, outside its sampling range of {low:.4g} to {high:.4g}: {unit}. If the values are right, "
                 "widen the sampling range in a new specification (--spec)"
             )
+
+
+def unit_notes(q: Floats, spec: EnvironmentSpec) -> list[str]:
+    """Return a sentence for each column of states q (n, C) that may be in another unit: it covers a small part of its
+    coordinate's sampling range, or many of its rows lie outside. Both may be right, so nothing is refused."""
+    notes = []
+    for index, coordinate in enumerate(spec.coordinates):
+        column = q[np.isfinite(q[:, index]), index]
+        low, high = limits(coordinate.sampling)
+        if coordinate.kind == "angle" or not len(column) or high <= low:
+            continue
+        first, last = float(column.min()), float(column.max())
+        rounding = SLACK * max(high - low, abs(low), abs(high))
+        outside = float(np.mean((column < low - rounding) | (column > high + rounding)))
+        covered = (last - first) / (high - low)
+        if covered < NARROW or outside > MOST_OUTSIDE:
+            share = f"{outside:.0%} of the rows lie outside" if outside > MOST_OUTSIDE else f"{100 * covered:.2g} % of"
+            notes.append(
+                f"{coordinate.name}: the log lies between {first:.4g} and {last:.4g}, {share} its sampling range of "
+                f"{low:.4g} to {high:.4g}: if the column is in another unit, convert it"
+            )
+    return notes
 
 
 def require_reward_unit(paid: Floats, known: Floats, name: str) -> None:
