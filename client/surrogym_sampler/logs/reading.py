@@ -22,6 +22,7 @@ from surrogym_shared.logs.text import table_of_text
 from surrogym_shared.logs.writing import EVALUATED
 from surrogym_shared.words import listed
 
+MINARI_FILE = "main_data.hdf5"  # of a data set
 Format = Literal["csv", "npz", "parquet", "hdf5", "minari", "surrogate"]
 
 MOST_BYTES = 1024**3  # of the arrays in an NPZ file
@@ -244,21 +245,62 @@ def read_minari(path: Path) -> Table:
         raise UnusableLog(f"expected a Minari data set in {path}, got one that can't be read: {error}") from error
     width = _width(path, data.observation_space)
     spaces = _declared(path, data.action_space)
-    require_sizes(path, data.total_steps, data.total_steps * (2 * width + 1))
-    episodes = list(data.iterate_episodes())
-    table = table_of_arrays(
-        path,
-        {
-            "observations": np.concatenate([e.observations[:-1].reshape(-1, width) for e in episodes]),
-            "actions": np.concatenate([_rows(e.actions) for e in episodes]),
-            "next_observations": np.concatenate([e.observations[1:].reshape(-1, width) for e in episodes]),
-            "reward": np.concatenate([e.rewards for e in episodes]),
-            "terminated": np.concatenate([e.terminations for e in episodes]),
-            "truncated": np.concatenate([e.truncations for e in episodes]),
-            "episode": np.concatenate([np.full(len(e.rewards), e.id) for e in episodes]),
-        },
+    episodes = _episodes(path, data, width)
+    return replace(
+        table_of_arrays(path, {name: np.concatenate([e[name] for e in episodes]) for name in episodes[0]}), **spaces
     )
-    return replace(table, **spaces)
+
+
+def _episodes(path: Path, data: Any, width: int) -> list[dict[str, Cells]]:
+    """Return the arrays of each episode. Their sizes are read before them."""
+    try:
+        _require_minari(path, data)
+        episodes = [_of_episode(episode, width) for episode in data.iterate_episodes()]
+    except UnusableLog:
+        raise
+    except (LookupError, ValueError, AssertionError, TypeError, AttributeError, RuntimeError, OSError) as error:
+        raise UnusableLog(
+            f"expected a Minari data set in {path}, got one with an episode that can't be read: record it again"
+        ) from error
+    if not episodes:
+        raise UnusableLog(f"expected a Minari data set with episodes in {path}, got none")
+    for number, arrays in enumerate(episodes):
+        rows = {name: len(array) for name, array in arrays.items()}
+        if len(set(rows.values())) > 1:
+            raise UnusableLog(
+                f"expected an action, a reward and an end for each step in episode {number} of {path}, got {rows}"
+            )
+    return episodes
+
+
+def _of_episode(episode: Any, width: int) -> dict[str, Cells]:
+    seen = np.asarray(episode.observations)
+    if prod(seen.shape[1:]) != width:
+        raise ValueError(f"observations of {seen.shape}")
+    return {
+        "observations": seen[:-1].reshape(-1, width),
+        "actions": _rows(np.asarray(episode.actions)),
+        "next_observations": seen[1:].reshape(-1, width),
+        "reward": np.asarray(episode.rewards),
+        "terminated": np.asarray(episode.terminations),
+        "truncated": np.asarray(episode.truncations),
+        "episode": np.full(len(episode.rewards), episode.id),
+    }
+
+
+def _require_minari(path: Path, data: Any) -> None:
+    """Raise ``UnusableLog`` if the arrays of a data set are too large, before one of them is read. Its metadata may
+    name other sizes."""
+    file = Path(data.storage.data_path) / MINARI_FILE
+    if not file.exists():  # another form of storage
+        require_sizes(path, data.total_steps, data.total_steps * (2 * prod(data.observation_space.shape) + 1))
+        return
+    import h5py
+
+    sizes: list[int] = []
+    with h5py.File(file, "r") as opened:
+        opened.visititems(lambda _, one: sizes.append(one.size) if isinstance(one, h5py.Dataset) else None)
+    require_sizes(path, max(sizes, default=0), sum(sizes))
 
 
 def _width(path: Path, space: Any) -> int:
