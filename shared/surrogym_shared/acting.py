@@ -192,8 +192,8 @@ class Actor:
         if policy.mean.size != self.observation:
             raise ValueError(f"policy: expected a mean of {self.observation} entries, got {policy.mean.size}")
         if policy.units[-1] != self._distribution.outputs:
-            expected = self._distribution.outputs
-            raise ValueError(f"policy: expected {expected} units in the last layer, got {policy.units[-1]}")
+            outputs = self._distribution.outputs
+            raise ValueError(f"policy: expected {outputs} units in the last layer, got {policy.units[-1]}")
         if self.counts and log is not None:
             raise ValueError("policy: expected no log_deviations with discrete actions, got some")
         if self.noisy and not self.counts and log is None:

@@ -56,9 +56,9 @@ def compile_c(command: Sequence[str], flags: Sequence[str], sources: Sequence[st
     """
     whole = [*command, *flags, "-o", str(out), *sources, "-lm"]
     try:
-        done = subprocess.run(whole, cwd=folder, capture_output=True, text=True, timeout=SECONDS, check=False)
+        process = subprocess.run(whole, cwd=folder, capture_output=True, text=True, timeout=SECONDS, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise CannotCompile(f"expected a C compiler, got {command[0]!r}: {error}") from error
-    if done.returncode:
-        said = done.stderr[:SHOWN].strip() or f"exit status {done.returncode}"
-        raise CannotCompile(f"{command[0]} refused the sources: {said}")
+    if process.returncode:
+        message = process.stderr[:SHOWN].strip() or f"exit status {process.returncode}"
+        raise CannotCompile(f"{command[0]} refused the sources: {message}")

@@ -37,10 +37,10 @@ def require_unique(what: str, names: Iterable[str]) -> None:
         earlier.add(name)
 
 
-def require_known(where: str, names: Iterable[str], known: Iterable[str]) -> None:
-    known = list(known)
-    unknown = [name for name in names if name not in known]
-    require(not unknown, f"{where} names unknown {unknown}: expected some of {known}")
+def require_known(where: str, names: Iterable[str], choices: Iterable[str]) -> None:
+    choices = list(choices)
+    unknown = [name for name in names if name not in choices]
+    require(not unknown, f"{where} names unknown {unknown}: expected some of {choices}")
 
 
 def trace_fault(

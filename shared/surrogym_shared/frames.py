@@ -216,15 +216,15 @@ def reset_request(seq: int | None, seed: int | Sequence[int] | None, mask: Bools
     Raises:
         FrameError: int64 can't represent a seed.
     """
-    packed = None if seed is None else _seeds(seed)
-    sent = int(seed) if isinstance(seed, int) else packed
-    return ResetRequest(seq, sent, None if mask is None else _flat(mask, BOOL))
+    seeds = None if seed is None else _seeds(seed)
+    seed_field = int(seed) if isinstance(seed, int) else seeds
+    return ResetRequest(seq, seed_field, None if mask is None else _flat(mask, BOOL))
 
 
 def step_request(seq: int | None, action: Array, mask: Bools | None, deviations: bool) -> StepRequest:
     """Build the request of a step with an action (N, F)."""
-    packed = None if mask is None else _flat(mask, BOOL)
-    return StepRequest(seq=seq, action=_flat(action, FLOAT64), mask=packed, deviations=deviations)
+    view = None if mask is None else _flat(mask, BOOL)
+    return StepRequest(seq=seq, action=_flat(action, FLOAT64), mask=view, deviations=deviations)
 
 
 def rollout_request(seq: int | None, actions: Array) -> RolloutRequest:
@@ -325,7 +325,7 @@ def rollout_reply(seq: int, results: Sequence[StepResult]) -> RolloutReply:
 
 
 def policy_reply(seq: int, result: PolicyRollout) -> PolicyReply:
-    ended = len(result.final_lanes) > 0
+    has_ends = len(result.final_lanes) > 0
     log, versions, untrusted = result.log_probability, result.model_version, result.untrusted
     reward, mean = _flat(result.reward, FLOAT64), _flat(result.reward_mean, FLOAT64)
     with np.errstate(over="ignore"):
@@ -342,9 +342,9 @@ def policy_reply(seq: int, result: PolicyRollout) -> PolicyReply:
         truncated=_flat(result.truncated, BOOL),
         model_version=_flat(versions[0] if (versions == versions[0]).all() else versions, INT64),
         reward_mean=None if mean.tobytes() == reward.tobytes() else mean,  # compared by bytes, because 0.0 == -0.0
-        final_steps=_flat(result.final_steps, INT64) if ended else None,
-        final_lanes=_flat(result.final_lanes, INT64) if ended else None,
-        final_observation=_flat(result.final_observation, FLOAT32) if ended else None,
+        final_steps=_flat(result.final_steps, INT64) if has_ends else None,
+        final_lanes=_flat(result.final_lanes, INT64) if has_ends else None,
+        final_observation=_flat(result.final_observation, FLOAT32) if has_ends else None,
         untrusted=None if untrusted is None else _flat(untrusted, BOOL),
     )
 
@@ -414,7 +414,7 @@ def step_result(step: Step, shape: Shape) -> StepResult:
 
 
 def _step(result: StepResult) -> Step:
-    ended = len(result.final_lanes) > 0
+    has_ends = len(result.final_lanes) > 0
     return Step(
         _flat(result.observation, FLOAT32),
         _flat(result.reward, FLOAT64),
@@ -422,8 +422,8 @@ def _step(result: StepResult) -> Step:
         _flat(result.truncated, BOOL),
         _flat(result.model_version, INT64),
         _flat(result.reward_mean, FLOAT64),
-        _flat(result.final_lanes, INT64) if ended else None,
-        _flat(result.final_observation, FLOAT32) if ended else None,
+        _flat(result.final_lanes, INT64) if has_ends else None,
+        _flat(result.final_observation, FLOAT32) if has_ends else None,
         None if result.deviation is None else _flat(result.deviation, FLOAT64),
         None if result.untrusted is None else _flat(result.untrusted, BOOL),
     )
@@ -431,10 +431,12 @@ def _step(result: StepResult) -> Step:
 
 def _final_steps(reply: PolicyReply, steps: int, count: int) -> Array:
     """Return the steps (K,) of the final lanes, in order."""
-    ended = _own("final_steps", memoryview(b"") if reply.final_steps is None else reply.final_steps, INT64, (count,))
-    if count and (ended[0] < 0 or ended[-1] >= steps or (np.diff(ended) < 0).any()):
-        raise FrameError(f"final_steps: expected some of 0..{steps - 1} in order, got {ended[:8].tolist()}")
-    return ended
+    final_steps = _own(
+        "final_steps", memoryview(b"") if reply.final_steps is None else reply.final_steps, INT64, (count,)
+    )
+    if count and (final_steps[0] < 0 or final_steps[-1] >= steps or (np.diff(final_steps) < 0).any()):
+        raise FrameError(f"final_steps: expected some of 0..{steps - 1} in order, got {final_steps[:8].tolist()}")
+    return final_steps
 
 
 def _final(step: Step | PolicyReply, shape: Shape) -> tuple[Array, Array]:
@@ -487,9 +489,9 @@ def _aligned(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int
 
 
 def _require_size(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-    expected = math.prod(shape) * dtype.itemsize
-    if view.nbytes != expected:
-        raise FrameError(f"{name}: expected {expected} bytes, shape {shape} of {dtype.name}, got {view.nbytes} bytes")
+    size = math.prod(shape) * dtype.itemsize
+    if view.nbytes != size:
+        raise FrameError(f"{name}: expected {size} bytes, shape {shape} of {dtype.name}, got {view.nbytes} bytes")
 
 
 def _checked(name: str, view: memoryview) -> memoryview:

@@ -116,8 +116,8 @@ class Network:
             arrays |= dict(zip(names, layer, strict=True))
         with zipfile.ZipFile(path, "w") as file:
             file.writestr(HEAD, json.dumps(head.model_dump()))
-            with file.open(ARRAYS, "w") as opened:
-                np.savez(opened, **arrays)
+            with file.open(ARRAYS, "w") as archive:
+                np.savez(archive, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> Self:

@@ -39,12 +39,12 @@ def one_line(error: BaseException, *, typed: bool = True) -> str:
     Never raises, whatever the exception's own code does.
     """
     try:
-        said = " ".join(str(error).split())
+        text = " ".join(str(error).split())
     except BaseException:
-        said = ""
-    if typed or not said:
-        said = f"{type(error).__name__}: {said}" if said else type(error).__name__
-    return said if len(said) <= MOST_CHARACTERS else f"{said[:MOST_CHARACTERS]}..."
+        text = ""
+    if typed or not text:
+        text = f"{type(error).__name__}: {text}" if text else type(error).__name__
+    return text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}..."
 
 
 class Registry(Generic[T]):
@@ -83,7 +83,7 @@ class Registry(Generic[T]):
 
     def why_broken(self, name: str) -> str | None:
         """Return why an entry point can't be used; None if it can, or if there is none of this name."""
-        return next((why for known, why in self.broken.items() if known.casefold() == name.casefold()), None)
+        return next((why for plugin, why in self.broken.items() if plugin.casefold() == name.casefold()), None)
 
     def instead_of(self, name: str) -> str | None:
         """Return what takes the place of a member that an earlier version had; None if there was none of this name."""
@@ -104,10 +104,10 @@ class Registry(Generic[T]):
 
     def get(self, name: str) -> type[T]:
         """Return the class of a name. Raises as ``name_of``."""
-        known = self.name_of(name)
-        if known not in self._built_in:
-            return self._others()[known]
-        built_in = self._built_in[known]
+        member_name = self.name_of(name)
+        if member_name not in self._built_in:
+            return self._others()[member_name]
+        built_in = self._built_in[member_name]
         if not isinstance(built_in, str):
             return built_in
         module, _, attribute = built_in.partition(":")
@@ -123,8 +123,8 @@ class Registry(Generic[T]):
                 except KeyboardInterrupt:
                     raise
                 except BaseException as error:  # another package's code may raise anything
-                    said = str(error) if isinstance(error, _Unfit) else one_line(error)
-                    broken[entries[0].name] = f"{self._described(entries)}: {said}"
+                    reason = str(error) if isinstance(error, _Unfit) else one_line(error)
+                    broken[entries[0].name] = f"{self._described(entries)}: {reason}"
             self._installed, self._broken = installed, broken
         return self._installed
 
@@ -151,9 +151,9 @@ class Registry(Generic[T]):
         return member
 
 
-def _same(name: str, known: Iterable[str]) -> str | None:
+def _same(name: str, members: Iterable[str]) -> str | None:
     """Return the known name that equals ``name`` apart from upper and lower case."""
-    return next((member for member in known if member.casefold() == name.casefold()), None)
+    return next((member for member in members if member.casefold() == name.casefold()), None)
 
 
 def _by_name(entries: Iterable[EntryPoint]) -> list[list[EntryPoint]]:

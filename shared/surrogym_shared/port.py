@@ -112,9 +112,9 @@ class PolicyRollout:
 def quick(kind: type[T], **fields: Any) -> T:
     """Make a frozen dataclass from all its fields, in half the time of its constructor. Every step makes two of
     them."""
-    made = object.__new__(kind)
-    made.__dict__.update(fields)
-    return made
+    instance = object.__new__(kind)
+    instance.__dict__.update(fields)
+    return instance
 
 
 @runtime_checkable

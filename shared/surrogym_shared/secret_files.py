@@ -48,7 +48,7 @@ def parse_token(entry: str) -> tuple[str, Role]:
     role, colon, token = entry.partition(":")
     if not colon:
         return entry, "admin"
-    for known in get_args(Role):
-        if role == known:
-            return token, known
+    for candidate in get_args(Role):
+        if role == candidate:
+            return token, candidate
     raise ValueError(f"a token's role: expected one of {', '.join(get_args(Role))} before the colon, got another word")

@@ -216,10 +216,10 @@ def _array(entry: Any, body: bytes) -> NDArray[Any]:
 
 def _pair(pair: Any) -> list[float]:
     """Return the error and the standard deviation of a prediction. Raises one of ``UNREADABLE`` if they are invalid."""
-    error, deviation = (float(one) for one in pair)
-    if not math.isfinite(error) or not 0 <= deviation < math.inf:
-        raise ValueError(f"a prediction with the error {error} and the standard deviation {deviation}")
-    return [error, deviation]
+    error, std = (float(one) for one in pair)
+    if not math.isfinite(error) or not 0 <= std < math.inf:
+        raise ValueError(f"a prediction with the error {error} and the standard deviation {std}")
+    return [error, std]
 
 
 def _name(name: object) -> str:
@@ -236,6 +236,6 @@ def _require_shapes(spec: EnvironmentSpec, samples: RealSamples) -> None:
     for name in RealSamples.__dataclass_fields__:
         if (array := getattr(samples, name)) is None:
             continue
-        expected, got = shapes.get(name, (n,)), array.shape
-        if got != expected:
-            raise NotASurrogateFile(f"{SAMPLES}{name}: expected shape {expected}, got {got}")
+        shape, got = shapes.get(name, (n,)), array.shape
+        if got != shape:
+            raise NotASurrogateFile(f"{SAMPLES}{name}: expected shape {shape}, got {got}")

@@ -14,7 +14,7 @@ from shutil import copytree, move, rmtree
 import pytest
 
 import surrogym_server
-from surrogym_shared.compiled import kept
+from surrogym_shared.compiled import disk_cache
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("client", "server", "shared")
@@ -59,7 +59,7 @@ def sources() -> set[Path]:
 
 def kept_of(folder: Path) -> Path:
     """Where numba keeps what it compiled from the sources in a folder; their content is the same in a copy."""
-    whole = kept.folder("surrogym_server")
+    whole = disk_cache.folder("surrogym_server")
     assert whole is not None
     return whole / f"{folder.name}_{sha1(str(folder).encode()).hexdigest()}"
 

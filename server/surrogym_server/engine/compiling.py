@@ -7,7 +7,7 @@ import sys
 from contextlib import suppress
 
 from surrogym_shared import compiled
-from surrogym_shared.compiled import kept
+from surrogym_shared.compiled import disk_cache
 
 PROGRAM = """
 import os
@@ -30,8 +30,8 @@ class Compiling:
 
     def start(self) -> None:
         """Start the process, unless compiled steps can't be stored on the disk, or are there already."""
-        to_be_kept = compiled.available() and kept.folder(PACKAGE) is not None and not kept.has_any(PACKAGE)
-        if self._process is None and to_be_kept:
+        is_cold = compiled.available() and disk_cache.folder(PACKAGE) is not None and not disk_cache.has_any(PACKAGE)
+        if self._process is None and is_cold:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", PROGRAM], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
             )

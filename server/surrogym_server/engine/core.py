@@ -79,7 +79,7 @@ def opened(
     """
     opening = request.opening
     settings = _limited(resolved(opening, definition), request.rewards, model)
-    settings = replace(settings, visited=_visited(settings, definition, request.visited))
+    settings = replace(settings, visited=_starts(settings, definition, request.visited))
     settings = in_fastest_form(settings, model)
     seed = secrets.randbits(63) if opening.seed is None else opening.seed
     return Session(
@@ -132,7 +132,7 @@ def _limited(settings: VirtualSettings, rewards: SampledRewards | None, model: D
     return replace(settings, reward_limits=reward_limits(rewards.low, rewards.high))
 
 
-def _visited(settings: VirtualSettings, definition: EnvironmentDefinition, states: Array | None) -> Tensor | None:
+def _starts(settings: VirtualSettings, definition: EnvironmentDefinition, states: Array | None) -> Tensor | None:
     """States of real steps, (k, C), at which a share of the episodes starts; None if the settings have no such share.
 
     Raises:
@@ -194,8 +194,8 @@ def carried_out(
         request, Step
     ):  # checked first and without a pattern, because most requests are steps, and this is faster
         u = policy_actions(session.definition.action, request.action, session.settings.num_envs)
-        stepped, result = _stepped(session, u, request.mask, request.stds, models, interrupts)
-        return stepped, (result,)
+        after, result = _step(session, u, request.mask, request.stds, models, interrupts)
+        return after, (result,)
     match request:
         case Reset():
             latest = models.latest(session.surrogate_id) if session.model == "latest" else session.model
@@ -226,10 +226,10 @@ def _next_step(
     models: Models, require_wanted: Callable[[], None], interrupts: bool, session: Session, u: Array
 ) -> tuple[Session, StepResult]:
     require_wanted()
-    return _stepped(session, u, None, False, models, interrupts)
+    return _step(session, u, None, False, models, interrupts)
 
 
-def _stepped(
+def _step(
     session: Session, u: Array, mask: Bools | None, stds: bool, models: Models, interrupts: bool
 ) -> tuple[Session, StepResult]:
     surrogate, device = session.surrogate_id, session.definition.device

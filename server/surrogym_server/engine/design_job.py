@@ -77,14 +77,14 @@ class DesignResult:
 
 def run_design_job(job: DesignJob) -> DesignResult:
     """Do one round: fit a model, judge it, choose queries. Raises like ``sampling.design.advance``."""
-    started = time.perf_counter()
+    begin = time.perf_counter()
     torch.set_num_threads(job.threads)
     with threadpool_limits(job.threads):  # matrix products are small: more threads would slow them
         decision, samples = _decide(job)
     with plugin_calls(job.definition):
-        stored = to_bytes(decision.model)
+        model = to_bytes(decision.model)
     return DesignResult(
-        model=stored,
+        model=model,
         description=json.loads(json.dumps(decision.model.description)),  # a family's own types become JSON's
         fidelity=fidelity_fields(
             decision.model,
@@ -96,12 +96,12 @@ def run_design_job(job: DesignJob) -> DesignResult:
         data_hash=samples.digest,
         state=decision.state.to_json(),
         verdict=decision.verdict,
-        seconds=time.perf_counter() - started,
+        seconds=time.perf_counter() - begin,
         queries=decision.queries,
     )
 
 
-def judge_stored(job: DesignJob, stored: bytes) -> DesignResult:
+def judge_stored(job: DesignJob, data: bytes) -> DesignResult:
     """Judge a stored model of the job's samples, without a fit and without choosing queries.
 
     The verdict is ``continue`` if the model was fitted to other samples.
@@ -109,13 +109,13 @@ def judge_stored(job: DesignJob, stored: bytes) -> DesignResult:
     Raises:
         InvalidInput: not a model of the job's definition.
     """
-    started = time.perf_counter()
-    model, samples = from_bytes(job.definition, stored), _samples(job)
+    begin = time.perf_counter()
+    model, samples = from_bytes(job.definition, data), _samples(job)
     state = DesignState.from_json(job.state)
     defaults = state.defaults.values or default_tolerances(job.definition, model.scales.tolist())
     judgement = judge_model(model, samples, job.definition.tolerances_or(defaults), _request(job), state)
     return DesignResult(
-        model=stored,
+        model=data,
         description=model.description,
         fidelity=fidelity_fields(
             model,
@@ -127,7 +127,7 @@ def judge_stored(job: DesignJob, stored: bytes) -> DesignResult:
         data_hash=model.digest,
         state=job.state,
         verdict=judgement.verdict if model.digest == samples.digest else "continue",
-        seconds=time.perf_counter() - started,
+        seconds=time.perf_counter() - begin,
     )
 
 
@@ -150,17 +150,19 @@ def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
         model = from_bytes(job.definition, job.previous)
         if model.digest == samples.at(torch.arange(min(model.samples, len(samples)))).digest:
             is_chosen = torch.tensor([purpose not in UNCHOSEN for purpose in job.samples.purpose])
-            new = is_chosen[_known(job)].index_fill(0, torch.arange(model.samples), value=False).nonzero()[-LATEST:, 0]
+            new = (
+                is_chosen[_is_known(job)].index_fill(0, torch.arange(model.samples), value=False).nonzero()[-LATEST:, 0]
+            )
             return predicted(model, samples.at(new))
     return ()
 
 
 def _samples(job: DesignJob) -> Samples:
     """Samples of the job that a model can learn from, because all lags are known where they begin."""
-    return Samples.of(job.samples).at(_known(job))
+    return Samples.of(job.samples).at(_is_known(job))
 
 
-def _known(job: DesignJob) -> torch.Tensor:
+def _is_known(job: DesignJob) -> torch.Tensor:
     """Whether all lags are known where each of n samples begins, (n,) bool."""
     return job.definition.known(torch.from_numpy(job.samples.coordinates))
 
@@ -176,7 +178,7 @@ def _request(job: DesignJob) -> Request:
         states=None if job.occupancy is None else torch.from_numpy(job.occupancy),
         logged=job.samples.purpose.count("logged"),
         audited=job.samples.purpose.count("audit"),
-        unlearned=int((~_known(job)).sum()),
+        unlearned=int((~_is_known(job)).sum()),
         open=job.open_steps,
         prior=None if job.prior is None else from_bytes(job.definition, job.prior),
     )

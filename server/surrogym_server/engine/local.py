@@ -101,7 +101,7 @@ class LocalEngine(SessionEngine):
             nbytes = await asyncio.to_thread(self._expected_bytes, request)
             self._live.check_room(nbytes)
             self._tallies.forget_all_but(session.id for session in self._live)
-            return info_of(self._live.add(await asyncio.to_thread(self._opened, request, digest), nbytes))
+            return info_of(self._live.add(await asyncio.to_thread(self._new_session, request, digest), nbytes))
 
     async def advance(self, request: Advance) -> Reply:
         if (reply := self.try_now(request)) is not None:
@@ -110,7 +110,7 @@ class LocalEngine(SessionEngine):
         answer = await self._live.advance(
             request.session, request.seq, fingerprint_of(request), self._work(request), steps, self._deadline(request)
         )
-        return self._counted(request, answer, began)
+        return self._tally(request, answer, began)
 
     def try_now(self, request: Advance) -> Reply | None:
         if not self._live.prompt(request.session, steps := steps_asked(request)):
@@ -119,7 +119,7 @@ class LocalEngine(SessionEngine):
         answer = self._live.advance_now(
             request.session, request.seq, fingerprint_of(request), self._work(request), steps, self._deadline(request)
         )
-        return self._counted(request, answer, began)
+        return self._tally(request, answer, began)
 
     async def describe(self, session: str) -> SessionInfo:
         return info_of(self._live.get(session))
@@ -131,7 +131,7 @@ class LocalEngine(SessionEngine):
     async def submit(self, session: str) -> Visited:
         live = self._live.get(session)
         states = visited_states(live)
-        return await asyncio.to_thread(self._visited, live, states)
+        return await asyncio.to_thread(self._visits, live, states)
 
     async def close(self, session: str) -> None:
         self.end(session)
@@ -193,7 +193,7 @@ class LocalEngine(SessionEngine):
     def _deadline(self, request: Advance) -> float | None:
         return None if request.within is None else self._live.clock() + request.within
 
-    def _counted(self, request: Advance, answer: Answer, began: float) -> Reply:
+    def _tally(self, request: Advance, answer: Answer, began: float) -> Reply:
         """Count a request and its steps, and return the reply. A repeated request counts, but its steps don't."""
         reply = Reply(answer.seq, answer.outcome)
         tally = self._tallies.of(request.session)
@@ -212,7 +212,7 @@ class LocalEngine(SessionEngine):
         draws = function_draws(model, settings.functions)
         return expected_bytes(request.definition, settings, draws.path_size)
 
-    def _opened(self, request: Open, digest: str) -> Session:
+    def _new_session(self, request: Open, digest: str) -> Session:
         definition = request.definition.on(self._device)
         latest = self._models.refresh(request.surrogate_id)
         version = latest if request.opening.model == "latest" else request.opening.model
@@ -220,7 +220,7 @@ class LocalEngine(SessionEngine):
         self._compiling.wait()
         return opened(request, definition, model, version, digest, self._place)
 
-    def _visited(self, session: Session, states: Array) -> Visited:
+    def _visits(self, session: Session, states: Array) -> Visited:
         surrogate = session.surrogate_id
         version = self._models.latest(surrogate) if session.model == "latest" else session.model
         tolerances, model = self._tolerances(surrogate, version), self._models.get(surrogate, version)

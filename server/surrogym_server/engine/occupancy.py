@@ -35,9 +35,9 @@ class Reservoir:
             return Reservoir(self.seed, visits, self.states, self.priority)
         before = self.states if len(self.states) else np.zeros((0, states.shape[1]))
         joined_states = np.concatenate([before, states[candidates]])
-        joined = np.concatenate([self.priority, priority[candidates]])
-        rows = np.sort(np.argsort(joined, kind="stable")[-CAPACITY:])
-        return Reservoir(self.seed, visits, joined_states[rows], joined[rows])
+        priorities = np.concatenate([self.priority, priority[candidates]])
+        rows = np.sort(np.argsort(priorities, kind="stable")[-CAPACITY:])
+        return Reservoir(self.seed, visits, joined_states[rows], priorities[rows])
 
 
 def _priorities(seed: int, first: int, count: int) -> Array:

@@ -63,7 +63,7 @@ def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Sessio
             f"{max(run.policy.units)} x {lanes}"
         )
     actor = _actor(len(definition.observation_names), definition.action, run)
-    waiting = _awaited(run, lanes)
+    waiting = _lanes_without_an_end(run, lanes)
     sensed_states = sensed(definition, session.settings.sensor_noise, session.lanes)
     observation = definition.observe(sensed_states).to(torch.float32).cpu().numpy()
     results, actions, logs = [], [], []
@@ -93,7 +93,7 @@ def _actor(observation: int, action: ActionDefinition, run: PolicyRun) -> Actor:
         raise InvalidInput(str(error)) from error
 
 
-def _awaited(run: PolicyRun, lanes: int) -> Bools:
+def _lanes_without_an_end(run: PolicyRun, lanes: int) -> Bools:
     if run.until is None:
         return np.ones(lanes, dtype=bool)
     if run.until.shape != (lanes,):

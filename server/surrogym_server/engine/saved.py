@@ -93,7 +93,7 @@ def _read(definition: EnvironmentDefinition, data: bytes, surrogate_id: int) -> 
         lanes=to_device(LaneState.from_arrays(_unprefixed("lanes", arrays)), definition.device),
         versions=arrays["versions"],
         answer=_answer(header, arrays),
-        visited=_visited(header, arrays),
+        visited=_reservoir(header, arrays),
         opened_by=None if opened_by is None else (opened_by[0], opened_by[1]),
         surrogate_id=surrogate_id,
     )
@@ -106,12 +106,12 @@ def _settings(saved: dict[str, Any], starts: NDArray[Any] | None, device: torch.
         "sensor_noise": tuple((name, std) for name, std in noise),
         "residual": None if residual is None else Residual.from_saved(residual),
     }
-    visited = None if starts is None else torch.from_numpy(starts).to(device)
-    return VirtualSettings(**{**saved, **tuples, "visited": visited})
+    states = None if starts is None else torch.from_numpy(starts).to(device)
+    return VirtualSettings(**{**saved, **tuples, "visited": states})
 
 
 def _answer(header: dict[str, Any], arrays: Arrays) -> Answer | None:
-    if (stored := header.get("answer")) is None:
+    if (entry := header.get("answer")) is None:
         return None
     outcome: Outcome
     if reset := _unprefixed("reset", arrays):
@@ -121,13 +121,13 @@ def _answer(header: dict[str, Any], arrays: Arrays) -> Answer | None:
         outcome = PolicyRollout(**fields)
     else:
         outcome = _steps(_unprefixed("steps", arrays))
-    return Answer(stored["seq"], Fingerprint(digest=stored["digest"]), outcome)
+    return Answer(entry["seq"], Fingerprint(digest=entry["digest"]), outcome)
 
 
-def _visited(header: dict[str, Any], arrays: Arrays) -> Reservoir | None:
-    if (stored := header.get("visited")) is None:
+def _reservoir(header: dict[str, Any], arrays: Arrays) -> Reservoir | None:
+    if (entry := header.get("visited")) is None:
         return None
-    return Reservoir(stored["seed"], stored["seen"], arrays["visited/states"], arrays["visited/priority"])
+    return Reservoir(entry["seed"], entry["seen"], arrays["visited/states"], arrays["visited/priority"])
 
 
 def _outcome_arrays(outcome: Outcome) -> Arrays:

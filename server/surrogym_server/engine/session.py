@@ -134,7 +134,7 @@ def reset_session(session: Session, seed: Seeds, mask: Bools | None, latest: int
     lanes_reset = np.ones(session.settings.num_envs, dtype=bool) if mask is None else mask
     versions = np.where(lanes_reset, latest, session.versions)
     session = replace(session, lanes=lanes, versions=versions)
-    return _visited(session, lanes_reset), ResetResult(observation, versions)
+    return _with_visits(session, lanes_reset), ResetResult(observation, versions)
 
 
 def step_session(
@@ -156,7 +156,7 @@ def step_session(
         transition = within(session.settings.reward_limits, transition)
     versions = np.where(transition.reset_lanes, latest, session.versions)
     session = _with(session, lanes=lanes, versions=versions)
-    return session if session.visited is None else _visited(session, mask), _result(transition, versions)
+    return session if session.visited is None else _with_visits(session, mask), _result(transition, versions)
 
 
 def _step_versions(
@@ -186,8 +186,8 @@ def _join(parts: Sequence[tuple[NDArray[np.intp], LaneTransition]]) -> LaneTrans
     order = np.argsort(np.concatenate([index for index, _ in parts]))
 
     def lanewise(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        joined: NDArray[Any] = np.concatenate(arrays)[order]
-        return joined
+        rows: NDArray[Any] = np.concatenate(arrays)[order]
+        return rows
 
     transitions = [transition for _, transition in parts]
     final_lanes = np.concatenate([index[t.final_lanes] for index, t in parts])
@@ -224,7 +224,7 @@ def _result(transition: LaneTransition, versions: Versions) -> StepResult:
     )
 
 
-def _visited(session: Session, mask: Bools | None) -> Session:
+def _with_visits(session: Session, mask: Bools | None) -> Session:
     if session.visited is None:
         return session
     states = session.lanes.q.cpu().numpy()

@@ -274,17 +274,17 @@ class LiveSessions:
         return answer
 
     async def _do(self, live: _Live, work: Work, steps: int, deadline: float | None) -> tuple[Session, Outcome]:
-        expected = live.seconds_per_step * steps
-        if expected < INLINE_SECONDS:
+        seconds_ahead = live.seconds_per_step * steps
+        if seconds_ahead < INLINE_SECONDS:
             return self._done_now(live, work, steps, deadline)
         threads = self._threads if steps == 1 else self._rollouts
-        result, seconds = await self._in_thread(threads, live.session, work, expected, deadline)
-        return _learned(live, result, seconds, steps)
+        result, seconds = await self._in_thread(threads, live.session, work, seconds_ahead, deadline)
+        return _with_measurement(live, result, seconds, steps)
 
     def _done_now(self, live: _Live, work: Work, steps: int, deadline: float | None) -> tuple[Session, Outcome]:
         self._check_deadline(deadline, live.seconds_per_step * steps)
         result, seconds = _timed(work, live.session)
-        return _learned(live, result, seconds, steps)
+        return _with_measurement(live, result, seconds, steps)
 
     async def _in_thread(
         self, threads: Threads, session: Session, work: Work, expected: float, deadline: float | None
@@ -313,13 +313,15 @@ class LiveSessions:
             )
 
 
-def _learned(live: _Live, result: tuple[Session, Outcome], seconds: float, steps: int) -> tuple[Session, Outcome]:
+def _with_measurement(
+    live: _Live, result: tuple[Session, Outcome], seconds: float, steps: int
+) -> tuple[Session, Outcome]:
     """Update the session's predicted seconds per step by a measurement, and pass the result on."""
     outcome = result[1]
     count = len(outcome) if isinstance(outcome, PolicyRollout) else steps  # a policy's rollout may have stopped early
     each = seconds / count
-    known = live.seconds_per_step if live.seconds_per_step < float("inf") else each
-    live.seconds_per_step = (1 - FORGETTING) * known + FORGETTING * each
+    average = live.seconds_per_step if live.seconds_per_step < float("inf") else each
+    live.seconds_per_step = (1 - FORGETTING) * average + FORGETTING * each
     return result
 
 

@@ -66,8 +66,8 @@ def fit_bound(
         for most, iterations in SEARCHES:
             rows = spread(len(y), len(y) if most is None else most)
             few = replace(options, max_iterations=iterations)
-            found = [_searched(x[rows], y[rows], few, start, inducing, reflection) for start in starts]
-            starts = [min(found, key=lambda pair: pair[0])[1]]
+            fits = [_searched(x[rows], y[rows], few, start, inducing, reflection) for start in starts]
+            starts = [min(fits, key=lambda pair: pair[0])[1]]
             if len(rows) == len(y):
                 break
         hyper = Parameters(x.shape[1], options, reflection).hyper(starts[0])
@@ -86,13 +86,13 @@ def fit_through_few(
     hyper = parameters.hyper(theta)
     if len(y) <= SOME or len(pivots(hyper, x, SOME)) == SOME:
         return None
-    found = [condition_sparse(hyper, x, y, SOME)]
+    posteriors = [condition_sparse(hyper, x, y, SOME)]
     if is_noisy(hyper):
         with blas().limit(limits=1):
             few = replace(options, max_iterations=SEARCHES[-1][1])
             _, searched = _searched(x, y, few, theta, SOME, reflection)
-        found.append(condition_sparse(parameters.hyper(searched), x, y, SOME))
-    whole = [posterior for posterior in found if loses_nothing(posterior)]
+        posteriors.append(condition_sparse(parameters.hyper(searched), x, y, SOME))
+    whole = [posterior for posterior in posteriors if loses_nothing(posterior)]
     return max(whole, key=lambda posterior: posterior.left_out.log_density, default=None)
 
 
@@ -181,12 +181,12 @@ class _Inputs:
 
 def _effects(posterior: Posterior, x: Tensor) -> Tensor:
     """By how much the mean at x (m, d) changes if one input has the value of another row, root mean squares (d,)."""
-    mean, found = posterior.mean(x), []
+    mean, effects = posterior.mean(x), []
     for j in range(x.shape[1]):
         changed = x.clone()
         changed[:, j] = x[:, j].roll(1)
-        found.append((posterior.mean(changed) - mean).square().mean().sqrt())
-    return torch.stack(found)
+        effects.append((posterior.mean(changed) - mean).square().mean().sqrt())
+    return torch.stack(effects)
 
 
 def _searched(
@@ -195,8 +195,8 @@ def _searched(
     """The least cost from a start, and its theta, with the inducing points that suit the start."""
     parameters = Parameters(x.shape[1], options, reflection)
     clipped = np.clip(start, parameters.lower, parameters.upper)
-    chosen = pivots(parameters.hyper(clipped), x, inducing)
-    return minimum(Bound(x, y, chosen, options, reflection), clipped)
+    inducing_points = pivots(parameters.hyper(clipped), x, inducing)
+    return minimum(Bound(x, y, inducing_points, options, reflection), clipped)
 
 
 class Bound(Parameters):
@@ -224,22 +224,22 @@ class Bound(Parameters):
         inner.flat[:: m + 1] += JITTER * prior / n
         if (lower := _factor(inner)) is None:
             return 1e10, np.zeros_like(theta)
-        known = _solved(lower, k)  # V
-        square = known @ known.T
+        v = _solve_lower(lower, k)  # V
+        square = v @ v.T
         s = square.copy()
         s.flat[:: m + 1] += noise
         if (root := _factor(s)) is None:
             return 1e10, np.zeros_like(theta)
-        weights = scipy.linalg.cho_solve((root, True), known @ self.y, check_finite=False)  # a
+        weights = scipy.linalg.cho_solve((root, True), v @ self.y, check_finite=False)  # a
         inverse = scipy.linalg.cho_solve((root, True), np.eye(m), check_finite=False)
-        alpha = (self.y - weights @ known) / noise
+        alpha = (self.y - weights @ v) / noise
         left = prior - float(square.trace())
         logs = (n - m) * math.log(noise) + 2 * float(np.log(root.diagonal()).sum())
         z = self.standardised(theta)
         value = 0.5 * (logs + self.y @ alpha + left / noise + z @ z) + self._constant
 
         back = scipy.linalg.solve_triangular(lower, np.eye(m), lower=True, trans=1, check_finite=False)  # L^-T
-        outer = (back @ (np.eye(m) / noise - inverse)) @ known
+        outer = (back @ (np.eye(m) / noise - inverse)) @ v
         outer += np.outer(back @ weights, alpha)
         within = np.outer(weights, weights) + s / noise - 2 * np.eye(m) + noise * inverse
         within = -0.5 * back @ within @ back.T
@@ -271,8 +271,8 @@ class Bound(Parameters):
         return _Covariances(k, smooth, diagonal, mirrored)
 
     def _polynomial(self, part: Polynomial) -> Array:
-        found: Array = part(torch.from_numpy(self.z), torch.from_numpy(self.x)).numpy()
-        return found
+        part_of_kernel: Array = part(torch.from_numpy(self.z), torch.from_numpy(self.x)).numpy()
+        return part_of_kernel
 
     def _gradient(self, theta: Array, covariances: _Covariances, outer: Array, each: float) -> Array:
         """Gradient over theta, given those over K_uf (m, n), K_uu included, and over each entry of K_ff's diagonal."""
@@ -309,8 +309,8 @@ def _exponential(a: Array, b: Array) -> Array:
     k = a @ b.T
     k -= 0.5 * np.square(a).sum(1)[:, None]
     k -= 0.5 * np.square(b).sum(1)
-    found: Array = np.exp(k, out=k)
-    return found
+    result: Array = np.exp(k, out=k)
+    return result
 
 
 def _factor(matrix: Array) -> Array | None:
@@ -319,7 +319,7 @@ def _factor(matrix: Array) -> Array | None:
     return None if info else np.ascontiguousarray(lower)
 
 
-def _solved(lower: Array, k: Array) -> Array:
+def _solve_lower(lower: Array, k: Array) -> Array:
     """L^-1 k for k (m, n) by rows."""
-    known: Array = scipy.linalg.blas.dtrsm(1.0, lower.T, k.T, side=1, lower=0).T
-    return known
+    solution: Array = scipy.linalg.blas.dtrsm(1.0, lower.T, k.T, side=1, lower=0).T
+    return solution

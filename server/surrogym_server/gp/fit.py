@@ -46,8 +46,8 @@ def fit(
     objective = Evidence(x, y, options, reflection)
     with blas().limit(limits=1):
         starts = [*_starts(objective.default_start, warm, len(y)), *objective.noisy_starts]
-        found = [minimum(objective, start) for start in starts]
-    value, theta = min(found, key=lambda pair: pair[0])
+        fits = [minimum(objective, start) for start in starts]
+    value, theta = min(fits, key=lambda pair: pair[0])
     return Fitted(condition(objective.hyper(theta), x, y), -value, theta)
 
 
@@ -75,16 +75,16 @@ def refine(
 
     The full set is searched in a few iterations. Both stages are bounded, see ``gp.subsets``.
     """
-    found, seen = [theta], min(len(y), SOME)
+    thetas, points = [theta], min(len(y), SOME)
     with blas().limit(limits=1):
         for most, iterations in REFINEMENTS:
-            if len(y) > seen:
+            if len(y) > points:
                 rows = spread(len(y), most)
                 objective = Evidence(x[rows], y[rows], replace(options, max_iterations=iterations), reflection)
-                found.append(minimum(objective, found[-1])[1])
-                seen = len(rows)
+                thetas.append(minimum(objective, thetas[-1])[1])
+                points = len(rows)
     parameters = Parameters(x.shape[1], options, reflection)
-    return tuple(parameters.hyper(theta) for theta in found)
+    return tuple(parameters.hyper(theta) for theta in thetas)
 
 
 def refine_where_hard(posterior: Posterior, x: Tensor, y: Tensor, options: FitOptions) -> Hyperparameters:

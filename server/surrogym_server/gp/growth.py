@@ -99,11 +99,11 @@ class _GrowingObjective:
     def __call__(self, theta: Array) -> tuple[float, Array]:
         objective, slope = self.plain(theta)
         rates, z = self.rates(theta), self._z
-        found = objective.evaluated(theta[: self.inner])
-        if found is None:
+        inner = objective.evaluated(theta[: self.inner])
+        if inner is None:
             return 1e10, np.zeros_like(theta)
-        over = objective.over_inputs(theta[: self.inner], found)
-        of_rates = (over * slope).sum(0) + z.sum(0) - (found.weights * objective.y) @ z
+        over = objective.over_inputs(theta[: self.inner], inner)
+        of_rates = (over * slope).sum(0) + z.sum(0) - (inner.weights * objective.y) @ z
         own = rates / PRIOR**2
-        value = found.value + float(z.sum(0) @ rates) + 0.5 * float(rates @ own)
-        return value, np.concatenate([found.slopes, (of_rates + own)[self._may]])
+        value = inner.value + float(z.sum(0) @ rates) + 0.5 * float(rates @ own)
+        return value, np.concatenate([inner.slopes, (of_rates + own)[self._may]])

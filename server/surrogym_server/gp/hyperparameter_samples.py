@@ -45,7 +45,7 @@ def hyperparameter_samples(
     )
     evidence = Evidence(posterior.x, posterior.y, options, hyper.reflection)
     chain = _Chain(evidence, np.random.default_rng(seed))
-    theta, found = evidence.theta(hyper), []
+    theta, hypers = evidence.theta(hyper), []
     with blas().limit(limits=1):
         if hyper.noise_variance > most_noise:
             theta = _with_less_noise(evidence, theta)
@@ -53,8 +53,8 @@ def hyperparameter_samples(
         for update in range(1, BURN_IN + THINNING * count + 1):
             theta, level = chain.update(theta, level)
             if update > BURN_IN and (update - BURN_IN) % THINNING == 0:
-                found.append(evidence.hyper(theta))
-    return tuple(found)
+                hypers.append(evidence.hyper(theta))
+    return tuple(hypers)
 
 
 def _with_less_noise(evidence: Evidence, theta: Array) -> Array:
@@ -89,9 +89,9 @@ class _Chain:
         angle = rng.uniform(0, 2 * math.pi)
         low, high = angle - 2 * math.pi, angle
         while high - low > NARROWEST:
-            turned = self._mean + around * math.cos(angle) + other * math.sin(angle)
-            if (found := self.log_likelihood(turned)) > least:
-                return turned, found
+            candidate = self._mean + around * math.cos(angle) + other * math.sin(angle)
+            if (log_likelihood := self.log_likelihood(candidate)) > least:
+                return candidate, log_likelihood
             low, high = (angle, high) if angle < 0 else (low, angle)
             angle = rng.uniform(low, high)
         return theta, level

@@ -42,8 +42,8 @@ class Joint:
     def between(self, a: slice, b: slice) -> Tensor:
         """Posterior covariance of the points a and the points b, (|a|, |b|)."""
         prior = covariance(self.hyper, self.x[a], self.x[b])
-        known = self.whitened[:, a].T @ self.whitened[:, b] + self.observed[:, a].T @ self.observed[:, b]
-        return prior - known
+        explained = self.whitened[:, a].T @ self.whitened[:, b] + self.observed[:, a].T @ self.observed[:, b]
+        return prior - explained
 
     def row(self, index: int) -> Tensor:
         """r of the point ``index``, (m,)."""

@@ -45,8 +45,8 @@ class Pathwise:
     def draw(self, noise: Tensor) -> Tensor:
         """Return the weights (N, size) of N posterior samples, made from standard normal ``noise`` (N, size)."""
         posterior = self.posterior
-        prior, measured = noise[:, : self._features], noise[:, self._features :]
-        at_points = prior @ self._prior_at_points.T + self._noise(measured)
+        prior, at_samples = noise[:, : self._features], noise[:, self._features :]
+        at_points = prior @ self._prior_at_points.T + self._noise(at_samples)
         return torch.cat([prior, -torch.cholesky_solve(at_points.T, posterior.factor).T], 1)
 
     def residual(self, x: Tensor, weights: Tensor) -> Tensor:
@@ -54,12 +54,12 @@ class Pathwise:
         k = covariance(self.posterior.hyper, x, self.posterior.x)
         return (torch.cat([self._prior(x), k], 1) * weights).sum(1)
 
-    def _noise(self, measured: Tensor) -> Tensor:
-        """Noise of the n points that standard normal ``measured`` (N, n) gives, (N, n)."""
+    def _noise(self, at_samples: Tensor) -> Tensor:
+        """Noise of the n points that standard normal ``at_samples`` (N, n) gives, (N, n)."""
         posterior = self.posterior
         if posterior.sparse is not None:
-            return measured @ self._sparse_noise
-        return math.sqrt(posterior.hyper.noise_variance + posterior.jitter) * measured
+            return at_samples @ self._sparse_noise
+        return math.sqrt(posterior.hyper.noise_variance + posterior.jitter) * at_samples
 
     @cached
     def _sparse_noise(self) -> Tensor:

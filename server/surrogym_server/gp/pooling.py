@@ -104,8 +104,8 @@ class Pool:
         back = [inputs.index(place) for place in sorted(inputs)]
         others = [i for i in range(len(self.parts)) if i != member]
         x = torch.cat([self.parts[i].read(self.inputs[i]) for i in others])
-        seen = replace(own, centre=first.centre)
-        y = torch.cat([seen.targets_of(self.parts[i]) for i in others])
+        own_targets = replace(own, centre=first.centre)
+        y = torch.cat([own_targets.targets_of(self.parts[i]) for i in others])
         rows = spread(len(y), max(0, most - len(own.y)))
         mirror = self.hyper.reflection
         ratio = (first.scale / own.scale) ** 2
@@ -117,7 +117,7 @@ class Pool:
             ratio * self.hyper.noise_variance,
             None if mirror is None else replace(mirror, signs=mirror.signs[back]),
         )
-        return torch.cat([own.read(inputs), x[rows]])[:, back], torch.cat([seen.targets_of(own), y[rows]]), hyper
+        return torch.cat([own.read(inputs), x[rows]])[:, back], torch.cat([own_targets.targets_of(own), y[rows]]), hyper
 
 
 def pools(parts: Sequence[Part], most: int) -> list[Pool]:
@@ -127,7 +127,7 @@ def pools(parts: Sequence[Part], most: int) -> list[Pool]:
     inputs is joined by others. Runs on the CPU. Raises ``NumericalFailure``.
     """
     few = [number for number, part in enumerate(parts) if len(part.reads) <= most]
-    free, found = set(range(len(parts))), list[Pool]()
+    free, result = set(range(len(parts))), list[Pool]()
     with blas().limit(limits=1):
         for first in sorted(few, key=lambda number: parts[number].posterior.left_out.error):
             if first not in free:
@@ -138,9 +138,9 @@ def pools(parts: Sequence[Part], most: int) -> list[Pool]:
                     numbers.append(other)
                     inputs.append(played)
             if len(numbers) > 1:
-                found.append(_pooled(numbers, [parts[number] for number in numbers], inputs))
+                result.append(_pooled(numbers, [parts[number] for number in numbers], inputs))
                 free -= set(numbers)
-    return found
+    return result
 
 
 def _inputs_alike(part: Part, other: Part) -> Inputs | None:
@@ -176,7 +176,7 @@ def _may_play(part: Part, other: Part) -> Tensor:
     return mirror.signs[:, None] == other.signs
 
 
-def _played(known: Posterior, x: Tensor, y: Tensor, may: Tensor) -> Inputs | None:
+def _played(process: Posterior, x: Tensor, y: Tensor, may: Tensor) -> Inputs | None:
     """Inputs of x (n, D) with which a process predicts targets (n,) best, found by exchanging one of them, or two with
     each other, as long as this helps.
 
@@ -187,23 +187,23 @@ def _played(known: Posterior, x: Tensor, y: Tensor, may: Tensor) -> Inputs | Non
         return None
     effect = ((x - x.mean(0)).T @ (y - y.mean())).abs() / x.std(0).clamp_min(1e-12)
     strongest = effect.argsort(descending=True)[: d + 1].tolist()
-    starts = [tried for tried in permutations(strongest, d) if _allowed(may, tried)]
+    starts = [choice for choice in permutations(strongest, d) if _allowed(may, choice)]
     if not starts:
-        any_allowed = next((tried for tried in permutations(range(size), d) if _allowed(may, tried)), None)
+        any_allowed = next((choice for choice in permutations(range(size), d) if _allowed(may, choice)), None)
         if any_allowed is None:
             return None
         starts = [any_allowed]
-    errors = _errors(known, x, y, starts)
-    found: list[tuple[float, Inputs]] = []
+    errors = _errors(process, x, y, starts)
+    optima: list[tuple[float, Inputs]] = []
     for place in errors.argsort()[:STARTS].tolist():
         best, error = starts[place], float(errors[place])
         for _ in range(SWEEPS):
-            tried = [t for t in _neighbours(best, size) if _allowed(may, t)]
-            if not tried or float((again := _errors(known, x, y, tried)).min()) >= error:
+            choices = [t for t in _neighbours(best, size) if _allowed(may, t)]
+            if not choices or float((again := _errors(process, x, y, choices)).min()) >= error:
                 break
-            best, error = tried[int(again.argmin())], float(again.min())
-        found.append((error, best))
-    return min(found)[1]
+            best, error = choices[int(again.argmin())], float(again.min())
+        optima.append((error, best))
+    return min(optima)[1]
 
 
 def _neighbours(inputs: Inputs, size: int) -> list[Inputs]:
@@ -221,10 +221,10 @@ def _allowed(may: Tensor, inputs: Inputs) -> bool:
     return bool(may[torch.arange(len(inputs)), list(inputs)].all())
 
 
-def _errors(known: Posterior, x: Tensor, y: Tensor, tried: Sequence[Inputs]) -> Tensor:
+def _errors(process: Posterior, x: Tensor, y: Tensor, choices: Sequence[Inputs]) -> Tensor:
     """Mean squared error of targets (n,) for each choice of inputs, (t,)."""
-    points = torch.cat([x[:, list(inputs)] for inputs in tried])
-    return (known.mean(points).view(len(tried), len(y)) - y).square().mean(1)
+    points = torch.cat([x[:, list(inputs)] for inputs in choices])
+    return (process.mean(points).view(len(choices), len(y)) - y).square().mean(1)
 
 
 def _pooled(numbers: Sequence[int], parts: Sequence[Part], inputs: Sequence[Inputs]) -> Pool:

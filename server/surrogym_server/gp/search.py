@@ -30,7 +30,7 @@ class Objective(Protocol):
 
 
 def minimum(objective: Objective, start: Array) -> tuple[float, Array]:
-    found = scipy.optimize.minimize(
+    result = scipy.optimize.minimize(
         objective,
         np.clip(start, objective.lower, objective.upper),
         jac=True,
@@ -38,7 +38,7 @@ def minimum(objective: Objective, start: Array) -> tuple[float, Array]:
         bounds=np.stack([objective.lower, objective.upper], 1),
         options={"maxiter": objective.options.max_iterations, "ftol": 1e-9, "gtol": 1e-5},
     )
-    return float(found.fun), found.x
+    return float(result.fun), result.x
 
 
 @cache
@@ -103,8 +103,8 @@ class Evidence(Parameters):
         return [start]
 
     def __call__(self, theta: Array) -> tuple[float, Array]:
-        found = self.evaluated(theta)
-        return (1e10, np.zeros_like(theta)) if found is None else (found.value, found.slopes)
+        terms = self.evaluated(theta)
+        return (1e10, np.zeros_like(theta)) if terms is None else (terms.value, terms.slopes)
 
     def evaluated(self, theta: Array) -> Evaluated | None:
         """Value and gradient at theta. None if float64 can't factor K: a very large cost then stops the line search."""
@@ -136,11 +136,11 @@ class Evidence(Parameters):
         gradient = z / self.prior[:, 1] - np.concatenate([*slopes, [noise * trace]])
         return Evaluated(float(value), gradient, half, weighted, weights)
 
-    def over_inputs(self, theta: Array, found: Evaluated) -> Array:
+    def over_inputs(self, theta: Array, terms: Evaluated) -> Array:
         """Gradient of the value over the inputs x, (n, d). Only without a reflection and a quadratic part."""
         lengthscale, _, linear, _, _ = self.values(theta)
         smooth, line = np.zeros((self.n, self.n)), np.zeros((self.n, self.n))
-        smooth.ravel()[self.places], line.ravel()[self.places] = found.weighted[0], found.half
+        smooth.ravel()[self.places], line.ravel()[self.places] = terms.weighted[0], terms.half
         smooth, line = smooth + smooth.T, line + line.T  # each pair counts for both of its points
         pulled = (smooth.sum(1)[:, None] * self.x - smooth @ self.x) * lengthscale**-2
         slopes: Array = pulled - linear * (line @ self.x)

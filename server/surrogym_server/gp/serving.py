@@ -129,14 +129,14 @@ class Serving:
         """Means at x (m, d), shape (m, O)."""
         return in_blocks(self.rows, lambda rows: (self._means(*self._covariances(rows)),), x)[0]
 
-    def mean_and_std(self, x: Tensor, wanted: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Means at x (m, d), and latent standard deviations of the columns ``wanted``, 0 in the others: (m, O) each."""
+    def mean_and_std(self, x: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Means at x (m, d), and latent standard deviations of the ``columns``, 0 in the others: (m, O) each."""
 
         def block(rows: Tensor) -> tuple[Tensor, Tensor]:
             z, smooth = self._covariances(rows)
             mean, squared = self._means(z, smooth), z.square()
             std = torch.zeros_like(mean)
-            for column in self.processes.keys() & set(wanted):
+            for column in self.processes.keys() & set(columns):
                 std[:, column] = self.processes[column].std(rows, z, squared, smooth)
             return mean, std
 

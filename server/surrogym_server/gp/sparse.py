@@ -76,16 +76,16 @@ def condition_many(
     """
     if len(y) <= MAX_EXACT:
         return condition(hypers[-1], x, y)
-    judged = censored or Censored(x[:0], y[:0], y[:0])
+    censor = censored or Censored(x[:0], y[:0], y[:0])
 
     def density(posterior: Posterior) -> float:
-        return len(y) * posterior.left_out.log_density + judged.log_probability(posterior)
+        return len(y) * posterior.left_out.log_density + censor.log_probability(posterior)
 
     def misfit(posterior: Posterior) -> float:
-        return len(y) * posterior.left_out.error**2 + judged.misfit(posterior)
+        return len(y) * posterior.left_out.error**2 + censor.misfit(posterior)
 
-    found = [max(_with_noises(hyper, x, y), key=density) for hyper in hypers]
-    return min(found if earlier is None else [earlier, *found], key=misfit)
+    posteriors = [max(_with_noises(hyper, x, y), key=density) for hyper in hypers]
+    return min(posteriors if earlier is None else [earlier, *posteriors], key=misfit)
 
 
 def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor, most: int | None = None) -> Posterior:
@@ -123,35 +123,35 @@ def _with_noises(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Iterator[Poste
 
 def _projected(hyper: Hyperparameters, x: Tensor, y: Tensor, pivots: tuple[Tensor, Tensor, Tensor]) -> Posterior:
     """The process through the inducing points of ``_pivots``."""
-    chosen, known, left = pivots  # (m,), V (m, n), (n,)
-    inducing = x[chosen]
-    lower = known[:, chosen].T.tril()
+    points, v, left = pivots  # (m,), V (m, n), (n,)
+    inducing = x[points]
+    lower = v[:, points].T.tril()
     noise = hyper.noise_variance
-    gram = known @ known.T
+    gram = v @ v.T
     solid, _ = factorise(gram + noise * torch.eye(len(gram), dtype=x.dtype, device=x.device))
-    whitened = torch.cholesky_solve((known @ y)[:, None], solid)
+    whitened = torch.cholesky_solve((v @ y)[:, None], solid)
     weights = torch.linalg.solve_triangular(lower.T, whitened, upper=True)[:, 0]
     inverse = torch.cholesky_inverse(factorise(gram)[0])
     inner, _ = factorise(torch.eye(len(gram), dtype=x.dtype, device=x.device) + noise * 0.5 * (inverse + inverse.T))
     factor = lower @ inner
     values = factor @ (factor.T @ weights)
-    residual = y - known.T @ whitened[:, 0]
-    left_out = LeftOut.of(*_left_out(known, solid, residual, noise, left))
+    residual = y - v.T @ whitened[:, 0]
+    left_out = LeftOut.of(*_left_out(v, solid, residual, noise, left))
     sparse = Sparse(len(y), float((left.mean() / variance(hyper, x).mean()).sqrt()), left_out)
     return Posterior(hyper, inducing, values, factor, weights, 0.0, sparse)
 
 
-def _left_out(known: Tensor, solid: Tensor, residual: Tensor, noise: float, left: Tensor) -> tuple[Tensor, Tensor]:
+def _left_out(v: Tensor, solid: Tensor, residual: Tensor, noise: float, left: Tensor) -> tuple[Tensor, Tensor]:
     """Error and variance, noise included, of each of n points predicted from all others, (n,) each.
 
     Args:
-        known: V (m, n).
+        v: V = L^-1 K of the m inducing points and all n, (m, n).
         solid: factor of C + sigma_n^2 I, (m, m).
         residual: y less the mean at every point, (n,).
         noise: sigma_n^2.
         left: variance that the inducing points leave, (n,).
     """
-    blocks = torch.split(known, BLOCK, dim=1)
+    blocks = torch.split(v, BLOCK, dim=1)
     own = [torch.linalg.solve_triangular(solid, block, upper=False).square().sum(0) for block in blocks]
     others = (1 - torch.cat(own)).clamp_min(SHARE)
     return residual / others, noise / others + left
@@ -164,7 +164,7 @@ def _pivots(hyper: Hyperparameters, x: Tensor, most: int | None = None) -> tuple
     """
     left, prior = variance(hyper, x), float(variance(hyper, x).mean())
     enough = max(BELOW_NOISE * hyper.noise_variance, EXPLAINED * prior)
-    rows, chosen = x.new_empty(min(INDUCING if most is None else most, len(x)), len(x)), []
+    rows, points = x.new_empty(min(INDUCING if most is None else most, len(x)), len(x)), []
     for count in range(len(rows)):
         pivot = int(left.argmax())
         if count and float(left[pivot]) <= enough:
@@ -173,5 +173,5 @@ def _pivots(hyper: Hyperparameters, x: Tensor, most: int | None = None) -> tuple
         rows[count] = row / left[pivot].sqrt()
         left = (left - rows[count].square()).clamp_min_(0)
         left[pivot] = 0.0
-        chosen.append(pivot)
-    return torch.tensor(chosen, device=x.device), rows[: len(chosen)], left
+        points.append(pivot)
+    return torch.tensor(points, device=x.device), rows[: len(points)], left

@@ -44,12 +44,12 @@ def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, r
     points = points[:MAX_CANDIDATES]
     reference, weights = points[:REFERENCE], points.q.new_ones(min(len(points), REFERENCE))
     if states is not None and len(states) and model.definition.design.visited_candidates:
-        visited = _visited(model.definition, states, len(points), rng)
-        also = _visited(model.definition, states, REFERENCE, rng)
+        visits = _visits(model.definition, states, len(points), rng)
+        also = _visits(model.definition, states, REFERENCE, rng)
         weights = torch.cat(
             [weights * (1 - OCCUPIED) / len(weights), weights.new_full((REFERENCE,), OCCUPIED / REFERENCE)]
         )
-        points, reference = Points.joined([points, visited]), Points.joined([reference, also])
+        points, reference = Points.joined([points, visits]), Points.joined([reference, also])
     reads = acquisition_of(model.definition.design.acquisition).reads_probability
     log_p = input_probability(model, points, states) if reads else points.q.new_zeros(len(points))
     return Candidates(points, log_p, reference, weights / weights.sum())
@@ -58,9 +58,9 @@ def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, r
 def with_reserved(candidates: Candidates, points: Points) -> Candidates:
     """Add k candidates, each with the largest probability of all, and reserve only these."""
     log_p = torch.cat([candidates.log_p, candidates.log_p.max().expand(len(points))])
-    joined = Points.joined([candidates.points, points])
-    reserved = torch.arange(len(joined)) >= len(candidates.points)
-    return replace(candidates, points=joined, log_p=log_p, reserved=reserved)
+    points_of_all = Points.joined([candidates.points, points])
+    reserved = torch.arange(len(points_of_all)) >= len(candidates.points)
+    return replace(candidates, points=points_of_all, log_p=log_p, reserved=reserved)
 
 
 def input_probability(model: DynamicsModel, points: Points, states: Tensor | None) -> Tensor:
@@ -83,6 +83,6 @@ def under_random_actions(definition: EnvironmentDefinition, states: Tensor, rng:
     return Points(states, random_points(definition, len(states), rng)[1])
 
 
-def _visited(definition: EnvironmentDefinition, states: Tensor, count: int, rng: np.random.Generator) -> Points:
+def _visits(definition: EnvironmentDefinition, states: Tensor, count: int, rng: np.random.Generator) -> Points:
     rows = torch.from_numpy(rng.integers(len(states), size=count))
     return under_random_actions(definition, states[rows], rng)

@@ -63,11 +63,11 @@ def _unknown(model: DynamicsModel, samples: Samples, points: Points, tolerance: 
     It does if it is not known to the tolerance, or if it is predicted to be clearly above the reward of every sample.
     While no sample has a reward that a trainer can distinguish from 0, every point does.
     """
-    foretold = model.transition(points.q, points.u, reward_std=True)
-    assert foretold.reward_std is not None
+    prediction = model.transition(points.q, points.u, reward_std=True)
+    assert prediction.reward_std is not None
     low, best = float(samples.reward.min()), float(samples.reward.max())
-    unmet = foretold.reward - best > UNMET * (foretold.reward - low)
-    return (foretold.reward_std > tolerance) | unmet | (best - low < _least(samples))
+    unmet = prediction.reward - best > UNMET * (prediction.reward - low)
+    return (prediction.reward_std > tolerance) | unmet | (best - low < _least(samples))
 
 
 def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Points, rng: np.random.Generator) -> Points:
@@ -81,13 +81,13 @@ def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Point
     at, value, size = torch.cat([points.q, points.u], -1)[best], value[best], points.q.shape[1]
     for climb in range(CLIMBS):
         steps = torch.from_numpy(rng.standard_normal((len(at), TRIES, at.shape[1])))
-        tried = at[:, None] + WIDEST * SHRINK**climb * (high - low) * steps
-        tried = _in_space(definition, tried.clamp(low, high).flatten(0, 1))
-        values = able.promise(tried[:, :size], tried[:, size:])
-        values = torch.where(_over(definition, tried[:, :size]), -torch.inf, values).reshape(len(at), TRIES)
+        trials = at[:, None] + WIDEST * SHRINK**climb * (high - low) * steps
+        trials = _in_space(definition, trials.clamp(low, high).flatten(0, 1))
+        values = able.promise(trials[:, :size], trials[:, size:])
+        values = torch.where(_over(definition, trials[:, :size]), -torch.inf, values).reshape(len(at), TRIES)
         new_value, place = values.max(1)
         better = new_value > value
-        neighbours = tried.reshape(len(at), TRIES, -1)[torch.arange(len(at)), place]
+        neighbours = trials.reshape(len(at), TRIES, -1)[torch.arange(len(at)), place]
         at, value = torch.where(better[:, None], neighbours, at), torch.where(better, new_value, value)
     at = at[value.argsort(descending=True)]
     return Points(at[:, :size], at[:, size:])

@@ -80,8 +80,8 @@ def predicted(model: DynamicsModel, samples: Samples) -> Predictions:
     assert transition.reward_std is not None
     mean = torch.cat([model.means(samples.q, samples.u)[:, :-1], transition.reward[:, None]], -1)
     error = torch.cat([increments(model.definition, samples), samples.reward[:, None]], -1) - mean
-    rewarded = torch.hypot(transition.reward_std, _reward_std_by_state(model, samples))
-    std = torch.hypot(torch.cat([transition.std, rewarded[:, None]], -1), _noise(model, error))
+    reward_std = torch.hypot(transition.reward_std, _reward_std_by_state(model, samples))
+    std = torch.hypot(torch.cat([transition.std, reward_std[:, None]], -1), _noise(model, error))
     usable = error.isfinite() & std.isfinite()
     if not model.definition.moves_observation:
         usable[:, :-1] &= ~saturated(model.definition, samples.q_next)[:, None]

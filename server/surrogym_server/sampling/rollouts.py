@@ -118,8 +118,8 @@ def best_rollout(
     actions, _, value = _search(definition, worth, longest, starts, POPULATION, rng)
     if snapshots:
         origins = torch.tensor(list(snapshots.values()), dtype=torch.float64)[:, None]
-        others, place, known = _search(definition, worth, longest, origins, POPULATION * STARTS, rng)
-        if known > value:
+        others, place, value_from_snapshot = _search(definition, worth, longest, origins, POPULATION * STARTS, rng)
+        if value_from_snapshot > value:
             return Query.rollout(others.tolist(), list(snapshots)[place])
     return Query.rollout(actions.tolist())
 

@@ -52,8 +52,8 @@ class DesignState:
     def to_json(self) -> dict[str, Any]:
         warm = {key: array.tolist() for key, array in self.warm.items()}
         usual, ranges = list(self.defaults.values), list(self.defaults.ranges)
-        ended = [] if self.ended_under is None else self.ended_under.to_list()
-        fields = {"round": self.round, "usual": usual, "ranges": ranges, "warm": warm, "ended_with": ended}
+        conditions = [] if self.ended_under is None else self.ended_under.to_list()
+        fields = {"round": self.round, "usual": usual, "ranges": ranges, "warm": warm, "ended_with": conditions}
         fields["ended_as"] = self.ended_as
         return fields | {"predictions": pairs_of(self.predictions), "tested_at": self.tested_at}
 
@@ -61,12 +61,12 @@ class DesignState:
     def from_json(cls, state: dict[str, Any]) -> DesignState:
         warm = {key: np.array(array) for key, array in state.get("warm", {}).items()}
         defaults = DefaultTolerances(tuple(state.get("usual", ())), tuple(state.get("ranges", ())))
-        ended = state.get("ended_with")
+        conditions = state.get("ended_with")
         return cls(
             round=state.get("round", 0),
             defaults=defaults,
             warm=warm,
-            ended_under=Conditions.from_list(ended) if ended else None,
+            ended_under=Conditions.from_list(conditions) if conditions else None,
             ended_as=state.get("ended_as", ""),
             predictions=from_pairs(state.get("predictions", [])),
             tested_at=state.get("tested_at", 0),

@@ -25,7 +25,7 @@ class Alive(Generic[T]):
         self._forget_at = FORGET_AT
         self._lock = threading.Lock()
 
-    def note(self, surrogate: str, name: str, said: T) -> bool:
+    def note(self, surrogate: str, name: str, status: T) -> bool:
         """Note a call. Returns whether the caller is new, or was silent for so long that it counted as gone. A new
         caller is not noted while ``MOST_NAMES`` others of the surrogate are active."""
         now = self._clock()
@@ -35,9 +35,9 @@ class Alive(Generic[T]):
                 names = self._heard[surrogate] = self._active(names, now)
                 if len(names) >= MOST_NAMES:
                     return False
-            before, _ = names.get(name, (-ALIVE_SECONDS, said))
+            before, _ = names.get(name, (-ALIVE_SECONDS, status))
             new = name not in names
-            names[name] = (now, said)
+            names[name] = (now, status)
             if new:
                 self._forget_silent(now)
         return now - before >= ALIVE_SECONDS

@@ -33,23 +33,23 @@ class Definitions:
     def __init__(self, storage: Storage, define: Define) -> None:
         self._storage = storage
         self._define = define
-        self._made: dict[str, tuple[int, EnvironmentDefinition]] = {}
+        self._cache: dict[str, tuple[int, EnvironmentDefinition]] = {}
         self._lock = Lock()
 
     def get(self, name: str) -> EnvironmentDefinition:
         """The definition of a surrogate. Raises ``UnknownSurrogate``."""
-        known = self._made.get(name)
-        if known is not None and known[0] == self._storage.surrogates.standing(name).id:
-            return known[1]
+        entry = self._cache.get(name)
+        if entry is not None and entry[0] == self._storage.surrogates.standing(name).id:
+            return entry[1]
         return self.of(self._storage.surrogates.get(name))
 
     def of(self, record: SurrogateRecord) -> EnvironmentDefinition:
         """The definition of a surrogate whose record was read."""
         with self._lock:
-            id, definition = self._made.get(record.name, (None, None))
+            id, definition = self._cache.get(record.name, (None, None))
             if definition is None or id != record.id:
                 definition = self._define(record.spec)
-                self._made[record.name] = (record.id, definition)
+                self._cache[record.name] = (record.id, definition)
             return definition
 
     def for_model(self, name: str) -> EnvironmentDefinition:
@@ -71,15 +71,15 @@ class Definitions:
 
         Surrogates whose specification can't be read are left out.
         """
-        found = []
+        sentences = []
         for summary in self._storage.surrogates.summaries():
             try:
                 self.for_design(summary.name)
             except NotInstalled as error:
-                found.append(str(error))
+                sentences.append(str(error))
             except SurrogymError:  # deleted meanwhile, or damaged, which its readers are told
                 continue
-        return found
+        return sentences
 
 
 def _require(name: str, lack: str | None) -> None:

@@ -82,8 +82,8 @@ class EventService:
 
     async def _page(self, name: str, after: int, version: int) -> Page:
         """The events after one. Streams that ask for the same at the same version share the answer."""
-        known, task = self._shared.get(name, (None, None))
-        if task is None or known != (after, version):
+        position, task = self._shared.get(name, (None, None))
+        if task is None or position != (after, version):
             task = asyncio.create_task(self._read(lambda: Page(tuple(self._storage.events.list(name, after, PAGE)))))
             self._shared[name] = (after, version), task
         try:

@@ -56,9 +56,9 @@ class QueryService:
             return Claim(queries, standing.phase, standing.paused)
 
         self._samplers.heard(name, sampler)
-        claimed = await self._lines.claim(name, None, claim, wait_seconds, present)
+        leases = await self._lines.claim(name, None, claim, wait_seconds, present)
         self._samplers.heard(name, sampler)
-        return claimed
+        return leases
 
     def renew(self, name: str, query_id: int, token: str, lease_seconds: float) -> None:
         """Renew a lease. Raises ``UnknownQuery``, ``ForeignLease`` or ``LeaseExpired``."""

@@ -126,9 +126,9 @@ class SampleService:
     def drop_snapshots(self, name: str, snapshots: Sequence[str]) -> int:
         """Forget snapshots that no sampler holds any more, and return how many were known. Queries that begin there
         are chosen anew."""
-        dropped = self._storage.snapshots.drop(name, snapshots)
+        count = self._storage.snapshots.drop(name, snapshots)
         self._notices.post(name)
-        return dropped
+        return count
 
     def all(self, name: str) -> list[SampleRecord]:
         """All samples, in order of arrival."""
@@ -185,6 +185,6 @@ def _checked(definition: EnvironmentDefinition, index: int, sample: NewSample) -
 
 
 def _check_observation(definition: EnvironmentDefinition, where: str, observation: tuple[float, ...] | None) -> None:
-    expected = len(definition.observation_names)
-    if observation is not None and len(observation) != expected:
-        raise InvalidInput(f"{where}: expected {expected} entries, got {len(observation)}")
+    size = len(definition.observation_names)
+    if observation is not None and len(observation) != size:
+        raise InvalidInput(f"{where}: expected {size} entries, got {len(observation)}")

@@ -41,7 +41,7 @@ class SessionService:
 
     async def open(self, surrogate: str, opening: Opening) -> SessionInfo:
         """Open a session; raises ``UnknownSurrogate``, and as ``SessionEngine.open``."""
-        return await self._engine.open(await asyncio.to_thread(self._asked, surrogate, opening))
+        return await self._engine.open(await asyncio.to_thread(self._request, surrogate, opening))
 
     async def get(self, id: str) -> SessionInfo:
         """Return a session's present state.
@@ -73,10 +73,10 @@ class SessionService:
             NotReset: nothing was visited yet.
             UnknownSurrogate: it was deleted by another server.
         """
-        visited = await self._engine.submit(id)
-        name = await asyncio.to_thread(self._storage.surrogates.name_of, visited.surrogate_id)
-        await asyncio.to_thread(self._storage.occupancy.put, name, checkpoint, visited.states)
-        return len(visited.states), visited.confidence_index
+        visits = await self._engine.submit(id)
+        name = await asyncio.to_thread(self._storage.surrogates.name_of, visits.surrogate_id)
+        await asyncio.to_thread(self._storage.occupancy.put, name, checkpoint, visits.states)
+        return len(visits.states), visits.confidence_index
 
     async def activity(self, surrogate: str) -> list[SessionActivity]:
         """Return the activity of a surrogate's open sessions, oldest first. Raises ``UnknownSurrogate``."""
@@ -85,9 +85,9 @@ class SessionService:
 
     async def save(self) -> int:
         """Hand all live sessions to storage; returns how many."""
-        saved = [SavedSession(one.id, one.surrogate, one.data) for one in await self._engine.save()]
-        self._storage.sessions.save(saved)
-        return len(saved)
+        sessions = [SavedSession(one.id, one.surrogate, one.data) for one in await self._engine.save()]
+        self._storage.sessions.save(sessions)
+        return len(sessions)
 
     async def restore(self) -> int:
         """Take the saved sessions back; returns how many. The log names each that can't be, and why."""
@@ -98,32 +98,32 @@ class SessionService:
             return 0
         return sum([await self._restored(saved) for saved in saved_sessions])
 
-    async def _restored(self, saved: SavedSession) -> bool:
+    async def _restored(self, session: SavedSession) -> bool:
         try:
-            record = self._storage.surrogates.get(saved.surrogate)
-            data = Saved(saved.id, saved.surrogate, saved.data)
+            record = self._storage.surrogates.get(session.surrogate)
+            data = Saved(session.id, session.surrogate, session.data)
             await self._engine.restore(Restore(data, record.id, self._definitions.of(record)))
         except SurrogymError as error:
-            logger.warning("the saved session %s is lost: %s", saved.id, error)
+            logger.warning("the saved session %s is lost: %s", session.id, error)
             return False
         return True
 
-    def _asked(self, surrogate: str, opening: Opening) -> Open:
+    def _request(self, surrogate: str, opening: Opening) -> Open:
         record = self._storage.surrogates.get(surrogate)
         definition = self._definitions.of(record)
-        rewards, visited = self._rewards(surrogate, definition), self._visited(surrogate, opening)
-        return Open(surrogate, record.id, definition, opening, rewards, visited)
+        rewards, starts = self._rewards(surrogate, definition), self._starts(surrogate, opening)
+        return Open(surrogate, record.id, definition, opening, rewards, starts)
 
-    def _visited(self, surrogate: str, opening: Opening) -> Array | None:
+    def _starts(self, surrogate: str, opening: Opening) -> Array | None:
         """States of the surrogate's real steps, evenly spaced if there are more than ``MOST_STARTS``; None if the
         session starts no episode there."""
         if opening.settings.start_visited == 0:
             return None
         states = self._storage.samples.arrays(surrogate).coordinates
         rows = np.linspace(0, len(states) - 1, min(len(states), MOST_STARTS)).astype(int)
-        chosen: Array = states[rows]
-        return chosen
+        starts: Array = states[rows]
+        return starts
 
     def _rewards(self, surrogate: str, definition: EnvironmentDefinition) -> SampledRewards | None:
-        seen = self._storage.samples.reward_range(surrogate) if limits_rewards(definition) else None
-        return None if seen is None else SampledRewards(*seen, self._storage.samples.count(surrogate))
+        limits = self._storage.samples.reward_range(surrogate) if limits_rewards(definition) else None
+        return None if limits is None else SampledRewards(*limits, self._storage.samples.count(surrogate))

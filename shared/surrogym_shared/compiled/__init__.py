@@ -16,5 +16,5 @@ SWITCH = "SURROGYM_COMPILED"  # environment variable: 0 turns compiled code off
 @cache
 def available() -> bool:
     """Whether this process can compile code. This does not import numba."""
-    wanted = os.environ.get(SWITCH, "1") != "0" and os.environ.get("NUMBA_DISABLE_JIT", "0") == "0"
-    return wanted and find_spec("numba") is not None
+    enabled = os.environ.get(SWITCH, "1") != "0" and os.environ.get("NUMBA_DISABLE_JIT", "0") == "0"
+    return enabled and find_spec("numba") is not None

@@ -12,7 +12,7 @@ from numba import njit
 from numba.core import config
 from numba.core.errors import NumbaError
 
-from surrogym_shared.compiled import kept
+from surrogym_shared.compiled import disk_cache
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -44,7 +44,7 @@ def entry(*arguments: Any) -> Callable[[F], F]:
 
     def compile_or_load(function: F) -> F:
         chosen: dict[str, Any] = {"fastmath": {"contract"}, **OPTIONS}
-        folder = kept.folder(function.__module__.partition(".")[0])
+        folder = disk_cache.folder(function.__module__.partition(".")[0])
         if folder is not None:
             try:
                 with _kept_in(folder):

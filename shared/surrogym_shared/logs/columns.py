@@ -163,7 +163,7 @@ def roles_by_name(names: Sequence[str]) -> Roles:
         UnusableLog: states or actions have no column, too many, or two for one name, or another role has two.
     """
     headings = [heading(name) for name in names]
-    single: dict[str, Any] = {role: _only(role, headings, known) for role, known in SINGLE.items()}
+    single: dict[str, Any] = {role: _only(role, headings, names_of_role) for role, names_of_role in SINGLE.items()}
     left = [one for one in headings if one.column not in single.values()]
     action = _single("action", [(_part(match) or "0", one.column) for one in left if (match := ACTION.match(one.name))])
     left = [one for one in left if one.column not in action.values()]
@@ -174,14 +174,14 @@ def roles_by_name(names: Sequence[str]) -> Roles:
     often = Counter(one.name for one in plain)
     state = marked or {one.name if often[one.name] == 1 else one.column: one.column for one in plain}
     _require(names, state, action)
-    used = {*state.values(), *action.values(), *following.values(), *single.values()}
-    ignored = tuple(name for name in names if name not in used)
-    return _checked(Roles(state, action, following, **single, ignored=ignored, units=_units(names, used)))
+    columns = {*state.values(), *action.values(), *following.values(), *single.values()}
+    ignored = tuple(name for name in names if name not in columns)
+    return _checked(Roles(state, action, following, **single, ignored=ignored, units=_units(names, columns)))
 
 
-def _units(names: Iterable[str], used: Iterable[str | None]) -> dict[str, str]:
+def _units(names: Iterable[str], columns: Iterable[str | None]) -> dict[str, str]:
     """Return the unit of each used column whose heading has one."""
-    headings = {name: _as_time(heading(name)) or heading(name) for name in names if name in set(used)}
+    headings = {name: _as_time(heading(name)) or heading(name) for name in names if name in set(columns)}
     return {name: one.unit for name, one in headings.items() if one.unit}
 
 
@@ -189,8 +189,8 @@ def _as_time(one: Heading) -> Heading | None:
     """Return the heading of a column of times with its unit; None if it is no such column."""
     for quantity in (one, timed(one)):
         short = len(quantity.plain) == 1
-        known = SHORT_TIMES if short and quantity is not one else TIMES
-        if quantity.plain in SINGLE["time"] and (not quantity.unit or not short or quantity.unit in known):
+        units = SHORT_TIMES if short and quantity is not one else TIMES
+        if quantity.plain in SINGLE["time"] and (not quantity.unit or not short or quantity.unit in units):
             return quantity
     return None
 
@@ -315,14 +315,14 @@ def _require_one_role(mapped: LogMapping, where: str) -> None:
 def _require_declared(mapped: LogMapping, state: Iterable[str], action: Iterable[str], where: str) -> None:
     """Raise ``UnusableLog`` if limits, angles or constants of a mapping name nothing, or contradict each other."""
     states, actions = list(state), list(action)
-    for key, entries, known in (
+    for key, entries, choices in (
         ("limits", mapped.limits, [*states, *actions]),
         ("angles", mapped.angles or (), states),
         ("constants", mapped.constants, states),
     ):
-        if unknown := sorted(set(entries) - set(known)):
+        if unknown := sorted(set(entries) - set(choices)):
             what = "one of" if key == "limits" else "one of the states"
-            raise UnusableLog(f"{where} names {unknown[0]!r} in {key}: expected {what} {known}")
+            raise UnusableLog(f"{where} names {unknown[0]!r} in {key}: expected {what} {choices}")
     if both := sorted(set(mapped.angles or ()) & set(mapped.constants)):
         raise UnusableLog(f"{where}: expected {both[0]!r} in angles or in constants, got it in both")
     if both := sorted(set(mapped.limits) & set(states) & set(actions)):
@@ -406,7 +406,7 @@ def _require(names: Iterable[str], state: Mapping[str, str], action: Mapping[str
             )
 
 
-def _only(role: str, headings: Iterable[Heading], known: Sequence[str]) -> str | None:
+def _only(role: str, headings: Iterable[Heading], names: Sequence[str]) -> str | None:
     """Return the column with a known name of a role; None without one. Raises ``UnusableLog`` if there are several.
 
     Case only matters for single letters: t is a time, T a temperature. A letter with a physical unit is a quantity.
@@ -414,7 +414,7 @@ def _only(role: str, headings: Iterable[Heading], known: Sequence[str]) -> str |
     if role == "time":
         columns = [one.column for one in headings if _as_time(one) is not None]
     else:
-        columns = [one.column for one in headings if one.plain in known and not (len(one.plain) == 1 and one.unit)]
+        columns = [one.column for one in headings if one.plain in names and not (len(one.plain) == 1 and one.unit)]
     if len(columns) > 1:
         raise UnusableLog(
             f"expected one column for the role {role}, got {' and '.join(columns)}: rename one, or name the "

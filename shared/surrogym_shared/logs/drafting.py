@@ -274,7 +274,7 @@ def _action(roles: Roles, steps: Transitions, notes: list[str]) -> BoxAction | D
             )
         return _discrete(counts)
     if roles.discrete is None and not one_hot:
-        notes += _asked(names, codes, whole)
+        notes += _questions(names, codes, whole)
     return _amounts(roles, steps.u)
 
 
@@ -310,7 +310,7 @@ def _discrete(counts: list[int]) -> DiscreteAction | MultiDiscreteAction:
     return DiscreteAction(n=counts[0]) if len(counts) == 1 else MultiDiscreteAction(nvec=tuple(counts))
 
 
-def _asked(names: list[str], codes: list[Floats], whole: list[bool]) -> Iterator[str]:
+def _questions(names: list[str], codes: list[Floats], whole: list[bool]) -> Iterator[str]:
     """Remark on actions that are few whole numbers (``whole``) and are drafted as amounts, and ask whether they are
     choices."""
     values = ", ".join(

@@ -56,7 +56,7 @@ def heading(column: str) -> Heading:
     name, unit = column, ""
     if match is not None:
         name = match["name"]
-        unit = next(found for found in match.groups()[1:] if found is not None).strip()
+        unit = next(group for group in match.groups()[1:] if group is not None).strip()
     words = tuple(word if len(word) == 1 else word.lower() for word in WORDS.findall(name))
     return Heading(column, name, "" if unit in NO_UNIT else unit, words)
 

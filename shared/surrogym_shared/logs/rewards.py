@@ -15,11 +15,11 @@ def declared_reward(spec: EnvironmentSpec, q: Floats, u: Floats, q_next: Floats,
     if not isinstance(reward, DeclaredReward):
         raise TypeError(f"expected a declared reward, got a {reward.kind} one")
     read = q_next if reward.timing == "after" else q
-    paid = np.sum([_paid(spec, term, read, u) for term in reward.terms], axis=0)
-    return np.asarray(paid + reward.terminal * terminated, dtype=np.float64)
+    reward_sum = np.sum([_reward_of(spec, term, read, u) for term in reward.terms], axis=0)
+    return np.asarray(reward_sum + reward.terminal * terminated, dtype=np.float64)
 
 
-def _paid(spec: EnvironmentSpec, term: RewardTerm, q: Floats, u: Floats) -> Floats:
+def _reward_of(spec: EnvironmentSpec, term: RewardTerm, q: Floats, u: Floats) -> Floats:
     """Compute one term of the reward (n,): weight * shape(of) if every inequality of ``when`` holds, else 0."""
     of = [
         (0.0 if one.term is None else evaluate(spec, one.term, q)) + (u @ np.array(one.action) if one.action else 0.0)

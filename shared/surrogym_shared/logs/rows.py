@@ -109,10 +109,10 @@ def _matrix(
 
 def _numbered(column: str, cells: Floats, choices: tuple[float, ...]) -> tuple[Floats, dict[int, str]]:
     """Return the number of each cell's choice, (n,), and a reason for each cell that is none, by the row's index."""
-    known = np.array(choices)
-    same = cells[:, None] == known
+    values = np.array(choices)
+    same = cells[:, None] == values
     numbered = np.where(same.any(1), same.argmax(1), np.nan)
-    words = f"{column}: expected one of {known.tolist()}"
+    words = f"{column}: expected one of {values.tolist()}"
     return numbered, {int(row): f"{words}, got {cells[row]:g}" for row in np.flatnonzero(~same.any(1))}
 
 

@@ -149,17 +149,17 @@ def _heading(head: _Head, delimiter: str, where: str, remarks: list[str]) -> tup
             remarks.append(skipped)
         row = _cells(head.row, delimiter)
         if delimiter == BLANKS and len(cells) != len(row):
-            joined = _cells(UNIT_APART.sub("", head.line), delimiter)
-            cells = joined if len(joined) == len(row) else cells
+            cells_of_both = _cells(UNIT_APART.sub("", head.line), delimiter)
+            cells = cells_of_both if len(cells_of_both) == len(row) else cells
         return cells, head.before + 1, remarks
     if head.comments:
         line = head.comments[-1].strip('"').lstrip("#%/ ")
-        named = [name.strip() for name in _cells(line, delimiter)]
-        if delimiter == BLANKS and len(named) != len(cells):
-            named = _cells(UNIT_APART.sub("", line), delimiter)
-        if len(named) == len(cells) and not _is_row(named):
+        names = [name.strip() for name in _cells(line, delimiter)]
+        if delimiter == BLANKS and len(names) != len(cells):
+            names = _cells(UNIT_APART.sub("", line), delimiter)
+        if len(names) == len(cells) and not _is_row(names):
             remarks.append("the heading is the comment line before the first row")
-            return named, head.before, remarks
+            return names, head.before, remarks
     raise UnusableLog(
         f"expected a heading that names the columns in {where}, got a row of numbers ({', '.join(cells[:4])[:60]}) as "
         "its first line: write a heading above it, such as time,level,action_valve,reward"

@@ -53,23 +53,23 @@ def turn_of(steps: Transitions, index: int) -> Turn | None:
     count = int(jumps.sum())
     if not 0 < count <= MOST_JUMPS * len(change):
         return None
-    expected, deviation = _motion(steps, index, change, jumps, width)
-    deviation = max(deviation, FINEST * width)
-    across = np.abs(change - expected)[jumps]
+    forecast, std = _motion(steps, index, change, jumps, width)
+    std = max(std, FINEST * width)
+    across = np.abs(change - forecast)[jumps]
     size = float(np.median(across))
-    known = [turn for turn in KNOWN if abs(turn - size) <= max(NEAR * turn, CONTINUES * deviation / math.sqrt(count))]
+    turns = [turn for turn in KNOWN if abs(turn - size) <= max(NEAR * turn, CONTINUES * std / math.sqrt(count))]
     whole = bool((before == np.floor(before)).all() and (after == np.floor(after)).all())
-    known = [turn for turn in known if not (whole and turn in (1.0, FULL_TURN)) and _lies_in(low, high, turn)]
-    size = min(known, key=lambda turn: abs(turn - size), default=size)
+    turns = [turn for turn in turns if not (whole and turn in (1.0, FULL_TURN)) and _lies_in(low, high, turn)]
+    size = min(turns, key=lambda turn: abs(turn - size), default=size)
     if width < FILLED * size:
         return None
-    usual = max(float(np.quantile(np.abs(change[~jumps]), 0.95)), deviation)
-    for within in (CONTINUES * deviation, max(CONTINUES * deviation, ROUGHLY * usual)):
+    usual = max(float(np.quantile(np.abs(change[~jumps]), 0.95)), std)
+    for within in (CONTINUES * std, max(CONTINUES * std, ROUGHLY * usual)):
         if (np.abs(across - size) > within).mean() > OUTLIERS:
             continue
         chance = min(1.0, 2 * within / usual)
-        sure = chance ** (count if known else count - 1) < BY_CHANCE
-        if known or (sure and count > 1):
+        sure = chance ** (count if turns else count - 1) < BY_CHANCE
+        if turns or (sure and count > 1):
             return Turn(size, KNOWN.get(size, ""), sure)
     return None
 
@@ -98,6 +98,6 @@ def _motion(steps: Transitions, index: int, change: Floats, jumps: Bools, width:
     if slow.sum() < 3 * x.shape[1]:
         x = x[:, :1]
     weights = np.linalg.lstsq(x[slow], change[slow], rcond=None)[0]
-    expected = x @ weights
-    left = (change - expected)[slow]
-    return expected, float(math.sqrt((left**2).sum() / max(1, len(left) - x.shape[1])))
+    forecast = x @ weights
+    left = (change - forecast)[slow]
+    return forecast, float(math.sqrt((left**2).sum() / max(1, len(left) - x.shape[1])))

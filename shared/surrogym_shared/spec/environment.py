@@ -228,7 +228,7 @@ class EnvironmentSpec(Frozen):
 
     def _require_lags(self) -> None:
         """Check that each lag repeats something that is known, no older than an episode, and that there is a past."""
-        known: dict[str, Coordinate] = {}
+        earlier: dict[str, Coordinate] = {}
         age = dict.fromkeys(self.coordinate_names, 0)
         longest = min((limit for limit in (self.time_limit, self.max_rollout) if limit is not None), default=math.inf)
         for c in self.coordinates:
@@ -240,23 +240,23 @@ class EnvironmentSpec(Frozen):
                     "reset: expected query 'rollout', got 'step'",
                 )
                 if c.lag.kind == "steps":
-                    twice = any(k.counted for k in known.values())
+                    twice = any(k.counted for k in earlier.values())
                     require(not twice, f"{where}: expected one coordinate of kind 'steps', got two")
                 elif c.lag.entry is not None:
                     size = self.action.size
                     require(c.lag.entry < size, f"{where}: expected an entry below {size}, got {c.lag.entry}")
                 else:
                     sources = [
-                        n for n, k in known.items() if (k.moves if c.lag.kind == "change" else k.kind == "linear")
+                        n for n, k in earlier.items() if (k.moves if c.lag.kind == "change" else k.kind == "linear")
                     ]
-                    expected = "of an earlier coordinate; lags of an angle are of kind 'change'"
-                    require_known(f"{where} ({expected})", (c.lag.of or "",), sources)
+                    rule = "of an earlier coordinate; lags of an angle are of kind 'change'"
+                    require_known(f"{where} ({rule})", (c.lag.of or "",), sources)
                 age[c.name] = 1 + age[c.lag.of or c.name]
                 require(
                     age[c.name] < longest,
                     f"{where}: looks {age[c.name]} steps back: expected fewer than an episode's {longest}",
                 )
-            known[c.name] = c
+            earlier[c.name] = c
         for name, steps in (("budget", self.design.budget), ("initial", self.design.initial)):
             require(
                 not self.unknown_steps or not steps or steps > self.unknown_steps + 1,

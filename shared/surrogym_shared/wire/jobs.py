@@ -78,12 +78,12 @@ class EvaluateTask(Request):
     )
     reference: bool = Field(
         default=False,
-        exclude_if=lambda asked: not asked,  # older workers don't know it
+        exclude_if=lambda value: not value,  # older workers don't know it
         description="also run the same starts with the reference controller that the worker was started with",
     )
     video: bool = Field(
         default=False,
-        exclude_if=lambda asked: not asked,
+        exclude_if=lambda value: not value,
         description="draw the best, the median and the worst episode into a video of the policy",
     )
 

@@ -9,7 +9,7 @@ import pytest
 from surrogym_server.engine import compiling
 from surrogym_server.engine.compiling import Compiling
 from surrogym_shared import compiled
-from surrogym_shared.compiled import kept
+from surrogym_shared.compiled import disk_cache
 
 pytestmark = pytest.mark.skipif(not compiled.available(), reason="numba is not installed, or switched off")
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.skipif(not compiled.available(), reason="numba is not i
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder in the place of the user's."""
-    monkeypatch.setattr(kept, "folder", lambda _: tmp_path)
+    monkeypatch.setattr(disk_cache, "folder", lambda _: tmp_path)
     return tmp_path
 
 

@@ -37,8 +37,8 @@ def learn(training: Training, definition: EnvironmentDefinition, samples: Sample
 
 def _reward(training: Training, inputs: Inputs, samples: Samples) -> tuple[Regression | None, float]:
     """The reward of non-terminating steps, and the mean of what terminating steps pay in addition."""
-    if (known := inputs.definition.declared_reward) is not None:
-        return None, known.terminal
+    if (declared := inputs.definition.declared_reward) is not None:
+        return None, declared.terminal
     goes_on = enough(~samples.terminated)
     x = inputs.of_reward(samples.q, samples.u, samples.q_next)
     reward = _noiseless(training, x[goes_on], samples.reward[goes_on, None])

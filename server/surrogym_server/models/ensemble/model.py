@@ -126,23 +126,23 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         x = self._inputs.of_transition(q, u)
         changes = self.transitions(x)
         spread = between(changes).sqrt() if stds or noise is not None else q.new_zeros(len(q), 0)
-        change = _chosen(changes, member)
+        change = _of_member(changes, member)
         change = change if noise is None else change + spread * noise
         change = change if process is None else change + self.transitions.shaken(x, process)
         q_next = self._arrived(q, u, change)
         rewards = self._rewards(q, u, q_next)
         doubt = between(rewards).sqrt() if reward_std else q.new_zeros(len(q), 0)
-        return q_next, _chosen(rewards, member), spread, doubt
+        return q_next, _of_member(rewards, member), spread, doubt
 
     def _rewards(self, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
         """Rewards of every member, (K, m)."""
-        if (known := self.definition.declared_reward) is not None:
-            return known(q_next if known.after else q, u).expand(self.transitions.networks.members, -1)
+        if (declared := self.definition.declared_reward) is not None:
+            return declared(q_next if declared.after else q, u).expand(self.transitions.networks.members, -1)
         assert self.reward is not None
         return self.reward(self._inputs.of_reward(q, u, q_next))[..., 0]
 
 
-def _chosen(values: Tensor, member: Tensor | None) -> Tensor:
+def _of_member(values: Tensor, member: Tensor | None) -> Tensor:
     """The mean of members' values (K, m, ...), or the value of one member (m,) in each row."""
     if member is None:
         return values.mean(0)

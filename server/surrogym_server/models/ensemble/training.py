@@ -89,18 +89,20 @@ def train_with_noise(training: Training, x: Tensor, y: Tensor) -> tuple[Networks
     linear = basis(x, quadratic=False)
     skip = _ridge(linear, y - nonlinear(x, anchors)).requires_grad_()
     hidden = tuple(anchor.clone().requires_grad_() for anchor in anchors)
-    begun = x.new_full((training.members, 1, y.shape[1]), 2 * math.log(NOISE_BEGINS)).requires_grad_()
+    log_noise = x.new_full((training.members, 1, y.shape[1]), 2 * math.log(NOISE_BEGINS)).requires_grad_()
     noisy = tuple(weights.requires_grad_() for weights in (*drawn[:-1], torch.zeros_like(drawn[-1])))
 
     def objective() -> Tensor:
         rows = _batch(len(x), generator)
         mean = linear[rows] @ skip + nonlinear(x[rows], hidden)
-        log_variance = bounded(begun + nonlinear(x[rows], noisy))
+        log_variance = bounded(log_noise + nonlinear(x[rows], noisy))
         pull = [((w - a).square() / v).sum() for w, a, v in zip(hidden, anchors, variances, strict=True)]
         return _unlikely(mean, log_variance, y[rows], training.beta) + NOISE**2 / len(x) * torch.stack(pull).sum()
 
-    _descend((skip, *hidden, begun, *noisy), objective, training.steps)
-    constant = torch.cat([begun, begun.new_zeros(len(begun), x.shape[1], y.shape[1])], 1)  # it reads x by units alone
+    _descend((skip, *hidden, log_noise, *noisy), objective, training.steps)
+    constant = torch.cat(
+        [log_noise, log_noise.new_zeros(len(log_noise), x.shape[1], y.shape[1])], 1
+    )  # it reads x by units alone
     return Networks(*map(in_rows, (skip, *hidden))), Networks(*map(in_rows, (constant, *noisy)))
 
 
@@ -135,8 +137,8 @@ def _priors(
     h, k = training.units, training.members
     shapes = ((k, d, h), (k, 1, h), (k, h, h), (k, 1, h), (k, h, p))
     variances = (1 / d, 1.0, 1 / h, 1.0, 1 / h)
-    drawn = (torch.randn(shape, generator=generator, dtype=torch.float64) for shape in shapes)
-    return tuple(math.sqrt(v) * weights for weights, v in zip(drawn, variances, strict=True)), variances
+    numbers = (torch.randn(shape, generator=generator, dtype=torch.float64) for shape in shapes)
+    return tuple(math.sqrt(v) * weights for weights, v in zip(numbers, variances, strict=True)), variances
 
 
 def _ridge(b: Tensor, target: Tensor) -> Tensor:

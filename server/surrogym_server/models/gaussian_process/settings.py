@@ -37,9 +37,9 @@ class Settings:
     inducing: int = 0
 
     def __post_init__(self) -> None:
-        for name, known in CHOICES.items():
-            if (value := getattr(self, name)) not in known:
-                raise ValueError(f"expected {name} to be one of {', '.join(known)}, got {value!r}")
+        for name, choices in CHOICES.items():
+            if (value := getattr(self, name)) not in choices:
+                raise ValueError(f"expected {name} to be one of {', '.join(choices)}, got {value!r}")
         for name in ("reward_jumps", "reward_peaks", "rates", "drop_inputs", "repeated_parts"):
             if not isinstance(value := getattr(self, name), bool):
                 raise ValueError(f"expected {name} to be true or false, got {value!r}")

@@ -15,5 +15,5 @@ def take_excursion(round: Round) -> tuple[Query, ...] | None:
         return None
     if not round.room:
         return ()
-    visited = torch.cat([round.samples.q, round.samples.q_next])
-    return (excursion(round.model, visited, round.request.snapshots, round.room, round.generator()),)
+    states = torch.cat([round.samples.q, round.samples.q_next])
+    return (excursion(round.model, states, round.request.snapshots, round.room, round.generator()),)

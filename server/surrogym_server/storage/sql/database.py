@@ -257,16 +257,16 @@ def connect(url: str, synchronous: Synchronous = "full") -> Database:
         Unavailable: another server holds the SQLite file, or a log lies beside it that isn't its own.
     """
     try:
-        parsed = sa.make_url(url)
+        location = sa.make_url(url)
     except sa.exc.ArgumentError:
         raise InvalidInput(f"expected a database address such as sqlite:///surrogym.db, got {url!r}") from None
-    match parsed.get_backend_name():
-        case "sqlite" if parsed.database and parsed.database != ":memory:":
-            return _sqlite(Path(parsed.database), synchronous)
+    match location.get_backend_name():
+        case "sqlite" if location.database and location.database != ":memory:":
+            return _sqlite(Path(location.database), synchronous)
         case "postgresql":
-            return _postgresql(parsed)
+            return _postgresql(location)
         case _:
-            address = parsed.render_as_string()
+            address = location.render_as_string()
             raise InvalidInput(f"expected sqlite:///path or postgresql://user@host/name, got {address}")
 
 

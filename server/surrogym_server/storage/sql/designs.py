@@ -20,7 +20,7 @@ from surrogym_server.storage.records import (
     SurrogateRecord,
     fingerprint,
 )
-from surrogym_server.storage.sql import surrogates as stored
+from surrogym_server.storage.sql import surrogates as surrogate_rows
 from surrogym_server.storage.sql.database import NOW, Database, constant
 from surrogym_server.storage.sql.models import insert_model
 from surrogym_server.storage.sql.queries import IS_INCOMPLETE, begin_initial, queue_initial
@@ -95,16 +95,16 @@ class SqlDesigns(port.Designs):
             surrogate = hold(connection, name)
             raised = recall(connection, surrogate, "ask", key, body)
             if raised is None:
-                before = stored.read(connection, name)
+                before = surrogate_rows.read(connection, name)
                 raised = _to_raise(connection, before, queries, allowed=raise_budget)
                 extra, budget = before.extra_queries + queries, before.budget + raised
                 touch(connection, surrogate, extra_queries=extra, budget=budget, checkpoint=checkpoint)
                 remember(connection, surrogate, "ask", key, body, raised)
-            return Granted(stored.read(connection, name), raised)
+            return Granted(surrogate_rows.read(connection, name), raised)
 
     def left(self, name: str) -> int:
         with self._database.read() as connection:
-            return max(0, _unspoken(connection, stored.read(connection, name)))
+            return max(0, _unspoken(connection, surrogate_rows.read(connection, name)))
 
     def due(self) -> list[str]:
         with self._database.read() as connection:
@@ -139,7 +139,7 @@ class SqlDesigns(port.Designs):
                 return None
             lease = FitLease(name, secrets.token_urlsafe(16), *row, expires=surrogate.now + seconds)
             _update(connection, surrogate, fit_token=lease.token, fit_owner=owner, **_lasting(lease.expires, seconds))
-            stored.update_phase(connection, surrogate, "fitting", None)
+            surrogate_rows.update_phase(connection, surrogate, "fitting", None)
             return lease
 
     def renew(self, lease: FitLease, seconds: float) -> FitLease:
@@ -166,7 +166,7 @@ class SqlDesigns(port.Designs):
                 return
             changes = {} if error is None else {"fitted_revision": lease.revision}
             _update(connection, surrogate, **NO_RIGHT, **changes)
-            stored.update_phase(connection, surrogate, _phase_after(surrogate, error), error)
+            surrogate_rows.update_phase(connection, surrogate, _phase_after(surrogate, error), error)
 
 
 def _lasting(expires: float, seconds: float) -> dict[str, float]:
@@ -175,7 +175,7 @@ def _lasting(expires: float, seconds: float) -> dict[str, float]:
 
 def _unspoken(connection: Connection, record: SurrogateRecord) -> int:
     """Real steps that the budget has left; negative if it was lowered, or if people reported more samples."""
-    return record.budget - stored.spoken_for(connection, record.id) - record.extra_queries
+    return record.budget - surrogate_rows.spoken_for(connection, record.id) - record.extra_queries
 
 
 def _to_raise(connection: Connection, record: SurrogateRecord, queries: int, *, allowed: bool) -> int:
@@ -218,4 +218,4 @@ def _finish(connection: Connection, surrogate: Row[Any], lease: FitLease, design
 
 
 def _phase_after(surrogate: Row[Any], error: str | None) -> Phase:
-    return "failed" if error is not None else stored.resting_phase(surrogate.round)
+    return "failed" if error is not None else surrogate_rows.resting_phase(surrogate.round)

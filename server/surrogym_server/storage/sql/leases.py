@@ -236,19 +236,19 @@ def read_answered(connection: Connection, surrogate: Row[Any], batch: Sequence[N
     query_ids = {sample.query_id for sample in batch if sample.query_id is not None}
     by_id = _lock_queries(connection, surrogate, query_ids)
     by_token = _leases(connection, surrogate, by_id)
-    answered = [_lease_of(sample, by_id, by_token) for sample in batch]
+    answers = [_lease_of(sample, by_id, by_token) for sample in batch]
     steps: dict[int, set[int]] = defaultdict(set)
-    for sample, lease in zip(batch, answered, strict=True):
+    for sample, lease in zip(batch, answers, strict=True):
         if lease is not None:
             steps[lease.lease_id].add(sample.step)
-    for lease in {lease.lease_id: lease for lease in answered if lease}.values():
+    for lease in {lease.lease_id: lease for lease in answers if lease}.values():
         _check_steps(lease, steps[lease.lease_id])
-    return answered
+    return answers
 
 
-def settle(connection: Connection, answered: Iterable[Answered]) -> None:
+def settle(connection: Connection, answers: Iterable[Answered]) -> None:
     """Mark leases as answered, and their queries too, except a query of which another lease is live."""
-    leases_done = {one.lease_id: one for one in answered}
+    leases_done = {one.lease_id: one for one in answers}
     if not leases_done:
         return
     set_outcome(connection, list(leases_done), "answered")

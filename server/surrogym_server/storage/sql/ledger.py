@@ -49,16 +49,16 @@ class CountedSamples:
     """
 
     def __init__(self) -> None:
-        self._known: dict[int, SampleCounts] = {}
+        self._counts: dict[int, SampleCounts] = {}
 
     def of(self, connection: Connection, surrogate_id: int) -> SampleCounts:
-        earlier = self._known.get(surrogate_id, NONE)
+        earlier = self._counts.get(surrogate_id, NONE)
         since = connection.execute(SINCE, {"owner": surrogate_id, "newest": earlier.newest})
         return self._add(surrogate_id, earlier, since)
 
     def of_many(self, connection: Connection, newest: Mapping[int, int | None]) -> dict[int, SampleCounts]:
         """Count the samples of surrogates by a few statements, given the id of the newest sample of each."""
-        earlier = {id: self._known.get(id, NONE) for id in newest}
+        earlier = {id: self._counts.get(id, NONE) for id in newest}
         stale = [id for id, last in newest.items() if earlier[id].newest < (last or 0)]
         for first in range(0, len(stale), COUNTED_AT_ONCE):
             some = {id: earlier[id] for id in stale[first : first + COUNTED_AT_ONCE]}
@@ -80,9 +80,9 @@ class CountedSamples:
                 raise damaged(f"expected one of {list(COUNTED)} in samples.purpose, got {purpose!r}")
             by_purpose[purpose] = by_purpose.get(purpose, 0) + int(count)
             newest = max(newest, int(last))
-        if len(self._known) > MOST_KEPT:
-            self._known = {}
-        counts = self._known[surrogate_id] = SampleCounts(newest, by_purpose)
+        if len(self._counts) > MOST_KEPT:
+            self._counts = {}
+        counts = self._counts[surrogate_id] = SampleCounts(newest, by_purpose)
         return counts
 
 

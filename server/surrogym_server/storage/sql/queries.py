@@ -107,7 +107,7 @@ class SqlQueries(port.Queries):
                 .returning(leases.c.expires)
             ).scalar()
             if renewed is None:
-                raise _ended(query_id)
+                raise _lease_expired(query_id)
             return float(renewed)
 
     def fail(
@@ -124,7 +124,7 @@ class SqlQueries(port.Queries):
                 give_up_lost(connection, surrogate, given_back)
                 return given_back
             elif lease.outcome != outcome:
-                raise _ended(query_id)
+                raise _lease_expired(query_id)
             return _read(connection, surrogate.id, query_id)
 
     def withdraw(self, name: str, query_ids: Sequence[int]) -> int:
@@ -199,7 +199,7 @@ def query_counts(connection: Connection, span: Span) -> dict[int, QueryCounts]:
     return {surrogate: QueryCounts(**counts) for surrogate, counts in of_surrogates.items()}
 
 
-def _ended(query_id: int) -> LeaseExpired:
+def _lease_expired(query_id: int) -> LeaseExpired:
     return LeaseExpired(f"the lease of query {query_id} has ended: claim a query again")
 
 
@@ -277,12 +277,12 @@ def _give_up_queries(connection: Connection, surrogate: Row[Any], names: Sequenc
     removed = connection.execute(sa.delete(queries).where(unbegun).returning(queries.c.steps, queries.c.extra)).all()
     waiting = (queries.c.surrogate_id == surrogate.id) & (queries.c.status == "pending") & from_there
     aside = sa.update(queries).where(waiting).values(status="set_aside", error=GONE).returning(queries.c.id)
-    begun = sorted(connection.execute(aside).scalars())
+    leases_begun = sorted(connection.execute(aside).scalars())
     if removed:
         append_event(connection, surrogate, "queries", withdrawn=len(removed), round=surrogate.round)
-    for query_id in begun:
+    for query_id in leases_begun:
         append_event(connection, surrogate, "set_aside", query_id=query_id, error=GONE)
-    if removed or begun:
+    if removed or leases_begun:
         again = sum(row.steps for row in removed if row.extra)
         touch(connection, surrogate, extra_queries=surrogates.c.extra_queries + again)
 

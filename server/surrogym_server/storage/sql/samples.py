@@ -77,8 +77,8 @@ class SqlSamples(port.Samples):
             before: list[int] | None = recall(connection, surrogate, "add_samples", key, body)
             if before is not None:
                 return AddedSamples(tuple(before), len(before))
-            answered = read_answered(connection, surrogate, samples)
-            added = _store(connection, surrogate, sampler, samples, answered)
+            answers = read_answered(connection, surrogate, samples)
+            added = _store(connection, surrogate, sampler, samples, answers)
             remember(connection, surrogate, "add_samples", key, body, added.ids)
             return added
 
@@ -127,17 +127,17 @@ def _store(
     surrogate: Row[Any],
     sampler: str,
     batch: Sequence[NewSample],
-    answered: Sequence[Answered | None],
+    answers: Sequence[Answered | None],
 ) -> AddedSamples:
     """Insert the new samples of the batch. A step reported under one lease is one sample."""
-    identities = [_identity(place, *pair) for place, pair in enumerate(zip(batch, answered, strict=True))]
-    leases = [lease for lease in answered if lease]
+    identities = [_identity(place, *pair) for place, pair in enumerate(zip(batch, answers, strict=True))]
+    leases = [lease for lease in answers if lease]
     reported = {(lease.lease_id, step): sample for lease in leases for step, sample in lease.reported.items()}
     ids: dict[Identity, int] = {identity: sample.sample_id for identity, sample in reported.items()}
     prints: dict[Identity, str] = {identity: sample.fingerprint for identity, sample in reported.items()}
     new: dict[Identity, dict[str, Any]] = {}
     new_snapshots: dict[str, Vector] = {}
-    for identity, sample, lease in zip(identities, batch, answered, strict=True):
+    for identity, sample, lease in zip(identities, batch, answers, strict=True):
         row = row_of(surrogate, sampler, sample, lease)
         if prints.setdefault(identity, row["fingerprint"]) != row["fingerprint"]:
             raise IdempotencyConflict(

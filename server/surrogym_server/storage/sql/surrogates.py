@@ -233,12 +233,12 @@ def spoken_for(connection: Connection, surrogate_id: int) -> int:
     Queries that were set aside count, because steps may have been taken; refused ones don't.
     """
     sampled = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id, samples.c.purpose.not_in(FREE))
-    awaited = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0)).where(
+    steps = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0)).where(
         queries.c.surrogate_id == surrogate_id,
         queries.c.status.not_in(("answered", "refused")),
         queries.c.purpose.not_in(FREE),
     )
-    return int(connection.execute(sa.select(sampled.scalar_subquery() + awaited.scalar_subquery())).scalar_one())
+    return int(connection.execute(sa.select(sampled.scalar_subquery() + steps.scalar_subquery())).scalar_one())
 
 
 def _apply(connection: Connection, surrogate: Row[Any], changes: dict[str, Any]) -> None:
@@ -299,22 +299,22 @@ class Counted:
 
     def __init__(self, samples: CountedSamples) -> None:
         self._samples = samples
-        self._answered: dict[int, tuple[int | None, int]] = {}  # by surrogate: its newest sample's id, and the number
+        self._answers: dict[int, tuple[int | None, int]] = {}  # by surrogate: its newest sample's id, and the number
 
     def read(self, connection: Connection, newest: Mapping[int, int | None]) -> dict[int, tuple[SampleCounts, int]]:
         """The numbers of each surrogate, given the id of its newest sample, which was read before."""
         counts = self._samples.of_many(connection, newest)
-        stale = [id for id in newest if self._answered.get(id, (-1, 0))[0] != newest[id]]
+        stale = [id for id in newest if self._answers.get(id, (-1, 0))[0] != newest[id]]
         for first in range(0, len(stale), AT_ONCE):
             self._count(connection, {id: newest[id] for id in stale[first : first + AT_ONCE]})
-        return {id: (counts[id], self._answered[id][1]) for id in newest}
+        return {id: (counts[id], self._answers[id][1]) for id in newest}
 
     def _count(self, connection: Connection, newest: Mapping[int, int | None]) -> None:
         rows = connection.execute(ANSWERED, {"owners": list(newest)}).all()
-        answered = {int(id): int(count) for id, count in rows}
-        if len(self._answered) > MOST_KEPT:
-            self._answered = {}
-        self._answered |= {id: (last, answered.get(id, 0)) for id, last in newest.items()}
+        counts_by_id = {int(id): int(count) for id, count in rows}
+        if len(self._answers) > MOST_KEPT:
+            self._answers = {}
+        self._answers |= {id: (last, counts_by_id.get(id, 0)) for id, last in newest.items()}
 
 
 def read_summaries(
@@ -332,13 +332,13 @@ def read_summaries(
         return []
     span = (rows[0].id, rows[-1].id)
     answers = counts.read(connection, {row.id: row[len(SUMMARY_COLUMNS) + 1] for row in rows})
-    spent = ledgers(connection, span, {id: counts.by_purpose for id, (counts, _) in answers.items()})
+    ledger_by_id = ledgers(connection, span, {id: counts.by_purpose for id, (counts, _) in answers.items()})
     newest, none_spent = newest_of(connection, span), LedgerRecord()
     summaries = []
     for row in rows:
         id, *values, spec, _ = row[: len(SUMMARY_COLUMNS) + 2]
         queue = QueryCounts(answered=answers[id][1], **{status: row._mapping[status] for status in UNANSWERED})
-        numbers = (spent.get(id, none_spent), queue, *newest.get(id, (None, None)))
+        numbers = (ledger_by_id.get(id, none_spent), queue, *newest.get(id, (None, None)))
         fields: tuple[Any, ...] = (id, *values, _environment(spec), *numbers)
         summaries.append(SurrogateSummary(*fields))
     return summaries

@@ -153,7 +153,7 @@ def test_a_process_with_inequalities_foretells_where_the_limit_is_reached(monkey
         return float((after[valve] < VALVE - 0.05).double().mean()), float((after - test.q_next[:, 1])[~valve].std())
 
     short, error = short_and_error()
-    monkeypatch.setattr(learning, "held", lambda _, output, *others: output)  # noqa: ARG005
+    monkeypatch.setattr(learning, "within_limits", lambda _, output, *others: output)  # noqa: ARG005
     short_without, error_without = short_and_error()
     assert short < 0.05 < 0.1 < short_without
     assert error < error_without
@@ -188,7 +188,7 @@ def test_samples_at_a_limit_that_the_process_foretells_change_nothing(monkeypatc
     samples = steps(30, False, 5)  # the pressure is linear below the valve
     assert bool((samples.q_next[:, 1] >= VALVE).any())
     model = gaussian_processes(RELIEVED, samples)
-    monkeypatch.setattr(learning, "held", lambda _, output, *others: output)  # noqa: ARG005
+    monkeypatch.setattr(learning, "within_limits", lambda _, output, *others: output)  # noqa: ARG005
     assert to_bytes(gaussian_processes(RELIEVED, samples)) == to_bytes(model)
 
 
@@ -241,5 +241,5 @@ def test_a_process_of_inducing_points_has_inequalities_with_its_own_hyperparamet
         return float((VALVE - model.transition(samples.q, samples.u).q_next[:, 1])[at_valve].max())
 
     assert short() < 0.05
-    monkeypatch.setattr(learning, "held", lambda _, output, *others: output)  # noqa: ARG005
+    monkeypatch.setattr(learning, "within_limits", lambda _, output, *others: output)  # noqa: ARG005
     assert short() > 0.2

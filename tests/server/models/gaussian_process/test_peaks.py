@@ -15,7 +15,7 @@ from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.gaussian_process.codec.model import GaussianProcessCodec
 from surrogym_server.models.gaussian_process.feature_maps import reward_candidates
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
-from surrogym_server.models.gaussian_process.learning.peaks import _learned
+from surrogym_server.models.gaussian_process.learning.peaks import _account_of
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_shared.spec import ModelChoice
@@ -88,7 +88,7 @@ def test_samples_that_agree_with_a_fit_add_no_structure_to_it():
     assert int(paid.sum()) < 55
     for going in (paid, torch.ones_like(paid)):
         learner = OutputLearner(DEFINITION, Settings(), {}, {})
-        found.append(_learned(learner, samples.reward, inputs, going, 0.0, 1.0))
+        found.append(_account_of(learner, samples.reward, inputs, going, 0.0, 1.0))
     assert found[1][1] == pytest.approx(found[0][1])
     assert len(found[1][0].posterior.y) == 60
 

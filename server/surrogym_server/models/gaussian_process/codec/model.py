@@ -115,6 +115,10 @@ def _require_consistent(model: GaussianProcessModel) -> None:
     if (model.ending is not None) != definition.learns_termination:
         learned, got = ("learned" if x else "declared" for x in (definition.learns_termination, model.ending))
         raise InvalidInput(f"expected a model of an environment whose termination is {learned}, got {got}")
-    known = definition.declared_reward
-    if known is not None and (reward.posterior, reward.centre, reward.feature_map.after) != (None, 0.0, known.after):
+    declared = definition.declared_reward
+    if declared is not None and (reward.posterior, reward.centre, reward.feature_map.after) != (
+        None,
+        0.0,
+        declared.after,
+    ):
         raise InvalidInput("expected a model without a learned reward, because the environment's reward is declared")

@@ -127,8 +127,8 @@ def _warp(entry: dict[str, Any] | None) -> Warp | None:
 def _sparse(entry: dict[str, Any] | None) -> Sparse | None:
     if entry is None:
         return None
-    found = entry["left_out"]
-    left_out = LeftOut(*(float(found[name]) for name in ("error", "within_one", "within_two", "log_density")))
+    errors = entry["left_out"]
+    left_out = LeftOut(*(float(errors[name]) for name in ("error", "within_one", "within_two", "log_density")))
     return Sparse(int(entry["points"]), float(entry["unexplained"]), left_out)
 
 

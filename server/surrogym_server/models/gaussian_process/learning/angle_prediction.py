@@ -26,9 +26,9 @@ def learn_drift(definition: EnvironmentDefinition, samples: Samples) -> Drift:
     centre, scale = torch.tensor([scaling(definition.coordinates[i].sampling) for i in moved_by], dtype=torch.float64).T
     basis = torch.cat([torch.ones(len(samples), 1, dtype=torch.float64), (samples.q[:, moved_by] - centre) / scale], 1)
     change = angle_increments(definition, samples.q, samples.q_next)
-    fitted = torch.linalg.lstsq(basis, change, driver="gelsd").solution
+    coefficients = torch.linalg.lstsq(basis, change, driver="gelsd").solution
     weights = torch.zeros(len(definition.angles), len(definition.coordinates), dtype=torch.float64)
-    weights[:, moved_by] = fitted[1:].T / scale
+    weights[:, moved_by] = coefficients[1:].T / scale
     return tuple(tuple(row) for row in weights.tolist())
 
 

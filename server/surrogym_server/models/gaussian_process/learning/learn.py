@@ -16,7 +16,7 @@ from surrogym_server.models.gaussian_process.censoring import saturates, stopped
 from surrogym_server.models.gaussian_process.feature_maps import candidates
 from surrogym_server.models.gaussian_process.learning.angle_prediction import learn_drift
 from surrogym_server.models.gaussian_process.learning.dropping import without_inputs
-from surrogym_server.models.gaussian_process.learning.limits import held, past_limits
+from surrogym_server.models.gaussian_process.learning.limits import past_limits, within_limits
 from surrogym_server.models.gaussian_process.learning.many import ByBound, BySubsets
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.prior import Known, better_of
@@ -108,5 +108,5 @@ def _coordinate(learner: OutputLearner, among: _Among, name: str, target: Tensor
     output = output_with_rates(learner, name, target, inputs, keep, among.keep_lead, side)
     output = past_limits(learner, output, target, inputs, keep, among.keep_lead, among.past, side)
     used = among.past if output.past_limits else keep
-    output = held(learner, output, target, inputs, used, side)
+    output = within_limits(learner, output, target, inputs, used, side)
     return without_inputs(learner, output, target, inputs, used)

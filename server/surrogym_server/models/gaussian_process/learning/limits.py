@@ -47,24 +47,28 @@ def past_limits(
     more: Tensor,
     side: Tensor,
 ) -> OutputModel:
-    """The output, learned from samples ``keep`` (n,) with targets (n,), or with a map that reads the lead from
-    ``keep_lead`` (n,). Or from those of ``more`` (n,) as well, without the lead. ``side`` is that of ``held``."""
-    learned = keep_lead if output.feature_map.lead else keep
+    """Return the output, or one that also learns from the samples ``more`` (n,) and reads no lead, if its error is
+    smaller.
+
+    The output was learned from targets (n,) of the samples ``keep`` (n,), or ``keep_lead`` (n,) if it reads the lead.
+    ``side`` is as in ``within_limits``.
+    """
+    rows = keep_lead if output.feature_map.lead else keep
     if not bool((more & ~keep).any()):
         return output
     plain = {m: x for m, x in inputs.items() if not m.lead}
-    wide, every = keep | more, learned | more
+    wide, every = keep | more, rows | more
     wider = output_with_rates(learner, output.name + WIDER, target, plain, wide, wide, side)
     if wider.posterior is None:
         return output
     wider = replace(wider, name=output.name, past_limits=True)
     if output.posterior is None:
         return wider
-    found = _error(wider, target, inputs_of(wider, inputs), wide, every)
-    return wider if found < _error(output, target, inputs_of(output, inputs), learned, every) else output
+    error = _error(wider, target, inputs_of(wider, inputs), wide, every)
+    return wider if error < _error(output, target, inputs_of(output, inputs), rows, every) else output
 
 
-def held(
+def within_limits(
     learner: OutputLearner,
     output: OutputModel,
     target: Tensor,
@@ -94,10 +98,10 @@ def held(
             again = output_with_rates(learner, name + HELD, target, plain, more, more, side)
         else:
             again = _with_samples(learner, output, target, inputs, more)
-        found = replace(again, name=name, past_limits=past, at_limit=_sides(again, side[more]))
-        if _misfit(found, target, inputs, more, side) > WORSE * _misfit(output, target, inputs, keep, side):
+        candidate = replace(again, name=name, past_limits=past, at_limit=_sides(again, side[more]))
+        if _misfit(candidate, target, inputs, more, side) > WORSE * _misfit(output, target, inputs, keep, side):
             break
-        output, keep = found, more
+        output, keep = candidate, more
     return output
 
 
@@ -108,11 +112,11 @@ def _sides(output: OutputModel, side: Tensor) -> tuple[int, ...]:
 
 
 def _misfit(
-    output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], learned: Tensor, side: Tensor
+    output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], rows: Tensor, side: Tensor
 ) -> float:
     """Sum of squared errors of targets (n,).
 
-    A sample away from the output's limit, where ``side`` (n,) is 0, is predicted from the others of ``learned`` (n,).
+    A sample away from the output's limit, where ``side`` (n,) is 0, is predicted from the others of ``rows`` (n,).
     One at the limit has the error by which the prediction falls short of it.
     """
     if output.posterior is None:
@@ -120,11 +124,11 @@ def _misfit(
     x = inputs_of(output, inputs)
     short = (side * (target - output.mean(x))).clamp_min(0)
     if output.posterior.sparse is None:
-        foretold, _ = output.posterior.leave_one_out()
-        off = output.scale * output.amplitude(x[learned]) * (foretold - output.posterior.y)
+        predictions, _ = output.posterior.leave_one_out()
+        off = output.scale * output.amplitude(x[rows]) * (predictions - output.posterior.y)
     else:
-        off = (target - output.mean(x))[learned]
-    return float(short.square().sum() + off[side[learned] == 0].square().sum())
+        off = (target - output.mean(x))[rows]
+    return float(short.square().sum() + off[side[rows] == 0].square().sum())
 
 
 def _with_samples(
@@ -143,30 +147,30 @@ def _violated(posterior: Posterior, x: Tensor, y: Tensor, side: Tensor) -> list[
     at any. ``side`` (k,) has the sign of the side, and the amplitude as its size. The one that falls the shortest is
     observed first."""
     joint, mean = Joint.of(posterior, x), posterior.mean(x)
-    chosen: list[int] = []
-    while len(chosen) < min(MOST, len(y)):
-        short = (side * (y - mean)).index_fill(0, torch.tensor(chosen, dtype=torch.long), 0.0)
+    points: list[int] = []
+    while len(points) < min(MOST, len(y)):
+        short = (side * (y - mean)).index_fill(0, torch.tensor(points, dtype=torch.long), 0.0)
         worst = int(short.argmax())
         if short[worst] <= SHORT:
             break
         joint, spread = joint.observe(worst), (joint.variance[worst] + joint.noise).sqrt()
         mean = mean + joint.observed[-1] * (y - mean)[worst] / spread
-        chosen.append(worst)
-    return chosen
+        points.append(worst)
+    return points
 
 
-def _error(output: OutputModel, target: Tensor, x: Tensor, learned: Tensor, every: Tensor) -> float:
+def _error(output: OutputModel, target: Tensor, x: Tensor, rows: Tensor, every: Tensor) -> float:
     """Mean squared error of targets (n,) at inputs x (n, d), over the samples ``every`` (n,).
 
-    Those of them that the output ``learned`` (n,) count by their leave-one-out errors. A process of inducing points has
-    none of its samples: each of these points stands for many samples, so to leave one out says nothing about a sample.
-    There the residuals count, because each of many samples hardly influences the process.
+    The samples ``rows`` (n,), from which the output was learned, count by their leave-one-out errors. A process of
+    inducing points has none of its samples: each of these points stands for many samples, so to leave one out says
+    nothing about a sample. There the residuals count, because each of many samples hardly influences the process.
     """
     assert output.posterior is not None
     if output.posterior.sparse is not None:
         return float((target - output.mean(x))[every].square().mean())
-    found, others = output.leave_one_out().error ** 2, every & ~learned
+    error, others = output.leave_one_out().error ** 2, every & ~rows
     if not bool(others.any()):
-        return found
+        return error
     count, left = int(every.sum()), int(others.sum())
-    return ((count - left) * found + float((target[others] - output.mean(x[others])).square().sum())) / count
+    return ((count - left) * error + float((target[others] - output.mean(x[others])).square().sum())) / count

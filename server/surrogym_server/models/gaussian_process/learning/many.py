@@ -94,10 +94,10 @@ class BySubsets(ManySamples):
         theta = fit_some(x, y, options, theta, mirror)
         if (through_few := fit_through_few(x, y, options, theta, mirror)) is not None:
             return through_few
-        found = condition_many(refine(x, y, options, theta, mirror), x, y, at_limit)
-        if found.sparse is None or found.left_out.error <= EXPLAINED:
-            return found
-        return condition_many([refine_where_hard(found, x, y, options)], x, y, at_limit, earlier=found)
+        posterior = condition_many(refine(x, y, options, theta, mirror), x, y, at_limit)
+        if posterior.sparse is None or posterior.left_out.error <= EXPLAINED:
+            return posterior
+        return condition_many([refine_where_hard(posterior, x, y, options)], x, y, at_limit, earlier=posterior)
 
     def conditioned(self, hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
         return condition_sparse(hyper, x, y)

@@ -93,9 +93,9 @@ class OutputLearner:
         were alike."""
         key, rows = f"{name}|{feature_map}{also}", spread(len(y), subsets.FEW)
         mirror = reflection(self.definition, feature_map)
-        fitted = fit(x[rows], y[rows], self.options(name), self.warm.get(key), mirror)
-        self.thetas[key] = fitted.theta
-        return replace(fitted, score=fitted.score * len(y) / len(rows))
+        result = fit(x[rows], y[rows], self.options(name), self.warm.get(key), mirror)
+        self.thetas[key] = result.theta
+        return replace(result, score=result.score * len(y) / len(rows))
 
     def refined(
         self,

@@ -45,9 +45,9 @@ def with_peak(
 ) -> OutputModel:
     """The reward learned by its logarithm from the samples ``going`` (n,), if that explains them better; else
     ``plain``."""
-    accounts = [_learned(learner, reward, inputs, going, *base) for base in _bases(reward[going])]
-    better = [found for found, structure in accounts if _better(found, structure, plain, reward, inputs, going)]
-    return max(better, key=lambda found: _agreement(found, reward, inputs, going), default=plain)
+    accounts = [_account_of(learner, reward, inputs, going, *base) for base in _bases(reward[going])]
+    better = [account for account, structure in accounts if _better(account, structure, plain, reward, inputs, going)]
+    return max(better, key=lambda account: _agreement(account, reward, inputs, going), default=plain)
 
 
 def _bases(reward: Tensor) -> Iterator[tuple[float, float]]:
@@ -69,20 +69,20 @@ def _heights(reward: Tensor, base: float, sign: float) -> Tensor:
 def _trace(height: Tensor, base: float) -> bool:
     """Whether heights (n,) show an isolated peak: above 0 in few places, and elsewhere too small for a trainer, which
     computes in float32."""
-    known, highest = torch.finfo(torch.float32), float(height.max())
-    return 0 < highest < max(known.eps * abs(base), known.tiny) and float(height.median()) == 0
+    float32, highest = torch.finfo(torch.float32), float(height.max())
+    return 0 < highest < max(float32.eps * abs(base), float32.tiny) and float(height.median()) == 0
 
 
 def _spread(height: Tensor) -> float:
     """Decades between the largest and the faint ones of the samples with a reward, of heights (n,)."""
-    paid = height[height > 0]
-    if len(paid) < 2:
+    heights = height[height > 0]
+    if len(heights) < 2:
         return 0.0
-    faint = paid.sort().values[math.ceil(FAINT * len(paid)) - 1]
-    return math.log10(float(paid.max())) - math.log10(float(faint))
+    faint = heights.sort().values[math.ceil(FAINT * len(heights)) - 1]
+    return math.log10(float(heights.max())) - math.log10(float(faint))
 
 
-def _learned(
+def _account_of(
     learner: OutputLearner,
     reward: Tensor,
     inputs: Mapping[FeatureMap, Tensor],
@@ -96,20 +96,20 @@ def _learned(
     all.
     """
     height = _heights(reward, base, sign)
-    paid = going & (height > 0)
-    nothing, few = going & ~paid, int(paid.sum()) < FEWEST
-    least = float(height[paid].min().log()) - few * BELOW
-    target = torch.where(paid, height.log(), least)
-    learned = going if few else paid
-    output = learner.output(PEAK, target, inputs, learned, learned)
+    positive = going & (height > 0)
+    nothing, few = going & ~positive, int(positive.sum()) < FEWEST
+    least = float(height[positive].min().log()) - few * BELOW
+    target = torch.where(positive, height.log(), least)
+    rows = going if few else positive
+    output = learner.output(PEAK, target, inputs, rows, rows)
     for _ in range(REFITS):
-        against = nothing & ~learned & (output.mean(inputs[output.feature_map]) > least)
+        against = nothing & ~rows & (output.mean(inputs[output.feature_map]) > least)
         if not bool(against.any()):
             break
-        learned = learned | against
-        output = learner.output(PEAK, target, inputs, learned, learned)
+        rows = rows | against
+        output = learner.output(PEAK, target, inputs, rows, rows)
     structure = _structure(output)
-    if output.posterior is not None and bool((going & ~learned).any()):
+    if output.posterior is not None and bool((going & ~rows).any()):
         x = inputs[output.feature_map]
         y = (torch.where(nothing, output.mean(x).clamp_max(least), target) - output.centre) / output.scale
         posterior = condition_many([output.posterior.hyper], x[going], y[going])
@@ -119,7 +119,7 @@ def _learned(
 
 
 def _better(
-    found: OutputModel,
+    account: OutputModel,
     structure: float,
     plain: OutputModel,
     reward: Tensor,
@@ -127,15 +127,15 @@ def _better(
     going: Tensor,
 ) -> bool:
     """Whether logarithms, with such ``structure`` in them, explain the samples better than their values do."""
-    if found.posterior is None:
+    if account.posterior is None:
         return False
     if plain.posterior is None:
         return True
-    assert found.warp is not None
-    height = _heights(reward[going], found.warp.base, found.warp.sign)
-    if _trace(height, found.warp.base) or _spread(height) >= DECADES:
+    assert account.warp is not None
+    height = _heights(reward[going], account.warp.base, account.warp.sign)
+    if _trace(height, account.warp.base) or _spread(height) >= DECADES:
         return True
-    return structure >= GAIN and _agreement(found, reward, inputs, going) >= _agreement(plain, reward, inputs, going)
+    return structure >= GAIN and _agreement(account, reward, inputs, going) >= _agreement(plain, reward, inputs, going)
 
 
 def _structure(output: OutputModel) -> float:
@@ -156,12 +156,12 @@ def _agreement(output: OutputModel, reward: Tensor, inputs: Mapping[FeatureMap, 
         mean, latent = posterior.mean_and_variance(inputs[output.feature_map][going])
         variance = latent + posterior.hyper.noise_variance
     centre, spread = output.centre + output.scale * mean, output.scale * variance.sqrt()
-    seen = reward[going]
+    rewards = reward[going]
     base = 0.0 if warp is None else warp.base
-    width = RESOLUTION * float((seen - base).abs().max())
-    low, high = seen - width, seen + width
+    width = RESOLUTION * float((rewards - base).abs().max())
+    low, high = rewards - width, rewards + width
     if warp is not None:
         ends = [(warp.sign * (end - warp.base)).clamp_min(0).log() for end in (low, high)]
         low, high = ends if warp.sign > 0 else ends[::-1]
     share = torch.special.ndtr((high - centre) / spread) - torch.special.ndtr((low - centre) / spread)
-    return float(share.clamp_min(1 / (len(seen) + 2) ** 2).log().sum())
+    return float(share.clamp_min(1 / (len(rewards) + 2) ** 2).log().sum())

@@ -34,15 +34,15 @@ def output_with_rates(
     if not bool(may.any()):
         return output
     try:
-        grown = _grown(learner, output, target, inputs, keep, may)
+        growing = _growing(learner, output, target, inputs, keep, may)
     except NumericalFailure:
         return output
-    if not any(grown.feature_map.rates):
+    if not any(growing.feature_map.rates):
         return output
-    plain, other = _evidence([output, grown], inputs, keep)
+    plain, other = _evidence([output, growing], inputs, keep)
     other += ODDS * int(may.sum())
-    scores = (*output.scores, (str(grown.feature_map), other))
-    return replace(grown, scores=scores) if other > plain else output
+    scores = (*output.scores, (str(growing.feature_map), other))
+    return replace(growing, scores=scores) if other > plain else output
 
 
 def inputs_of(output: OutputModel, inputs: Mapping[FeatureMap, Tensor]) -> Tensor:
@@ -68,7 +68,7 @@ def _may_have_rates(
     return may if enough and is_unexplained(posterior) else none
 
 
-def _grown(
+def _growing(
     learner: OutputLearner,
     output: OutputModel,
     target: Tensor,
@@ -82,16 +82,16 @@ def _grown(
     rows, among = spread(len(t), subsets.FEW), ",".join(map(str, may.nonzero().ravel().tolist()))
     key = f"{output.name}|{plain}|rates of {among}"  # a warm start has a rate for each of these inputs
     starts = [learner.thetas[f"{output.name}|{plain}"], *([learner.warm[key]] if key in learner.warm else [])]
-    found = fit_growing(z[rows], t[rows], may, learner.options(output.name), starts)
-    learner.thetas[key] = found.fitted.theta
-    grown, rates = replace(plain, rates=found.rates), torch.tensor(found.rates, dtype=torch.float64)
-    posterior = found.fitted.posterior
+    growth = fit_growing(z[rows], t[rows], may, learner.options(output.name), starts)
+    learner.thetas[key] = growth.fitted.theta
+    feature_map, rates = replace(plain, rates=growth.rates), torch.tensor(growth.rates, dtype=torch.float64)
+    posterior = growth.fitted.posterior
     if len(rows) < len(t):
         x = bend(z, rates)
         posterior = learner.refined(
-            output.name, grown, x, t / amplitude(x, rates), found.fitted.theta[: -int(may.sum())]
+            output.name, feature_map, x, t / amplitude(x, rates), growth.fitted.theta[: -int(may.sum())]
         )
-    return replace(output, feature_map=grown, posterior=posterior)
+    return replace(output, feature_map=feature_map, posterior=posterior)
 
 
 def _evidence(outputs: Sequence[OutputModel], inputs: Mapping[FeatureMap, Tensor], keep: Tensor) -> list[float]:

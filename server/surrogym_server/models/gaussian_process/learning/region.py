@@ -34,12 +34,12 @@ def learn_termination(learner: OutputLearner, samples: Samples, prior: GaussianP
 def learn_region(learner: OutputLearner, name: str, q: Tensor, inside: Tensor) -> Region:
     """Learn which of q (n, C) lie inside (n,): thresholds and a classifier, weighted by their leave-one-out predictions
     of the labels."""
-    found: list[tuple[Form, float]] = [_classifier(learner, name, q, inside)]
-    found += thresholds(learner.definition, q, inside)
-    names = [str(form.description.get("inside", "classifier")) for form, _ in found]
-    scores = torch.tensor([score for _, score in found], dtype=torch.float64)
+    scored: list[tuple[Form, float]] = [_classifier(learner, name, q, inside)]
+    scored += thresholds(learner.definition, q, inside)
+    names = [str(form.description.get("inside", "classifier")) for form, _ in scored]
+    scores = torch.tensor([score for _, score in scored], dtype=torch.float64)
     weights = torch.where(scores - scores.max() > math.log(FAINT), scores, -torch.inf).softmax(0).tolist()
-    forms = tuple((w, form) for w, (form, _) in zip(weights, found, strict=True) if w > 0)
+    forms = tuple((w, form) for w, (form, _) in zip(weights, scored, strict=True) if w > 0)
     return Region(forms, tuple(zip(names, scores.tolist(), strict=True)))
 
 

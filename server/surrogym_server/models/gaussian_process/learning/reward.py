@@ -31,8 +31,8 @@ def learn_reward(
     The reward of a prior is used if what it leaves has smaller leave-one-out errors.
     """
     definition = learner.definition
-    if (known := definition.declared_reward) is not None:
-        return _declared(known, samples), known.terminal, ()
+    if (declared := definition.declared_reward) is not None:
+        return _declared(declared, samples), declared.terminal, ()
     inputs = {
         m: encode(definition, m, samples.q_next if m.after else samples.q, samples.u)
         for m in learner.allowed(reward_candidates(definition))
@@ -71,9 +71,9 @@ def _without_action(definition: EnvironmentDefinition, samples: Samples) -> dict
     }
 
 
-def _declared(known: DeclaredRewardDefinition, samples: Samples) -> OutputModel:
+def _declared(reward: DeclaredRewardDefinition, samples: Samples) -> OutputModel:
     """The declared reward without a process. Its score is the largest error over the samples."""
-    paid = known(samples.q_next if known.after else samples.q, samples.u) + known.terminal * samples.terminated
-    off = float((samples.reward - paid).abs().max())
+    rewards = reward(samples.q_next if reward.after else samples.q, samples.u) + reward.terminal * samples.terminated
+    off = float((samples.reward - rewards).abs().max())
     scores = (("declared, largest error over the samples", off),)
-    return OutputModel(REWARD, FeatureMap(after=known.after), None, 0.0, 1.0, 0, scores)
+    return OutputModel(REWARD, FeatureMap(after=reward.after), None, 0.0, 1.0, 0, scores)

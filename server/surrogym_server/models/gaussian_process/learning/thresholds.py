@@ -29,13 +29,13 @@ def thresholds(definition: EnvironmentDefinition, q: Tensor, inside: Tensor) -> 
     A union of them, a complement of a union of two or more (of one would be the same again), both or none.
     """
     values, labels = Axes.of(definition)(q).numpy(), inside.numpy()
-    found = []
+    forms = []
     for complement in (False, True):
-        wanted = ~labels if complement else labels
-        rules = explain(values, wanted)
+        targets = ~labels if complement else labels
+        rules = explain(values, targets)
         if len(rules) > complement:
-            found.append((Thresholds(definition, rules, complement), _left_out(definition, values, wanted)))
-    return found
+            forms.append((Thresholds(definition, rules, complement), _left_out(definition, values, targets)))
+    return forms
 
 
 def explain(values: Floats, inside: Bools) -> Rules:
@@ -46,14 +46,14 @@ def explain(values: Floats, inside: Bools) -> Rules:
     outside = values[~inside].max(0)
     reached = values[inside] > outside + SLACK * width  # (i, A)
     share = np.where(reached, (values[inside] - outside) / width, np.inf)
-    chosen = _cover(reached, share)
-    if not chosen:
+    axes = _cover(reached, share)
+    if not axes:
         return ()
-    assigned = _assign(reached, share, chosen)
-    free = [axis for axis in range(values.shape[1]) if axis not in chosen]
+    assigned = _assign(reached, share, axes)
+    free = [axis for axis in range(values.shape[1]) if axis not in axes]
     return tuple(
         _rivals(values[inside], outside, width, assigned == place, [axis, *free])
-        for place, axis in enumerate(chosen)
+        for place, axis in enumerate(axes)
         if (assigned == place).any()
     )
 
@@ -67,22 +67,22 @@ def log_probability(probability: Tensor, inside: Tensor) -> float:
 def _cover(reached: Bools, share: Floats) -> list[int]:
     """Axes that together reach every sample, chosen greedily. Of axes that reach as many, the one with the
     widest gap."""
-    chosen: list[int] = []
+    axes: list[int] = []
     left = np.ones(len(reached), dtype=bool)
     while left.any():
         counts = reached[left].sum(0)
         if counts.max() == 0:
             return []
         gap = np.where(counts == counts.max(), np.where(reached[left], share[left], np.inf).min(0), -np.inf)
-        chosen.append(int(gap.argmax()))
-        left &= ~reached[:, chosen[-1]]
-    return chosen
+        axes.append(int(gap.argmax()))
+        left &= ~reached[:, axes[-1]]
+    return axes
 
 
-def _assign(reached: Bools, share: Floats, chosen: list[int]) -> NDArray[np.int64]:
+def _assign(reached: Bools, share: Floats, axes: list[int]) -> NDArray[np.int64]:
     """Axis that explains each sample (i,): the only possible one, or the one beyond which it lies farthest, relative to
     the samples that this axis alone explains."""
-    able, distance = reached[:, chosen], share[:, chosen]
+    able, distance = reached[:, axes], share[:, axes]
     sole = able.sum(1) == 1
     nearest = np.where(sole[:, None] & able, distance, np.inf).min(0, initial=np.inf)
     ratio = np.where(able, distance / np.where(np.isfinite(nearest), nearest, 1.0), -np.inf)

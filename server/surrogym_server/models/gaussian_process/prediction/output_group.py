@@ -71,15 +71,15 @@ class OutputGroup:
         return cls(encoder, serving, noise, tuple(drawn), begin, grown)
 
     def predict(
-        self, x: Tensor, wanted: tuple[int, ...], kick: Tensor | None, process: Tensor | None, paths: Tensor | None
+        self, x: Tensor, columns: tuple[int, ...], kick: Tensor | None, process: Tensor | None, paths: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Values at features x (m, d), and the latent standard deviations of the wanted columns, (m, O) each.
 
         A value is the posterior's mean. ``kick`` (m, O) moves it by latent standard deviations, ``process`` (m, O) by
         standard deviations of the noise. With ``paths`` (m, W) it is that of a posterior sample, one for each row.
         """
-        if wanted:
-            value, spread = self.serving.mean_and_std(x, wanted)
+        if columns:
+            value, spread = self.serving.mean_and_std(x, columns)
         else:
             value, spread = self.serving.mean(x), x.new_zeros(len(x), 0)
         if kick is not None:
@@ -91,7 +91,7 @@ class OutputGroup:
         for one in self.grown:
             grown = amplitude(x[:, one.inputs], one.rates)
             value[:, one.column] = one.centre + grown * (value[:, one.column] - one.centre)
-            if wanted:
+            if columns:
                 spread[:, one.column] *= grown
         return value, spread
 

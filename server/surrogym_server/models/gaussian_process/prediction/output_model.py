@@ -103,21 +103,21 @@ class OutputModel:
         """
         if self.posterior is None:
             return LeaveOneOutErrors(0.0, 1.0, 1.0)
-        found = self._left_out(self.posterior)
-        error = self.scale * found.error
+        left_out = self._left_out(self.posterior)
+        error = self.scale * left_out.error
         if self.feature_map.rates:
-            error = self._left_out_grown(found.error)
+            error = self._left_out_grown(left_out.error)
         if self.warp is not None:
             error = self._left_out_warped(self.warp, error)
-        return LeaveOneOutErrors(error, found.within_one, found.within_two)
+        return LeaveOneOutErrors(error, left_out.within_one, left_out.within_two)
 
     def _left_out(self, posterior: Posterior) -> LeftOut:
         if posterior.sparse is not None:
             return posterior.left_out
-        foretold, variance = self._foretold(posterior)
-        return LeftOut.of(foretold - posterior.y, variance)
+        predictions, variance = self._predictions_left_out(posterior)
+        return LeftOut.of(predictions - posterior.y, variance)
 
-    def _foretold(self, posterior: Posterior) -> tuple[Tensor, Tensor]:
+    def _predictions_left_out(self, posterior: Posterior) -> tuple[Tensor, Tensor]:
         """Each y of an exact process from the others, within its limit, and the variance, (n,) each."""
         mean, variance = posterior.leave_one_out()
         side = mean.new_tensor(self.at_limit or [0] * len(mean))
@@ -136,7 +136,7 @@ class OutputModel:
         assert self.posterior is not None
         if self.posterior.sparse is not None:
             return self.scale * self._typical_amplitude * error
-        mean, _ = self._foretold(self.posterior)
+        mean, _ = self._predictions_left_out(self.posterior)
         off = self.scale * self.amplitude(self.posterior.x) * (mean - self.posterior.y)
         return float(off.square().mean().sqrt())
 
@@ -145,9 +145,9 @@ class OutputModel:
         assert self.posterior is not None
         if self.posterior.sparse is not None:
             return error * warp.size
-        mean, _ = self._foretold(self.posterior)
-        foretold, seen = (warp.value(self.centre + self.scale * y) for y in (mean, self.posterior.y))
-        return float((foretold - seen).square().mean().sqrt())
+        mean, _ = self._predictions_left_out(self.posterior)
+        predictions, rewards = (warp.value(self.centre + self.scale * y) for y in (mean, self.posterior.y))
+        return float((predictions - rewards).square().mean().sqrt())
 
 
 def paid(warp: Warp | None, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:

@@ -38,13 +38,13 @@ class Axes:
     @classmethod
     def of(cls, definition: EnvironmentDefinition) -> Axes:
         """Axes of the moving coordinates, and of the observation entries that are not one of them."""
-        size, found = len(definition.coordinates), {}
+        size, names = len(definition.coordinates), {}
         for index in definition.moving:
             weights = tuple(float(i == index) for i in range(size))
-            found[TermDefinition((PartDefinition("linear", 1.0, weights),))] = definition.coordinates[index].name
+            names[TermDefinition((PartDefinition("linear", 1.0, weights),))] = definition.coordinates[index].name
         for name, term in zip(definition.observation_names, definition.observation_terms, strict=True):
-            found.setdefault(term, name)
-        return cls(tuple(found.values()), to_device(compile_terms(list(found), size), definition.device))
+            names.setdefault(term, name)
+        return cls(tuple(names.values()), to_device(compile_terms(list(names), size), definition.device))
 
     def __len__(self) -> int:
         return 3 * len(self.names)
@@ -106,8 +106,8 @@ class Thresholds:
             ]
             for rule in self.rules
         ]
-        joined = "none of" if self.complement else "any of"
-        return {"kind": "thresholds", "inside": joined, "rules": rules}
+        words = "none of" if self.complement else "any of"
+        return {"kind": "thresholds", "inside": words, "rules": rules}
 
     @cached
     def _axes(self) -> Axes:

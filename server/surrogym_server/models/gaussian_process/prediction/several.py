@@ -117,8 +117,8 @@ class FunctionsOfSeveral(FunctionDraws, CompiledSteps):
         return Transition(
             torch.cat([part.q_next for part in parts])[order],
             torch.cat([part.reward for part in parts])[order],
-            _joined([part.std for part in parts], order),
-            _joined([part.reward_std for part in parts], order),
+            _join([part.std for part in parts], order),
+            _join([part.reward_std for part in parts], order),
         )
 
     def compiled(self) -> ArraySteps | None:
@@ -154,7 +154,7 @@ class StepsOfSeveral(ArraySteps):
         all_ = ArrayTransition(np.empty_like(q), np.empty(len(q)), np.empty((len(q), outputs)), np.empty(len(q), bool))
         for index, rows in _members(torch.from_numpy(paths[:, 0]).long(), len(self.models)):
             which = rows.numpy()
-            moved = self.models[index](
+            result = self.models[index](
                 q[which],
                 u[which],
                 noise=None if noise is None else noise[which],
@@ -163,7 +163,7 @@ class StepsOfSeveral(ArraySteps):
                 stds=stds,
                 reward_std=reward_std,
             )
-            for whole, part in zip(vars(all_).values(), vars(moved).values(), strict=True):
+            for whole, part in zip(vars(all_).values(), vars(result).values(), strict=True):
                 whole[which] = part
         return all_
 
@@ -174,6 +174,6 @@ def _members(number: Tensor, count: int) -> list[tuple[int, Tensor]]:
     return [(index, which) for index, which in rows if len(which)]
 
 
-def _joined(parts: Sequence[Tensor | None], order: Tensor) -> Tensor | None:
-    known = [part for part in parts if part is not None]
-    return torch.cat(known)[order] if known else None
+def _join(parts: Sequence[Tensor | None], order: Tensor) -> Tensor | None:
+    tensors = [part for part in parts if part is not None]
+    return torch.cat(tensors)[order] if tensors else None

@@ -18,21 +18,21 @@ def folder(package: str) -> Path | None:
     Args:
         package: an imported top-level package.
     """
-    chosen = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
+    root = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
     try:
-        found = (Path(chosen) if chosen else Path.home() / ".cache") / "surrogym" / _digest_of_sources(package)
-        found.mkdir(mode=0o700, parents=True, exist_ok=True)
-        state = found.stat()
+        path = (Path(root) if root else Path.home() / ".cache") / "surrogym" / _digest_of_sources(package)
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        state = path.stat()
         own = not hasattr(os, "getuid") or (state.st_uid == os.getuid() and not state.st_mode & 0o022)
-        return found if own and os.access(found, os.W_OK) else None
+        return path if own and os.access(path, os.W_OK) else None
     except (OSError, RuntimeError):  # no home folder, or a read-only one
         return None
 
 
 def has_any(package: str) -> bool:
     """Whether an earlier process has stored a compiled function."""
-    found = folder(package)
-    return found is not None and any(found.glob("*/*.nbi"))
+    path = folder(package)
+    return path is not None and any(path.glob("*/*.nbi"))
 
 
 def _digest_of_sources(package: str) -> str:
