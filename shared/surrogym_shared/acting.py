@@ -75,7 +75,7 @@ class ActingPolicy:
     """
 
     mean: Array  # (D,) subtracted from an observation
-    deviation: Array  # (D,) which divides the difference
+    deviation: Array  # (D,) standard deviation by which the difference is divided
     layers: tuple[Layer, ...]
     activation: Activation = "tanh"  # activation function of the hidden layers
     log_deviations: Array | None = None  # (F,) logarithms of the standard deviations of the noise; None without noise

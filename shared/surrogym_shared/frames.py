@@ -211,7 +211,8 @@ def read_reply(content: bytes) -> Reply:
 
 
 def reset_request(seq: int | None, seed: int | Sequence[int] | None, mask: Bools | None) -> ResetRequest:
-    """Build the request of a reset. The seed is one integer, or one for each lane.
+    """Build the request of a reset. The seed is one integer, or one for each lane, or None.
+    ``mask`` (N,) has the lanes to reset; None resets all.
 
     Raises:
         FrameError: int64 can't represent a seed.
@@ -222,7 +223,8 @@ def reset_request(seq: int | None, seed: int | Sequence[int] | None, mask: Bools
 
 
 def step_request(seq: int | None, action: Array, mask: Bools | None, deviations: bool) -> StepRequest:
-    """Build the request of a step with an action (N, F)."""
+    """Build the request of a step with an action (N, F). ``mask`` (N,) has the lanes to step; None steps all. With
+    ``deviations``, the reply has the predicted standard deviation of each output."""
     view = None if mask is None else _flat(mask, BOOL)
     return StepRequest(seq=seq, action=_flat(action, FLOAT64), mask=view, deviations=deviations)
 
@@ -235,7 +237,8 @@ def rollout_request(seq: int | None, actions: Array) -> RolloutRequest:
 def policy_request(
     seq: int | None, policy: ActingPolicy, steps: int, noise: NoiseKey | None, until: Bools | None
 ) -> PolicyRequest:
-    """Build the request of a policy's rollout, with a mask ``until`` (N,)."""
+    """Build the request of a policy's rollout of at most ``steps`` steps. It stops once an episode has ended in each
+    lane of the mask ``until`` (N,). A ``noise`` of None takes the most probable actions."""
     dtype = FLOAT32 if policy.dtype == np.float32 else FLOAT64
     return PolicyRequest(
         seq=seq,
@@ -466,7 +469,8 @@ def _size(space: ActionSpace) -> int:
 
 
 def _flat(array: Array, dtype: np.dtype[Any]) -> memoryview:
-    """Return the memory of a contiguous array of this dtype, or that of a converted copy."""
+    """Return the bytes of an array as a view of its memory if it is contiguous and of this dtype; otherwise of a
+    converted copy."""
     return np.ascontiguousarray(array, dtype).data
 
 

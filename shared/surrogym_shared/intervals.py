@@ -1,4 +1,4 @@
-"""95 % intervals of what episodes measure: the mean of a return, and a share of successes."""
+"""95 % intervals of two results of episodes: the mean return, and the share of successes."""
 
 from __future__ import annotations
 

@@ -25,7 +25,8 @@ KEY_BYTES = 4
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """Positions in a frame, from its first byte on: where its key and its payload begin, and where it ends."""
+    """Positions in a frame, counted from its first byte: the beginning of its key, the beginning of its payload, and
+    its end."""
 
     key: int  # position of the mask's key; equal to ``payload`` without a mask
     payload: int

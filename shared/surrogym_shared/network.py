@@ -30,7 +30,7 @@ ARRAYS = "network.npz"
 MAX_BYTES = 16 * 1024 * 1024  # largest contents of a file
 MAX_HEAD_BYTES = 64 * 1024
 MAX_LAYERS = 8
-OUTSIDE = ("mean", "deviation", "low", "high")  # arrays of a policy beside its layers
+OUTSIDE = ("mean", "deviation", "low", "high")  # arrays of a policy's file that belong to no layer
 
 
 class Layer(NamedTuple):

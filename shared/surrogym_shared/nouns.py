@@ -1,7 +1,7 @@
-"""The nouns of the loop, which the wire, the storage, the design and the sampler share.
+"""Types for a query and a real step, which the wire, the storage, the design and the sampler share.
 
-They are plain values without checks: the wire's models check what arrives. This file imports NumPy and the standard
-library alone, so that the pure core may import it. Phases, verdicts and kinds are in ``states`` and ``kinds``.
+They are plain values without checks, because the wire's models check all input. This file imports NumPy and the
+standard library alone, so that the pure core may import it. Phases, verdicts and kinds are in ``states`` and ``kinds``.
 
 Shapes: C coordinates, F action entries, D observation entries, T actions of a query, n real steps.
 """
@@ -22,9 +22,9 @@ Vector = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Query:
-    """Real steps that are wanted: where they begin, and the actions to apply from there.
+    """Request for real steps: where they begin, and the actions to apply from there.
 
-    They begin at coordinates to which the original environment is set, at a snapshot to which it returns, or at a
+    The steps begin at coordinates to which the original environment is set, at a snapshot to which it returns, or at a
     reset. A query that begins at coordinates has one action.
     """
 

@@ -1,4 +1,4 @@
-"""Read and write a whole surrogate as one file: specification, model and real samples. It contains no code and no
+"""Read and write a whole surrogate as one file: specification, model and real samples. The file contains no code and no
 pickles.
 
 The file is safetensors: eight bytes with the length of a JSON header, the header, then arrays as raw bytes. The model's

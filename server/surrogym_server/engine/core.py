@@ -1,4 +1,4 @@
-"""Requests applied to sessions: pure functions, the same in every engine and in ``LocalSurrogate``."""
+"""Apply requests to sessions: pure functions, which every engine and ``LocalSurrogate`` call."""
 
 from __future__ import annotations
 

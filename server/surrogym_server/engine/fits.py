@@ -159,7 +159,7 @@ def _terminal_blocked() -> Iterator[None]:
 def _live_with(lifeline: Connection, others_end: Connection | None) -> None:
     if others_end is not None:
         others_end.close()
-    gc.enable()  # the parent starts without
+    gc.enable()  # the parent process starts children with its collector off
     os.nice(NICENESS)
     Thread(target=_exit_when_closed, args=(lifeline,), daemon=True).start()
 

@@ -54,7 +54,7 @@ class NearbyAnswers(OutputOutlook):
     candidates: Points  # m candidates
     reference: Points  # r reference points
     own: Tensor  # (m,) variance at each candidate, as if the queries before were answered
-    there: Tensor  # (r,) variance at each reference point, as if the same
+    there: Tensor  # (r,) variance at each reference point, as if these queries were answered
     learns: Tensor  # (m,) bool: whether a model learns from a step at the candidate, because its lags are known
 
     @classmethod

@@ -33,8 +33,9 @@ def highest(
 ) -> Points | None:
     """Return the step at which the reward may be highest, found by climbing from m points.
 
-    None if the highest reward is known to the tolerance, or if the reward does not pay almost nowhere (the module says
-    more). While all samples have the reward 0, there is nothing to climb: then it is the point farthest from them.
+    None if the highest reward is known to the tolerance, or if the environment pays in more than a small part of the
+    range (see the module's docstring). While all samples have the reward 0, there is nothing to climb: the step is then
+    the point farthest from all samples.
     """
     definition = model.definition
     points = points[~_over(definition, points.q)]

@@ -92,7 +92,7 @@ class Request:
     snapshots: Mapping[str, Vector] = field(default_factory=dict)  # coordinates (C,) of each snapshot, by its name
     logged: int = 0  # number of the samples that come from a log
     audited: int = 0  # number of the samples that are steps of audits
-    unlearned: int = 0  # real steps that are no samples here, because their lags were not known
+    unlearned: int = 0  # real steps that are not among the samples, because their lags were not known
     open: int = 0  # real steps of the pending queries that may still be answered
     prior: DynamicsModel | None = None  # model of what is known beforehand
     surprises: Predictions = ()  # predictions, by the last model, of the samples that are new in this round
@@ -100,7 +100,8 @@ class Request:
     def cost(self, samples: int) -> int:
         """Number of real steps that count towards the budget, of a design that has this number of samples.
 
-        Samples of logs and audits don't count. Steps from which nothing is learned do, although they are no samples.
+        Samples of logs and audits don't count. Steps whose lags were not known do count, although they are not among
+        the samples.
         """
         return samples - self.logged - self.audited + self.unlearned
 

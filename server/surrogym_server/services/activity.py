@@ -1,4 +1,5 @@
-"""Samplers, and others who call regularly, that are active. Shown to people, and kept in memory."""
+"""Active callers, such as samplers: those whose last call is not long ago. They are kept in memory, and shown to
+people."""
 
 from __future__ import annotations
 
@@ -11,13 +12,13 @@ from typing import Generic, TypeVar
 Clock = Callable[[], float]
 T = TypeVar("T")
 
-ALIVE_SECONDS = 75.0  # one that was silent for longer counts as gone; the longest claim waits for 60
-FORGET_AT = 256  # entries, those of the silent included; a search through all at each call would take longer with each
-MOST_NAMES = 1_000  # of a surrogate at once; a caller beyond them is served, but not shown
+ALIVE_SECONDS = 75.0  # a caller that was silent for longer counts as gone; the longest claim waits for 60 s
+FORGET_AT = 256  # number of callers from which on silent ones are removed; to look for them at each call would be slow
+MOST_NAMES = 1_000  # most active callers of a surrogate; further ones are served, but not shown
 
 
 class Alive(Generic[T]):
-    """When each was last heard of, and what it reported about itself. Any thread may call it."""
+    """When each caller was last heard of, and what it reported about itself (``T``). Any thread may use it."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock = clock
@@ -43,7 +44,7 @@ class Alive(Generic[T]):
         return now - before >= ALIVE_SECONDS
 
     def alive(self) -> list[tuple[str, str, T]]:
-        """The surrogate, the name and the report of each."""
+        """Return the surrogate, the name and the report of each active caller, sorted by surrogate and name."""
         now = self._clock()
         with self._lock:
             heard = {surrogate: self._active(names, now) for surrogate, names in self._heard.items()}
@@ -71,7 +72,7 @@ class Samplers(Alive[None]):
         self.note(surrogate, sampler, None)
 
     def by_surrogate(self) -> dict[str, list[str]]:
-        """Names of the samplers that claimed or answered lately."""
+        """Return the names of the active samplers, by surrogate."""
         alive = defaultdict[str, list[str]](list)
         for surrogate, sampler, _ in self.alive():
             alive[surrogate].append(sampler)

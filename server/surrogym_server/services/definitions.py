@@ -37,14 +37,14 @@ class Definitions:
         self._lock = Lock()
 
     def get(self, name: str) -> EnvironmentDefinition:
-        """The definition of a surrogate. Raises ``UnknownSurrogate``."""
+        """Return the definition of a surrogate. Raises ``UnknownSurrogate``."""
         entry = self._cache.get(name)
         if entry is not None and entry[0] == self._storage.surrogates.standing(name).id:
             return entry[1]
         return self.of(self._storage.surrogates.get(name))
 
     def of(self, record: SurrogateRecord) -> EnvironmentDefinition:
-        """The definition of a surrogate whose record was read."""
+        """Return the definition of the surrogate that a record describes, without reading the record again."""
         with self._lock:
             id, definition = self._cache.get(record.name, (None, None))
             if definition is None or id != record.id:
@@ -53,15 +53,15 @@ class Definitions:
             return definition
 
     def for_model(self, name: str) -> EnvironmentDefinition:
-        """The definition, to read a model. Raises ``UnknownSurrogate``, or ``NotInstalled`` if the model's family is
-        missing."""
+        """Return the definition of a surrogate for a caller that reads a model. Raises ``UnknownSurrogate``, or
+        ``NotInstalled`` if the model's family is missing."""
         definition = self.get(name)
         _require(name, MODELS.lack(definition.learning.model))
         return definition
 
     def for_design(self, name: str) -> EnvironmentDefinition:
-        """The definition, to do a round. Raises like ``for_model``, and ``NotInstalled`` if its acquisition
-        is missing."""
+        """Return the definition of a surrogate for a caller that does a round. Raises like ``for_model``, and
+        ``NotInstalled`` if its acquisition is missing."""
         definition = self.for_model(name)
         _require(name, ACQUISITIONS.lack(definition.design.acquisition))
         return definition
@@ -77,7 +77,7 @@ class Definitions:
                 self.for_design(summary.name)
             except NotInstalled as error:
                 sentences.append(str(error))
-            except SurrogymError:  # deleted meanwhile, or damaged, which its readers are told
+            except SurrogymError:  # it was deleted meanwhile, or is damaged, which any request for it reports
                 continue
         return sentences
 
@@ -123,7 +123,7 @@ def check_rollouts(definition: EnvironmentDefinition, queries: Sequence[Query]) 
     """Check queries of rollouts, and return them in the model's units.
 
     Raises:
-        InvalidInput: one that is too long, of another shape, or out of bounds.
+        InvalidInput: a rollout that is too long, of another shape, or out of bounds.
     """
     longest = definition.max_rollout or 0
     for query in queries:

@@ -43,11 +43,11 @@ logger = logging.getLogger(__name__)
 
 FIT_LEASE_SECONDS = 30.0
 RENEWALS_PER_LEASE = 3
-ATTEMPTS = 5  # of a fit whose process died, or whose result could not be stored
+ATTEMPTS = 5  # most attempts at a fit whose process died, or whose result could not be stored
 LONG_SECONDS = 60.0  # the log names a fit that takes longer
-PASSED_SECONDS = 5.0  # other fits start beside one that takes longer
-MOST_PASSED = 3  # long fits that don't count towards ``fit_workers``; each is a process
-PAUSE_SECONDS = 1.0  # between checks whether a fit is still wanted
+PASSED_SECONDS = 5.0  # after this time, another fit may start beside a fit
+MOST_PASSED = 3  # most long fits that don't count towards ``fit_workers``; each is a process
+PAUSE_SECONDS = 1.0  # time between two checks whether a fit is still wanted
 
 
 class _Turn:
@@ -106,13 +106,13 @@ class Designer:
     ) -> None:
         """Args:
         storage: holds the right to fit.
-        definitions: of the surrogates in it.
-        plan: the first queries under a budget.
+        definitions: definitions of the surrogates in the storage.
+        plan: function that returns the first queries of a design, given its budget.
         fits: runs the jobs.
         models: is informed of each new version.
         notices: wake this designer, and are posted after each fit.
         metrics: counters of this process.
-        settings: how often it looks, and how long and how many fits run."""
+        settings: how often to look for due surrogates, and how long and how many fits may run."""
         self._storage = storage
         self._definitions = definitions
         self._plan = plan
@@ -122,8 +122,8 @@ class Designer:
         self._metrics = metrics
         self._settings = settings
         self._usual, self._passed = asyncio.Semaphore(settings.fit_workers), asyncio.Semaphore(MOST_PASSED)
-        self._tasks: dict[str, asyncio.Task[None]] = {}  # of the surrogates that are fitted or wait for their turn
-        self._unavailable: dict[str, int] = {}  # consecutive fits without a process or storage, by surrogate
+        self._tasks: dict[str, asyncio.Task[None]] = {}  # fits that run or wait for their turn, by surrogate
+        self._unavailable: dict[str, int] = {}  # fits in succession that lacked a process or storage, by surrogate
 
     async def run(self) -> None:
         """Fit due surrogates until cancelled. Surrogates whose fit is cancelled stay due."""
@@ -134,7 +134,7 @@ class Designer:
                         await self._begin_all_due()
                     except Unavailable as error:
                         logger.warning("the storage is unavailable or damaged, so the design waits: %s", error)
-                    except Exception:  # one surrogate's trouble must not end the design of all others
+                    except Exception:  # an error of one surrogate must not end the fits of all others
                         logger.exception("the search for due fits failed; it is repeated shortly")
                     await listener.wait(self._settings.look_seconds)
         finally:
@@ -179,11 +179,11 @@ class Designer:
         """Request more queries from the next fit.
 
         The queries are weighted by the occupancy of a checkpoint (None: the latest, if any). With ``raise_budget`` the
-        budget is raised to hold them.
+        budget is raised as far as the queries need.
 
         Raises:
             InvalidInput: no occupancy was submitted under this name.
-            BeyondBudget: the budget has too few left, and may not be raised.
+            BeyondBudget: the budget has too few real steps left, and may not be raised.
         """
         if checkpoint is not None and self._storage.occupancy.get(name, checkpoint) is None:
             raise InvalidInput(
@@ -229,11 +229,12 @@ class Designer:
         return attempts < ATTEMPTS
 
     async def _result(self, lease: FitLease, turn: _Turn) -> DesignResult:
-        """Result of the job of a lease. The job is stopped if nobody wants it any more, or if it takes too long.
+        """Run the job of a lease, and return its result. The job is stopped if its result is not wanted any more,
+        because another server has the right to fit or the surrogate was deleted, or if it takes too long.
 
         Raises:
-            LeaseExpired, UnknownSurrogate: nobody wants it any more.
-            PluginFailed: it took too long.
+            LeaseExpired, UnknownSurrogate: the result is not wanted any more.
+            PluginFailed: the job took too long.
             Exception: any error of the job.
         """
         job = await asyncio.to_thread(self._job, lease)
@@ -258,7 +259,7 @@ class Designer:
 
     async def _keep(self, lease: FitLease) -> None:
         """Renew the right to fit while the fit is wanted, and log a long fit. Raises ``LeaseExpired`` or
-        ``UnknownSurrogate`` if nobody wants it any more."""
+        ``UnknownSurrogate`` if the fit is not wanted any more."""
         began, tell_after = time.monotonic(), LONG_SECONDS
         with self._notices.listen(lease.surrogate) as listener:
             while True:
@@ -307,7 +308,7 @@ class Designer:
         )
 
     def _previous(self, name: str) -> bytes | None:
-        """The newest model; None if there is none, or if it is damaged."""
+        """Return the newest model as bytes; None if there is none, or if it is damaged."""
         try:
             return self._storage.models.blob(name)
         except (NoModel, Damaged):

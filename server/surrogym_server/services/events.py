@@ -15,15 +15,15 @@ from surrogym_server.storage.records import EventRecord
 T = TypeVar("T")
 
 SILENCE_SECONDS = 15.0
-CHANGE_SECONDS = 0.2  # at least, between two pages of new events, and between two notices that something has changed
+CHANGE_SECONDS = 0.2  # least time between two pages of new events, and between two results of ``changes``
 PAGE = 200
 RETRY_SECONDS = 2.0
-READING = 2  # reads at once: streams that open together leave the other threads and the event loop to others
+READING = 2  # most reads at a time, so that many streams that open together don't take all threads
 
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """Events in order. All streams that wait for the same ones share one page."""
+    """Events in order. All streams that wait for the same events share one page."""
 
     events: tuple[EventRecord, ...]
 
@@ -38,7 +38,7 @@ class EventService:
         self._shared: dict[str, tuple[tuple[int, int], asyncio.Task[Page]]] = {}  # the last page of each surrogate
 
     async def newest(self, name: str) -> int:
-        """The id of the last event, 0 before the first. Raises ``UnknownSurrogate``."""
+        """Return the id of the last event, 0 before the first. Raises ``UnknownSurrogate``."""
         newest = await self._read(lambda: self._storage.events.newest([name]))
         if name not in newest:
             raise UnknownSurrogate(f"expected the name of a surrogate, got {name!r}, which does not exist")
@@ -64,7 +64,7 @@ class EventService:
                         page = await self._page(name, after, version)
                     except UnknownSurrogate:
                         return
-                    except Unavailable:  # it continues when storage is back
+                    except Unavailable:  # the stream continues once the storage is back
                         await asyncio.sleep(RETRY_SECONDS)
                         continue
                     if page.events:
@@ -81,7 +81,8 @@ class EventService:
                 self._shared.pop(name, None)
 
     async def _page(self, name: str, after: int, version: int) -> Page:
-        """The events after one. Streams that ask for the same at the same version share the answer."""
+        """Return the events with an id above ``after``. Streams that ask for the same page at the same version of the
+        listener share it."""
         position, task = self._shared.get(name, (None, None))
         if task is None or position != (after, version):
             task = asyncio.create_task(self._read(lambda: Page(tuple(self._storage.events.list(name, after, PAGE)))))

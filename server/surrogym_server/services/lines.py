@@ -12,16 +12,17 @@ from surrogym_server.services.notices import Listener, Notices
 
 T = TypeVar("T")
 
-FIRST = 4  # claims of a line that ask the database at once
-LOOK_SECONDS = 2.0  # between looks whether the caller has closed its connection
+FIRST = 4  # most claims of a line that ask the database at a time
+LOOK_SECONDS = 2.0  # time between two checks whether the caller has closed its connection
 
 Present = Callable[[], Awaitable[None]]  # raises if the caller has closed its connection
 
 
 class _Line(Generic[T]):
-    """Claims that ask for the same. ``answer`` is the last one without work, to a question asked at ``version``.
+    """Claims for the same work. ``answer`` is the last answer without work, to a question asked at ``version``.
 
-    It listens as long as it exists, so that ``heard.version`` tells whether that answer still holds.
+    The line listens to notices as long as it exists: while ``heard.version`` equals ``version``, the answer still
+    holds.
     """
 
     def __init__(self, listening: ExitStack, heard: Listener) -> None:
@@ -34,11 +35,10 @@ class _Line(Generic[T]):
 
 
 class Lines(Generic[T]):
-    """Claims that wait, by what they ask for.
+    """Claims that wait, grouped by the work that they ask for.
 
     Args:
-        notices: which say that a surrogate has changed. Whatever makes work claimable posts a notice or appends an
-            event.
+        notices: tell that a surrogate has changed. Whatever makes work claimable posts a notice or appends an event.
         has_work: whether an answer ends the wait because it has work, which belongs to this claim alone.
         ends: whether an answer without work ends the wait, given the answer known before it.
     """
@@ -54,10 +54,10 @@ class Lines(Generic[T]):
     async def claim(
         self, surrogate: str, kind: Hashable, ask: Callable[[], T], seconds: float, present: Present | None = None
     ) -> T:
-        """Ask for work, and wait for it up to ``seconds``. Returns an answer with work, or the last without.
+        """Ask for work, and wait for it up to ``seconds``. Returns an answer with work, or the last answer without any.
 
         Args:
-            surrogate: whose notices tell of work.
+            surrogate: name of the surrogate, whose notices tell of new work.
             kind: claims of equal kinds can take the same work.
             ask: asks the database, in a thread.
             present: raises if the caller has closed its connection; called before each question.
@@ -82,7 +82,7 @@ class Lines(Generic[T]):
                 line.first.release()
 
     async def _answer(self, line: _Line[T], ask: Callable[[], T]) -> T:
-        """The answer that the line knows, if nothing has happened since; else a new one."""
+        """Return the line's last answer if nothing has happened since; else ask again."""
         if line.answer is not None and line.version == line.heard.version:
             return line.answer
         version, answer = line.heard.version, await asyncio.to_thread(ask)

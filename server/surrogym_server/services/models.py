@@ -41,7 +41,7 @@ class Said(Generic[T]):
 
 
 def load_model(storage: Storage, definitions: Definitions, surrogate: int, version: int) -> DynamicsModel:
-    """Load a stored model of a surrogate's id.
+    """Load a stored model of the surrogate with this id.
 
     Raises:
         UnknownModel, UnknownSurrogate: as the classes say.
@@ -58,8 +58,8 @@ def load_model(storage: Storage, definitions: Definitions, surrogate: int, versi
 
 
 def stored_tolerances(storage: Storage, surrogate: int, version: int) -> tuple[float, ...]:
-    """Tolerances of the outputs, (O,), by which a stored model of a surrogate's id was judged. Raises ``UnknownModel``
-    or ``UnknownSurrogate``."""
+    """Return the tolerances (O,) by which a stored model of the surrogate with this id was judged. Raises
+    ``UnknownModel`` or ``UnknownSurrogate``."""
     return tuple(storage.models.get(storage.surrogates.name_of(surrogate), version).tolerances)
 
 
@@ -92,7 +92,7 @@ class ModelService:
         self._notices = notices
 
     def list(self, name: str) -> list[ModelRecord]:
-        """All models, oldest first."""
+        """Return the records of all models of a surrogate, oldest first."""
         self._storage.surrogates.get(name)
         return self._storage.models.list(name)
 
@@ -101,7 +101,7 @@ class ModelService:
         return self._storage.models.get(name, version)
 
     def export(self, name: str, version: int) -> bytes:
-        """The model as a safetensors file. Raises ``UnknownModel`` or ``Damaged``."""
+        """Return a model as a safetensors file. Raises ``UnknownModel`` or ``Damaged``."""
         return stored_model(self._storage, name, version)
 
     def add(self, name: str, data: bytes) -> ModelRecord:
@@ -137,7 +137,8 @@ class ModelService:
             return Said(version, model.definition.outputs, predict_points(model, q, u))
 
     def query_uncertainty(self, name: str, q: Array, u: Array, version: int | None) -> Said[UncertaintyResult]:
-        """Uncertainty at q (n, C) under u (n, F), weighted by the latest occupancy. Raises like ``predict``."""
+        """Return the uncertainty at q (n, C) under u (n, F), weighted by the latest occupancy. Raises like
+        ``predict``."""
         version, model = self._model(name, version)
         q, u = check_points(model.definition, q, u)
         tolerances = np.array(self._storage.models.get(name, version).tolerances)

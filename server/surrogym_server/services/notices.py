@@ -9,7 +9,7 @@ from itertools import chain, islice
 
 from surrogym_server.storage.announcements import Alone, Announcements
 
-AT_ONCE = 50  # listeners woken in one turn of the event loop, so that other requests are answered between the turns
+AT_ONCE = 50  # most listeners woken in one turn of the event loop; other requests are answered between the turns
 
 
 class Listener:
@@ -21,7 +21,8 @@ class Listener:
 
     @property
     def version(self) -> int:
-        """Number of the last notice that this listener could hear. Equal numbers: nothing has happened between."""
+        """Number of the last notice that this listener could hear. If it is the same at two times, nothing has happened
+        in between."""
         return self._audience.version
 
     def wake(self) -> None:
@@ -38,7 +39,7 @@ class Listener:
 
 
 class Audience:
-    """The listeners to one surrogate, or to all."""
+    """The listeners to one surrogate, or to all surrogates."""
 
     def __init__(self, version: int) -> None:
         self.version = version
@@ -46,7 +47,7 @@ class Audience:
 
 
 class Notices:
-    """Listeners by surrogate. ``post`` may be called from any thread, the rest from the event loop's.
+    """Listeners by surrogate. ``post`` may be called from any thread, all other methods from the event loop's thread.
 
     Args:
         announcements: of the database, which carry notices between its servers.
@@ -74,7 +75,7 @@ class Notices:
 
     @contextmanager
     def listen(self, surrogate: str | None = None) -> Iterator[Listener]:
-        """Listen to one surrogate, or to all, within the context."""
+        """Return a context that listens to one surrogate, or to all surrogates."""
         audience = self._everything
         if surrogate is not None:
             audience = self._audiences.setdefault(surrogate, Audience(self._next()))
@@ -106,7 +107,8 @@ class Notices:
                 self._wake(name)
 
     def _hear(self, surrogate: str | None) -> None:
-        """Wake in this process; None wakes everybody, as notices may have been missed."""
+        """Wake the listeners of this process to a surrogate. None wakes all listeners, because notices may have been
+        lost."""
         with suppress(RuntimeError):  # the loop has ended, and nobody listens any more
             if surrogate is None:
                 self._loop.call_soon_threadsafe(self._wake_all)

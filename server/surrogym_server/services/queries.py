@@ -42,7 +42,7 @@ class QueryService:
         wait_seconds: float,
         present: Present | None = None,
     ) -> Claim:
-        """Lease up to ``limit`` queries. If there are none, wait for some, or for the end of the design.
+        """Lease up to ``limit`` queries. If there are none, wait until there are, or until the design ends.
 
         ``present`` raises if the sampler has disconnected meanwhile; then it gets no lease.
 
@@ -69,7 +69,8 @@ class QueryService:
     def fail(
         self, name: str, query_id: int, token: str, error: str, *, begun: bool, refused: bool = False
     ) -> QueryRecord:
-        """Return a query with an error, and whether a step of it may have been taken, or the environment refused it.
+        """Return a leased query with an error. ``begun``: a step of it may have been taken. ``refused``: the
+        environment refused it.
 
         Raises:
             UnknownQuery, ForeignLease, LeaseExpired: as the storage says.
@@ -117,7 +118,7 @@ class QueryService:
         return withdrawn
 
     def list(self, name: str, statuses: Sequence[QueryStatus]) -> list[QueryRecord]:
-        """The queries of these statuses (none: all), oldest first."""
+        """Return the queries with one of the ``statuses``, oldest first; all queries if ``statuses`` is empty."""
         return self._storage.queries.list(name, statuses)
 
 

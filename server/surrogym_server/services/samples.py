@@ -19,8 +19,8 @@ from surrogym_server.storage.records import LedgerRecord, LogPart, NewSample, Sa
 from surrogym_shared.nouns import Vector
 
 PAGE = 10_000
-BATCH = 500  # steps of a log in one transaction
-LOG = "log"  # the sampler of logged steps
+BATCH = 500  # most steps of a log that one transaction stores
+LOG = "log"  # name that logged steps have in the place of a sampler's
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class SampleService:
         key: str | None,
         log: LogPart | None = None,
     ) -> Added:
-        """Store real steps, all or nothing. They are committed when it returns.
+        """Store real steps, all or nothing. They are committed when the call returns.
 
         Steps of a ``log`` were recorded before the design. When the log is complete, the initial queries that it covers
         are withdrawn.
@@ -86,7 +86,8 @@ class SampleService:
     def add_log(self, name: str, samples: Sequence[NewSample], origin: str | None = None) -> AddedLog:
         """Store a whole log, batch by batch; a repeat stores what an earlier call did not. Raises as ``add``.
 
-        ``origin`` distinguishes the log from others with the same numbers; None: nothing does.
+        ``origin`` distinguishes the log from others with the same numbers; with None, logs with the same numbers count
+        as one.
         """
         first, duplicates, after = 0, 0, origin
         while first < len(samples):
@@ -116,11 +117,11 @@ class SampleService:
             self._storage.queries.withdraw(name, covering)
 
     def page(self, name: str, after: int, limit: int) -> list[SampleRecord]:
-        """Up to ``limit`` samples with an id above ``after``. Raises ``UnknownSurrogate``."""
+        """Return up to ``limit`` samples with an id above ``after``, in order. Raises ``UnknownSurrogate``."""
         return self._storage.samples.page(name, after, limit)
 
     def snapshots(self, name: str) -> dict[str, Vector]:
-        """The coordinates (C,) of the snapshots that samplers hold, by name."""
+        """Return the coordinates (C,) of the snapshots that samplers hold, by name."""
         return self._storage.snapshots.all(name)
 
     def drop_snapshots(self, name: str, snapshots: Sequence[str]) -> int:
@@ -131,7 +132,7 @@ class SampleService:
         return count
 
     def all(self, name: str) -> list[SampleRecord]:
-        """All samples, in order of arrival."""
+        """Return all samples, in order of arrival."""
         records = page = self.page(name, 0, PAGE)
         while len(page) == PAGE:
             page = self.page(name, page[-1].id, PAGE)
@@ -139,7 +140,7 @@ class SampleService:
         return records
 
     def coordinate_names(self, name: str) -> tuple[str, ...]:
-        """Names of the entries of a sample's coordinates."""
+        """Return the names of the entries of a sample's coordinates."""
         return self._definitions.get(name).coordinate_names
 
     def report_steps(self, name: str, steps: int, episodes: int, note: str, key: str) -> LedgerRecord:

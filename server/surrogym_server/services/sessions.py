@@ -36,7 +36,7 @@ class SessionService:
 
     @property
     def replay(self) -> int:
-        """How many of its last requests a client should keep."""
+        """Number of its last requests that a client should keep, to repeat them after a checkpoint."""
         return self._engine.replay
 
     async def open(self, surrogate: str, opening: Opening) -> SessionInfo:
@@ -51,12 +51,12 @@ class SessionService:
             SessionExpired: the session was idle for too long.
         """
         info = await self._engine.describe(id)
-        if info.behind:  # whoever reads its seq here has no requests to send again
+        if info.behind:  # a caller that asks for the session's state has kept no requests to repeat
             raise UnknownSession(f"session {id!r} lost its session host, and is behind its last reply: open a new one")
         return info
 
     async def coordinates(self, id: str) -> Array:
-        """The coordinates of all lanes, (N, C). Raises ``UnknownSession`` or ``SessionExpired``."""
+        """Return the coordinates of all lanes, (N, C). Raises ``UnknownSession`` or ``SessionExpired``."""
         return await self._engine.coordinates(id)
 
     async def close(self, id: str) -> None:
@@ -64,9 +64,8 @@ class SessionService:
         await self._engine.close(id)
 
     async def submit_occupancy(self, id: str, checkpoint: str) -> tuple[int, float]:
-        """Store the states that a session visited under a name; returns how many, and the confidence index there.
-
-        By the surrogate's id: the name may be another surrogate's by now.
+        """Store the states that a session visited under a checkpoint's name. Return their number, and the confidence
+        index over them. The surrogate is found by its id, because another surrogate may have its name by now.
 
         Raises:
             InvalidInput: the session was opened without occupancy.
@@ -84,13 +83,14 @@ class SessionService:
         return await self._engine.activity(surrogate)
 
     async def save(self) -> int:
-        """Hand all live sessions to storage; returns how many."""
+        """Store all live sessions, and return their number."""
         sessions = [SavedSession(one.id, one.surrogate, one.data) for one in await self._engine.save()]
         self._storage.sessions.save(sessions)
         return len(sessions)
 
     async def restore(self) -> int:
-        """Take the saved sessions back; returns how many. The log names each that can't be, and why."""
+        """Restore the saved sessions, and return how many were restored. The log names each session that can't be
+        restored, and why."""
         try:
             saved_sessions = self._storage.sessions.take()
         except Damaged as error:

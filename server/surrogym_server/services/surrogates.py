@@ -74,13 +74,15 @@ class SurrogateService:
     ) -> None:
         """
         Args:
-            storage: holds them.
-            definitions: of those in it.
-            define: the definition of a new spec; raises ``InvalidSpec`` where it asks for what is not installed.
-            complete: a spec with every field that this program knows, as JSON; an older one lacked some.
-            plan: the first queries of a design with a budget.
-            engine: has their sessions.
-            notices, samplers: of this process.
+            storage: stores the surrogates.
+            definitions: definitions of the stored surrogates.
+            define: returns the definition of a new specification; raises ``InvalidSpec`` if it needs a package that is
+                not installed.
+            complete: returns a specification with every field that this program knows, as JSON; one from an older
+                program may lack some.
+            plan: returns the first queries of a design, given its budget.
+            engine: has the sessions of all surrogates.
+            notices, samplers: those of this process.
         """
         self._storage = storage
         self._definitions = definitions
@@ -94,7 +96,7 @@ class SurrogateService:
     def create(self, name: str, spec: dict[str, Any], budget: int, target: float) -> tuple[SurrogateStatus, bool]:
         """Create a surrogate with its initial queries. The same name and specification again change nothing.
 
-        Returns its status, and whether this call made it.
+        Returns the surrogate's status, and whether this call created it.
 
         Raises:
             SpecConflict: the name exists with another specification.
@@ -125,11 +127,11 @@ class SurrogateService:
         return self._status(self._storage.surrogates.get(name))
 
     def spec(self, name: str) -> dict[str, Any]:
-        """The stored spec. Raises ``UnknownSurrogate``."""
+        """Return the stored specification. Raises ``UnknownSurrogate``."""
         return self._storage.surrogates.get(name).spec
 
     def list(self, after: int, limit: int) -> list[Listed]:
-        """Up to ``limit`` surrogates with an id above ``after``, oldest first."""
+        """Return up to ``limit`` surrogates with an id above ``after``, oldest first."""
         alive, sessions = self._samplers.by_surrogate(), self._engine.counts().sessions
         return [
             Listed(summary, tuple(alive.get(summary.name, ())), sessions.get(summary.name, 0))
@@ -145,11 +147,11 @@ class SurrogateService:
         target: float | None = None,
         tolerances: dict[str, float | None] | None = None,
     ) -> SurrogateStatus:
-        """Change everything that is not None. None in ``tolerances`` removes a tolerance that was set.
+        """Change the fields that are not None. A tolerance of None removes the one that was set for its output.
 
         Raises:
             UnknownSurrogate: there is none of this name.
-            InvalidInput: a tolerance for what is no output.
+            InvalidInput: a tolerance for a name that is not an output.
         """
         outputs = self._definitions.get(name).outputs
         if unknown := sorted(set(tolerances or ()) - set(outputs)):
@@ -196,7 +198,8 @@ class SurrogateService:
 
 
 def check_same(name: str, had: Any, got: Any) -> None:
-    """Raise ``SpecConflict`` if two specifications differ; the message names the place."""
+    """Raise ``SpecConflict`` if the stored specification and the new one differ. The message names the first
+    difference."""
     if had != got:
         where, old, new = difference(had, got)
         raise SpecConflict(
@@ -206,7 +209,7 @@ def check_same(name: str, had: Any, got: Any) -> None:
 
 
 def difference(had: Any, got: Any, where: str = "") -> tuple[str, Any, Any]:
-    """The first place where two JSON values differ, as ``coordinates.0.name``, and both values there."""
+    """Return the first place where two JSON values differ, such as ``coordinates.0.name``, and both values there."""
     if isinstance(had, dict) and isinstance(got, dict):
         pairs = [(key, had.get(key, ABSENT), got.get(key, ABSENT)) for key in {**had, **got}]
     elif isinstance(had, list) and isinstance(got, list) and len(had) == len(got):

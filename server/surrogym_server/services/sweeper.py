@@ -16,7 +16,7 @@ from surrogym_server.storage.port import Storage
 
 logger = logging.getLogger(__name__)
 
-EVENTS_KEPT = 10_000  # of a surrogate; the oldest beyond them are removed
+EVENTS_KEPT = 10_000  # most events of a surrogate that are kept, the newest ones
 PRUNE_SECONDS = 60.0
 
 
@@ -30,7 +30,7 @@ class Sweeper:
         notices: Notices,
         others: Sequence[Callable[[], Awaitable[None]]] = (),
     ) -> None:
-        """``others`` are sweeps of features."""
+        """``others`` are functions of features, called at each sweep."""
         self._storage = storage
         self._engine = engine
         self._seconds = seconds
@@ -58,7 +58,8 @@ class Sweeper:
         self._metrics.expired_leases += await asyncio.to_thread(self._storage.queries.sweep_expired)
 
     async def _find_changes(self) -> None:
-        """Wake those who wait for a surrogate that has changed, although its notice was lost: one question for all."""
+        """Wake those who wait for a surrogate that has changed, although the notice of the change was lost. One
+        statement asks for all surrogates."""
         if names := self._notices.listened:
             self._notices.compare(await asyncio.to_thread(self._storage.events.newest, names))
 
@@ -67,7 +68,7 @@ class Sweeper:
             await sweep()
         except SurrogymError as error:
             logger.warning("a sweep stopped early; it is repeated shortly: %s", error)
-        except Exception:  # leases must continue to expire, whatever error one sweep raises
+        except Exception:  # the next sweeps have to run, whatever error this one raises
             logger.exception("a sweep failed; it is repeated shortly")
 
     def _prune(self) -> None:

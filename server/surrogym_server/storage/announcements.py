@@ -18,7 +18,7 @@ class Announcements(ABC):
 
     @abstractmethod
     def announce(self, surrogate: str) -> None:
-        """Tell all other servers, soon. Returns at once, and never raises.
+        """Tell all other servers soon that something happened to the surrogate. Returns at once, and never raises.
 
         Announcements of one surrogate that wait to be sent are sent once.
         """
@@ -27,7 +27,7 @@ class Announcements(ABC):
     def listen(self, hear: Hear) -> None:
         """Call ``hear``, in a thread, for each announcement of another server from now on. To be called once.
 
-        After a lost connection, it is called with None once the connection is back.
+        After a lost connection, ``hear`` is called with None as soon as the connection is back.
         """
 
     @abstractmethod

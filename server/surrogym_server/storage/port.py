@@ -4,7 +4,7 @@ For all of it:
 - an operation is atomic, and what it changed is durable when it returns;
 - any thread may call, and on PostgreSQL any number of servers;
 - time is the database's clock, and a lease ends by that clock alone, whichever process dies; if the clock is set back,
-  no lease lasts longer than it was given;
+  no lease lasts longer than its duration;
 - an operation on a surrogate that does not exist raises ``UnknownSurrogate``;
 - an operation that raises has changed nothing;
 - a repeat with the same idempotency ``key`` and the same arguments changes nothing and returns the first result;
@@ -63,10 +63,11 @@ class Surrogates(ABC):
         """Create a surrogate in phase ``collecting`` with its initial queries, and return whether it is new.
 
         Many queries are queued in several transactions, so that they block no writer for long. No fit is due before
-        all are there. If a crash interrupts it, ``Designs.unbegun`` has the surrogate, and ``ask_first`` continues.
+        all are there. If a crash interrupts the call, ``Designs.unbegun`` returns the surrogate, and ``ask_first``
+        queues the missing queries.
 
-        If the name is taken, return the existing surrogate unchanged, and False. The caller checks whether it is the
-        same.
+        If the name is taken, return the existing surrogate unchanged, and False. The caller checks whether its
+        specification is the same.
         """
 
     @abstractmethod
@@ -196,7 +197,8 @@ class Designs(ABC):
 
     @abstractmethod
     def renew(self, lease: FitLease, seconds: float) -> FitLease:
-        """Extend the right to ``seconds`` from now. A right that has expired unnoticed is valid again.
+        """Extend the right to ``seconds`` from now. A right that has expired, and that no server has taken since, is
+        valid again.
 
         Raises:
             LeaseExpired: another server has taken the right since.
@@ -360,8 +362,8 @@ class Snapshots(ABC):
     def drop(self, name: str, snapshots: Sequence[str]) -> int:
         """Forget snapshots, and return how many were known. Unknown names are skipped.
 
-        Pending queries that begin there are removed, and a fit becomes due, which chooses anew. Those of them that a
-        sampler has begun are set aside.
+        Pending queries that begin there are removed, and a fit becomes due, which chooses anew. Queries of which a
+        sampler may have taken steps are set aside instead.
         """
 
 
@@ -413,7 +415,7 @@ class Models(ABC):
 
     @abstractmethod
     def add(self, name: str, model: NewModel) -> int:
-        """Store an imported model as the newest version, and return it. The design is not changed."""
+        """Store an imported model as the newest version, and return its version number. The design is not changed."""
 
 
 class Priors(ABC):
@@ -473,14 +475,16 @@ class Sessions(ABC):
 class Events(ABC):
     """Part of the storage for events of surrogates.
 
-    Every change that may end a wait appends an event: a claim that waits for queries or jobs looks again after one.
+    Every change that may end a wait appends an event: a claim that waits for queries or jobs looks again after each
+    event.
     """
 
     @abstractmethod
     def newest(self, names: Sequence[str]) -> dict[str, int]:
-        """Return the id of each surrogate's newest event, 0 before the first. Those that do not exist are left out.
+        """Return the id of each surrogate's newest event, 0 before the first. Surrogates that do not exist are left
+        out.
 
-        It is one statement. Its cost does not depend on the number of events.
+        It takes one statement, whose cost does not depend on the number of events.
         """
 
     @abstractmethod

@@ -194,7 +194,7 @@ class NewSample(Sample):
 class LogPart:
     """Where in a log the samples of a report belong."""
 
-    after: str | None = None  # digest from the reply to the part before; None for the first part of a log
+    after: str | None = None  # ``AddedSamples.digest`` of the part before; None for the first part of a log
     complete: bool = True  # this is the last part of the log
 
 
@@ -208,7 +208,7 @@ class AddedSamples:
 
     Attributes:
         ids: ids of the samples, in order.
-        duplicates: number of them that had been stored before.
+        duplicates: number of samples that had been stored before.
         digest: hash of the log up to the end of the batch; None if the samples are not logged.
         restart: hash of the log up to the sample from which it has to be sent again; None if the batch was stored.
     """

@@ -30,7 +30,7 @@ def folder(package: str) -> Path | None:
 
 
 def has_any(package: str) -> bool:
-    """Whether an earlier process has stored a compiled function."""
+    """Whether the package's cache folder has a compiled function, which an earlier process stored."""
     path = folder(package)
     return path is not None and any(path.glob("*/*.nbi"))
 

@@ -1,4 +1,4 @@
-"""What an FMU computes: variables, a period, and C source of its step."""
+"""The content of an FMU: its variables, its period, and the C source of its step."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ class Block:
 
 
 class Names:
-    """Names of an FMU's variables. One that is taken is preceded by its kind; ``time`` always is."""
+    """Names of an FMU's variables. A taken name is preceded by its variable's kind; ``time`` is taken."""
 
     def __init__(self) -> None:
         self._taken = {TIME}

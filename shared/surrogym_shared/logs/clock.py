@@ -1,7 +1,7 @@
-"""Episodes, repeated rows and clocks of a log: what says which row continues which.
+"""Find the episodes, repeated rows and clock of a log, which tell which row continues which.
 
 A row repeats another one only by evidence of its place: the same time in the same episode, or a whole file that was
-joined to itself. Equal numbers alone say nothing, because a plant at rest writes equal rows.
+joined to itself. Equal numbers alone are no evidence, because a plant at rest writes equal rows.
 """
 
 from __future__ import annotations

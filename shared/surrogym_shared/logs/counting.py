@@ -1,4 +1,4 @@
-"""What the cells of a column show: numbers of rows, clocks, numbers of episodes, or marks."""
+"""Find out what the cells of a column are: numbers of rows, times of a clock, numbers of episodes, or marks."""
 
 from __future__ import annotations
 
@@ -44,7 +44,8 @@ def numbering(cells: Cells) -> Numbering | None:
 
 
 def is_unordered(cells: Cells) -> bool:
-    """Whether whole numbers are different in each row and fall somewhere: an index of rows in another order."""
+    """Whether whole numbers differ in all rows and fall at least once, as an index does whose rows are in another
+    order."""
     values = measured(cells)
     whole = values is not None and bool((values == np.floor(values)).all())
     return values is not None and whole and len(np.unique(values)) == len(values) and bool((np.diff(values) < 0).any())
@@ -57,7 +58,7 @@ def grows_always(cells: Cells) -> bool:
 
 
 def grows(cells: Cells) -> bool:
-    """Whether a column never falls but to where it began, as a time does that restarts."""
+    """Whether a column only ever falls to its first value, as a time does that restarts."""
     values = measured(cells)
     if values is None:
         return False

@@ -1,4 +1,5 @@
-"""Roles of the columns of a table: by a mapping, or by their names and by what their cells show."""
+"""Find out which column of a table has which role: state, action, reward and so on. A mapping declares the roles;
+without one, the names of the columns and the contents of their cells decide."""
 
 from __future__ import annotations
 
@@ -132,7 +133,7 @@ def _plain(table: Table, roles: Roles) -> list[str]:
 
 
 def _numbering(name: str, table: Table) -> Numbering | None:
-    """What a column counts. That it restarts or has gaps only counts if its name is that of a counter.
+    """Return what a column counts. That it restarts or has gaps only counts if its name is that of a counter.
 
     Raises:
         UnusableLog: the rows are in another order than their numbers.

@@ -81,8 +81,8 @@ def _lies_in(low: float, high: float, turn: float) -> bool:
 
 
 def _motion(steps: Transitions, index: int, change: Floats, jumps: Bools, width: float) -> tuple[Floats, float]:
-    """Return the changes that the steps without a jump let expect of all steps (m,), and their standard deviation from
-    it."""
+    """Fit the motion to the steps without a jump. Return the changes (m,) that it predicts for all steps, and the
+    standard deviation of the error at the steps without a jump."""
     slow = ~jumps
     follows = np.zeros(len(change), dtype=np.bool_)
     follows[1:] = (steps.row[1:] == steps.row[:-1] + 1) & (steps.q[1:] == steps.q_next[:-1]).all(1) & slow[:-1]

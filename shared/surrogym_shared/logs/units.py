@@ -72,7 +72,7 @@ def unit_notes(q: Floats, spec: EnvironmentSpec) -> list[str]:
 def require_reward_unit(paid: Floats, known: Floats, name: str) -> None:
     """Refuse rewards that seem to be in another unit than those of a surrogate's samples.
 
-    Rewards of 0 have no unit, and few samples may all have small rewards by chance. Neither tells anything.
+    Rewards of 0 have no unit, and few samples may all have small rewards by chance. In both cases nothing is refused.
 
     Args:
         paid: rewards of the log, (m,).

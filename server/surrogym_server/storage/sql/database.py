@@ -110,8 +110,8 @@ class Database:
         """Keep one connection to a SQLite file until ``close``, and watch the file and SQLite's files beside it.
 
         SQLite deletes its write-ahead log with the last connection. While this one is open, a missing or different log
-        shows that another program changed it. The content of the log is merged first, so that a copy made while no
-        server ran differs from the file in its beginning.
+        shows that another program changed it. The content of the log is merged into the file first. So the beginning of
+        the file differs from that of a copy made while no server ran.
         """
         if self._lock is None:
             return
@@ -164,7 +164,8 @@ class Database:
             return
         self._lock.require_in_place()
         if not self._lock.is_as_noted():
-            # Having the turn excludes a program that is still merging the log into the file.
+            # A program that is still merging the log into the file can't be at work while this process has the write
+            # lock.
             with self._take_turn():
                 self._lock.require_own_content()
 

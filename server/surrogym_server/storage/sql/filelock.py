@@ -45,12 +45,12 @@ _turn = threading.Lock()
 class FileLock:
     """A lock held from construction to ``close`` or the end of the process; child processes never inherit it.
 
-    It belongs to the file, under whatever name the file is opened. A file that does not exist is created, empty.
+    The lock belongs to the file, under whatever name the file is opened. A file that does not exist is created, empty.
     Close it after SQLite's connections: closing any descriptor of a file drops the locks that SQLite has on it.
 
     Raises:
-        Unavailable: another server holds it, the file can't be read and written, or a write-ahead log lies beside it
-            that was written for another database.
+        Unavailable: another server holds the lock, the file can't be read and written, or a write-ahead log lies beside
+            it that was written for another database.
     """
 
     def __init__(self, path: Path) -> None:
@@ -82,7 +82,8 @@ class FileLock:
         return os.pread(self._descriptors[-1], HEADER_BYTES, 0)
 
     def log_is_merged(self) -> bool:
-        """Whether the next transaction may begin a new log. Only a caller with the right to write may ask."""
+        """Whether all of the file's log is merged, so that the next transaction may begin a new log. The caller has the
+        write lock."""
         if self._index_descriptor is None:
             self._index_descriptor = os.open(
                 self._index, os.O_RDONLY | os.O_CLOEXEC
@@ -115,7 +116,8 @@ class FileLock:
         return self._noted is None or self.header() == self._noted
 
     def require_own_content(self) -> None:
-        """Find out whether a changed beginning of the file comes from its own log, and note it if so.
+        """Find out whether a changed beginning of the file comes from its own log, and remember the new beginning if
+        so.
 
         The caller keeps others from writing.
 
@@ -171,7 +173,8 @@ def _identity(path: Path) -> Identity | None:
 
 
 def _lock_byte(path: Path) -> int:
-    """An open file description lock: no other kind of lock uses this byte, and only its descriptor releases it."""
+    """Lock ``LOCKED_BYTE`` of a file by an open file description lock, and return the descriptor, which alone releases
+    it."""
     descriptor = _open(path)
     assert WHOLE_DESCRIPTION is not None
     try:
@@ -188,8 +191,8 @@ def _range(kind: int, first: int, count: int) -> bytes:
 
 
 def _lock_beside(path: Path) -> int:
-    """A lock on a file beside the database, for systems that can't lock a byte this way. It is the same for every
-    symbolic link."""
+    """Lock a file beside the database, and return its descriptor, on systems without open file description locks. All
+    symbolic links to a database lead to the same lock."""
     resolved = path.resolve()
     descriptor = _open(resolved.with_name(resolved.name + ".lock"))
     try:
@@ -258,12 +261,14 @@ def belongs(log: Path, header: bytes) -> bool:
 
 
 def is_merged(index: bytes) -> bool:
-    """Whether all of a log is in the database, so that the next transaction may begin a new log.
+    """Whether all frames of a write-ahead log are merged into its database, so that the next transaction may begin a
+    new log.
 
-    ``index`` is the beginning of the log's index, read by a caller with the right to write.
+    ``index`` has the first ``INDEX_BYTES`` bytes of the log's index, the file ``-shm``. The caller has the write lock,
+    so that the index does not change.
     """
     if len(index) < INDEX_BYTES or struct.unpack_from("=I", index)[0] != INDEX_VERSION:
-        return True  # the log is then marked again, which does no harm
+        return True  # an unknown index counts as merged: the log is then marked once more, without harm
     frames, merged = struct.unpack_from("=I", index, 16)[0], struct.unpack_from("=I", index, 96)[0]
     return bool(frames == merged)
 

@@ -1,7 +1,7 @@
 """Leases of queries: how they begin, how they end, and which of them a reported sample answers.
 
 The caller holds the surrogate unless a docstring says otherwise. A lease has one answer: one sample, or the first
-samples of a rollout. It comes whole, in one batch.
+samples of a rollout. An answer comes whole, in one batch.
 """
 
 from __future__ import annotations

@@ -42,10 +42,10 @@ NONE = SampleCounts()
 
 
 class CountedSamples:
-    """Numbers of samples of each surrogate. Only samples since the last look are counted.
+    """Numbers of samples of each surrogate. Each call counts only the samples that were added since the last one.
 
-    Samples of a surrogate are added one transaction after the other, so their ids grow. They are never changed, and go
-    only with their surrogate. Other processes may add samples too.
+    Samples of a surrogate are added one transaction after the other, so their ids grow. Samples are never changed, and
+    only deleted with their surrogate. Other processes may add samples too.
     """
 
     def __init__(self) -> None:

@@ -91,7 +91,8 @@ def newest_of(connection: Connection, span: Span) -> dict[int, tuple[int, float]
 
 
 def insert_model(connection: Connection, surrogate: Row[Any], model: NewModel) -> int:
-    """Store a model as the newest version. The surrogate is held, so that versions have no gaps."""
+    """Store a model as the newest version. The caller has locked the surrogate (``rows.hold``), so that versions have
+    no gaps."""
     newest = sa.select(sa.func.max(models.c.version)).where(models.c.surrogate_id == surrogate.id)
     version = (connection.execute(newest).scalar() or 0) + 1
     connection.execute(
@@ -153,7 +154,7 @@ class SqlPolicyNames(port.PolicyNames):
 
 
 def resolve(connection: Connection, surrogate: int, name: str, which: str) -> int:
-    """The version that a version, an alias or ``latest`` means. Raises ``UnknownPolicy``."""
+    """Return the version number that ``which`` means: a number, an alias or ``latest``. Raises ``UnknownPolicy``."""
     if which.isascii() and which.isdecimal() and len(which) < 10:
         require_version(connection, surrogate, name, int(which))
         return int(which)

@@ -114,7 +114,8 @@ def insert_queries(
     *,
     extra: bool = False,
 ) -> list[int]:
-    """Queue queries, and return their ids in the same order. ``extra``: the design alone would not have made them."""
+    """Queue queries, and return their ids in the same order. ``extra`` marks queries that ``improve`` requested, which
+    the design alone would not have chosen."""
     if not new_queries:
         return []
     common = {"surrogate_id": surrogate.id, "purpose": purpose, "round": round, "status": "pending", "attempts": 0}

@@ -155,7 +155,7 @@ def _store(
 
 
 def _identity(place: int, sample: NewSample, lease: Answered | None) -> Identity:
-    """What identifies a sample in a batch: its lease and step, or its place if it has no lease."""
+    """Return what identifies a sample in its batch: its lease and step, or its place if it has no lease."""
     return (lease.lease_id, sample.step) if lease else (None, place)
 
 

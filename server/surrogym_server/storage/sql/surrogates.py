@@ -302,7 +302,8 @@ class Counted:
         self._answers: dict[int, tuple[int | None, int]] = {}  # by surrogate: its newest sample's id, and the number
 
     def read(self, connection: Connection, newest: Mapping[int, int | None]) -> dict[int, tuple[SampleCounts, int]]:
-        """The numbers of each surrogate, given the id of its newest sample, which was read before."""
+        """Return the numbers of samples and answered queries of each surrogate, given the id of its newest sample,
+        which was read before."""
         counts = self._samples.of_many(connection, newest)
         stale = [id for id in newest if self._answers.get(id, (-1, 0))[0] != newest[id]]
         for first in range(0, len(stale), AT_ONCE):

@@ -121,7 +121,9 @@ class Checked(sa.types.TypeDecorator[Any]):
 
 
 def checked(table: sa.Table) -> sa.Table:
-    """Check the values of columns without a type of this file. Ids are not checked, because they only refer to rows."""
+    """Let a table's columns of plain SQL types check the values that they read (see ``Checked``), and return the table.
+    ``Floats``, ``Json`` and ``Word`` check their values by themselves. Ids are not checked, because they only refer to
+    rows."""
     for column in table.columns:
         if type(column.type) in PLAIN and column.type is not Id:
             column.type = Checked(f"{table.name}.{column.name}", column.type)
