@@ -81,12 +81,12 @@ class ActingPolicy:
     log_deviations: Array | None = None  # (F,) logarithms of the standard deviations of the noise; None without noise
 
     def __post_init__(self) -> None:
-        arrays = self._named()
+        arrays = self._arrays_by_name()
         if not 1 <= len(self.layers) <= MAX_LAYERS:
             raise ValueError(f"policy: expected 1 to {MAX_LAYERS} layers, got {len(self.layers)}")
         for name, array in arrays.items():
             if array.dtype not in (np.float32, np.float64) or array.dtype != self.mean.dtype:
-                raise ValueError(f"policy: expected {name} as {_allowed(self.mean.dtype)}, got {array.dtype}")
+                raise ValueError(f"policy: expected {name} as {_dtype_names(self.mean.dtype)}, got {array.dtype}")
         self._check_shapes()
         for name, array in arrays.items():
             if not np.isfinite(array).all():
@@ -119,7 +119,7 @@ class ActingPolicy:
         """Return weights and bias of each layer as one vector."""
         return np.concatenate([part.ravel() for layer in self.layers for part in layer])
 
-    def _named(self) -> dict[str, Array]:
+    def _arrays_by_name(self) -> dict[str, Array]:
         arrays = {"mean": self.mean, "deviation": self.deviation}
         for i, layer in enumerate(self.layers):
             arrays |= {f"layers[{i}].weights": layer.weights, f"layers[{i}].bias": layer.bias}
@@ -136,7 +136,7 @@ class ActingPolicy:
             size = after
         if self.log_deviations is not None:
             shapes["log_deviations"] = (max(self.log_deviations.size, 1),)
-        for name, array in self._named().items():
+        for name, array in self._arrays_by_name().items():
             if array.shape != shapes[name]:
                 raise ValueError(f"policy: expected {name} of shape {shapes[name]}, got {array.shape}")
         if (count := parameters_of(self.mean.size, self.units)) > MAX_PARAMETERS:
@@ -213,8 +213,8 @@ class Actor:
         if not np.isfinite(y).all():
             raise ValueError("policy: expected finite outputs of the network, got NaN or infinity")
         if noise is None:
-            sent = most_probable(y, self.low, self.high, self.counts)
-            return Acted(sent.reshape(len(y), -1).astype(np.float64), None, sent)
+            for_surrogate = most_probable(y, self.low, self.high, self.counts)
+            return Acted(for_surrogate.reshape(len(y), -1).astype(np.float64), None, for_surrogate)
         further = np.zeros(0, dtype=policy.dtype) if policy.log_deviations is None else policy.log_deviations
         action, log = self._distribution.sample(y, further, self._keyed.at(noise))
         return Acted(action, log, self._distribution.sent(action))
@@ -249,5 +249,5 @@ def _words(*words: int) -> NDArray[np.uint64]:
     return np.array(words, dtype=np.uint64)
 
 
-def _allowed(dtype: np.dtype[Any]) -> str:
+def _dtype_names(dtype: np.dtype[Any]) -> str:
     return str(dtype) if dtype in (np.float32, np.float64) else "float32 or float64"

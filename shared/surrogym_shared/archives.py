@@ -52,7 +52,7 @@ def read_entries(zipped: Path | bytes, limit: int) -> dict[str, bytes]:
         OSError: the file can't be read.
         ValueError: the file is not a zip, is too large, or contradicts the sizes in its headers.
     """
-    with _opened(zipped, limit) as archive:
+    with _open_zip(zipped, limit) as archive:
         return {entry.filename: _content(archive, entry) for entry in archive.infolist()}
 
 
@@ -79,7 +79,7 @@ def read_arrays(
         OSError: the file can't be read.
         ValueError: as ``read_entries`` and ``require``, or an array contradicts the size in its header.
     """
-    with _opened(npz, limit) as archive:
+    with _open_zip(npz, limit) as archive:
         entries = {entry.filename.removesuffix(ARRAY): entry for entry in archive.infolist()}
         require({name: _header(archive, entry, name) for name, entry in entries.items()})
         return {name: _array(archive, entry, name) for name, entry in entries.items()}
@@ -94,7 +94,7 @@ def require_finite(arrays: Mapping[str, NDArray[Any]], positive: str) -> None:
 
 
 @contextmanager
-def _opened(zipped: Path | bytes, limit: int) -> Iterator[zipfile.ZipFile]:
+def _open_zip(zipped: Path | bytes, limit: int) -> Iterator[zipfile.ZipFile]:
     """Open a zip with names that differ, whose entries have at most ``limit`` bytes together. Its errors become
     ValueError."""
     try:

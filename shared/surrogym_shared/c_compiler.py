@@ -25,13 +25,13 @@ def c_compiler() -> tuple[str, ...] | None:
     Raises:
         CannotCompile: ``CC`` names no program.
     """
-    if named := os.environ.get("CC", "").strip():
+    if text := os.environ.get("CC", "").strip():
         try:
-            command = tuple(shlex.split(named))
+            command = tuple(shlex.split(text))
         except ValueError:  # a quotation mark is not closed
             command = ()
         if not command or shutil.which(command[0]) is None:
-            raise CannotCompile(f"expected the variable CC to name a C compiler on the search path, got {named!r}")
+            raise CannotCompile(f"expected the variable CC to name a C compiler on the search path, got {text!r}")
         return command
     return next(((name,) for name in COMPILERS if shutil.which(name)), None)
 

@@ -30,8 +30,8 @@ def of_mean(values: Sequence[float]) -> Interval | None:
     rng = np.random.default_rng(0)
     means = np.concatenate(
         [
-            array[rng.integers(len(array), size=(min(rows, RESAMPLES - begun), len(array)))].mean(1)
-            for begun in range(0, RESAMPLES, rows)
+            array[rng.integers(len(array), size=(min(rows, RESAMPLES - first), len(array)))].mean(1)
+            for first in range(0, RESAMPLES, rows)
         ]
     )
     low, high = np.quantile(means, QUANTILES)

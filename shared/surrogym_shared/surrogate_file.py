@@ -108,7 +108,7 @@ class SurrogateFile:
             "about": self.about,
         }
         header[METADATA] = header.get(METADATA, {}) | {OWN: json.dumps(own)}
-        return _joined(header, b"".join(parts))
+        return _join(header, b"".join(parts))
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
@@ -133,7 +133,7 @@ class SurrogateFile:
             entries = {one: header.pop(SAMPLES + one) for one in names}
             samples = RealSamples(**{name: _array(entry, body) for name, entry in entries.items()})
             end = min(entry["data_offsets"][0] for entry in entries.values())
-            model = _joined(header, body[:end])
+            model = _join(header, body[:end])
             name = _name(own["name"])
             tolerances = {str(output): float(value) for output, value in own.get("tolerances", {}).items()}
             ledger = {str(purpose): int(steps) for purpose, steps in own.get("ledger", {}).items()}
@@ -197,7 +197,7 @@ def _split(data: bytes) -> tuple[Header, bytes]:
     return header, data[end:]
 
 
-def _joined(header: Header, body: bytes) -> bytes:
+def _join(header: Header, body: bytes) -> bytes:
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % LENGTH_BYTES)  # the format requires that arrays begin at a multiple of eight
     return len(text).to_bytes(LENGTH_BYTES, "little") + text + body

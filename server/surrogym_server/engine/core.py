@@ -71,10 +71,10 @@ def opened(
 
     Args:
         request: the opening.
-        definition: of the surrogate, on the device of the lanes.
+        definition: definition of the surrogate, on the device of the lanes.
         model: the version that the session begins with, on the same device.
-        version: of the model.
-        digest: of the opening.
+        version: number of this version.
+        digest: content hash of the opening, to recognise a repeat.
         place: suffix of the session's id.
     """
     opening = request.opening
@@ -178,7 +178,7 @@ def carried_out(
 
     Args:
         request: the request.
-        models: of the session's surrogate.
+        models: models of the session's surrogate.
         require_wanted: called before each step of a rollout; raises if its caller no longer waits.
         interrupts: whether a ``KeyboardInterrupt`` from a model's code is a failure of that code. True in a server,
             where Ctrl-C does not raise it.

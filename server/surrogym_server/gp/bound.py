@@ -195,20 +195,18 @@ def _searched(
     """The least cost from a start, and its theta, with the inducing points that suit the start."""
     parameters = Parameters(x.shape[1], options, reflection)
     clipped = np.clip(start, parameters.lower, parameters.upper)
-    inducing_points = pivots(parameters.hyper(clipped), x, inducing)
-    return minimum(Bound(x, y, inducing_points, options, reflection), clipped)
+    inducing_rows = pivots(parameters.hyper(clipped), x, inducing)
+    return minimum(Bound(x, y, inducing_rows, options, reflection), clipped)
 
 
 class Bound(Parameters):
     """Negative bound with priors, and its gradient."""
 
-    def __init__(
-        self, x: Tensor, y: Tensor, chosen: Tensor, options: FitOptions, reflection: Reflection | None
-    ) -> None:
-        """Prepare the bound of x (n, d) and y (n,); ``chosen`` (m,) are the numbers of the inducing points."""
+    def __init__(self, x: Tensor, y: Tensor, rows: Tensor, options: FitOptions, reflection: Reflection | None) -> None:
+        """Prepare the bound of x (n, d) and y (n,); ``rows`` (m,) are the numbers of the inducing points."""
         super().__init__(x.shape[1], options, reflection)
-        self.x, self.y, self.chosen = x.numpy(), y.numpy(), chosen.numpy()
-        self.z = self.x[self.chosen]
+        self.x, self.y, self.inducing_rows = x.numpy(), y.numpy(), rows.numpy()
+        self.z = self.x[self.inducing_rows]
         self.parity = 0 if reflection is None else reflection.parity
         self.signs = np.ones(self.d) if reflection is None else reflection.signs.numpy()
         self._lines = Polynomial.of(1.0, 0.0, reflection, x)
@@ -220,7 +218,7 @@ class Bound(Parameters):
         covariances = self._covariances(theta)
         k, noise = covariances.k, self.values(theta)[-1]
         n, m, prior = len(self.y), len(self.z), float(covariances.diagonal.sum())
-        inner = k[:, self.chosen].copy()
+        inner = k[:, self.inducing_rows].copy()
         inner.flat[:: m + 1] += JITTER * prior / n
         if (lower := _factor(inner)) is None:
             return 1e10, np.zeros_like(theta)
@@ -243,11 +241,11 @@ class Bound(Parameters):
         outer += np.outer(back @ weights, alpha)
         within = np.outer(weights, weights) + s / noise - 2 * np.eye(m) + noise * inverse
         within = -0.5 * back @ within @ back.T
-        outer[:, self.chosen] += within
+        outer[:, self.inducing_rows] += within
         each = -0.5 / noise + JITTER * float(within.trace()) / n  # of the diagonal of K_ff
         gradient = self._gradient(theta, covariances, outer, each)
-        taken = n - m + noise * float(inverse.trace())
-        gradient[-1] = 0.5 * (noise * float(alpha @ alpha) - taken + left / noise)
+        freedom = n - m + noise * float(inverse.trace())
+        gradient[-1] = 0.5 * (noise * float(alpha @ alpha) - freedom + left / noise)
         return float(value), z / self.prior[:, 1] - gradient
 
     def _covariances(self, theta: Array) -> _Covariances:
@@ -285,8 +283,8 @@ class Bound(Parameters):
             squared = weighted.sum(1) @ np.square(self.z) + weighted.sum(0) @ np.square(x)
             gradient[: self.d] += (squared - 2 * ((weighted @ x) * self.z).sum(0)) / lengthscale**2
         if self.parity:
-            turned = -2 * (self.signs - 1) / lengthscale**2
-            gradient[: self.d] += each * turned * (covariances.mirrored @ np.square(self.x))
+            slope = -2 * (self.signs - 1) / lengthscale**2
+            gradient[: self.d] += each * slope * (covariances.mirrored @ np.square(self.x))
         x, place = torch.from_numpy(self.x), self.d + 1
         for variance, part in ((linear, self._lines), (quadratic, self._squares)):
             if variance:

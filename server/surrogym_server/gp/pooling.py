@@ -187,9 +187,9 @@ def _played(process: Posterior, x: Tensor, y: Tensor, may: Tensor) -> Inputs | N
         return None
     effect = ((x - x.mean(0)).T @ (y - y.mean())).abs() / x.std(0).clamp_min(1e-12)
     strongest = effect.argsort(descending=True)[: d + 1].tolist()
-    starts = [choice for choice in permutations(strongest, d) if _allowed(may, choice)]
+    starts = [choice for choice in permutations(strongest, d) if _may_read(may, choice)]
     if not starts:
-        any_allowed = next((choice for choice in permutations(range(size), d) if _allowed(may, choice)), None)
+        any_allowed = next((choice for choice in permutations(range(size), d) if _may_read(may, choice)), None)
         if any_allowed is None:
             return None
         starts = [any_allowed]
@@ -198,7 +198,7 @@ def _played(process: Posterior, x: Tensor, y: Tensor, may: Tensor) -> Inputs | N
     for place in errors.argsort()[:STARTS].tolist():
         best, error = starts[place], float(errors[place])
         for _ in range(SWEEPS):
-            choices = [t for t in _neighbours(best, size) if _allowed(may, t)]
+            choices = [t for t in _neighbours(best, size) if _may_read(may, t)]
             if not choices or float((again := _errors(process, x, y, choices)).min()) >= error:
                 break
             best, error = choices[int(again.argmin())], float(again.min())
@@ -217,7 +217,7 @@ def _neighbours(inputs: Inputs, size: int) -> list[Inputs]:
     return swaps
 
 
-def _allowed(may: Tensor, inputs: Inputs) -> bool:
+def _may_read(may: Tensor, inputs: Inputs) -> bool:
     return bool(may[torch.arange(len(inputs)), list(inputs)].all())
 
 

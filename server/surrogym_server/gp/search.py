@@ -121,9 +121,9 @@ class Evidence(Parameters):
         matrix = np.zeros((self.n, self.n))
         matrix.ravel()[self.places] = k
         matrix.flat[:: self.n + 1] += noise
-        if (solved := self._solve(matrix)) is None:
+        if (solution := self._solve(matrix)) is None:
             return None
-        inverse, weights, log_root = solved
+        inverse, weights, log_root = solution
         product = weights.take(self.rows) * weights.take(self.columns)
         half = 0.5 * self.twice * (product - inverse.ravel().take(self.places))
         weighted = half * smooth

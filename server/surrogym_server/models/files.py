@@ -25,8 +25,8 @@ MALFORMED = (SafetensorError, ValueError, LookupError, TypeError, AttributeError
 def to_bytes(model: DynamicsModel) -> bytes:
     """Write the whole model, serving arrays included."""
     family = model.definition.learning.model
-    stored = learner_of(family).codec.encode(model)
-    return with_checksum({FAMILY: family.name, **stored.header}, stored.tensors)
+    data = learner_of(family).codec.encode(model)
+    return with_checksum({FAMILY: family.name, **data.header}, data.tensors)
 
 
 def with_checksum(header: dict[str, Any], tensors: dict[str, Tensor]) -> bytes:

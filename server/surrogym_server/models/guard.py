@@ -46,20 +46,20 @@ def learn(
     with plugin_calls(definition):
         learner = learner_of(definition.learning.model)
         if prior is not None and isinstance(learner, TakesPrior):
-            learned = learner.learn_beside(prior, definition, samples, warm)
+            result = learner.learn_beside(prior, definition, samples, warm)
         else:
-            learned = learner.learn(definition, samples, warm)
-        model: object = getattr(learned, "model", learned)
+            result = learner.learn(definition, samples, warm)
+        model: object = getattr(result, "model", result)
         if not isinstance(model, DynamicsModel):
             raise _wrong(definition, "expected learn to return a Learned with a DynamicsModel", type(model).__name__)
-        for name, array in learned.warm.items():
+        for name, array in result.warm.items():
             if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
                 raise _wrong(
                     definition, f"expected the warm start {name!r} to be an array of numbers", type(array).__name__
                 )
         every = max(1, len(samples) // POINTS)
-        require_sound(learned.model, samples.q[::every][:POINTS], samples.u[::every][:POINTS])
-    return learned
+        require_sound(result.model, samples.q[::every][:POINTS], samples.u[::every][:POINTS])
+    return result
 
 
 def require_sound(model: DynamicsModel, q: Tensor, u: Tensor) -> None:
@@ -118,9 +118,9 @@ def require_numbers(definition: EnvironmentDefinition, what: str, values: Tensor
 
 
 def _require_shape(definition: EnvironmentDefinition, what: str, values: Tensor | None, shape: tuple[int, ...]) -> None:
-    got = getattr(values, "shape", None)
-    if got != shape:
-        came = type(values).__name__ if got is None else str(tuple(got))
+    shape_of_values = getattr(values, "shape", None)
+    if shape_of_values != shape:
+        came = type(values).__name__ if shape_of_values is None else str(tuple(shape_of_values))
         raise _wrong(definition, f"{what}: expected the shape {tuple(shape)}", came)
 
 

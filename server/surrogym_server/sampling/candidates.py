@@ -16,7 +16,7 @@ from surrogym_server.sampling.latin_hypercube import random_points
 from surrogym_server.sampling.occupancy import log_occupancy
 
 MAX_CANDIDATES = 4_096  # most candidates of each kind, because memory holds their covariances with the reference
-REFERENCE = 256  # reference points of each kind: from the Monte Carlo set, and visited
+REFERENCE = 256  # reference points of each kind: from the Monte Carlo set, and from visited states
 OCCUPIED = (
     0.75  # weight of the visited states among the reference points; those from the whole sampling range have the rest
 )

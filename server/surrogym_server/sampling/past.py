@@ -48,7 +48,7 @@ def owed_to_past(model: DynamicsModel, samples: Samples, limits: Sequence[float]
     now = torch.cat([_state(definition, newest.q), newest.u], -1)
     pasts = [_past(newest.u, increments(definition, newest), follows, depth) for depth in DEPTHS]
     shares = [
-        max(_explained(at, now, *past) for past in pasts)
+        max(_explained_share(at, now, *past) for past in pasts)
         if one.error > limit and (at := able.at_samples(newest, column)) is not None
         else 0.0
         for column, (one, limit) in enumerate(zip(errors.leave_one_out()[:-1], limits, strict=False))
@@ -57,7 +57,7 @@ def owed_to_past(model: DynamicsModel, samples: Samples, limits: Sequence[float]
 
 
 def pairs_lacking(definition: EnvironmentDefinition, samples: Samples) -> int:
-    """Number of consecutive steps that ``owed_to_past`` needs in addition."""
+    """Number of consecutive steps that ``owed_to_past`` needs in addition to those of the samples."""
     state, size, changes = _state(definition, samples.q[:1]).shape[1], samples.u.shape[1], len(definition.moving)
     enough = PAIRS * (state + size + changes + DEPTHS[0] * size + 1)
     return max(0, enough - int((preceding(definition, samples) >= 0).sum()))
@@ -80,7 +80,7 @@ def _past(u: Tensor, change: Tensor, follows: Tensor, depth: int) -> tuple[Tenso
     return torch.cat(columns, -1), complete
 
 
-def _explained(at: AtSamples, now: Tensor, past: Tensor, complete: Tensor) -> float:
+def _explained_share(at: AtSamples, now: Tensor, past: Tensor, complete: Tensor) -> float:
     """Share of an output's squared error at n samples that their past explains in addition to state and action.
 
     Args:

@@ -72,8 +72,8 @@ def interval_score(low: Tensor, high: Tensor, value: Tensor, level: float) -> Te
 def predicted(model: DynamicsModel, samples: Samples) -> Predictions:
     """Predict samples that the model has not learned from.
 
-    Left out are outputs of steps that ended at a declared limit, because the limit cuts the change off, and rewards of
-    steps that ended the episode, because they contain the terminal reward.
+    Outputs of steps that ended at a declared limit are left out, because the limit cuts the change off. Rewards of
+    steps that ended the episode are left out, because they contain the terminal reward.
     """
     transition = model.transition(samples.q, samples.u, stds=True, reward_std=True)
     assert transition.std is not None

@@ -286,7 +286,7 @@ class Designer:
         pending = [query for query in unanswered if query.status != "refused"]
         refused = [query for query in unanswered if query.status == "refused"]
         spoken = sum(purpose not in FREE for purpose in samples.purpose) + sum(query.steps for query in pending)
-        visited = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
+        visits = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
         definition = self._definitions.for_design(name).with_tolerances(record.tolerances)
         return DesignJob(
             definition=definition,
@@ -301,7 +301,7 @@ class Designer:
             extra_queries=min(
                 lease.extra_queries, max(0, record.budget - spoken)
             ),  # the budget may have been lowered since
-            occupancy=None if visited is None else visited.states,
+            occupancy=None if visits is None else visits.states,
             threads=self._settings.threads,
             prior=self._storage.priors.blob(name),
             previous=self._previous(name) if set(samples.purpose).difference(UNCHOSEN) else None,

@@ -96,7 +96,7 @@ class SessionService:
         except Damaged as error:
             logger.error("the saved sessions can't be read, so trainers must open new ones: %s", error)
             return 0
-        return sum([await self._restored(saved) for saved in saved_sessions])
+        return sum([await self._restored(session) for session in saved_sessions])
 
     async def _restored(self, session: SavedSession) -> bool:
         try:

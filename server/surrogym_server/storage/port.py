@@ -454,10 +454,12 @@ class Occupancy(ABC):
         latest."""
 
     @abstractmethod
-    def get(self, name: str, checkpoint: str) -> OccupancyRecord | None: ...
+    def get(self, name: str, checkpoint: str) -> OccupancyRecord | None:
+        """Return the occupancy of a checkpoint; None if none is stored."""
 
     @abstractmethod
-    def latest(self, name: str) -> OccupancyRecord | None: ...
+    def latest(self, name: str) -> OccupancyRecord | None:
+        """Return the occupancy that was stored last; None if none is stored."""
 
 
 class Sessions(ABC):

@@ -123,12 +123,12 @@ class Names:
     """Names of an FMU's variables. A taken name is preceded by its variable's kind; ``time`` is taken."""
 
     def __init__(self) -> None:
-        self._taken = {TIME}
+        self._names = {TIME}
 
     def free(self, name: str, kind: str) -> str:
         """Return a name that no variable has yet, and take it."""
-        name_of_variable = f"{kind}.{name}" if name in self._taken else name
-        self._taken.add(name_of_variable)
+        name_of_variable = f"{kind}.{name}" if name in self._names else name
+        self._names.add(name_of_variable)
         return name_of_variable
 
 

@@ -58,7 +58,7 @@ def model_description(block: Block) -> bytes:
     for reference, one in outputs:
         if one.start is None:
             SubElement(structure, "InitialUnknown", valueReference=str(reference))
-    return _written(root)
+    return _to_xml(root)
 
 
 def _add(variables: Element, one: Variable, reference: int) -> None:
@@ -95,10 +95,10 @@ def build_description(block: Block, sources: list[str]) -> bytes:
     files = SubElement(configuration, "SourceFileSet", language="C99")
     for name in sources:
         SubElement(files, "SourceFile", name=name)
-    return _written(root)
+    return _to_xml(root)
 
 
-def _written(root: Element) -> bytes:
+def _to_xml(root: Element) -> bytes:
     indent(root)
     body: bytes = tostring(root, encoding="utf-8")
     return b'<?xml version="1.0" encoding="UTF-8"?>\n' + body + b"\n"

@@ -78,7 +78,7 @@ def draft(roles: Roles, steps: Transitions, name: str, budget: int = 0) -> Draft
     spec = EnvironmentSpec(
         environment=name,
         coordinates=tuple(coordinates),
-        observation=tuple(entry for c in coordinates for entry in _observed(c)),
+        observation=tuple(entry for c in coordinates for entry in _entries_of(c)),
         action=_action(roles, steps, notes),
         start=starts,
         starts=_starts(steps, columns, coordinates),
@@ -229,7 +229,7 @@ def wrapped(angles: Floats) -> Floats:
     return np.remainder(angles + np.pi, 2 * np.pi) - np.pi
 
 
-def _observed(coordinate: Coordinate) -> Iterator[ObservationEntry]:
+def _entries_of(coordinate: Coordinate) -> Iterator[ObservationEntry]:
     name = coordinate.name
     if coordinate.kind != "angle":
         yield ObservationEntry(name=name, term=Term.linear(**{name: 1}))

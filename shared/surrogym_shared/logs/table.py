@@ -87,7 +87,7 @@ def numbers(name: str, cells: Cells) -> tuple[Floats, dict[int, str]]:
     """
     if kind := NO_NUMBERS.get(cells.dtype.kind):
         raise UnusableLog(f"{name}: expected a column of numbers, got {kind} ({cells.dtype})")
-    values = _plain(cells) if cells.dtype.kind in "biuf" else _parsed(cells)
+    values = _plain(cells) if cells.dtype.kind in "biuf" else _parse(cells)
     unusable = np.flatnonzero(~(np.abs(values) <= MAX_MEASURED))
     return values, {int(row): f"{name}: {_reason(cells[row], values[row])}" for row in unusable}
 
@@ -179,7 +179,7 @@ def is_date(cell: str) -> bool:
     return True
 
 
-def _parsed(cells: Cells) -> Floats:
+def _parse(cells: Cells) -> Floats:
     text = "".join(map(str, cells))
     if text.isascii() and "_" not in text:  # excludes what NumPy reads as a number beyond decimal ones
         try:

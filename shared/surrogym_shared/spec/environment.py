@@ -178,8 +178,8 @@ class EnvironmentSpec(Frozen):
         moving = [c.name for c in self.coordinates if c.moves]
         require(bool(moving), "expected at least one coordinate that moves (linear or angle)")
         self._require_lags()
-        learned = moving if self.preset.moves == "coordinates" else self.observation_names
-        require_known("tolerances", self.tolerances, (*learned, REWARD))
+        learned_names = moving if self.preset.moves == "coordinates" else self.observation_names
+        require_known("tolerances", self.tolerances, (*learned_names, REWARD))
         for c in self.coordinates:
             if c.bounds is not None:
                 if c.bounds.stops is not None:

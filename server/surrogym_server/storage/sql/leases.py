@@ -175,8 +175,10 @@ def give_back(
 
 def is_unbegun(surrogate_id: int) -> sa.ColumnElement[bool]:
     """Whether a row of queries is a pending query of this surrogate that no sampler has begun."""
-    begun = sa.select(leases.c.id).where(leases.c.query_id == queries.c.id, leases.c.outcome.not_in(BEFORE_A_STEP))
-    return (queries.c.surrogate_id == surrogate_id) & (queries.c.status == "pending") & ~sa.exists(begun)
+    leases_with_steps = sa.select(leases.c.id).where(
+        leases.c.query_id == queries.c.id, leases.c.outcome.not_in(BEFORE_A_STEP)
+    )
+    return (queries.c.surrogate_id == surrogate_id) & (queries.c.status == "pending") & ~sa.exists(leases_with_steps)
 
 
 def requeue_set_aside(connection: Connection, surrogate: Row[Any]) -> int:
@@ -304,8 +306,8 @@ def _leases(connection: Connection, surrogate: Row[Any], by_id: dict[int, Row[An
 def _reported(connection: Connection, lease_ids: Sequence[int]) -> dict[int, dict[int, Reported]]:
     """Return the samples stored under each of these leases, by step."""
     reported: dict[int, dict[int, Reported]] = defaultdict(dict)
-    for lease_id, step, *stored in connection.execute(REPORTED, {"reported": lease_ids}):
-        reported[lease_id][step] = Reported(*stored)
+    for lease_id, step, *columns in connection.execute(REPORTED, {"reported": lease_ids}):
+        reported[lease_id][step] = Reported(*columns)
     return reported
 
 

@@ -112,12 +112,12 @@ def _unresolved() -> sa.Select[Any]:
     """
     failed, expired, is_open = constant("failed"), constant("expired"), constant("open")
     unswept = (leases.c.outcome == is_open) & (leases.c.expires <= NOW)
-    ended = leases.c.outcome.in_((failed, expired, is_open)) & ((leases.c.outcome != is_open) | unswept)
+    has_no_answer = leases.c.outcome.in_((failed, expired, is_open)) & ((leases.c.outcome != is_open) | unswept)
     how = sa.case((leases.c.outcome == failed, failed), else_=expired).label("how")
     summed = sa.select(leases.c.surrogate_id, how, sa.type_coerce(sa.func.sum(queries.c.steps), sa.Integer()))
     own = summed.join_from(surrogates, leases, leases.c.surrogate_id == surrogates.c.id)
-    joined = own.join(queries, queries.c.id == leases.c.query_id)
-    return joined.where(surrogates.c.id.between(*BOUNDS), ended).group_by(leases.c.surrogate_id, how)
+    join = own.join(queries, queries.c.id == leases.c.query_id)
+    return join.where(surrogates.c.id.between(*BOUNDS), has_no_answer).group_by(leases.c.surrogate_id, how)
 
 
 OTHERS = sa.union_all(_evaluations(), _unresolved())

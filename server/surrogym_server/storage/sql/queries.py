@@ -179,8 +179,8 @@ def _require_room(connection: Connection, surrogate: Row[Any], steps: int) -> No
     ``LEAST_AUDITED``."""
     sums = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0), sa.func.max(surrogates.c.budget))
     own = (queries.c.surrogate_id == surrogates.c.id) & (queries.c.purpose == "audit")
-    joined = sums.select_from(surrogates.outerjoin(queries, own)).where(surrogates.c.id == surrogate.id)
-    before, budget = connection.execute(joined).one()
+    join = sums.select_from(surrogates.outerjoin(queries, own)).where(surrogates.c.id == surrogate.id)
+    before, budget = connection.execute(join).one()
     limit = max(int(budget), LEAST_AUDITED)
     if before + steps > limit:
         raise BeyondBudget(

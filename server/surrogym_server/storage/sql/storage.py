@@ -236,7 +236,7 @@ class Readiness:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="readiness")
         self._lock = Lock()
         self._probe: Future[None] | None = None
-        self._begun = 0.0
+        self._probe_start = 0.0
 
     def require(self) -> None:
         """Raise ``Unavailable`` unless all tables exist, a write was recently made durable, and no broken page was ever
@@ -259,8 +259,8 @@ class Readiness:
         """Return the last check of the database, or begin a new one if that is finished and old."""
         with self._lock:
             now = time.monotonic()
-            if self._probe is None or (self._probe.done() and now - self._begun >= FRESH_SECONDS):
-                self._probe, self._begun = self._thread.submit(self._write), now
+            if self._probe is None or (self._probe.done() and now - self._probe_start >= FRESH_SECONDS):
+                self._probe, self._probe_start = self._thread.submit(self._write), now
             return self._probe
 
     def _write(self) -> None:

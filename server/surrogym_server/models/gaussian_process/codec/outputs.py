@@ -95,18 +95,18 @@ def read_output(
     if feature_map.parity and mirror is None:
         raise ValueError(f"expected inputs without mirror images, because the environment has none, got {feature_map}")
     posterior = None
-    if (stored := entry["posterior"]) is not None:
+    if (header := entry["posterior"]) is not None:
         arrays = {n: tensors[f"{prefix}.{n}"] for n in ("x", "y", "factor", "weights", "lengthscale")}
         hyper = Hyperparameters(
             arrays["lengthscale"],
-            float(stored["signal_variance"]),
-            float(stored["linear_variance"]),
-            float(stored["quadratic_variance"]),
-            float(stored["noise_variance"]),
+            float(header["signal_variance"]),
+            float(header["linear_variance"]),
+            float(header["quadratic_variance"]),
+            float(header["noise_variance"]),
             mirror,
         )
         x, y, factor, weights = (arrays[name] for name in ("x", "y", "factor", "weights"))
-        jitter, sparse = float(stored["jitter"]), _sparse(stored.get("sparse"))
+        jitter, sparse = float(header["jitter"]), _sparse(header.get("sparse"))
         posterior = Posterior(hyper, x, y, factor, weights, jitter, sparse)
     scores = tuple((name, score) for name, score in entry["scores"])
     centre, scale = float(entry["centre"]), float(entry["scale"])
@@ -135,8 +135,8 @@ def _sparse(entry: dict[str, Any] | None) -> Sparse | None:
 def _feature_map(entry: dict[str, Any]) -> FeatureMap:
     drift = tuple(tuple(float(w) for w in row) for row in entry["drift"])
     rates = tuple(float(rate) for rate in entry["rates"])
-    dropped = tuple(int(place) for place in entry["dropped"])
-    return FeatureMap(**{**entry, "drift": drift, "rates": rates, "dropped": dropped})
+    places = tuple(int(place) for place in entry["dropped"])
+    return FeatureMap(**{**entry, "drift": drift, "rates": rates, "dropped": places})
 
 
 def _require_drift(definition: EnvironmentDefinition, output: OutputModel) -> None:
@@ -151,20 +151,15 @@ def _require_drift(definition: EnvironmentDefinition, output: OutputModel) -> No
 
 def _require_dropped(definition: EnvironmentDefinition, output: OutputModel) -> None:
     """Check that the features left out are some of the map's, in order, and that a process is left with one."""
-    if not (dropped := output.feature_map.dropped):
+    if not (places := output.feature_map.dropped):
         return
     count = len(features(definition, replace(output.feature_map, rates=(), dropped=())))
-    ordered = list(dropped) == sorted(set(dropped))
-    if (
-        output.posterior is None
-        or not ordered
-        or len(dropped) >= count
-        or not 0 <= min(dropped) <= max(dropped) < count
-    ):
+    ordered = list(places) == sorted(set(places))
+    if output.posterior is None or not ordered or len(places) >= count or not 0 <= min(places) <= max(places) < count:
         raise InvalidInput(
             f"output {output.name!r}: expected the numbers of the inputs that are left out (dropped) to be some, "
             "not all, "
-            f"of 0 to {count - 1} in rising order, got {dropped}"
+            f"of 0 to {count - 1} in rising order, got {places}"
         )
 
 

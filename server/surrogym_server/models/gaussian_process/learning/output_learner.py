@@ -73,20 +73,20 @@ class OutputLearner:
         whole = _with_whole_history(inputs)
         best = better(*whole)
         best = better(*(m for m in inputs if m not in whole and replace(m, history=best.history) == best))
-        chosen, centre = fits[best], around[best]
+        best_fit, centre = fits[best], around[best]
         y = (target - centre) / scale
         more = bool(best.lead) and bool((keep_lead & ~keep).any())
-        used = keep_lead if more else keep
-        if int(used.sum()) > subsets.FEW:
-            rest = None if side is None else ((side != 0) & ~used)
+        rows = keep_lead if more else keep
+        if int(rows.sum()) > subsets.FEW:
+            rest = None if side is None else ((side != 0) & ~rows)
             at_limit = None if side is None else Censored(inputs[best][rest], y[rest], side[rest])
-            posterior = self.refined(name, best, inputs[best][used], y[used], chosen.theta, at_limit)
+            posterior = self.refined(name, best, inputs[best][rows], y[rows], best_fit.theta, at_limit)
         elif more:
-            posterior = self._fit(name, best, inputs[best][used], y[used], "|all").posterior
+            posterior = self._fit(name, best, inputs[best][rows], y[rows], "|all").posterior
         else:
-            posterior = chosen.posterior
+            posterior = best_fit.posterior
         scores = tuple((str(m), f.score) for m, f in fits.items())
-        return OutputModel(name, best, posterior, centre, scale, int((~used).sum()), scores)
+        return OutputModel(name, best, posterior, centre, scale, int((~rows).sum()), scores)
 
     def _fit(self, name: str, feature_map: FeatureMap, x: Tensor, y: Tensor, also: str = "") -> Fitted:
         """Fit to all points. If there are many, fit to some of them, and scale the score as if the others

@@ -97,10 +97,10 @@ def _growing(
 def _evidence(outputs: Sequence[OutputModel], inputs: Mapping[FeatureMap, Tensor], keep: Tensor) -> list[float]:
     """Log density of the targets by each of the outputs, in the output's scale: with inducing points, which have no
     evidence of all samples, the density of each target given all others."""
-    fitted = [(output, posterior) for output in outputs if (posterior := output.posterior) is not None]
-    exact = all(posterior.sparse is None for _, posterior in fitted)
+    pairs = [(output, posterior) for output in outputs if (posterior := output.posterior) is not None]
+    exact = all(posterior.sparse is None for _, posterior in pairs)
     return [
         (posterior.log_evidence if exact else posterior.points * posterior.left_out.log_density)
         - float(output.amplitude(inputs_of(output, inputs)[keep]).log().sum())
-        for output, posterior in fitted
+        for output, posterior in pairs
     ]

@@ -58,17 +58,17 @@ def _is_to_learn(learner: OutputLearner, output: OutputModel) -> bool:
 
 def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Candidate | None:
     """The output with its process; None if it can't share samples."""
-    posterior, selection, chosen = output.posterior, learner.selections.get(output.name), output.feature_map
-    if posterior is None or posterior.sparse is not None or chosen.rates or output.at_limit:
+    posterior, selection, feature_map = output.posterior, learner.selections.get(output.name), output.feature_map
+    if posterior is None or posterior.sparse is not None or feature_map.rates or output.at_limit:
         return None
     if output.size_with_prior is not None:
         return None
-    if selection is None and not chosen.dropped:
+    if selection is None and not feature_map.dropped:
         return None
-    mirror = reflection(learner.definition, replace(chosen, parity="odd"))
+    mirror = reflection(learner.definition, replace(feature_map, parity="odd"))
     size = posterior.x.shape[1]
     reads, fewer = tuple(range(size)), posterior.hyper
-    if not chosen.dropped and selection is not None:
+    if not feature_map.dropped and selection is not None:
         reads, fewer = tuple(selection.mask.nonzero()[:, 0].tolist()), selection.hyper
     part = Part(
         posterior.x,
@@ -81,7 +81,7 @@ def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Cand
         fewer,
         None if mirror is None else mirror.signs,
     )
-    every = tuple(i for i in range(size + len(chosen.dropped)) if i not in chosen.dropped)
+    every = tuple(i for i in range(size + len(feature_map.dropped)) if i not in feature_map.dropped)
     return _Candidate(place, output, part, every)
 
 
@@ -94,14 +94,14 @@ def _sharing(members: Sequence[_Candidate], pool: Pool, member: int) -> OutputMo
         posterior = condition(hyper, x, y)
     except NumericalFailure:
         return output
-    foretold, _ = posterior.leave_one_out()
-    off = (foretold - y)[: len(candidate.part.y)].square().mean().sqrt()
+    predictions, _ = posterior.leave_one_out()
+    off = (predictions - y)[: len(candidate.part.y)].square().mean().sqrt()
     if float(off) > output.posterior.left_out.error:
         return output
     whole = replace(output.feature_map, dropped=(), parity=members[0].output.feature_map.parity)
     mask = torch.zeros(len(candidate.every) + len(output.feature_map.dropped), dtype=torch.bool)
     mask[[candidate.every[place] for place in pool.inputs[member]]] = True
     others = tuple(other.output.name for other in members if other is not candidate)
-    scores = (*output.scores, (str(chosen := map_without(whole, mask)), pool.gain))
+    scores = (*output.scores, (str(candidate_map := map_without(whole, mask)), pool.gain))
     centre = pool.parts[0].centre
-    return replace(output, feature_map=chosen, posterior=posterior, centre=centre, scores=scores, shared=others)
+    return replace(output, feature_map=candidate_map, posterior=posterior, centre=centre, scores=scores, shared=others)

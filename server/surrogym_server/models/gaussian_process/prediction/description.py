@@ -60,9 +60,9 @@ def _inputs(definition: EnvironmentDefinition, feature_map: FeatureMap) -> dict[
 
 def structure(output: OutputModel) -> str:
     """Kernel and inputs of an output, in a few words."""
-    learned = "" if output.size_with_prior is None else "prior + "
+    prefix = "" if output.size_with_prior is None else "prior + "
     if output.posterior is None:
-        return f"{learned}constant"
-    learned += "" if output.warp is None else f"{output.warp}: "
+        return f"{prefix}constant"
+    prefix += "" if output.warp is None else f"{output.warp}: "
     shared = f", with samples of {', '.join(output.shared)}" if output.shared else ""
-    return f"{learned}{output.posterior.hyper.kernel} on {output.feature_map}{shared}"
+    return f"{prefix}{output.posterior.hyper.kernel} on {output.feature_map}{shared}"

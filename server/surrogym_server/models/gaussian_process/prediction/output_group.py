@@ -59,16 +59,18 @@ class OutputGroup:
     ) -> OutputGroup:
         """Compile outputs for ``columns`` of them. Their draws' weights start at ``begin``."""
         device = encoder.definition.device
-        noise, drawn = torch.zeros(columns, dtype=torch.float64, device=device), []
+        noise, samplers = torch.zeros(columns, dtype=torch.float64, device=device), []
         for output in outputs:
             if output.posterior is None:
                 continue
             noise[output.column] = output.scale * math.sqrt(output.posterior.hyper.noise_variance)
             pathwise = Pathwise(output.posterior)
             span = slice(begin, begin := begin + pathwise.size)
-            drawn.append(Drawn(output.column, span, torch.tensor(output.inputs, device=device), output.scale, pathwise))
+            samplers.append(
+                Drawn(output.column, span, torch.tensor(output.inputs, device=device), output.scale, pathwise)
+            )
         serving = Serving.of(outputs, columns, encoder.width(lead), device)
-        return cls(encoder, serving, noise, tuple(drawn), begin, grown)
+        return cls(encoder, serving, noise, tuple(samplers), begin, grown)
 
     def predict(
         self, x: Tensor, columns: tuple[int, ...], kick: Tensor | None, process: Tensor | None, paths: Tensor | None

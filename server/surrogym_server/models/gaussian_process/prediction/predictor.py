@@ -46,11 +46,11 @@ class Predictor:
         reward_std: bool,
     ) -> Transition:
         """Predict like ``DynamicsModel.transition``, in blocks of rows, with variances only as requested."""
-        wanted = self._columns if stds or noise is not None else ()
-        wanted += (self._reward_column,) if reward_std else ()
+        columns = self._columns if stds or noise is not None else ()
+        columns += (self._reward_column,) if reward_std else ()
         rows = min(group.serving.rows for group in self._groups if group)
-        q_next, mean, spread = in_blocks(rows, partial(self._step, wanted), q, u, noise, process, paths)
-        reward, edges = self._rewarded(q, u, q_next, mean[:, -1])
+        q_next, mean, spread = in_blocks(rows, partial(self._step, columns), q, u, noise, process, paths)
+        reward, edges = self._rewards(q, u, q_next, mean[:, -1])
         return Transition(
             q_next,
             reward,
@@ -61,7 +61,7 @@ class Predictor:
     def means(self, q: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Changes (m, M), next coordinates (m, C) and rewards (m,) of the means."""
         q_next, mean, _ = self._step((), q, u, None, None, None)
-        reward, _ = self._rewarded(q, u, q_next, mean[:, -1])
+        reward, _ = self._rewards(q, u, q_next, mean[:, -1])
         return mean[:, list(self._columns)], q_next, reward
 
     @cached_property
@@ -72,12 +72,12 @@ class Predictor:
     def draw(self, noise: Tensor) -> Tensor:
         """Sample functions from the posteriors of all outputs, one for each row of standard normal ``noise`` (N, W):
         (N, W)."""
-        drawn = [one for group in self._groups if group for one in group.drawn]
-        return torch.cat([noise[:, :0], *(one.pathwise.draw(noise[:, one.span]) for one in drawn)], 1)
+        samplers = [one for group in self._groups if group for one in group.drawn]
+        return torch.cat([noise[:, :0], *(one.pathwise.draw(noise[:, one.span]) for one in samplers)], 1)
 
     def _step(
         self,
-        wanted: tuple[int, ...],
+        columns: tuple[int, ...],
         q: Tensor,
         u: Tensor,
         noise: Tensor | None,
@@ -91,16 +91,16 @@ class Predictor:
         first, second, after = self._groups
         kick, shake = self._in_columns(noise), self._in_columns(process)
         x = first.encoder(q, u)
-        mean, spread = first.predict(x, wanted, kick, shake, paths)
+        mean, spread = first.predict(x, columns, kick, shake, paths)
         if self.prior is not None:
             mean = mean + self._by_prior(self.prior, q, u)
         if second is not None:
             lead = clip(self.definition, q + mean[:, :-1])[:, leading(self.definition)]
-            following = second.predict(first.encoder.with_lead(x, lead), wanted, kick, shake, paths)
+            following = second.predict(first.encoder.with_lead(x, lead), columns, kick, shake, paths)
             mean, spread = _sum((mean, spread), following)
         q_next = moved(self.definition, self._inverse, q, u, mean[:, :-1])
         if after is not None:
-            reward = after.predict(after.encoder(q_next, u), wanted, None, None, paths)
+            reward = after.predict(after.encoder(q_next, u), columns, None, None, paths)
             mean, spread = _sum((mean, spread), reward)
         return q_next, mean, spread
 
@@ -120,14 +120,14 @@ class Predictor:
             uses[column] = output.size_with_prior is not None
         return uses
 
-    def _rewarded(self, q: Tensor, u: Tensor, q_next: Tensor, mean: Tensor) -> tuple[Tensor, Tensor | float]:
+    def _rewards(self, q: Tensor, u: Tensor, q_next: Tensor, mean: Tensor) -> tuple[Tensor, Tensor | float]:
         """Rewards (m,) of steps from q (m, C) under u (m, F) to q_next (m, C): the process' mean, the jumps and the
         declared reward. Also the variance (m,) that uncertain edges of jumps cause, 0 without jumps."""
         state = q_next if self.reward.feature_map.after else q
         if self.reward.warp is not None:
             mean = self.reward.warp.value(mean)
-        if (known := self.definition.declared_reward) is not None:
-            mean = mean + known(state, u)
+        if (declared := self.definition.declared_reward) is not None:
+            mean = mean + declared(state, u)
         if not self.jumps:
             return mean, 0.0
         added, variance = jumped(self.jumps, state)
@@ -154,8 +154,8 @@ class Predictor:
 
     @cached_property
     def _reward_column(self) -> int:
-        moved = self.transitions if self.definition.moves_observation else self.definition.coordinates
-        return len(moved)
+        names = self.transitions if self.definition.moves_observation else self.definition.coordinates
+        return len(names)
 
     @cached
     def _groups(self) -> tuple[OutputGroup, OutputGroup | None, OutputGroup | None]:
@@ -175,10 +175,10 @@ class Predictor:
         return first, second, third
 
     def _group(self, encoder: Encoder, outputs: Sequence[tuple[int, OutputModel]], begin: int) -> OutputGroup:
-        served = [Output(c, o.posterior, encoder.inputs(o.feature_map), o.centre, o.scale) for c, o in outputs]
+        processes = [Output(c, o.posterior, encoder.inputs(o.feature_map), o.centre, o.scale) for c, o in outputs]
         lead = any(o.feature_map.lead for _, o in outputs)
         like = torch.zeros(0, dtype=torch.float64, device=self.definition.device)
-        grown = tuple(
+        growths = tuple(
             Grown(
                 column,
                 torch.tensor(encoder.inputs(output.feature_map), device=like.device),
@@ -188,7 +188,7 @@ class Predictor:
             for column, output in outputs
             if output.feature_map.rates
         )
-        return OutputGroup.of(encoder, served, self._reward_column + 1, lead=lead, begin=begin, grown=grown)
+        return OutputGroup.of(encoder, processes, self._reward_column + 1, lead=lead, begin=begin, grown=growths)
 
     @cached_property
     def _inverse(self) -> ObservationInverse | None:
