@@ -272,7 +272,9 @@ def _require_in_float(what: str, *arrays: Any) -> None:
 def _measurements(spec: EnvironmentSpec, ranges: dict[str, tuple[float, float]]) -> tuple[Measurement, ...]:
     names = [c.name for c in spec.coordinates if c.lag is None]
     if unknown := sorted(set(ranges) - set(names)):
-        raise NotDeployable(f"expected the range of a measurement ({', '.join(names)}), got {', '.join(unknown)}")
+        raise NotDeployable(
+            f"--range: expected the name of a measurement ({', '.join(names)}), got {', '.join(unknown)}"
+        )
     found = []
     for place, c in enumerate(spec.coordinates):
         if c.lag is not None:

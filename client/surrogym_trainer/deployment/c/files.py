@@ -133,7 +133,7 @@ def _title(controller: Controller) -> str:
 def _clock(controller: Controller) -> dict[str, str]:
     """Return the sketch's clock of 32 bits: microseconds if they suffice for the period and the timeout."""
     if controller.period is None:
-        raise NotDeployable("a sketch has a period: expected --period, or sampling_period in the specification")
+        raise NotDeployable("a sketch has a period: give it by --period, or by sampling_period in the specification")
     longest = max(controller.period, controller.timeout)
     if longest > LONGEST:
         raise NotDeployable(f"expected a period and a timeout of a sketch up to {LONGEST:,} s, got {longest:g} s")

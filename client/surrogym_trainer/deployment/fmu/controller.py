@@ -33,7 +33,7 @@ def write(controller: Controller, folder: Path) -> None:
 def block_of(controller: Controller) -> Block:
     """Return the block of a controller. Raises ``NotDeployable``."""
     if controller.period is None:
-        raise NotDeployable("an FMU has a period: expected --period, or sampling_period in the specification")
+        raise NotDeployable("an FMU has a period: give it by --period, or by sampling_period in the specification")
     prefix = prefix_of(controller)
     names = {"prefix": prefix, "PREFIX": prefix.upper(), "fallback": ", ".join(map(number, controller.fallback))}
     glue = Template(files(__package__).joinpath("block.c.txt").read_text(encoding="utf-8")).substitute(names)
