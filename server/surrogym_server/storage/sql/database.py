@@ -33,13 +33,12 @@ SQLSTATES = ("XX001", "XX002", "42P01", "42703")  # data and index corrupted, un
 OTHER_SCHEMA = re.compile(
     r"no such (table|column)|has no column|already exists"
 )  # SQLite's messages about a wrong schema, which have no code
-RESTORE = "stop the server and restore a backup"
 UNDECODABLE = "Could not decode to UTF-8"  # in the message of SQLite's driver, which has no error class for this
 
 
 def damaged(reason: object) -> Damaged:
     """The error for stored data that this program can't have written."""
-    return Damaged(f"the database is damaged: {reason}; {RESTORE}")
+    return Damaged(f"the database is damaged: {reason}")
 
 
 def means_damage(error: sa.exc.DBAPIError) -> bool:
