@@ -7,7 +7,6 @@ import os
 import numpy as np
 
 from surrogym.design import Design, Query
-from surrogym_sampler.original.errors import OriginalError
 from surrogym_sampler.priors.prior import Progress, SimulatorPrior
 from surrogym_shared.surrogate_file import SurrogateFile
 
@@ -33,7 +32,7 @@ class Prior(SimulatorPrior):
         """Take a step of the simulator. One that it can't take is given up."""
         try:
             step = self.simulator.step_from(np.array(query.coordinates), np.array(query.action))
-        except OriginalError:
+        except Exception:  # any code of a user: the design goes elsewhere
             design.give_up(query)
             return
         numbers = [*np.ravel(step.coordinates), *np.ravel(step.next_coordinates), step.reward]

@@ -41,7 +41,19 @@ def test_a_simulator_is_calibrated_and_the_design_ends_after_few_real_steps(on_s
     assert about["error"] < 1e-3 < about["error_before"]
     assert (view.phase, result["phase"]) == ("ready", "ready")
     assert view.ledger.total <= 10
-    assert not [name for name in others if name.endswith(".simulator")]
+    assert not [name for name in others if ".simulator-" in name]
+
+
+def test_a_simulator_that_fails_in_places_and_prints_is_still_a_prior(on_server, server_process, hinge):
+    with Api(server_process.url) as api:
+        PriorCalls(api.connection).wait(hinge)
+        sampler = Sampler(api, hinge, Real(), SamplerSettings(until_done=True, wait_seconds=1.0))
+        beside = threading.Thread(target=sampler.run)
+        beside.start()
+        said = on_server("prior", hinge, "support.hinge:Partial", "--steps", "60", "--json")
+        beside.join()
+    assert said.code == 0
+    assert json.loads(said.out)["prior"]["about"]["source"] == "support.hinge:Partial"
 
 
 def test_what_it_is_not_used_for_is_said_before_anything_changes(on_server, server_process, hinge):
@@ -51,8 +63,12 @@ def test_what_it_is_not_used_for_is_said_before_anything_changes(on_server, serv
         ("prior", hinge, "support.hinge:Textbook", "-p", "weight"): "friction, length, mass",
         ("prior", hinge, "support.hinge:Nothing"): "support.hinge:Nothing",
         ("prior", hinge, "nothing.surrogate"): "no file",
-        ("prior", hinge, f"surrogate:{hinge}", "-p", "mass"): "no parameters",
+        ("prior", hinge, "surrogate:other", "-p", "mass"): "no parameters",
         ("prior", hinge, "surrogate:nobody"): "nobody",
+        ("prior", hinge, f"surrogate:{hinge}"): "itself",
+        ("prior", hinge, "support.hinge:Renamed"): "rate",
+        ("prior", hinge, "support.hinge:Weaker"): "0.5",
+        ("prior", hinge, "support.hinge:Broken"): "the solver diverged",
         ("prior", "nobody", "support.hinge:Textbook"): "nobody",
     }
     for arguments, words in refused.items():

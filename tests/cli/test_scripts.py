@@ -21,6 +21,8 @@ ELSEWHERE = {
     "evaluate": "test_commands.py",
     "export-policy": "tests/policies/test_export.py",
     "policy alias": "test_commands.py",
+    "prior": "test_prior.py",
+    "watch": "test_watch.py",
     "policy delete": "test_commands.py",
     "policy get": "test_commands.py",
     "policy push": "test_commands.py",

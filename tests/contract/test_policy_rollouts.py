@@ -169,7 +169,7 @@ def test_too_many_steps_of_all_lanes_are_refused(port: PolicyPort, opened: Opene
 def test_a_layer_too_wide_for_so_many_lanes_is_refused(port: PolicyPort, opened: Opened, harness):
     session = opened(num_envs=20_000)
     port.reset(session)
-    with pytest.raises(harness.errors.TooLarge, match="units of a layer"):
+    with pytest.raises(harness.errors.TooLarge, match="units times lanes"):
         port.rollout_policy(session, random_policy((3, 1_000, 1)), 1)
 
 

@@ -92,7 +92,7 @@ def test_what_can_not_be_written_or_checked_is_refused_and_nothing_is_written(su
         ([str(path), *to, "--check"], "--check needs --env"),
         ([str(path), *to, "--env", "Pendulum-v1"], "--env together with --check"),
         ([str(path), *to, "--check", "--env", "MountainCarContinuous-v0"], "does not fit the environment"),
-        ([str(path), "--target", "st", "--out", "c", "--check"], "got st"),
+        ([str(path), "--target", "st", "--out", "c", "--check"], "structured text"),
     ]:
         said = surrogym("deploy", *arguments)
         assert (said.code, words in said.err.replace("\n", " ")) == (1, True), said.err

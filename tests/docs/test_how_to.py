@@ -137,3 +137,11 @@ def test_a_policy_acts_on_a_machine_with_a_past(tmp_path: Path) -> None:
     machine, own_program = programs("history.md")
     (tmp_path / "tank.py").write_text(machine, encoding="utf-8")
     run(tmp_path, "-c", f"{own_program}\nassert abs(reading - 1) < 0.1, reading")
+
+
+def test_a_simulator_is_a_prior_in_this_process(tmp_path: Path) -> None:
+    plant, program = programs("priors.md")
+    (tmp_path / "arm.py").write_text(plant)
+    phase, steps, _ = run(tmp_path, "-c", program).split(maxsplit=2)
+    assert phase == "ready"
+    assert int(steps) < 27  # without a prior

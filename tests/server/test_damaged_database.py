@@ -122,7 +122,7 @@ def test_the_version_before_replaces_a_model_with_a_flipped_bit(server: ServerPr
     flip(server.folder / "surrogym.db", "models", "blob")
     exported = client.get(f"/v1/surrogates/{NAME}/models/{newest}?format=safetensors")
     assert (exported.status_code, exported.json()["code"]) == (500, "damaged")
-    assert f"model {newest} of '{NAME}' has changed since it was stored" in exported.json()["detail"]
+    assert f"checksum of model {newest} of '{NAME}'" in exported.json()["detail"]
     predicted = client.post(f"/v1/surrogates/{NAME}/predict", json=said)
     assert predicted.raise_for_status().json()["model_version"] == newest - 1
     assert client.get(f"/v1/surrogates/{NAME}").json()["model_version"] == newest - 1

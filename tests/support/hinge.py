@@ -97,3 +97,29 @@ def steps_of(plant: Textbook, count: int, seed: int = 0) -> list[RealStep]:
     lows, highs = (np.array([getattr(one, end) for one in RANGES.values()]) for end in ("low", "high"))
     starts = rng.uniform(lows, highs, (count, 2))
     return [plant.step_from(q, u) for q, u in zip(starts, rng.uniform(-1, 1, (count, 1)), strict=True)]
+
+
+class Renamed(Textbook):
+    """A simulator whose coordinates have other names."""
+
+    def spec(self) -> EnvironmentSpec:
+        fields = hinge_spec().model_dump()
+        text = EnvironmentSpec.model_validate(fields).model_dump_json().replace("speed", "rate")
+        return EnvironmentSpec.model_validate_json(text)
+
+
+class Weaker(Textbook):
+    """A simulator with other action limits."""
+
+    def spec(self) -> EnvironmentSpec:
+        return hinge_spec(action=BoxAction(low=(-0.5,), high=(0.5,)).model_dump())
+
+
+class Partial(Textbook):
+    """A simulator that prints, and that fails in a part of its range."""
+
+    def step_from(self, coordinates: Array, action: Array) -> RealStep:
+        print("hello from the simulator")
+        if coordinates[1] < -3:
+            raise FloatingPointError("the solver diverged")
+        return super().step_from(coordinates, action)

@@ -229,7 +229,7 @@ def test_it_continues_from_a_saved_policy(surrogate, tmp_path: Path):
     resumed = replace(settings, start_from=first)
     train(surrogate, tmp_path / "second.zip", resumed)
     load_policy(first).save(tmp_path / "alone.zip")
-    with pytest.raises(UnusablePolicy, match="got a policy without"):
+    with pytest.raises(UnusablePolicy, match="no state of a training"):
         train(
             surrogate,
             tmp_path / "third.zip",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -77,6 +78,7 @@ def command(
     Example: surrogym prior arm surrogate:arm-of-last-year
     """
     from surrogym.cli.errors import CommandError
+    from surrogym.cli.printing import prints_aside
     from surrogym_client.transport.priors import PriorCalls
     from surrogym_shared.terminal import on_interrupt, progress
 
@@ -89,19 +91,23 @@ def command(
             output.give({"surrogate": surrogate, "prior": None}, lambda: f"{surrogate} learns without a prior")
             return
         target = _Target(api, calls, view)
+        if simulator == OTHER + surrogate:
+            raise CommandError(f"expected another surrogate than {surrogate} itself")
         if _is_model(simulator) and (parameter or steps):
             raise CommandError(f"expected no --parameter and no --steps with {simulator}: a model has no parameters")
         if (file := _file_of(api, simulator)) is not None:
             stored = calls.put(surrogate, file)
-            _give(output, target.api.surrogate(surrogate), stored)
+            with progress("prior", quiet=output.quiet) as update:
+                _give(output, target.fitted(view.round, update), stored)
             return
         with (
+            prints_aside(),
             _opened(api, view, simulator, parameter or [], steps) as prior,
             progress("prior", quiet=output.quiet) as update,
             on_interrupt(lambda: _interrupted(surrogate, calls.get(surrogate))),
         ):
-            stored = target.follow(prior, update)
-        _give(output, api.surrogate(surrogate), stored)
+            stored, view = target.follow(prior, update)
+        _give(output, view, stored)
 
 
 @dataclass(frozen=True)
@@ -112,31 +118,40 @@ class _Target:
     calls: PriorCalls
     view: SurrogateView
 
-    def follow(self, prior: ServerPrior, update: Update) -> PriorView:
+    def follow(self, prior: ServerPrior, update: Update) -> tuple[PriorView, SurrogateView]:
         """Set the prior as soon as the initial queries are answered, and anew whenever it has changed, until the design
-        ends."""
-        import time
-
+        ends. Returns the prior and the surrogate."""
         from surrogym.cli.errors import CommandError
         from surrogym_client.surrogates.waiting import share_of_design, words_of_design
-        from surrogym_shared.states import COMPLETED
 
-        name, used = self.view.name, 0
+        name, used, fitted = self.view.name, 0, self.view.round
         stored = self.calls.wait(name)
         while True:
-            view = self.api.surrogate(name)
+            view, present = self.api.surrogate(name), self.calls.get(name)
             if view.phase == "failed":
                 raise CommandError(f"the design of {name!r} failed: {view.error}")
+            if present.about is None and not present.awaited:
+                raise CommandError(f"the prior of {name!r} was dropped by another command")
             is_new = view.samples > used and view.samples >= LEAST
             if is_new and (used or not _asked(view)):
                 real, used = self._real_steps(), view.samples
                 if prior.update(real, update) and prior.file is not None:
-                    stored = self.calls.put(name, prior.file.to_bytes())
+                    stored, fitted = self.calls.put(name, prior.file.to_bytes()), view.round
                 continue
-            if used and view.phase in COMPLETED and not _asked(view):
-                return stored
-            update(share_of_design(view), words_of_design(view) if used else _waiting(view))
+            if used and _has_ended(view, fitted):
+                return stored, view
+            is_waiting = bool(_asked(view)) or not used
+            update(share_of_design(view), _waiting(view) if is_waiting else words_of_design(view))
             time.sleep(LOOK_SECONDS)
+
+    def fitted(self, after: int, update: Update) -> SurrogateView:
+        """Return the surrogate after the fit that a new prior makes due; at once if there is nothing to fit to."""
+        view = self.api.surrogate(self.view.name)
+        while view.samples >= LEAST and view.round <= after and view.phase != "failed" and not _asked(view):
+            update(None, "a model is being fitted")
+            time.sleep(LOOK_SECONDS)
+            view = self.api.surrogate(self.view.name)
+        return view
 
     def _real_steps(self) -> list[RealStep]:
         from surrogym_shared.nouns import RealStep
@@ -179,6 +194,13 @@ def _file_of(api: Api, source: str) -> bytes | None:
         raise CommandError(str(error)) from error
 
 
+def _has_ended(view: SurrogateView, fitted: int) -> bool:
+    """Whether a design has ended with a fit after the round ``fitted``."""
+    from surrogym_shared.states import COMPLETED
+
+    return view.phase in COMPLETED and view.round > fitted and not _asked(view)
+
+
 def _asked(view: SurrogateView) -> int:
     """Number of queries that wait for a sampler, or for its answer."""
     return view.queries.pending + view.queries.leased
@@ -187,8 +209,8 @@ def _asked(view: SurrogateView) -> int:
 def _waiting(view: SurrogateView) -> str:
     from surrogym_sampler.original.loading import sample_command
 
-    awaited = "its answers" if view.samplers else f"a sampler ({sample_command(view.name, view.environment)})"
-    return f"{view.samples} real steps; {_asked(view)} initial queries wait for {awaited}"
+    awaited = "the sampler's answers" if view.samplers else f"a sampler ({sample_command(view.name, view.environment)})"
+    return f"{view.samples} real steps; {_asked(view)} queries wait for {awaited}"
 
 
 def _interrupted(name: str, stored: PriorView) -> str:
@@ -205,6 +227,8 @@ def _give(output: Output, view: SurrogateView, stored: PriorView) -> None:
 def words_of_prior(about: PriorAbout) -> list[str]:
     """Describe what a prior was made from, a line each."""
     lines = [f"prior: {about.source}"]
+    if about.parameters and about.error is not None and about.error > LACKING:
+        lines.append("  it lacks something, or the plant has noise: the values below may stand for what it lacks")
     for one in about.parameters:
         known = f"{one.low:.4g} to {one.high:.4g}" if one.determined else "not determined by these steps"
         lines.append(f"  {one.name:<16} {one.value:<10.4g} {known}")
@@ -213,8 +237,6 @@ def words_of_prior(about: PriorAbout) -> list[str]:
         lines.append(
             f"  error {about.error_before:.2%} of the changes as it was, {about.error:.2%} calibrated, {steps}"
         )
-    if about.parameters and about.error is not None and about.error > LACKING:
-        lines.append("  the simulator lacks something: its calibrated values may stand for what it lacks")
     return lines
 
 

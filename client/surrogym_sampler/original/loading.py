@@ -249,7 +249,7 @@ def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str,
         raise
 
 
-class _Respecified:
+class Respecified:
     """A user's environment whose specification was replaced on the command line."""
 
     def __init__(self, environment: object, spec: EnvironmentSpec) -> None:
@@ -278,4 +278,4 @@ def _own(name: str, made: Any, spec: EnvironmentSpec | None, choose: Choose) -> 
     own = made.spec()
     given = choose(spec or own)
     require_period(name, given, period_of(made))
-    return answering(made if given == own else _Respecified(made, given))
+    return answering(made if given == own else Respecified(made, given))

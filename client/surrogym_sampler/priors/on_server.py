@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from uuid import uuid4
+
+import numpy as np
 
 from surrogym_client.errors import UnknownSurrogate
 from surrogym_client.surrogates.transfer import export_surrogate
-from surrogym_client.surrogates.waiting import wait_for_design
+from surrogym_client.surrogates.waiting import wait_for_model
 from surrogym_client.transport.api import Api
+from surrogym_sampler.original.errors import StepRefused
+from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealStep
 from surrogym_sampler.priors.prior import Progress, SimulatorPrior
 from surrogym_sampler.queries.settings import SamplerSettings
 from surrogym_sampler.queries.worker import Sampler
@@ -18,8 +23,35 @@ from surrogym_shared.wire import SurrogateView
 
 BATCH = 64  # queries of one claim
 LONGEST_FIT = 1_800.0  # seconds
-SUFFIX = ".simulator"  # of the name of the surrogate that the server learns the simulator's model in
-LONGEST_NAME = 64
+MARK = ".simulator-"  # in the name of the surrogate that the server learns the simulator's model in
+TOKEN = 8  # hexadecimal digits behind it
+MOST_OF_NAME = 64 - len(MARK) - TOKEN
+
+
+class Careful:
+    """A simulator that refuses a step which it can't take, so that the design goes elsewhere."""
+
+    parallel = True
+
+    def __init__(self, simulator: OriginalEnvironment) -> None:
+        self._simulator = simulator
+
+    def spec(self) -> EnvironmentSpec:
+        return self._simulator.spec()
+
+    def step_from(self, coordinates: Array, action: Array) -> RealStep:
+        """Take a step. Raises ``StepRefused`` for any error of the simulator, and for numbers that are not finite."""
+        try:
+            step = self._simulator.step_from(coordinates, action)
+            numbers = [*np.ravel(step.coordinates), *np.ravel(step.next_coordinates), step.reward]
+        except Exception as error:  # any code of a user
+            raise StepRefused(f"{type(error).__name__}: {error}") from error
+        if not np.isfinite(numbers).all():
+            raise StepRefused("the simulator gave numbers that are not finite")
+        return step
+
+    def close(self) -> None:
+        self._simulator.close()
 
 
 class ServerPrior(SimulatorPrior):
@@ -43,11 +75,10 @@ class ServerPrior(SimulatorPrior):
     ) -> None:
         super().__init__(simulator, spec, parameters, steps=steps)
         self._api = api
-        self._name = name[: LONGEST_NAME - len(SUFFIX)] + SUFFIX
+        self._name = f"{name[:MOST_OF_NAME]}{MARK}{uuid4().hex[:TOKEN]}"
 
     def learn(self, say: Progress) -> SurrogateFile:
         """Learn the model as ``SimulatorPrior.learn`` says. Raises ``SurrogymClientError`` as every request."""
-        self._remove()
         try:
             self._api.create_surrogate(self._name, self.spec)
             taken = 0
@@ -57,10 +88,9 @@ class ServerPrior(SimulatorPrior):
                 taken += 1
                 say(0.5 * min(1.0, taken / self.steps), f"{taken} of {self.steps} steps of the simulator")
 
-            Sampler(
-                self._api, self._name, self.simulator, SamplerSettings(until_done=True, batch=BATCH), report=count
-            ).run()
-            wait_for_design(self._api, self._name, LONGEST_FIT, lambda view: say(0.75, _words(view)))
+            settings = SamplerSettings(until_done=True, max_queries=self.steps, batch=BATCH)
+            Sampler(self._api, self._name, Careful(self.simulator), settings, report=count).run()
+            wait_for_model(self._api, self._name, LONGEST_FIT, lambda view: say(0.75, _words(view)))
             return export_surrogate(self._api, self._name)
         finally:
             self._remove()

@@ -12,12 +12,13 @@ from typing import Any, Self
 
 import numpy as np
 
+from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import UnknownEnvironment
-from surrogym_sampler.original.loading import make, with_choices
+from surrogym_sampler.original.loading import Respecified, is_own, make, with_choices
 from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealStep
 from surrogym_sampler.priors.calibration import Calibration, RealTransitions, calibrate
 from surrogym_sampler.priors.parameters import adjustable, read_parameters
-from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.surrogate_file import SurrogateFile
 from surrogym_shared.wire.priors import CalibratedParameter, PriorAbout
 
@@ -25,6 +26,7 @@ BY_INPUT = 50  # steps of the simulator for each coordinate and action entry
 FEWEST, MOST = 100, 400  # of these steps
 WORSE = 1.5  # ratio of errors on real steps from which values are taken for outdated
 AGAIN = 2  # growth of the number of real steps after which the parameters are calibrated again
+TRIALS = 5  # steps that a simulator is tried with
 RIGHT = 1e-3  # of the changes: an error that is small enough
 
 Progress = Callable[[float | None, str], None]
@@ -102,7 +104,8 @@ class SimulatorPrior(ABC):
             is_right = present <= max(RIGHT, WORSE * self.calibration.error)
             if is_right and len(real) < AGAIN * self._calibrated_on:
                 return False
-        progress(0.0, f"calibrating {len(self.parameters)} parameters on {len(real)} real steps")
+        names = ", ".join(parameter.name for parameter in self.parameters)
+        progress(0.0, f"{'calibrating ' + names if names else 'comparing'} on {len(real)} real steps")
         found = calibrate(self.spec, steps, self.parameters, self._own, self._step)
         self._calibrated_on = len(real)
         if present is not None and present <= max(RIGHT, WORSE * found.error):
@@ -143,17 +146,70 @@ class SimulatorPrior(ABC):
 
 
 def _opened(simulator: str | OriginalEnvironment, spec: EnvironmentSpec) -> OriginalEnvironment:
-    opened: Any = make(simulator, spec=_named(spec, simulator)) if isinstance(simulator, str) else simulator
-    if not callable(getattr(opened, "step_from", None)):
-        opened.close()
-        raise UnknownEnvironment("expected a simulator that can be set to a state (step_from), got one without it")
-    environment: OriginalEnvironment = opened
+    """Open a simulator, and take a few steps of it.
+
+    Raises:
+        UnknownEnvironment: it has other coordinates, units or actions than the plant, or can't take any of these steps.
+    """
+    opened: Any = make(simulator) if isinstance(simulator, str) and is_own(simulator) else simulator
+    try:
+        if not isinstance(opened, str):
+            _require_alike(spec, opened.spec())
+            if not callable(getattr(opened, "step_from", None)):
+                raise UnknownEnvironment("expected a simulator with step_from, which sets it to a state, got none")
+        environment: OriginalEnvironment = _respecified(simulator, opened, spec)
+        _require_steps(environment, spec)
+    except BaseException:
+        if isinstance(simulator, str) and not isinstance(opened, str):
+            opened.close()
+        raise
     return environment
 
 
-def _named(spec: EnvironmentSpec, simulator: str) -> EnvironmentSpec:
-    """The specification as one of the simulator, whose name may differ from the plant's."""
-    return spec if ":" in simulator else spec.model_copy(update={"environment": simulator})
+def _respecified(simulator: str | OriginalEnvironment, opened: Any, spec: EnvironmentSpec) -> Any:
+    """The simulator with the plant's specification. A name of an adapter has none of its own, and is opened here."""
+    if isinstance(simulator, str) and not is_own(simulator):
+        return make(simulator, spec=spec.model_copy(update={"environment": simulator}))
+    return Respecified(opened, spec)
+
+
+def _require_alike(spec: EnvironmentSpec, own: EnvironmentSpec) -> None:
+    for what, expected, got in (
+        ("coordinates", _coordinates(spec), _coordinates(own)),
+        ("action", *(one.action.model_dump(exclude={"bins"}) for one in (spec, own))),
+    ):
+        if expected != got:
+            raise UnknownEnvironment(f"expected a simulator with the plant's {what}, {expected}, got {got}")
+
+
+def _coordinates(spec: EnvironmentSpec) -> list[str]:
+    """Name, kind and unit of each coordinate, in words."""
+    return [" ".join([one.name, f"({one.kind})", one.unit or ""]).strip() for one in spec.coordinates]
+
+
+def _require_steps(environment: OriginalEnvironment, spec: EnvironmentSpec) -> None:
+    """Check that the simulator takes one of a few steps from states drawn from their ranges."""
+    rng, why = np.random.default_rng(0), ""
+    for _ in range(TRIALS):
+        start = draw(spec, rng, wide=True)
+        try:
+            reached = np.asarray(environment.step_from(start, _middle(spec)).next_coordinates)
+            if reached.shape == start.shape and np.isfinite(reached).all():
+                return
+            why = f"it gave {reached.tolist()}"
+        except Exception as error:  # any code of a user
+            why = f"{type(error).__name__}: {str(error)[:200]}"
+    raise UnknownEnvironment(
+        f"expected a simulator that steps from its sampling range to {len(spec.coordinates)} finite coordinates, "
+        f"got one that took none of {TRIALS}: {why}"
+    )
+
+
+def _middle(spec: EnvironmentSpec) -> Array:
+    """The action (F,) in the middle of its bounds, or the first discrete one."""
+    if isinstance(spec.action, BoxAction):
+        return np.asarray(np.mean([spec.action.low, spec.action.high], axis=0))
+    return np.zeros(spec.action.size)
 
 
 def _transitions(real: Sequence[RealStep]) -> RealTransitions:

@@ -150,7 +150,7 @@ def test_a_mask_steps_some_lanes_and_leaves_the_others(pendulum_model, started):
     assert masked.reward[1] == masked.reward_mean[1] == 0
     assert some.elapsed.tolist() == [1, 0, 1]
     torch.testing.assert_close(some.q[[0, 2]], everyone.q[[0, 2]], rtol=0, atol=0)
-    with pytest.raises(InvalidInput, match="expected 3 entries, got 2"):
+    with pytest.raises(InvalidInput, match=r"expected 3 entries.* got 2"):
         step(pendulum_model, settings, lanes, u, np.ones(2, bool))
 
 

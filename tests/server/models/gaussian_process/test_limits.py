@@ -180,7 +180,7 @@ def test_points_at_limits_survive_storage_and_are_checked():
     for sides in ((1, 0), (2,) * len(model.transitions[1].at_limit)):
         malformed = replace(model.transitions[1], at_limit=sides)
         stored = to_bytes(replace(model, transitions=(model.transitions[0], malformed)))
-        with pytest.raises(InvalidInput, match="expected a side"):
+        with pytest.raises(InvalidInput, match="at_limit"):
             from_bytes(RELIEVED, stored)
 
 

@@ -146,7 +146,7 @@ def test_rates_survive_storage(model, points):
 def test_malformed_rates_are_refused(model, rates):
     output = model.transitions[0]
     wrong = replace(output, feature_map=replace(output.feature_map, rates=rates))
-    with pytest.raises(InvalidInput, match=r"rates|amplitude"):
+    with pytest.raises(InvalidInput, match=r"rate|amplitude"):
         require_output(REACTION, wrong)
 
 
