@@ -6,8 +6,9 @@ import os
 
 import numpy as np
 
-from surrogym.design import Design, Query
-from surrogym_sampler.priors.prior import Progress, SimulatorPrior
+from surrogym.design import Design
+from surrogym_sampler.original.errors import StepRefused
+from surrogym_sampler.priors.prior import Careful, Progress, SimulatorPrior
 from surrogym_shared.surrogate_file import SurrogateFile
 
 MOST_THREADS = 4
@@ -22,21 +23,11 @@ class Prior(SimulatorPrior):
     """
 
     def learn(self, say: Progress) -> SurrogateFile:
-        design = Design(self.spec, threads=min(MOST_THREADS, os.cpu_count() or 1))
+        design, simulator = Design(self.spec, threads=min(MOST_THREADS, os.cpu_count() or 1)), Careful(self.simulator)
         while (query := design.ask()) is not None:
-            self._answer(design, query)
+            try:
+                design.tell(query, simulator.step_from(np.array(query.coordinates), np.array(query.action)))
+            except StepRefused:
+                design.give_up(query)
             say(0.5 * design.steps / self.steps, f"{design.steps} of {self.steps} steps of the simulator")
         return design.to_file("prior")
-
-    def _answer(self, design: Design, query: Query) -> None:
-        """Take a step of the simulator. One that it can't take is given up."""
-        try:
-            step = self.simulator.step_from(np.array(query.coordinates), np.array(query.action))
-        except Exception:  # any code of a user: the design goes elsewhere
-            design.give_up(query)
-            return
-        numbers = [*np.ravel(step.coordinates), *np.ravel(step.next_coordinates), step.reward]
-        if np.isfinite(numbers).all():
-            design.tell(query, step)
-        else:
-            design.give_up(query)

@@ -6,15 +6,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 from uuid import uuid4
 
-import numpy as np
-
 from surrogym_client.errors import UnknownSurrogate
 from surrogym_client.surrogates.transfer import export_surrogate
 from surrogym_client.surrogates.waiting import wait_for_model
 from surrogym_client.transport.api import Api
-from surrogym_sampler.original.errors import StepRefused
-from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealStep
-from surrogym_sampler.priors.prior import Progress, SimulatorPrior
+from surrogym_sampler.priors.prior import Careful, Progress, SimulatorPrior
 from surrogym_sampler.queries.settings import SamplerSettings
 from surrogym_sampler.queries.worker import Sampler
 from surrogym_shared.spec import EnvironmentSpec
@@ -26,32 +22,6 @@ LONGEST_FIT = 1_800.0  # seconds
 MARK = ".simulator-"  # in the name of the surrogate that the server learns the simulator's model in
 TOKEN = 8  # hexadecimal digits behind it
 MOST_OF_NAME = 64 - len(MARK) - TOKEN
-
-
-class Careful:
-    """A simulator that refuses a step which it can't take, so that the design goes elsewhere."""
-
-    parallel = True
-
-    def __init__(self, simulator: OriginalEnvironment) -> None:
-        self._simulator = simulator
-
-    def spec(self) -> EnvironmentSpec:
-        return self._simulator.spec()
-
-    def step_from(self, coordinates: Array, action: Array) -> RealStep:
-        """Take a step. Raises ``StepRefused`` for any error of the simulator, and for numbers that are not finite."""
-        try:
-            step = self._simulator.step_from(coordinates, action)
-            numbers = [*np.ravel(step.coordinates), *np.ravel(step.next_coordinates), step.reward]
-        except Exception as error:  # any code of a user
-            raise StepRefused(f"{type(error).__name__}: {error}") from error
-        if not np.isfinite(numbers).all():
-            raise StepRefused("the simulator gave numbers that are not finite")
-        return step
-
-    def close(self) -> None:
-        self._simulator.close()
 
 
 class ServerPrior(SimulatorPrior):

@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from surrogym_sampler.original.episodes import draw
-from surrogym_sampler.original.errors import UnknownEnvironment
+from surrogym_sampler.original.errors import StepRefused, UnknownEnvironment
 from surrogym_sampler.original.loading import Respecified, is_own, make, with_choices
 from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealStep
 from surrogym_sampler.priors.calibration import Calibration, RealTransitions, calibrate
@@ -35,6 +35,32 @@ Progress = Callable[[float | None, str], None]
 def silent(share: float | None, words: str) -> None:
     """Show no progress."""
     del share, words
+
+
+class Careful:
+    """A simulator that refuses a step which it can't take, so that the design goes elsewhere."""
+
+    parallel = True
+
+    def __init__(self, simulator: OriginalEnvironment) -> None:
+        self._simulator = simulator
+
+    def spec(self) -> EnvironmentSpec:
+        return self._simulator.spec()
+
+    def step_from(self, coordinates: Array, action: Array) -> RealStep:
+        """Take a step. Raises ``StepRefused`` for any error of the simulator, and for numbers that are not finite."""
+        try:
+            step = self._simulator.step_from(coordinates, action)
+            numbers = [*np.ravel(step.coordinates), *np.ravel(step.next_coordinates), step.reward]
+        except Exception as error:  # any code of a user
+            raise StepRefused(f"{type(error).__name__}: {error}") from error
+        if not np.isfinite(numbers).all():
+            raise StepRefused("the simulator gave numbers that are not finite")
+        return step
+
+    def close(self) -> None:
+        self._simulator.close()
 
 
 class SimulatorPrior(ABC):
