@@ -43,7 +43,7 @@ from surrogym_shared.spec import Bounds, Design, EnvironmentSpec
 
 SIZES, UNSEEN, EPISODES, LENGTH, BUDGET = (12, 24, 50, 100), 1_500, 10, 100, 100
 REACTOR = example()
-PAST_LIMITS, HELD = learning.past_limits, learning.held
+PAST_LIMITS, WITHIN_LIMITS = learning.past_limits, learning.within_limits
 
 
 def unchanged(_: Any, output: OutputModel, *_others: Any) -> OutputModel:
@@ -54,8 +54,8 @@ def unchanged(_: Any, output: OutputModel, *_others: Any) -> OutputModel:
 WAYS = {
     "without": (unchanged, unchanged),
     "of others": (PAST_LIMITS, unchanged),
-    "inequalities": (PAST_LIMITS, HELD),
-    "no rates": (PAST_LIMITS, HELD),
+    "inequalities": (PAST_LIMITS, WITHIN_LIMITS),
+    "no rates": (PAST_LIMITS, WITHIN_LIMITS),
 }
 
 
@@ -70,7 +70,7 @@ def learn_by(
     spec: EnvironmentSpec, way: str, acquisition: str = "integrated_variance", seed: int = 0
 ) -> EnvironmentDefinition:
     """Learn in that way from now on. Returns the environment with a design."""
-    learning.past_limits, learning.held = WAYS[way]
+    learning.past_limits, learning.within_limits = WAYS[way]
     model = {"name": "gaussian_process", "settings": {"rates": way != "no rates"}}
     design = Design.model_validate({"acquisition": acquisition, "seed": seed, "model": model})
     return definition_from_spec(spec.model_copy(update={"design": design}))
