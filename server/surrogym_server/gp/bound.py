@@ -4,9 +4,9 @@ With K_uu of the inducing points Z, K_uf of Z and the n points X, Q = K_uf^T K_u
 
     F = log N(y | 0, Q + sigma_n^2 I) - tr(K_ff - Q) / (2 sigma_n^2) <= log p(y).
 
-The trace counts what the inducing points leave unexplained, so hyperparameters that maximise F do not take it for
-something that was learned: the noise grows by it. With all points as inducing ones F is the evidence. At the optimum of
-the variational distribution predictions are those of the projected process, see ``gp.sparse``.
+The trace counts what the inducing points leave unexplained. So hyperparameters that maximise F treat this part as
+noise: sigma_n^2 grows by it. With all points as inducing ones F is the evidence. At the optimum of the variational
+distribution predictions are those of the projected process, see ``gp.sparse``.
 
 With L L^T = K_uu, V = L^-1 K_uf, S = V V^T + sigma_n^2 I, a = S^-1 V y and alpha = (y - V^T a) / sigma_n^2, all is
 computed in O(n m^2), and
@@ -14,7 +14,7 @@ computed in O(n m^2), and
     dF/dK_uf = L^-T (a alpha^T + (I - sigma_n^2 S^-1) V / sigma_n^2),
     dF/dK_uu = -1/2 L^-T (a a^T + S / sigma_n^2 - 2 I + sigma_n^2 S^-1) L^-1.
 
-Z are some of the X, and stay where they are in a search. Those that the others explain least are a good choice
+Z are some of the X, and do not change during a search. Those that the others explain least are a good choice
 (``gp.sparse``), because F is at most tr(K_ff - Q) |y|^2 / (2 sigma_n^4) below the evidence.
 
 References: Titsias, "Variational learning of inducing variables in sparse Gaussian processes", AISTATS 2009; Burt,
@@ -40,23 +40,26 @@ from surrogym_server.gp.search import blas, minimum
 from surrogym_server.gp.sparse import condition_sparse, pivots
 from surrogym_server.gp.subsets import SOME, spread
 
-SEARCHES = ((2_000, 40), (None, 15))  # most points of each search, None for all, and its iterations
-NOISY = 1e-4  # noise variance, as a share of the output's: with less, errors of inducing points count beside it
-PRECISE = 1e-4  # error of points that are predicted from the others, in standard deviations of the output
-HARDLY, TRIES = 0.3, 6  # of the noise: largest effect of an input that may be left out; and searches
-JITTER = 1e-9  # of the points' mean prior variance: added to the diagonal of K_uu
+SEARCHES = ((2_000, 40), (None, 15))  # most points (None for all) and iterations of each search, one after the other
+NOISY = 1e-4  # least noise variance, as a share of the output's variance, beside which inducing errors are small
+PRECISE = 1e-4  # error of points predicted from the others that counts as exact, in the output's standard deviations
+HARDLY = 0.3  # an input may be left out if its effect on the mean is below this share of the noise deviation
+TRIES = 6  # most searches for inputs that can be left out
+JITTER = 1e-9  # added to the diagonal of K_uu, as a share of the points' mean prior variance
 
 
 def fit_bound(
     x: Tensor, y: Tensor, options: FitOptions, theta: Array, inducing: int, reflection: Reflection | None = None
 ) -> Posterior:
-    """Fit a process to x (n, d) and y (n,), both standardised, through at most ``inducing`` points.
+    """Fit a process to x (n, d) and y (n,), both standardised, through at most ``inducing`` points. Runs on the CPU.
 
-    The search begins at ``theta``, which was fitted to some of the points, and at shorter length scales. It sees some
-    of the points first, and then all. Each time the inducing points are chosen anew. Runs on the CPU.
+    Args:
+        theta: free parameters that were fitted to some of the points. The search starts there and at shorter length
+            scales, first with some of the points and then with all. Each search chooses its own inducing points.
+        inducing: greatest number of inducing points.
 
     Raises:
-        NumericalFailure: as ``condition``.
+        NumericalFailure: no jitter makes the covariance of the points positive definite.
     """
     shorter = theta.copy()
     shorter[: x.shape[1]] -= SHORTER
@@ -77,10 +80,16 @@ def fit_bound(
 def fit_through_few(
     x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection: Reflection | None = None
 ) -> Posterior | None:
-    """Fit a process to points x (n, d), y (n,), both standardised, through fewer than ``SOME`` of them. None if that
-    would lose something, see ``loses_nothing``, or if there are no more points.
+    """Fit a process to points x (n, d), y (n,), both standardised, through fewer than ``SOME`` of them as inducing
+    points. Runs on the CPU.
 
-    ``theta`` was fitted to some of the points. With noise, the bound of all is searched from there. Runs on the CPU.
+    Args:
+        theta: free parameters that were fitted to some of the points. If they have noise, the bound of all points is
+            maximised from there as well.
+
+    Returns:
+        The posterior; None if inducing points would lose accuracy (see ``loses_nothing``), or if there are at most
+        ``SOME`` points.
     """
     parameters = Parameters(x.shape[1], options, reflection)
     hyper = parameters.hyper(theta)
@@ -97,8 +106,11 @@ def fit_through_few(
 
 
 def loses_nothing(posterior: Posterior) -> bool:
-    """Whether a process stands for all of its points. Inducing points do where they leave less of the function open
-    than noise hides, or where each point is predicted precisely from the others."""
+    """Return whether a posterior represents all of its data.
+
+    An exact posterior does. Fewer than ``SOME`` inducing points do if the noise hides their errors, or if each point is
+    predicted precisely from the others.
+    """
     if posterior.sparse is None:
         return True
     hidden = is_noisy(posterior.hyper) or posterior.left_out.error <= PRECISE
@@ -106,31 +118,37 @@ def loses_nothing(posterior: Posterior) -> bool:
 
 
 def is_noisy(hyper: Hyperparameters) -> bool:
-    """Whether errors of inducing points are small beside the noise."""
+    """Return whether the noise is so large that the errors of inducing points are small beside it."""
     return hyper.noise_variance > NOISY
 
 
 @dataclass(frozen=True)
 class Fewer:
-    """A process of some of the inputs."""
+    """A process that reads only some of the inputs."""
 
-    mask: Tensor  # (d,) bool
+    mask: Tensor  # (d,) bool, true for the inputs that the process reads
     posterior: Posterior
 
 
 def fewer_inputs(
     x: Tensor, y: Tensor, posterior: Posterior, options: FitOptions, inducing: int, may: Tensor, odds: float
 ) -> Fewer | None:
-    """Leave out inputs of a process of x (n, d) and y (n,) that hardly change its mean, if the bound with priors is
-    greater without them; None if all are kept. Runs on the CPU.
+    """Leave out inputs that hardly change the mean of a process, if this increases the bound with priors. Runs on the
+    CPU.
 
-    All such inputs are tried at once. A set that is kept is halved, the inputs that matter least first, and its halves
-    are tried beside those that were left out, in ``TRIES`` searches at most.
+    All such inputs are tried at once. If they can't be left out together, the set is halved, and its halves are tried
+    beside the inputs already left out, in ``TRIES`` searches at most.
 
     Args:
+        x: inputs (n, d).
+        y: targets (n,).
         posterior: the process with all inputs.
-        may: (d,) bool, the inputs that may be left out. One is kept at least.
-        odds: log odds before any data that one input more is left out.
+        inducing: greatest number of inducing points.
+        may: (d,) bool, the inputs that may be left out. At least one input is kept.
+        odds: prior log odds of leaving out one input more.
+
+    Returns:
+        The process with fewer inputs, or None if all are kept.
     """
     effect = _effects(posterior, x[spread(len(y), SOME)])
     most = HARDLY * math.sqrt(posterior.hyper.noise_variance)
@@ -148,7 +166,7 @@ def fewer_inputs(
 
 
 class _Inputs:
-    """The inputs that a process keeps, and the free parameters with which its bound is greatest."""
+    """The inputs that a process still reads, and the free parameters that maximise its bound."""
 
     def __init__(self, x: Tensor, y: Tensor, options: FitOptions, inducing: int, hyper: Hyperparameters) -> None:
         self._x, self._y, self._options, self._inducing, self._mirror = x, y, options, inducing, hyper.reflection
@@ -157,11 +175,11 @@ class _Inputs:
         self.mask = torch.ones(x.shape[1], dtype=torch.bool)
 
     def without(self, out: Sequence[int], odds: float) -> bool:
-        """Leave out further inputs, if that makes the cost less."""
+        """Try to leave out the inputs ``out`` as well; do so and return true if this lowers the cost."""
         mask = self.mask.index_fill(0, torch.tensor(out), value=False)
         mirror = self._reflection(mask)
         if mirror is not None and mirror.parity < 0 and bool((mirror.signs > 0).all()):
-            return False  # such a function is zero
+            return False  # an odd function of unchanged inputs only is zero everywhere
         others = np.ones(len(self._theta) - int(self.mask.sum()), dtype=bool)
         start = self._theta[np.concatenate([mask[self.mask].numpy(), others])]
         cost, theta = _searched(self._x[:, mask], self._y, self._options, start, self._inducing, mirror)
@@ -180,7 +198,7 @@ class _Inputs:
 
 
 def _effects(posterior: Posterior, x: Tensor) -> Tensor:
-    """By how much the mean at x (m, d) changes if one input has the value of another row, root mean squares (d,)."""
+    """Return how much the mean at x (m, d) changes if one input takes another row's value: root mean squares (d,)."""
     mean, effects = posterior.mean(x), []
     for j in range(x.shape[1]):
         changed = x.clone()
@@ -192,7 +210,8 @@ def _effects(posterior: Posterior, x: Tensor) -> Tensor:
 def _searched(
     x: Tensor, y: Tensor, options: FitOptions, start: Array, inducing: int, reflection: Reflection | None
 ) -> tuple[float, Array]:
-    """The least cost from a start, and its theta, with the inducing points that suit the start."""
+    """Minimise the cost from a start, with inducing points chosen for the start. Return the least cost and its
+    theta."""
     parameters = Parameters(x.shape[1], options, reflection)
     clipped = np.clip(start, parameters.lower, parameters.upper)
     inducing_rows = pivots(parameters.hyper(clipped), x, inducing)
@@ -200,10 +219,10 @@ def _searched(
 
 
 class Bound(Parameters):
-    """Negative bound with priors, and its gradient."""
+    """Negative lower bound of the log evidence, with the priors of theta, and its gradient over theta."""
 
     def __init__(self, x: Tensor, y: Tensor, rows: Tensor, options: FitOptions, reflection: Reflection | None) -> None:
-        """Prepare the bound of x (n, d) and y (n,); ``rows`` (m,) are the numbers of the inducing points."""
+        """Prepare the bound of x (n, d) and y (n,); ``rows`` (m,) are the indices of the inducing points."""
         super().__init__(x.shape[1], options, reflection)
         self.x, self.y, self.inducing_rows = x.numpy(), y.numpy(), rows.numpy()
         self.z = self.x[self.inducing_rows]
@@ -214,7 +233,10 @@ class Bound(Parameters):
         self._constant = 0.5 * len(y) * math.log(2 * math.pi) + self.prior_constant
 
     def __call__(self, theta: Array) -> tuple[float, Array]:
-        """Value and gradient at theta. If float64 can't factor a matrix, a very large cost stops the line search."""
+        """Return value and gradient at theta.
+
+        If float64 can't factor a matrix, a very large cost stops the line search.
+        """
         covariances = self._covariances(theta)
         k, noise = covariances.k, self.values(theta)[-1]
         n, m, prior = len(self.y), len(self.z), float(covariances.diagonal.sum())
@@ -273,7 +295,14 @@ class Bound(Parameters):
         return part_of_kernel
 
     def _gradient(self, theta: Array, covariances: _Covariances, outer: Array, each: float) -> Array:
-        """Gradient over theta, given those over K_uf (m, n), K_uu included, and over each entry of K_ff's diagonal."""
+        """Return the gradient over theta by the chain rule.
+
+        Args:
+            theta: free parameters.
+            covariances: the covariances at theta.
+            outer: gradient over K_uf, (m, n), in which that over K_uu is included.
+            each: gradient over each entry of K_ff's diagonal, equal for all.
+        """
         lengthscale, signal, linear, quadratic, _ = self.values(theta)
         gradient, n = np.zeros_like(theta), len(self.y)
         gradient[self.d] = each * (n * signal + float(covariances.mirrored.sum()))
@@ -296,14 +325,14 @@ class Bound(Parameters):
 
 @dataclass(frozen=True)
 class _Covariances:
-    k: Array  # (m, n) of inducing points and points
-    smooth: list[Array]  # its squared exponential, and that of the points' mirror images
-    diagonal: Array  # (n,) of the points
-    mirrored: Array  # (n,) the share of each point's own mirror image in it; empty without a reflection
+    k: Array  # (m, n) covariances of the inducing points with all points
+    smooth: list[Array]  # the squared exponential in k, and with a reflection that of the points' mirror images
+    diagonal: Array  # (n,) prior variance of each point
+    mirrored: Array  # (n,) share of the diagonal from each point's own mirror image; empty without a reflection
 
 
 def _exponential(a: Array, b: Array) -> Array:
-    """exp(-1/2 |a_i - b_j|^2) of a (m, d) and b (n, d), (m, n)."""
+    """Return exp(-1/2 |a_i - b_j|^2) for inputs a (m, d) and b (n, d), shape (m, n)."""
     k = a @ b.T
     k -= 0.5 * np.square(a).sum(1)[:, None]
     k -= 0.5 * np.square(b).sum(1)
@@ -312,12 +341,12 @@ def _exponential(a: Array, b: Array) -> Array:
 
 
 def _factor(matrix: Array) -> Array | None:
-    """Lower Cholesky factor; None if there is none."""
+    """Return the lower Cholesky factor of a symmetric matrix; None if it is not positive definite."""
     lower, info = scipy.linalg.lapack.dpotrf(matrix, lower=1, clean=1)
     return None if info else np.ascontiguousarray(lower)
 
 
 def _solve_lower(lower: Array, k: Array) -> Array:
-    """L^-1 k for k (m, n) by rows."""
+    """Return L^-1 k for a lower triangular L (m, m) and k (m, n)."""
     solution: Array = scipy.linalg.blas.dtrsm(1.0, lower.T, k.T, side=1, lower=0).T
     return solution

@@ -1,6 +1,7 @@
-"""One process in compiled code: mean and latent standard deviation of a block of inputs (d, B), one in each column.
+"""One process in compiled code: mean and latent standard deviation of a block of inputs (d, B), one input a column.
 
-Exponents are computed by differences, which cost no more than products here (see ``gp.serving``, the reference).
+Exponents are computed from differences of inputs. In ``gp.serving``, the reference implementation, they come from
+matrix products, which would be no faster here.
 """
 
 from __future__ import annotations
@@ -19,24 +20,36 @@ from surrogym_shared.compiled.jit import inlined
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Places of a process' matrices: its numbers (below); columns of x and inverse length scales (2, d); points in length
-# scales (n, d), then their mirror images; weights of them (1, S); coefficients of x, x^2 and of the prior variance's
-# x^2, x^4, of the mirror's exponent, and of the polynomial covariances with points (5 + 2 n, d); L (n, n).
-# The frequencies of posterior samples (d, S), of inputs in their own unit: first those of the inputs that a reflection
-# leaves, then those of the inputs that it turns.
+# Indices of a process's matrices in the tables:
+# HEAD: the scalars that are numbered below.
+# INPUTS (2, d): columns of x that the process reads, and inverse length scales.
+# POINTS (S, d): points over the length scales, then their mirror images if there is a reflection.
+# WEIGHTS (1, S): weights of the points in the mean.
+# POLYNOMIALS (5 + 2 n, d): coefficients of x and x^2 in the mean, of x^2 and x^4 in the prior variance, of the mirror
+#   image's exponent, and of the polynomial covariances with the n points (first linear, then quadratic).
+# FACTOR (n, n): Cholesky factor L.
+# KEPT, TURNED (d, S): frequencies of posterior samples over the length scales, of the inputs whose sign a reflection
+#   keeps and of those whose sign it changes.
 HEAD, INPUTS, POINTS, WEIGHTS, POLYNOMIALS, FACTOR, KEPT, TURNED = range(8)
-# Scale, constants of mean and prior variance, parity of a reflection or 0, signal variance, constant of the polynomial
-# covariance, whether there is any, the number of points, whether there is a linear and a quadratic part, and whether a
-# reflection turns every input.
+# Columns of HEAD: scale of the output, constant of the mean, constant of the prior variance, parity of the reflection
+# (0 without one), signal variance, constant of the polynomial covariance, whether there is a polynomial part, number of
+# points, whether there is a linear part, whether there is a quadratic part, whether a reflection turns every input.
 SCALE, CENTRE, PRIOR, PARITY, SIGNAL, CONSTANT, POLYNOMIAL, COUNT, LINES, SQUARES, TURNS_ALL = range(11)
-OF_MEAN, OF_PRIOR, OF_MIRROR, OF_POINTS = 0, 2, 4, 5  # rows of POLYNOMIALS
+# First rows of the groups in POLYNOMIALS: mean, prior variance, exponent of the mirror image, covariances with points.
+OF_MEAN, OF_PRIOR, OF_MIRROR, OF_POINTS = 0, 2, 4, 5
 
 
 def add_process(
     tables: TablesBuilder, posterior: Posterior, inputs: tuple[int, ...], centre: float, scale: float
 ) -> int:
-    """Add a process that reads the columns ``inputs`` of x, and return its place. Its output is centre + scale *
-    process."""
+    """Add one output's process to the tables, and return the index of its first matrix there.
+
+    Args:
+        tables: tables under construction.
+        posterior: the process.
+        inputs: columns of x that the process reads.
+        centre, scale: the output is centre + scale * process.
+    """
     hyper, x, polynomial = posterior.hyper, posterior.x, posterior.hyper.polynomial
     points, weights, mirror = x, posterior.weights, torch.zeros_like(hyper.lengthscale)
     if (reflection := hyper.reflection) is not None:
@@ -81,7 +94,13 @@ def add_process(
 
 @inlined
 def _smooth(own: Floats, inverse: Floats, points: Floats) -> Floats:
-    """exp(-1/2 sum_j (x_j / l_j - X_ij)^2) of inputs (d, B) and points (S, d), (S, B)."""
+    """Return exp(-1/2 sum_j (x_j / l_j - X_ij)^2) for inputs x (d, B) and scaled points X (S, d), shape (S, B).
+
+    Args:
+        own: inputs x of the process.
+        inverse: inverse length scales 1 / l, (d,).
+        points: points over the length scales.
+    """
     size, lanes = own.shape
     scaled = np.empty_like(own)
     for j in range(size):
@@ -107,7 +126,14 @@ def _smooth(own: Floats, inverse: Floats, points: Floats) -> Floats:
 
 @inlined
 def _covariances(head: Floats, rows: Floats, own: Floats, smooth: Floats) -> Floats:
-    """Covariances of inputs (d, B) with the points, (n, B)."""
+    """Return the prior covariances of the inputs ``own`` (d, B) with the n points, (n, B).
+
+    Args:
+        head: matrix HEAD of the process.
+        rows: matrix POLYNOMIALS of the process.
+        own: inputs of the process.
+        smooth: squared exponential of the inputs with the points and their mirror images, (S, B).
+    """
     count, parity, signal = int(head[0, COUNT]), head[0, PARITY], head[0, SIGNAL]
     size, lanes = own.shape
     k = np.empty((count, lanes))
@@ -129,7 +155,7 @@ def _covariances(head: Floats, rows: Floats, own: Floats, smooth: Floats) -> Flo
 
 @inlined
 def _explain(factor: Floats, k: Floats) -> None:
-    """Replace k (n, B) by L^-1 k."""
+    """Replace k (n, B) by L^-1 k, where ``factor`` (n, n) is the lower triangular L."""
     lanes = k.shape[1]
     for i in range(len(factor)):
         j = 0
@@ -149,7 +175,15 @@ def _explain(factor: Floats, k: Floats) -> None:
 
 @inlined
 def _std(head: Floats, rows: Floats, own: Floats, explained: Floats, std: Floats) -> None:
-    """Write sqrt(k(x, x) - |L^-1 k|^2) to an array (B,)."""
+    """Write the latent standard deviation sqrt(k(x, x) - |L^-1 k|^2), in the output's unit, to ``std`` (B,).
+
+    Args:
+        head: matrix HEAD of the process.
+        rows: matrix POLYNOMIALS of the process.
+        own: inputs x of the process, (d, B).
+        explained: L^-1 k, (n, B).
+        std: array for the result.
+    """
     size, lanes = own.shape
     std[:] = 0.0
     if head[0, PARITY] != 0:
@@ -176,7 +210,17 @@ def _std(head: Floats, rows: Floats, own: Floats, explained: Floats, std: Floats
 def _add_residuals(
     head: Floats, rows: Floats, kept: Floats, turned: Floats, own: Floats, k: Floats, paths: Floats, mean: Floats
 ) -> None:
-    """Add to the mean (B,) the residuals of posterior samples, whose weights are the first columns of paths (B, W)."""
+    """Add the residuals of posterior samples, one sample for each of B inputs, to ``mean`` (B,).
+
+    Args:
+        head: matrix HEAD of the process.
+        rows: matrix POLYNOMIALS of the process.
+        kept, turned: matrices KEPT and TURNED of the process.
+        own: inputs of the process, (d, B).
+        k: covariances of the inputs with the n points, (n, B).
+        paths: weights of the posterior samples, (B, W), of which the first columns belong to this process.
+        mean: means in the output's unit, changed in place.
+    """
     (size, count), parity, scale = kept.shape, head[0, PARITY], head[0, SCALE]
     straight, mirrored = np.empty(count), np.empty(count)
     sine, cosine = np.empty(count), np.empty(count)
@@ -194,7 +238,7 @@ def _add_residuals(
         amplitude = np.sqrt(head[0, SIGNAL] / count)
         total = dot(cosine, paths[b, :count]) + dot(sine, paths[b, count : 2 * count])
         if parity != 0:
-            if head[0, TURNS_ALL]:  # cos(-a) = cos(a), sin(-a) = -sin(a)
+            if head[0, TURNS_ALL]:  # the mirror image has the opposite phase: cos(-a) = cos(a), sin(-a) = -sin(a)
                 total += parity * (dot(cosine, paths[b, :count]) - dot(sine, paths[b, count : 2 * count]))
             else:
                 sine_and_cosine(mirrored, sine, cosine)
@@ -220,10 +264,15 @@ def _add_residuals(
 def predict(
     numbers: Floats, places: Ints, at: int, x: Floats, wanted: bool, paths: Floats, mean: Floats, std: Floats
 ) -> None:
-    """Write the mean and, if wanted, the latent standard deviation at inputs x (d, B) to arrays (B,) each.
+    """Predict one output at inputs x (d, B), each a column, and write the results to ``mean`` and ``std``, (B,) each.
 
-    Both are in the output's unit. With ``paths`` (B, W) the value of a posterior sample, one for each column of x,
-    replaces the mean.
+    Args:
+        numbers, places: the tables.
+        at: index of the process's first matrix in the tables.
+        x: all inputs of the model.
+        wanted: whether to write the latent standard deviation too.
+        paths: (B, W) weights of one posterior sample for each input, whose value then replaces the mean; or (0, W).
+        mean, std: arrays for the results, in the output's unit.
     """
     head, inputs = matrix(numbers, places, at + HEAD), matrix(numbers, places, at + INPUTS)
     points, weights = matrix(numbers, places, at + POINTS), matrix(numbers, places, at + WEIGHTS)

@@ -19,17 +19,17 @@ from surrogym_server.gp.search import Evidence, blas, minimum
 from surrogym_server.gp.sparse import hardest
 from surrogym_server.gp.subsets import FEW, SOME, spread
 
-NOISY = 1e-2  # noise of a start from noise, of the output's variance
-MANY_POINTS = 24
-REFINEMENTS = ((1_000, 20), (2_000, 10))  # most points of further searches, and iterations: each begins near its end
-HARD, HARD_ITERATIONS = 1_000, 20  # points of a search where a process errs most, and its iterations
-SHORTER = 0.5  # logarithm of the second start's length scales, below the first's
+NOISY = 1e-2  # noise variance at which the noisy search starts, as a share of the output's variance
+MANY_POINTS = 24  # a warm fit to more points tries the default start in one of four fits only
+REFINEMENTS = ((1_000, 20), (2_000, 10))  # points and iterations of each further search; each starts near its optimum
+HARD, HARD_ITERATIONS = 1_000, 20  # number of points, and of iterations, of a search on the points with most error
+SHORTER = 0.5  # the second start's length scales are shorter than the first's by this much in the logarithm
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """Result of a fit: the posterior, its score (log evidence at the optimum, priors included), and theta for a warm
-    start."""
+    """Result of a fit: the posterior, its score (log evidence at the optimum, priors included), and the free parameters
+    theta, from which a later fit can start."""
 
     posterior: Posterior
     score: float
@@ -39,9 +39,14 @@ class Fitted:
 def fit(
     x: Tensor, y: Tensor, options: FitOptions, warm: Array | None = None, reflection: Reflection | None = None
 ) -> Fitted:
-    """Fit a process to x (n, d) and y (n,), both standardised. With a ``reflection``, fit functions with this symmetry.
+    """Fit a process to inputs x (n, d) and targets y (n,), both standardised. Runs on the CPU.
 
-    Runs on the CPU. ``warm`` is the theta of an earlier fit. Raises ``NumericalFailure``.
+    Args:
+        warm: theta of an earlier fit, tried as a start; None to start from the priors' means.
+        reflection: symmetry of the functions to fit, or None.
+
+    Raises:
+        NumericalFailure: no jitter makes the covariance of the points positive definite.
     """
     objective = Evidence(x, y, options, reflection)
     with blas().limit(limits=1):
@@ -52,10 +57,11 @@ def fit(
 
 
 def fit_some(x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection: Reflection | None = None) -> Array:
-    """Fit hyperparameters to some of x (n, d) and y (n,) from ``theta``, which was fitted to fewer. Return theta.
+    """Fit hyperparameters to at most ``SOME`` of the points x (n, d), y (n,), from a ``theta`` that was fitted to fewer
+    points. Return the new theta.
 
-    More points have other optima, because they resolve what fewer points explain as noise. So they are searched from
-    two starts.
+    The optimum moves with more points, because they resolve what fewer points explain as noise. So the search has two
+    starts: ``theta``, and one with shorter length scales and little noise.
     """
     rows = spread(len(y), SOME)
     objective = Evidence(x[rows], y[rows], options, reflection)
@@ -70,10 +76,12 @@ def fit_some(x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection
 def refine(
     x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection: Reflection | None = None
 ) -> tuple[Hyperparameters, ...]:
-    """Refine hyperparameters of x (n, d) and y (n,) from ``theta``, the result of ``fit_some``. Return the result of
-    each stage, that one included; the last one has seen all points.
+    """Refine hyperparameters of points x (n, d), y (n,) from ``theta``, the result of ``fit_some``.
 
-    The full set is searched in a few iterations. Both stages are bounded, see ``gp.subsets``.
+    Each stage searches on more points in fewer iterations, so that the time stays bounded (see ``gp.subsets``).
+
+    Returns:
+        The hyperparameters of ``theta`` and of each stage, in that order; the last stage saw the most points.
     """
     thetas, points = [theta], min(len(y), SOME)
     with blas().limit(limits=1):
@@ -88,10 +96,10 @@ def refine(
 
 
 def refine_where_hard(posterior: Posterior, x: Tensor, y: Tensor, options: FitOptions) -> Hyperparameters:
-    """Refine the hyperparameters of a process of many points x (n, d), y (n,) on the points that are hard for it.
+    """Refine the hyperparameters of a process of many points x (n, d), y (n,) on the points that it predicts worst.
 
-    Points drawn evenly say little about a small region where the function is steep, because few of them lie there. The
-    noise of the start is what the process errs at the hard points.
+    Evenly drawn points hardly constrain a small region where the function is steep, because few of them lie there. The
+    search starts with a noise variance equal to the mean squared error at the hard points.
     """
     rows = hardest(posterior, x, y, HARD)
     error = float((y[rows] - posterior.mean(x[rows])).square().mean())
@@ -103,10 +111,10 @@ def refine_where_hard(posterior: Posterior, x: Tensor, y: Tensor, options: FitOp
 
 
 def noisy_explanation(posterior: Posterior, options: FitOptions) -> float:
-    """Variance of the noise in the likeliest explanation of a posterior's points that a search from noise finds. It is
-    the posterior's own if that explains them better.
+    """Return the noise variance of the likeliest explanation of a posterior's points: the result of a search that
+    starts with much noise, or the posterior's own variance if that is likelier.
 
-    A warm fit can stay for many rounds at an optimum without noise. With many points some of them are searched.
+    It detects a warm fit that stays at an optimum without noise. Of many points, at most ``FEW`` are searched.
     """
     rows = spread(len(posterior.y), FEW)
     objective = Evidence(posterior.x[rows], posterior.y[rows], options, posterior.hyper.reflection)
@@ -119,8 +127,11 @@ def noisy_explanation(posterior: Posterior, options: FitOptions) -> float:
 
 
 def _starts(default: Array, warm: Array | None, points: int) -> Sequence[Array]:
-    """The default start and the warm start. With few points there are many optima and a fit is cheap, so both are
-    tried. With more than ``MANY_POINTS`` points the default start is tried in one of four fits only."""
+    """Return the starts of a fit: the default start, and the warm start if there is one.
+
+    With few points there are many optima and a fit is cheap, so both are tried. With more than ``MANY_POINTS`` points a
+    warm fit tries the default start in one of four fits only.
+    """
     if warm is None:
         return (default,)
     return (warm,) if points > MANY_POINTS and points % 4 else (warm, default)

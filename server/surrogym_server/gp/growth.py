@@ -32,30 +32,37 @@ from surrogym_server.gp.posterior import condition
 from surrogym_server.gp.search import Evidence, blas, minimum
 from surrogym_server.tensors import EDGE, STEEPEST, amplitude, bend
 
-PRIOR = 1.0  # standard deviation of a rate; inputs have standard deviation near 1
-FLAT = 1e-3  # smaller rates are 0: they bend nothing
+PRIOR = 1.0  # prior standard deviation of a rate, for inputs of standard deviation near 1
+FLAT = 1e-3  # rates smaller than this have no effect and are set to 0
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Growing:
-    """Result of a fit with rates."""
+    """Result of a fit of F with rates: the process G and the rates of its inputs."""
 
-    fitted: Fitted  # of G; its score is that of F, and its theta ends with the rates
-    rates: tuple[float, ...]  # (d,)
+    fitted: Fitted  # fit of G; its score is that of F, and its theta ends with the rates
+    rates: tuple[float, ...]  # (d,) rate of each input
 
 
 def fit_growing(z: Tensor, t: Tensor, may: Tensor, options: FitOptions, starts: Sequence[Array]) -> Growing:
-    """Fit F to inputs z (n, d) and targets t (n,), both standardised. Runs on the CPU. Raises ``NumericalFailure``.
+    """Fit F to inputs z (n, d) and targets t (n,), both standardised. Runs on the CPU.
 
     Args:
-        may: (d,) bool, the inputs that may have a rate. No sample of them may lie beyond ``EDGE``.
-        options: those of the fit without rates, without a quadratic part.
+        may: (d,) bool, the inputs that may have a rate. All their samples lie within ``EDGE``.
+        options: options of the fit without rates; they must have no quadratic part.
         starts: thetas of fits without rates, or of earlier fits with rates.
+
+    Raises:
+        NumericalFailure: no jitter makes the covariance of the points positive definite.
+        ValueError: an input that may have a rate lies beyond ``EDGE``, or the options have a quadratic part.
     """
     if bool((z[:, may].abs() > EDGE).any()):
-        raise ValueError(f"expected inputs within {EDGE} where a rate is allowed")
+        raise ValueError(
+            f"expected each input that may have a rate to be within {EDGE}, "
+            f"got {float(z[:, may].abs().max()):g}; set `may` to false for such inputs"
+        )
     objective = _GrowingObjective(z, t, may, options)
     padded = [np.concatenate([start, np.zeros(objective.size - len(start))]) for start in starts]
     with blas().limit(limits=1):
@@ -68,11 +75,11 @@ def fit_growing(z: Tensor, t: Tensor, may: Tensor, options: FitOptions, starts: 
 
 
 class _GrowingObjective:
-    """Negative log evidence with priors of theta = [theta of G, rates of the inputs that may have one]."""
+    """Negative log evidence, priors included, over theta = [theta of G, rates of the inputs that may have one]."""
 
     def __init__(self, z: Tensor, t: Tensor, may: Tensor, options: FitOptions) -> None:
         if options.quadratic:
-            raise ValueError("expected options without a quadratic part")
+            raise ValueError("expected fit options with quadratic=False, got quadratic=True: rates exclude that part")
         self.options, self._z, self._t, self._may = options, z.numpy(), t.numpy(), may.numpy()
         plain = Evidence(z, t, options, None)
         self.inner, count = len(plain.default_start), int(self._may.sum())
@@ -81,13 +88,13 @@ class _GrowingObjective:
         self.upper = np.concatenate([plain.upper, np.full(count, STEEPEST)])
 
     def rates(self, theta: Array) -> Array:
-        """The rates (d,)."""
+        """Return the rates of all inputs, (d,); inputs that may not have a rate have 0."""
         rates = np.zeros(self._z.shape[1])
         rates[self._may] = theta[self.inner :]
         return rates
 
     def plain(self, theta: Array) -> tuple[Evidence, Array]:
-        """The objective of G given the rates, and the slopes of the bent inputs over their rates, (n, d)."""
+        """Return the objective of G at the rates in theta, and the derivatives of w over the rates, (n, d)."""
         rates, z = self.rates(theta), self._z
         small = np.abs(rates) < FLAT
         safe = np.where(small, 1.0, rates)

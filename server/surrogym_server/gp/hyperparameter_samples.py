@@ -18,9 +18,9 @@ from surrogym_server.gp.parameters import MOST_NOISE, NOISE_FLOOR, FitOptions
 from surrogym_server.gp.posterior import Posterior
 from surrogym_server.gp.search import Evidence, blas, minimum
 
-BURN_IN, THINNING = 30, 10  # updates before the first sample, and between samples
-SHORTER = (0.0, 1.0, 2.0)  # logarithms of length scales, below those of the fit
-NARROWEST = 1e-6  # radians; theta stays where it is when no other angle is left
+BURN_IN, THINNING = 30, 10  # number of updates before the first sample, and between two samples
+SHORTER = (0.0, 1.0, 2.0)  # each start has length scales shorter by this much in the logarithm than the fitted ones
+NARROWEST = 1e-6  # in radians; if the interval of angles becomes narrower, theta stays unchanged
 
 Array = NDArray[np.float64]
 
@@ -28,16 +28,15 @@ Array = NDArray[np.float64]
 def hyperparameter_samples(
     posterior: Posterior, count: int, seed: int, noise_floor: float = NOISE_FLOOR, most_noise: float = MOST_NOISE
 ) -> tuple[Hyperparameters, ...]:
-    """Draw ``count`` hyperparameters from their posterior given the points of a process. A pure function of its
-    arguments.
+    """Draw hyperparameters from their posterior given the points of a process. The same arguments give the same result.
 
     Args:
-        posterior: an exact one, whose own hyperparameters are the start of the chain.
+        posterior: an exact process, whose own hyperparameters start the chain.
         count: number of samples.
-        seed: of the chain.
-        noise_floor: that of the fit: the least variance of the noise, as a share of the output's variance.
-        most_noise: the largest variance of the noise. If the process has more, the chain starts at the likeliest
-            hyperparameters with so little.
+        seed: seed of the chain.
+        noise_floor: least noise variance, as in the fit: a share of the output's variance.
+        most_noise: greatest noise variance. If the process has more, the chain starts at the likeliest hyperparameters
+            within this bound.
     """
     hyper = posterior.hyper
     options = FitOptions(
@@ -58,8 +57,8 @@ def hyperparameter_samples(
 
 
 def _with_less_noise(evidence: Evidence, theta: Array) -> Array:
-    """The likeliest theta within the bounds of ``evidence``, by searches from ever shorter length scales, because what
-    noise explained has to vary within short distances."""
+    """Return the likeliest theta within the bounds of ``evidence``, searched from ever shorter length scales: what was
+    noise before must now vary within short distances."""
     starts = [theta.copy() for _ in SHORTER]
     for start, shorter in zip(starts, SHORTER, strict=True):
         start[: evidence.d] -= shorter
@@ -67,14 +66,14 @@ def _with_less_noise(evidence: Evidence, theta: Array) -> Array:
 
 
 class _Chain:
-    """Updates of theta whose stationary distribution is its posterior."""
+    """Markov chain of theta, whose stationary distribution is the posterior of theta."""
 
     def __init__(self, evidence: Evidence, rng: np.random.Generator) -> None:
         self._evidence, self._rng = evidence, rng
         self._mean, self._std = evidence.prior.T
 
     def log_likelihood(self, theta: Array) -> float:
-        """Log evidence without the prior; -inf beyond the bounds of a fit."""
+        """Return the log evidence without the priors; -inf outside the bounds of a fit."""
         if (theta < self._evidence.lower).any() or (theta > self._evidence.upper).any():
             return -math.inf
         negative, _ = self._evidence(theta)
@@ -82,7 +81,7 @@ class _Chain:
         return 0.5 * float(z @ z) - negative
 
     def update(self, theta: Array, level: float) -> tuple[Array, float]:
-        """The next theta, and its log likelihood."""
+        """Return the next theta of the chain and its log likelihood; ``level`` is the log likelihood of ``theta``."""
         rng, around = self._rng, theta - self._mean
         other = self._std * rng.standard_normal(len(theta))
         least = level + math.log(1 - rng.random())

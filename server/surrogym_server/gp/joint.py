@@ -21,18 +21,18 @@ from surrogym_server.gp.posterior import Posterior
 
 @dataclass(frozen=True)
 class Joint:
-    """A process at m points, standardised like its posterior."""
+    """Posterior of a process at m fixed points, in the standardised units of the process."""
 
     hyper: Hyperparameters
     x: Tensor  # (m, d)
     whitened: Tensor  # (n, m) L^-1 k(X, x)
-    observed: Tensor  # (p, m) the rows r of p points assumed observed
-    variance: Tensor  # (m,) latent
+    observed: Tensor  # (p, m) the vectors r of p points that are assumed observed
+    variance: Tensor  # (m,) latent variance at the points
     noise: float
 
     @classmethod
     def of(cls, posterior: Posterior, x: Tensor) -> Joint:
-        """The posterior at x (m, d)."""
+        """Return the joint posterior at points x (m, d), before any assumed observation."""
         k = covariance(posterior.hyper, posterior.x, x)
         whitened = torch.linalg.solve_triangular(posterior.factor, k, upper=False)
         latent = (variance(posterior.hyper, x) - whitened.square().sum(0)).clamp_min(0)
@@ -40,18 +40,19 @@ class Joint:
         return cls(posterior.hyper, x, whitened, x.new_zeros(0, len(x)), latent, noise)
 
     def between(self, a: slice, b: slice) -> Tensor:
-        """Posterior covariance of the points a and the points b, (|a|, |b|)."""
+        """Return the posterior covariance of the points in slice a with those in slice b, (|a|, |b|)."""
         prior = covariance(self.hyper, self.x[a], self.x[b])
         explained = self.whitened[:, a].T @ self.whitened[:, b] + self.observed[:, a].T @ self.observed[:, b]
         return prior - explained
 
     def row(self, index: int) -> Tensor:
-        """r of the point ``index``, (m,)."""
+        """Return r (m,) for an observation at point ``index``: its covariances with all points, over the standard
+        deviation of the observation."""
         shared = self.between(slice(index, index + 1), slice(None))[0]
         return shared / (self.variance[index] + self.noise).sqrt()
 
     def observe(self, index: int) -> Joint:
-        """The posterior after an observation at the point ``index``."""
+        """Return the joint posterior as if point ``index`` had been observed as well."""
         row = self.row(index)
         shrunk = (self.variance - row.square()).clamp_min(0)
         return replace(self, observed=torch.cat([self.observed, row[None]]), variance=shrunk)

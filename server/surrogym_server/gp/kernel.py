@@ -3,9 +3,10 @@
 k(x, x') = sigma_f^2 exp(-1/2 (x - x')^T Lambda (x - x')) + sigma_l^2 (1 + x^T x') + sigma_q^2 sum_j x_j^2 x'_j^2,
 and the noise is never inside it. The last part has no cross terms: it is a quadratic cost with diagonal weights.
 
-With a reflection s the process is of functions with f(s x) = p f(x) alone, s x elementwise. Its squared exponential is
-sigma_f^2 (e(x, x') + p e(x, s x')), the covariance of (f(x) + p f(s x)) / sqrt(2); its polynomial parts keep what has
-the parity p: of an odd function the entries that s turns, of an even one the constant, the others and the squares.
+With a reflection s the process has only functions with f(s x) = p f(x), s x elementwise. Its squared exponential is
+sigma_f^2 (e(x, x') + p e(x, s x')), the covariance of (f(x) + p f(s x)) / sqrt(2). Its polynomial parts keep only the
+terms of parity p: for an odd function the x_j whose sign s changes; for an even one the constant, the other x_j and
+the squares.
 Reference: Ginsbourger, Roustant, Durrande, "On degeneracy and invariances of random fields paths with applications in
 Gaussian process modelling", Journal of Statistical Planning and Inference (2016), section 3.
 """
@@ -22,12 +23,12 @@ from torch import Tensor
 class Reflection:
     """A symmetry of functions: f(signs x) = parity f(x)."""
 
-    signs: Tensor  # (d,) each 1 or -1
+    signs: Tensor  # (d,) 1 or -1: the factor of each input in the mirror image
     parity: int  # 1: even, -1: odd
 
     @property
     def kept(self) -> Tensor:
-        """Which entries x_j have the parity, (d,) of 0 and 1."""
+        """1 for each input x_j for which f(x) = x_j has this symmetry, 0 for the others; shape (d,)."""
         return (1 + self.parity * self.signs) / 2
 
 
@@ -42,7 +43,14 @@ class Polynomial:
 
     @classmethod
     def of(cls, linear: float, quadratic: float, reflection: Reflection | None, like: Tensor) -> Polynomial:
-        """Build the parts of variances ``linear`` and ``quadratic`` that have the parity, at inputs (..., d)."""
+        """Build the polynomial with the terms of the reflection's parity, or with all terms without a reflection.
+
+        Args:
+            linear: variance of the constant and of each linear term.
+            quadratic: variance of each square.
+            reflection: the symmetry of the process, or None.
+            like: any tensor (..., d), which gives the number of inputs, the dtype and the device.
+        """
         ones = like.new_ones(like.shape[-1])
         if reflection is None:
             return cls(linear, linear * ones, quadratic * ones, quadratic > 0)
@@ -50,12 +58,12 @@ class Polynomial:
         return cls(linear * even, linear * reflection.kept, quadratic * even * ones, even and quadratic > 0)
 
     def __call__(self, a: Tensor, b: Tensor) -> Tensor:
-        """Between inputs a (..., m, d) and b (..., n, d), shape (..., m, n)."""
+        """Return the covariances of inputs a (..., m, d) and b (..., n, d), shape (..., m, n)."""
         k = self.constant + (a * self.linear) @ b.mT
         return k + (a.square() * self.quadratic) @ b.square().mT if self.has_squares else k
 
     def diagonal(self, x: Tensor) -> Tensor:
-        """At inputs x (..., d) with themselves, shape (...)."""
+        """Return the covariance of each input x (..., d) with itself, shape (...)."""
         squared = x.square()
         k = self.constant + squared @ self.linear
         return k + squared.square() @ self.quadratic if self.has_squares else k
@@ -63,18 +71,18 @@ class Polynomial:
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    """Hyperparameters, chosen by the marginal likelihood. Units: inputs and outputs are standardised."""
+    """Hyperparameters of a process, chosen by the marginal likelihood, in units of standardised inputs and outputs."""
 
     lengthscale: Tensor  # (d,)
     signal_variance: float
-    linear_variance: float  # 0: no linear part
-    quadratic_variance: float  # 0: no quadratic part
+    linear_variance: float  # 0 means no linear part
+    quadratic_variance: float  # 0 means no quadratic part
     noise_variance: float
     reflection: Reflection | None = None
 
     @property
     def kernel(self) -> str:
-        """The parts of the covariance, in words."""
+        """Names of the parts of the covariance, such as `squared exponential + linear`."""
         parts = ["squared exponential"]
         parts += ["linear"] if self.linear_variance > 0 else []
         parts += ["quadratic"] if self.quadratic_variance > 0 else []
@@ -86,7 +94,7 @@ class Hyperparameters:
 
     @property
     def polynomial(self) -> Polynomial:
-        """The parts beside the squared exponential."""
+        """Polynomial part of the covariance: all of it but the squared exponential."""
         return Polynomial.of(self.linear_variance, self.quadratic_variance, self.reflection, self.lengthscale)
 
 
@@ -110,7 +118,7 @@ def variance(hyper: Hyperparameters, x: Tensor) -> Tensor:
 
 
 def to_mirror(hyper: Hyperparameters) -> Tensor:
-    """The exponent of e(x, s x) is x^2 times these coefficients, (d,): x is 2 x_j from s x where s turns x_j."""
+    """Coefficients c (d,) with e(x, s x) = exp(sum_j c_j x_j^2): x and s x differ by 2 x_j where s_j is -1."""
     assert hyper.reflection is not None
     return (hyper.reflection.signs - 1) / hyper.lengthscale.square()
 

@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 
 from surrogym_server.gp.kernel import Hyperparameters, Reflection
 
-NOISE_FLOOR, MOST_NOISE = 1e-8, 2.0  # bounds of the noise, of the output's variance
+NOISE_FLOOR, MOST_NOISE = 1e-8, 2.0  # bounds of the noise variance, as shares of the output's variance
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Parts of the kernel, and the normal priors on logarithms: (mean, standard deviation).
+    """Parts of the kernel, and normal priors (mean, standard deviation) on the logarithms of hyperparameters.
 
     Inputs and outputs are standardised. The length scale's prior grows with sqrt(d), as distances do (Hvarfner et al.,
     ICML 2024).
     """
 
-    linear: bool = True  # parts beside the squared exponential
+    linear: bool = True  # whether the kernel has a linear part
     quadratic: bool = False
     lengthscale_prior: tuple[float, float] = (math.log(2.0), 1.2)
     signal_prior: tuple[float, float] = (0.0, 2.0)
@@ -40,14 +40,14 @@ class FitOptions:
 
 
 class Parameters:
-    """Free parameters of a process over d inputs."""
+    """Free parameters theta of a process over d inputs: their order, priors and bounds."""
 
     def __init__(self, d: int, options: FitOptions, reflection: Reflection | None) -> None:
         self.d, self.options, self.reflection = d, options, reflection
         lengthscale = (options.lengthscale_prior[0] + 0.5 * math.log(d), options.lengthscale_prior[1])
         priors = [lengthscale] * d + [options.signal_prior]
         priors += [options.linear_prior] * options.linear + [options.quadratic_prior] * options.quadratic
-        self.prior = np.array([*priors, options.noise_prior])  # mean and standard deviation of each
+        self.prior = np.array([*priors, options.noise_prior])  # mean and standard deviation of each free parameter
         self.prior_constant = float(np.log(self.prior[:, 1]).sum())
         size = len(self.prior)
         self.lower, self.upper = np.full(size, math.log(1e-8)), np.full(size, math.log(1e4))
@@ -57,7 +57,7 @@ class Parameters:
         self.default_start[-1] = math.log(1e-4)
 
     def theta(self, hyper: Hyperparameters) -> Array:
-        """The free parameters theta of hyperparameters, within the bounds; the inverse of ``hyper``."""
+        """Return the free parameters theta of hyperparameters, clipped to the bounds; the inverse of ``hyper``."""
         variances = [hyper.signal_variance]
         variances += [hyper.linear_variance] * self.options.linear
         variances += [hyper.quadratic_variance] * self.options.quadratic
@@ -70,16 +70,17 @@ class Parameters:
         return Hyperparameters(torch.from_numpy(lengthscale), signal, linear, quadratic, noise, self.reflection)
 
     def values(self, theta: Array) -> tuple[Array, float, float, float, float]:
-        """Length scales, and the variances of the three parts and of the noise."""
+        """Return the length scales (d,) and the variances of signal, linear part, quadratic part and noise at theta."""
         values = np.exp(theta)
         linear = float(values[self.d + 1]) if self.options.linear else 0.0
         quadratic = float(values[-2]) if self.options.quadratic else 0.0
         return values[: self.d], float(values[self.d]), linear, quadratic, float(values[-1])
 
     def standardised(self, theta: Array) -> Array:
-        """Distance of theta from the priors' means, in their standard deviations.
+        """Return how far each free parameter is from its prior's mean, in the prior's standard deviations.
 
-        The priors' negative log density is half of its square, ``prior_constant``, and log(2 pi) / 2 for each.
+        The negative log density of the priors is half the sum of its squares, plus ``prior_constant``, plus
+        log(2 pi) / 2 for each free parameter.
         """
         distance: Array = (theta - self.prior[:, 0]) / self.prior[:, 1]
         return distance

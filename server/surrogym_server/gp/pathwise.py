@@ -32,30 +32,30 @@ FREQUENCIES = 256  # S
 
 @dataclass(frozen=True)
 class Pathwise:
-    """Posterior samples of one process. Each is a row of ``size`` weights: of the prior's features, then of the n
-    points."""
+    """Posterior samples of one process. Each is a row of ``size`` weights: first those of the prior's features, then
+    those of the n points."""
 
     posterior: Posterior
 
     @property
     def size(self) -> int:
-        """Number of weights of a posterior sample, and of the standard normal numbers that make one."""
+        """Number of weights of a posterior sample, and of the standard normal numbers from which it is computed."""
         return self._features + len(self.posterior.y)
 
     def draw(self, noise: Tensor) -> Tensor:
-        """Return the weights (N, size) of N posterior samples, made from standard normal ``noise`` (N, size)."""
+        """Return the weights (N, size) of N posterior samples, computed from standard normal ``noise`` (N, size)."""
         posterior = self.posterior
         prior, at_samples = noise[:, : self._features], noise[:, self._features :]
         at_points = prior @ self._prior_at_points.T + self._noise(at_samples)
         return torch.cat([prior, -torch.cholesky_solve(at_points.T, posterior.factor).T], 1)
 
     def residual(self, x: Tensor, weights: Tensor) -> Tensor:
-        """Residual of posterior sample i, ``weights`` (N, size), at input i of x (N, d): (N,)."""
+        """Return the value less the posterior mean of sample i, ``weights`` (N, size), at input i of x (N, d): (N,)."""
         k = covariance(self.posterior.hyper, x, self.posterior.x)
         return (torch.cat([self._prior(x), k], 1) * weights).sum(1)
 
     def _noise(self, at_samples: Tensor) -> Tensor:
-        """Noise of the n points that standard normal ``at_samples`` (N, n) gives, (N, n)."""
+        """Scale standard normal ``at_samples`` (N, n) to the noise of the n points, (N, n)."""
         posterior = self.posterior
         if posterior.sparse is not None:
             return at_samples @ self._sparse_noise
@@ -63,7 +63,7 @@ class Pathwise:
 
     @cached
     def _sparse_noise(self) -> Tensor:
-        """Square root (n, n) of the remaining noise at inducing points, F F^T - k(Z, Z)."""
+        """Square root (n, n) of the remaining noise covariance at inducing points, F F^T - k(Z, Z)."""
         posterior = self.posterior
         left = posterior.factor @ posterior.factor.T - covariance(posterior.hyper, posterior.x, posterior.x)
         values, vectors = torch.linalg.eigh(left)
@@ -80,7 +80,8 @@ class Pathwise:
         return self._prior(self.posterior.x)
 
     def _prior(self, x: Tensor) -> Tensor:
-        """Features of the prior at x (m, d), whose scalar products are its covariance: (m, 2 S + polynomial ones)."""
+        """Return features of the prior at x (m, d), (m, 2 S + those of the polynomial parts). Their scalar products
+        approximate the prior covariance."""
         hyper = self.posterior.hyper
         parts = [self._waves(x)]
         if (reflection := hyper.reflection) is not None:
@@ -93,7 +94,7 @@ class Pathwise:
         return torch.cat(parts, 1)
 
     def _waves(self, x: Tensor) -> Tensor:
-        """Random Fourier features of the squared exponential at x (m, d), (m, 2 S)."""
+        """Return random Fourier features of the squared exponential at x (m, d), (m, 2 S)."""
         hyper = self.posterior.hyper
         phase = (x / hyper.lengthscale) @ frequencies(x.shape[1], x.device)
         return math.sqrt(hyper.signal_variance / FREQUENCIES) * torch.cat([phase.cos(), phase.sin()], 1)
@@ -102,6 +103,7 @@ class Pathwise:
 @cache
 @torch.inference_mode(False)
 def frequencies(d: int, device: torch.device) -> Tensor:
-    """Frequencies (d, S) of the squared exponential in length scales: standard normal, from a fixed seed."""
+    """Return frequencies (d, S) of the squared exponential, in units of 1 / length scale: standard normal numbers from
+    a fixed seed."""
     values = np.random.Generator(np.random.Philox(key=d)).standard_normal((d, FREQUENCIES))
     return torch.from_numpy(values).to(device)

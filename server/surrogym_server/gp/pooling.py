@@ -1,9 +1,9 @@
-"""Processes that are alike: the samples of one are further samples of another, with inputs of their own.
+"""Pooling: outputs that are the same function of different inputs learn from each other's samples.
 
-Masses in a row, tanks in series and rooms side by side do the same with inputs of their own. If their samples are far
-more likely as those of one function, all of them learn from all samples. Evidence is that of the targets in their own
-unit, priors of hyperparameters included. The function is known best from one of the processes, which reads few inputs;
-for another one, a search looks which of its inputs play the same parts.
+Masses in a row, tanks in series and rooms side by side obey the same law with inputs of their own. If their samples are
+far more likely as those of one function, all of them learn from all samples. Evidence is that of the targets in their
+own unit, priors of hyperparameters included. The function comes from the process that is known best and reads few
+inputs; for each other process, a search finds which of its inputs correspond to that function's arguments.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from surrogym_server.gp.search import Evidence, blas, minimum
 from surrogym_server.gp.subsets import FEW, spread
 
 Inputs = tuple[int, ...]
-STARTS, SWEEPS = 3, 4  # of a search for the inputs that play the parts of others
+STARTS, SWEEPS = 3, 4  # number of starts, and of sweeps from each, in a search for corresponding inputs
 
 
 @dataclass(frozen=True)
 class Part:
-    """An exact process and its samples.
+    """One output that may join a pool: its exact process, its samples and its unit.
 
     Attributes:
         x: inputs (n, D).
-        y: standardised targets (n,); in their unit they are centre + scale y.
-        hyper: hyperparameters, in the unit of y.
-        centre, scale: see ``y``.
-        options: those of the fit.
-        reads: places of the inputs that the process probably reads, ascending.
-        fewer: hyperparameters of the process that reads these alone.
-        signs: (D,) signs of the inputs in a mirror image of everything, or None if there is none.
+        y: standardised targets (n,); in the output's unit they are centre + scale y.
+        hyper: hyperparameters of the process of all inputs, for standardised targets.
+        centre, scale: unit of the output, see ``y``.
+        options: options with which the process was fitted.
+        reads: indices of the inputs that the process probably reads, ascending.
+        fewer: hyperparameters of the process of these inputs only.
+        signs: (D,) signs of the inputs in the mirror image of the environment, or None if it has no mirror symmetry.
     """
 
     x: Tensor
@@ -54,38 +54,39 @@ class Part:
 
     @cached_property
     def alone(self) -> float:
-        """Log evidence of the targets without other samples."""
+        """Log evidence of this output's targets from its own samples only."""
         return max(self.evidence(self.hyper, self.x, self.y), self.evidence(self.fewer, self.read(self.reads), self.y))
 
     @cached_property
     def posterior(self) -> Posterior:
-        """The process that reads few inputs."""
+        """Process that reads only the inputs ``reads``, conditioned on this output's samples."""
         return condition(self.fewer, self.read(self.reads), self.y)
 
     def read(self, inputs: Inputs) -> Tensor:
-        """Some of the inputs, (n, d)."""
+        """Return the samples of the inputs with these indices, (n, d)."""
         return self.x[:, list(inputs)]
 
     def targets_of(self, other: Part) -> Tensor:
-        """The targets (m,) of another part, standardised as those of this one."""
+        """Return the targets (m,) of another part, standardised with this part's centre and scale."""
         return (other.centre + other.scale * other.y - self.centre) / self.scale
 
     def evidence(self, hyper: Hyperparameters, x: Tensor, y: Tensor) -> float:
-        """Log evidence of targets (n,) at inputs (n, d), standardised as this part's, in the targets' unit."""
+        """Return the log evidence, in the output's unit, of targets (n,) that are standardised like this part's, at
+        inputs (n, d)."""
         objective = Evidence(x, y, self.options, hyper.reflection)
         return -objective(objective.theta(hyper))[0] - len(y) * math.log(self.scale)
 
 
 @dataclass(frozen=True)
 class Pool:
-    """Parts that are one function.
+    """Outputs that are modelled as one function.
 
     Attributes:
-        numbers: those of the parts, in the sequence that was given. The first one gives the unit.
-        parts: the parts.
-        inputs: for each part, its inputs in the order in which the function reads them.
+        numbers: indices of the pooled parts in the sequence given to ``pools``.
+        parts: the pooled parts. The first one gives the unit.
+        inputs: for each part, the indices of its inputs in the order in which the function reads them.
         hyper: hyperparameters of the function, in the unit of the first part.
-        gain: log evidence above that of the parts alone.
+        gain: log evidence of the pool less that of the separate parts.
     """
 
     numbers: tuple[int, ...]
@@ -95,10 +96,11 @@ class Pool:
     gain: float
 
     def samples_of(self, member: int, most: int) -> tuple[Tensor, Tensor, Hyperparameters]:
-        """Inputs (k, d), ascending, and targets (k,) of all parts, and the hyperparameters, as one part sees them.
+        """Return inputs (k, d), targets (k,) and hyperparameters of the pooled function, as one part uses them.
 
-        Its own samples come first, and all of them. Of the others there are as many as fit into ``most``. Targets have
-        the part's scale around the first part's centre: that of an odd function is 0.
+        The inputs are in ascending order of the part's indices. All of the part's own samples come first; samples of
+        the others fill up to ``most``. Targets are standardised with the part's scale and the first part's centre,
+        which is 0 for an odd function.
         """
         first, own, inputs = self.parts[0], self.parts[member], self.inputs[member]
         back = [inputs.index(place) for place in sorted(inputs)]
@@ -121,10 +123,13 @@ class Pool:
 
 
 def pools(parts: Sequence[Part], most: int) -> list[Pool]:
-    """Put parts together whose samples are more likely together.
+    """Group parts that are more likely one function than separate ones. Runs on the CPU.
 
-    The parts that are known best come first, and others join them. Only a part that probably reads at most ``most``
-    inputs is joined by others. Runs on the CPU. Raises ``NumericalFailure``.
+    Parts with the least leave-one-out error come first, and others join them. Only a part that probably reads at most
+    ``most`` inputs may be first.
+
+    Raises:
+        NumericalFailure: no jitter makes the covariance of a part's points positive definite.
     """
     few = [number for number, part in enumerate(parts) if len(part.reads) <= most]
     free, result = set(range(len(parts))), list[Pool]()
@@ -144,9 +149,10 @@ def pools(parts: Sequence[Part], most: int) -> list[Pool]:
 
 
 def _inputs_alike(part: Part, other: Part) -> Inputs | None:
-    """The inputs of another part that play the same parts; None if its samples are more likely apart.
+    """Return the inputs of ``other`` that correspond to the inputs that ``part`` reads; None if the two are more likely
+    separate functions.
 
-    Every order of inputs is equally likely before any data. Hyperparameters stay as they are.
+    Every order of inputs has the same prior probability. Hyperparameters stay unchanged.
     """
     if part.options != other.options:
         return None
@@ -160,13 +166,13 @@ def _inputs_alike(part: Part, other: Part) -> Inputs | None:
 
 
 def _orders(other: Part, count: int) -> float:
-    """Logarithm of the number of ways in which a part's inputs can play ``count`` parts."""
+    """Return the logarithm of the number of ordered choices of ``count`` inputs of a part."""
     return math.log(math.perm(other.x.shape[1], count))
 
 
 def _may_play(part: Part, other: Part) -> Tensor:
-    """Which inputs of another part may play each of the part's, (d, D) bool: those with the same sign in a mirror
-    image."""
+    """Return (d, D) bool: which inputs of ``other`` may correspond to each input that ``part`` reads. Both must have
+    the same sign in a mirror image."""
     mirror: Reflection | None = part.fewer.reflection
     d, size = len(part.reads), other.x.shape[1]
     if mirror is None:
@@ -177,10 +183,10 @@ def _may_play(part: Part, other: Part) -> Tensor:
 
 
 def _played(process: Posterior, x: Tensor, y: Tensor, may: Tensor) -> Inputs | None:
-    """Inputs of x (n, D) with which a process predicts targets (n,) best, found by exchanging one of them, or two with
-    each other, as long as this helps.
+    """Find the inputs of x (n, D) with which a process predicts targets y (n,) best; None if no choice is allowed.
 
-    The search begins at inputs that vary most with the targets. ``may`` (d, D) says which input may play which part.
+    The search starts at the inputs that vary most with the targets. As long as the error shrinks, it exchanges one
+    input, or two with each other. ``may`` (d, D) says which inputs of x may take the place of each of the process's d.
     """
     d, size = may.shape
     if size < d or not bool(may.any(1).all()):
@@ -207,7 +213,7 @@ def _played(process: Posterior, x: Tensor, y: Tensor, may: Tensor) -> Inputs | N
 
 
 def _neighbours(inputs: Inputs, size: int) -> list[Inputs]:
-    """The inputs with one exchanged for another of all ``size``, or with two in each other's place."""
+    """Return all choices in which one input is exchanged for another of the ``size`` inputs, or two change places."""
     swaps = []
     for place, old in enumerate(inputs):
         for new in set(range(size)) - {old}:
@@ -222,13 +228,13 @@ def _may_read(may: Tensor, inputs: Inputs) -> bool:
 
 
 def _errors(process: Posterior, x: Tensor, y: Tensor, choices: Sequence[Inputs]) -> Tensor:
-    """Mean squared error of targets (n,) for each choice of inputs, (t,)."""
+    """Return the mean squared error of the process at targets y (n,) for each choice of inputs, (t,)."""
     points = torch.cat([x[:, list(inputs)] for inputs in choices])
     return (process.mean(points).view(len(choices), len(y)) - y).square().mean(1)
 
 
 def _pooled(numbers: Sequence[int], parts: Sequence[Part], inputs: Sequence[Inputs]) -> Pool:
-    """Fit the one function, on some of the samples if they are many."""
+    """Fit the common function of the parts, on a subset of the samples if there are many."""
     first = parts[0]
     x = torch.cat([part.read(read) for part, read in zip(parts, inputs, strict=True)])
     y = torch.cat([first.targets_of(part) for part in parts])

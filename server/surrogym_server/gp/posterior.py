@@ -17,7 +17,7 @@ from surrogym_server.errors import NumericalFailure
 from surrogym_server.gp.kernel import Hyperparameters, covariance, variance
 
 MAX_JITTER = 1e-4
-BLOCK = 16_384  # rows predicted at once: bounds memory at any batch size
+BLOCK = 16_384  # number of rows predicted at once, which bounds the memory
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,12 @@ class LeftOut:
 
     error: float  # root mean square, in units of y
     within_one: float  # share of the points within one predictive standard deviation
-    within_two: float
+    within_two: float  # share of the points within two
     log_density: float  # mean log predictive density
 
     @classmethod
     def of(cls, error: Tensor, variance: Tensor) -> LeftOut:
-        """Compute it from errors (n,) and the variances (n,) predicted with them, noise included."""
+        """Compute the accuracy from prediction errors (n,) and their predicted variances (n,), noise included."""
         size, std = error.abs(), variance.sqrt()
         one, two = (float((size <= width * std).double().mean()) for width in (1, 2))
         log_density = -0.5 * float((size.square() / variance + (2 * math.pi * variance).log()).mean())
@@ -40,11 +40,11 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Sparse:
-    """The points that a process with inducing points represents, and the loss that this causes."""
+    """What a process with inducing points keeps of the many points that it was fitted to."""
 
-    points: int  # number of points that it was fitted to
-    unexplained: float  # root of the mean variance that stays unexplained at them, in prior standard deviations
-    left_out: LeftOut  # accuracy at these points
+    points: int  # number of points that the process was fitted to
+    unexplained: float  # standard deviation that the inducing points leave (root mean square), over the prior's
+    left_out: LeftOut  # accuracy at the points that the process was fitted to
 
 
 @dataclass(frozen=True)
@@ -90,32 +90,33 @@ class Posterior:
 
     @property
     def points(self) -> int:
-        """Number of points that it was fitted to: n, or those that its inducing points represent."""
+        """Number of points that the process was fitted to: n, or more if its n points are inducing points."""
         return len(self.y) if self.sparse is None else self.sparse.points
 
     @property
     def left_out(self) -> LeftOut:
-        """Accuracy in predicting each of the points from all others."""
+        """Accuracy in predicting each of the fitted points from all others."""
         if self.sparse is not None:
             return self.sparse.left_out
         mean, variance = self.leave_one_out()
         return LeftOut.of(mean - self.y, variance)
 
     def leave_one_out(self) -> tuple[Tensor, Tensor]:
-        """Predictive mean and variance (noise included) of each y from all others, (n,) each; R&W (2006), eq. 5.12."""
+        """Return the predictive mean and variance (noise included) of each y from all other points, (n,) each; R&W
+        (2006), eq. 5.12."""
         precision = torch.cholesky_inverse(self.factor).diagonal()
         return self.y - self.weights / precision, 1 / precision
 
     @property
     def noise_seen(self) -> float | None:
-        """Variance of the noise that the results of equal points show; None if no points are equal."""
+        """Noise variance estimated from points with equal inputs; None if all inputs differ."""
         equal = (self.x[:, None] == self.x).all(-1).triu(1)
         if not bool(equal.any()):
             return None
         return 0.5 * float((self.y[:, None] - self.y)[equal].square().mean())
 
     def extend(self, x: Tensor, y: Tensor) -> Posterior:
-        """Condition on one more point, x (d,) and y (), in O(n^2): a new row of the factor."""
+        """Return the process conditioned on one more point, x (d,) and y (), in O(n^2), by a new row of the factor."""
         k = covariance(self.hyper, x[None], self.x)
         row = torch.linalg.solve_triangular(self.factor, k.T, upper=False).T
         pivot = variance(self.hyper, x[None]) + self.hyper.noise_variance + self.jitter - row.square().sum(1)
@@ -141,11 +142,14 @@ def condition(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
 
 
 def factorise(k: Tensor) -> tuple[Tensor, float]:
-    """Lower Cholesky factor of k (n, n), and its jitter: 0, else from 1e-10 of the mean diagonal, times ten at each
-    try.
+    """Return the lower Cholesky factor of k (n, n), and the jitter that had to be added to its diagonal.
 
-    The factor is stored by rows, like a loaded one. By columns, as LAPACK returns it, a new model would differ from a
+    The jitter is 0, or if that fails 1e-10 of the mean diagonal, increased tenfold until k can be factored. The factor
+    is stored row by row, as a loaded one is. In LAPACK's order, column by column, a new model would differ from a
     loaded one in the last bits.
+
+    Raises:
+        NumericalFailure: k can't be factored, even with a jitter of ``MAX_JITTER`` of its mean diagonal.
     """
     factor, info = torch.linalg.cholesky_ex(k)
     if not bool(info):
@@ -158,7 +162,10 @@ def factorise(k: Tensor) -> tuple[Tensor, float]:
         if not bool(info):
             return factor.contiguous(), relative * scale
         relative *= 10
-    raise NumericalFailure(f"covariance of {len(k)} points is singular: no jitter up to {MAX_JITTER:g} repairs it")
+    raise NumericalFailure(
+        f"the covariance of {len(k)} points is singular, even with {MAX_JITTER:g} of its mean added to the diagonal; "
+        "look for infinite or far outlying values in the samples"
+    )
 
 
 def _weights(factor: Tensor, y: Tensor) -> Tensor:

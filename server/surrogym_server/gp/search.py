@@ -20,7 +20,7 @@ from surrogym_server.gp.parameters import Array, FitOptions, Parameters
 
 
 class Objective(Protocol):
-    """A cost with its gradient, within bounds."""
+    """Cost over theta, with its gradient and the bounds of theta."""
 
     options: FitOptions
     lower: Array
@@ -43,11 +43,11 @@ def minimum(objective: Objective, start: Array) -> tuple[float, Array]:
 
 @cache
 def blas() -> ThreadpoolController:
-    """Limit BLAS to one thread. L-BFGS-B multiplies matrices of a dozen rows; with more threads it waits ten times as
-    long as it computes if the machine has other work.
+    """Return a handle that limits the threads of all BLAS libraries in the process.
 
-    SciPy has a BLAS library of its own, beside NumPy's. A controller only knows libraries that are loaded when it is
-    made, so SciPy's parts are imported first.
+    L-BFGS-B multiplies matrices of a dozen rows; with more than one thread it waits ten times as long as it computes if
+    the machine has other work. SciPy has a BLAS library beside NumPy's, and a controller only knows libraries that were
+    loaded before it, so SciPy's parts are imported first.
     """
     for part in ("linalg", "optimize"):
         getattr(scipy, part)
@@ -56,21 +56,21 @@ def blas() -> ThreadpoolController:
 
 @dataclass(frozen=True)
 class Evaluated:
-    """An objective at one theta."""
+    """Value and gradient of an objective at one theta, with intermediate results."""
 
     value: float
-    slopes: Array  # over theta
-    half: Array  # (P,) 1/2 (beta beta^T - K^-1), twice off the diagonal
+    slopes: Array  # gradient over theta
+    half: Array  # (P,) 1/2 (beta beta^T - K^-1) at each pair of points; entries off the diagonal are doubled
     weighted: Array  # (1, P), or (2, P) with a reflection: half times the squared exponential
-    weights: Array  # (n,) beta
+    weights: Array  # (n,) beta = K^-1 y
 
 
 class Evidence(Parameters):
-    """Negative log evidence with priors, and its gradient.
+    """Negative log evidence of n points, priors of hyperparameters included, and its gradient over theta.
 
-    A fit makes thousands of evaluations on a few dozen points. So symmetric matrices are kept once, as pairs i >= j of
-    points, (P,) with P = n (n + 1) / 2, and NumPy and LAPACK are called: calls of torch take longer than the
-    computation.
+    A fit makes thousands of evaluations on a few dozen points. So each symmetric matrix is stored as its pairs i >= j
+    of points, (P,) with P = n (n + 1) / 2, and the computation uses NumPy and LAPACK: the overhead of calling torch
+    would exceed the computation.
     """
 
     def __init__(self, x: Tensor, y: Tensor, options: FitOptions, reflection: Reflection | None) -> None:
@@ -78,7 +78,7 @@ class Evidence(Parameters):
         n = len(x)
         self.n, self.x, self.y = n, x.numpy(), y.numpy()
         self.rows, self.columns = np.tril_indices(n)
-        self.places = self.rows * n + self.columns  # of the pairs in a matrix by rows
+        self.places = self.rows * n + self.columns  # index of each pair in the flattened (n, n) matrix
         self.twice = np.where(self.rows == self.columns, 1.0, 2.0)  # how often a pair occurs in a symmetric matrix
         mirrored = [] if reflection is None else [x * reflection.signs]
         differences = [other.numpy()[self.columns] - x.numpy()[self.rows] for other in (x, *mirrored)]
@@ -90,8 +90,10 @@ class Evidence(Parameters):
 
     @property
     def noisy_starts(self) -> list[Array]:
-        """A start with the noise of equal points, if their results differ. A search that has explained such results by
-        short length scales does not find the way to noise by itself."""
+        """At most one start, with the noise that points with equal inputs and different targets show.
+
+        A search that has explained such targets by short length scales does not find the noisy optimum by itself.
+        """
         equal = ~self.squared[:, : len(self.rows)].any(0) & (self.rows != self.columns)
         if not equal.any():
             return []
@@ -107,13 +109,13 @@ class Evidence(Parameters):
         return (1e10, np.zeros_like(theta)) if terms is None else (terms.value, terms.slopes)
 
     def evaluated(self, theta: Array) -> Evaluated | None:
-        """Value and gradient at theta. None if float64 can't factor K: a very large cost then stops the line search."""
+        """Return value and gradient at theta, or None if K has no Cholesky factor in float64."""
         lengthscale, signal, linear, quadratic, noise = self.values(theta)
         precision = lengthscale**-2
         smooth = (-0.5 * precision) @ self.squared
         np.exp(smooth, out=smooth)
         smooth *= signal
-        smooth = smooth.reshape(-1, len(self.rows))  # of the points, and of their mirror images
+        smooth = smooth.reshape(-1, len(self.rows))  # one row for the points, another for their mirror images
         k = smooth[0] + linear * self.linear + quadratic * self.quadratic
         if self.parity:
             smooth[1] *= self.parity
@@ -137,20 +139,26 @@ class Evidence(Parameters):
         return Evaluated(float(value), gradient, half, weighted, weights)
 
     def over_inputs(self, theta: Array, terms: Evaluated) -> Array:
-        """Gradient of the value over the inputs x, (n, d). Only without a reflection and a quadratic part."""
+        """Return the gradient of the value over the inputs x, (n, d).
+
+        Valid only without a reflection and without a quadratic part.
+        """
         lengthscale, _, linear, _, _ = self.values(theta)
         smooth, line = np.zeros((self.n, self.n)), np.zeros((self.n, self.n))
         smooth.ravel()[self.places], line.ravel()[self.places] = terms.weighted[0], terms.half
-        smooth, line = smooth + smooth.T, line + line.T  # each pair counts for both of its points
+        smooth, line = smooth + smooth.T, line + line.T  # each pair contributes to both of its points
         pulled = (smooth.sum(1)[:, None] * self.x - smooth @ self.x) * lengthscale**-2
         slopes: Array = pulled - linear * (line @ self.x)
         return slopes
 
     def _solve(self, matrix: Array) -> tuple[Array, Array, float] | None:
-        """From a matrix K, given by its lower half: the inverse (its lower half is valid), K^-1 y, and half of K's log
-        determinant. None if K has no Cholesky factor."""
+        """Return K^-1 (lower half valid), K^-1 y, and half of log det K; None if K has no Cholesky factor.
+
+        Args:
+            matrix: K (n, n), of which only the lower half is read. It is overwritten.
+        """
         lapack = scipy.linalg.lapack
-        upper, info = lapack.dpotrf(matrix.T, lower=0, overwrite_a=1)  # transposed: the order that LAPACK wants
+        upper, info = lapack.dpotrf(matrix.T, lower=0, overwrite_a=1)  # the transpose has LAPACK's column order
         if info:
             return None
         weights, _ = lapack.dpotrs(upper, self.y, lower=0)
@@ -159,6 +167,6 @@ class Evidence(Parameters):
         return inverse.T, weights, root
 
     def _pairs(self, symmetric: Tensor) -> Array:
-        """The pairs (P,) of a symmetric matrix (n, n)."""
+        """Return the pairs i >= j, (P,), of a symmetric matrix (n, n)."""
         pairs: Array = symmetric.numpy()[self.rows, self.columns]
         return pairs

@@ -22,23 +22,23 @@ from surrogym_server.gp.search import Evidence, blas, minimum
 
 @dataclass(frozen=True)
 class Selection:
-    """A process of some of the inputs."""
+    """Result of an elimination of inputs: a process that reads only some of them."""
 
-    mask: Tensor  # (d,) bool
-    theta: Array  # its free parameters
+    mask: Tensor  # (d,) bool, true for the inputs that the process reads
+    theta: Array  # free parameters of the process
     score: float  # log evidence, priors included
-    gain: float  # above that of the process with all inputs
+    gain: float  # score less the score of the process with all inputs
     hyper: Hyperparameters
 
 
 def select_inputs(posterior: Posterior, options: FitOptions, may: Tensor, odds: float) -> Selection:
-    """Select inputs of an exact process by backward elimination. Runs on the CPU.
+    """Eliminate inputs of an exact process backwards, one at a time, as long as its evidence allows. Runs on the CPU.
 
     Args:
         posterior: the process with all inputs, and its points.
-        options: those of its fit.
-        may: (d,) bool, the inputs that it may leave out. It keeps one at least.
-        odds: log odds before any data that it leaves out one input more.
+        options: options with which the process was fitted.
+        may: (d,) bool, the inputs that may be left out. At least one input is kept.
+        odds: prior log odds of leaving out one input more.
     """
     search = _Search(posterior, options, may)
     with blas().limit(limits=1):
@@ -58,7 +58,7 @@ class _Subset:
 
 
 class _Search:
-    """Subsets of the inputs of a process."""
+    """Search over the subsets of the inputs of a process."""
 
     def __init__(self, posterior: Posterior, options: FitOptions, may: Tensor) -> None:
         self._posterior, self._options, self._may = posterior, options, may
@@ -69,26 +69,30 @@ class _Search:
         return Evidence(self._posterior.x[:, mask], self._posterior.y, self._options, part)
 
     def whole(self) -> _Subset:
-        """All inputs, with hyperparameters near those of the process, which may come from other points."""
+        """Return all inputs, with hyperparameters fitted from those of the process, which may come from other
+        points."""
         mask = torch.ones_like(self._may)
         theta = self.objective(mask).theta(self._posterior.hyper)
         return self.fitted(_Subset(mask, theta, 0.0))
 
     def fitted(self, subset: _Subset) -> _Subset:
-        """The subset with hyperparameters of its own."""
+        """Return the subset with hyperparameters fitted to its inputs."""
         cost, theta = minimum(self.objective(subset.mask), subset.theta)
         return replace(subset, theta=theta, cost=cost)
 
     def without_one(self, subset: _Subset, most: float) -> _Subset | None:
-        """The best subset with one input less, if its cost is at most ``most``. Hyperparameters are fitted again only
-        if this decides."""
+        """Return the best subset with one input less, or None if each costs more than ``most``.
+
+        The hyperparameters of the best are fitted again only if its cost with the present ones is above ``most``.
+        """
         best = min(self._each_without_one(subset), key=lambda less: less.cost, default=None)
         if best is not None and best.cost > most:
             best = self.fitted(best)
         return best if best is not None and best.cost <= most else None
 
     def _each_without_one(self, subset: _Subset) -> Iterator[_Subset]:
-        """All with one input less that can still vary, with the hyperparameters as they are."""
+        """Yield each subset with one input less, with unchanged hyperparameters, unless the rest forces the function to
+        zero."""
         mirror, places = self._posterior.hyper.reflection, subset.mask.nonzero()[:, 0].tolist()
         for position, place in enumerate(places):
             mask = subset.mask.clone()

@@ -1,4 +1,4 @@
-"""Processes compiled for prediction: all outputs that read one set of inputs, in a few matrix products.
+"""Prediction of all outputs that read one set of inputs, in a few matrix products.
 
 The exponent of the squared exponential is linear in z(x) = [x, x^2, 1] (elementwise square):
 
@@ -6,7 +6,7 @@ The exponent of the squared exponential is linear in z(x) = [x, x^2, 1] (element
 
 so exp(z A) holds the smooth covariances of all outputs with all their points. The polynomial parts are linear in z as
 well, z R, so their share of the mean collapses into z Q, Q = R beta, and all means are exp(z A) W + z Q.
-The variance, k(x, x) - |L^-1 k(X, x)|^2, is taken by a triangular solve for those outputs alone that it is asked of.
+The variance, k(x, x) - |L^-1 k(X, x)|^2, takes a triangular solve and is computed for the requested outputs only.
 A process with a reflection has the columns of its points and then those of their mirror images.
 
 The products lose digits that differences keep: |error of the exponent| <= (2 d + 2) eps (|x| + |X_i|)^2 / 2, inputs in
@@ -27,17 +27,17 @@ from surrogym_server.gp.kernel import Hyperparameters, to_mirror
 from surrogym_server.gp.posterior import Posterior
 from surrogym_server.tensors import CPU, in_blocks
 
-BLOCK = 262_144  # covariances held at once: they stay in the cache, and memory is bounded at any batch size
-MIN_ROWS = 64
-MEAN_TOLERANCE = 1e-8  # of the prior's standard deviation
-VARIANCE_TOLERANCE = 5e-10  # of the prior's variance
+BLOCK = 262_144  # number of covariances held at once, so that they fit into the cache and memory is bounded
+MIN_ROWS = 64  # least number of rows predicted at once
+MEAN_TOLERANCE = 1e-8  # accepted rounding error of the mean, in prior standard deviations
+VARIANCE_TOLERANCE = 5e-10  # accepted rounding error of the variance, in prior variances
 
 
 @dataclass(frozen=True)
 class Output:
-    """One output: centre + scale * process. Without a posterior it is constant.
+    """One output of a model: centre + scale * process, or the constant centre if ``posterior`` is None.
 
-    ``inputs`` are the columns of x that its process reads, ``column`` is its column in the means.
+    ``inputs`` are the columns of x that the process reads; ``column`` is the output's column in the predicted means.
     """
 
     column: int
@@ -49,31 +49,39 @@ class Output:
 
 @dataclass(frozen=True)
 class _Process:
-    """One output's share of the products. D = 2 d + 1 entries of z, n points."""
+    """One output's part of the matrix products, with n points and D = 2 d + 1 entries of z."""
 
-    span: slice  # its columns of A
+    span: slice  # columns of A that belong to the output
     inputs: Tensor  # columns of x
     inverse_lengthscale: Tensor  # (d,)
     scaled: Tensor  # (n, d) points in length scales, and their mirror images if there is a reflection: (2 n, d)
     factor: Tensor  # (n, n) lower, L / sigma_f^2
     polynomial: Tensor | None  # (D, n) R / sigma_f^2
-    prior: Tensor  # (D,) k(x, x) = z^2 prior, and sigma_f^2 p e(x, s x) beside it
+    prior: Tensor  # (D,) coefficients of z^2 in the prior variance, without the mirror image's term
     signal_variance: float
-    parity: int  # 0 without a reflection
-    mirror: Tensor | None  # (D,) the exponent of e(x, s x) is z mirror
+    parity: int  # 1 or -1; 0 without a reflection
+    mirror: Tensor | None  # (D,) coefficients of z in the exponent of e(x, s x)
     scale: float
     mean_by_differences: bool
     variance_by_differences: bool
 
     def exponent(self, x: Tensor) -> Tensor:
-        """Exponent computed by differences, (m, n)."""
+        """Return the exponent of the squared exponential at x (m, width) with all points, from differences: (m, n)."""
         a = x.index_select(-1, self.inputs) * self.inverse_lengthscale
         distance = torch.cdist(a, self.scaled, compute_mode="donot_use_mm_for_euclid_dist")
         exponent: Tensor = distance.square_().mul_(-0.5)
         return exponent
 
     def std(self, x: Tensor, z: Tensor, squared: Tensor, smooth: Tensor) -> Tensor:
-        """Latent standard deviation (m,), in the output's unit. Overwrites its columns of ``smooth`` (m, S)."""
+        """Return the latent standard deviation (m,), in the output's unit. Overwrites this output's columns of
+        ``smooth``.
+
+        Args:
+            x: all inputs of the model, one row a point.
+            z: [x, x^2, 1], (m, D).
+            squared: z^2, (m, D).
+            smooth: squared exponentials with the points of all processes, (m, S).
+        """
         k = smooth[:, self.span]
         if self.variance_by_differences and not self.mean_by_differences:
             k = self.exponent(x).exp_()
@@ -92,17 +100,23 @@ class _Process:
 
 @dataclass(frozen=True)
 class Serving:
-    """Outputs over shared inputs x (m, d), ready to predict. O columns of means."""
+    """Outputs over shared inputs x (m, width), in the form in which they are predicted: O columns of means."""
 
-    exponents: Tensor  # A (D, S), S the points of all processes
-    weights: Tensor  # W (S, O), scales included
+    exponents: Tensor  # A (D, S), with S the number of points of all processes
+    weights: Tensor  # W (S, O), multiplied by the outputs' scales
     polynomials: Tensor  # Q (D, O), scales and centres included
-    processes: dict[int, _Process]  # by column; constant outputs have none
+    processes: dict[int, _Process]  # process of each output column; constant outputs have none
 
     @classmethod
     def of(cls, outputs: Sequence[Output], columns: int, width: int, device: torch.device = CPU) -> Serving:
-        """Compile outputs on one device for ``columns`` means of inputs (m, ``width``). Columns without an output are
-        0."""
+        """Compile outputs for prediction on one device.
+
+        Args:
+            outputs: the outputs, each with its column.
+            columns: number of columns of the means; those without an output stay 0.
+            width: number of inputs of the model.
+            device: where predictions run.
+        """
         total = sum(len(_points(o.posterior)) for o in outputs if o.posterior is not None)
         like = torch.zeros(0, dtype=torch.float64, device=device)
         exponents, weights = like.new_zeros(2 * width + 1, total), like.new_zeros(total, columns)
@@ -126,11 +140,12 @@ class Serving:
         return max(MIN_ROWS, BLOCK // max(1, self.exponents.shape[1]))
 
     def mean(self, x: Tensor) -> Tensor:
-        """Means at x (m, d), shape (m, O)."""
+        """Return the means at x (m, width), shape (m, O)."""
         return in_blocks(self.rows, lambda rows: (self._means(*self._covariances(rows)),), x)[0]
 
     def mean_and_std(self, x: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Means at x (m, d), and latent standard deviations of the ``columns``, 0 in the others: (m, O) each."""
+        """Return means and latent standard deviations at x (m, width), (m, O) each; the deviations of other columns
+        than ``columns`` are 0."""
 
         def block(rows: Tensor) -> tuple[Tensor, Tensor]:
             z, smooth = self._covariances(rows)
@@ -144,7 +159,7 @@ class Serving:
         return mean, std
 
     def _covariances(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """z (m, D), and the smooth covariances with the points of all processes, over their sigma_f^2, (m, S)."""
+        """Return z (m, D), and the squared exponentials of x with the points of all processes, (m, S)."""
         z = torch.cat([x, x * x, x.new_ones(len(x), 1)], -1)
         exponent = z @ self.exponents
         for process in self.processes.values():
@@ -180,21 +195,21 @@ def _process(output: Output, posterior: Posterior, span: slice, polynomial: Tens
 
 
 def _points(posterior: Posterior) -> Tensor:
-    """Points of the squared exponential, (n, d), and their mirror images under a reflection, (2 n, d)."""
+    """Return the points of the squared exponential, (n, d), or (2 n, d) with their mirror images under a reflection."""
     if (reflection := posterior.hyper.reflection) is None:
         return posterior.x
     return torch.cat([posterior.x, posterior.x * reflection.signs])
 
 
 def _weights(posterior: Posterior) -> Tensor:
-    """Weights of the points and their mirror images in the mean."""
+    """Return the weights in the mean of the points and, under a reflection, of their mirror images."""
     if (reflection := posterior.hyper.reflection) is None:
         return posterior.weights
     return torch.cat([posterior.weights, reflection.parity * posterior.weights])
 
 
 def _exponents(posterior: Posterior, inputs: Sequence[int], width: int) -> Tensor:
-    """Columns of A, (D, n), or (D, 2 n) with mirror images."""
+    """Return the columns of A for one process, (D, n), or (D, 2 n) with mirror images."""
     points = _points(posterior)
     precision = posterior.hyper.lengthscale.square().reciprocal()
     scaled = points / posterior.hyper.lengthscale
@@ -203,14 +218,14 @@ def _exponents(posterior: Posterior, inputs: Sequence[int], width: int) -> Tenso
 
 
 def _polynomial(posterior: Posterior, inputs: Sequence[int], width: int) -> Tensor:
-    """Columns of R, (D, n)."""
+    """Return the columns of R for one process: coefficients of z in its polynomial covariances, (D, n)."""
     polynomial, x = posterior.hyper.polynomial, posterior.x
     constant = x.new_full((len(x),), polynomial.constant)
     return _in_z((x * polynomial.linear).T, (x.square() * polynomial.quadratic).T, constant, inputs, width)
 
 
 def _prior(hyper: Hyperparameters, inputs: Sequence[int], width: int) -> Tensor:
-    """k(x, x) = z^2 p: the coefficients p (D,) of z^2 = [x^2, x^4, 1]."""
+    """Return the coefficients p (D,) of the prior variance k(x, x) = z^2 p, with z^2 = [x^2, x^4, 1]."""
     polynomial = hyper.polynomial
     constant = polynomial.linear.new_full((1,), hyper.signal_variance + polynomial.constant)
     return _in_z(polynomial.linear[:, None], polynomial.quadratic[:, None], constant, inputs, width)[:, 0]
@@ -223,9 +238,15 @@ def _squares_alone(coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _in_z(linear: Tensor, quadratic: Tensor, constant: Tensor, inputs: Sequence[int], width: int) -> Tensor:
-    """Arrange the coefficients of n quadratic functions of some inputs as columns for the entries of z.
+    """Arrange the coefficients of n quadratic functions of some inputs as columns for the entries of z = [x, x^2, 1].
 
-    Shapes: linear (d, n), quadratic (d, n), constant (n,), result (2 width + 1, n).
+    Args:
+        linear, quadratic: coefficients of the inputs and their squares, (d, n) each.
+        constant: constants, (n,).
+        inputs: the d inputs among the ``width`` inputs of the model.
+
+    Returns:
+        (2 width + 1, n).
     """
     rows = linear.new_zeros(2 * width + 1, linear.shape[1])
     at = torch.tensor(inputs, device=linear.device)
@@ -234,13 +255,13 @@ def _in_z(linear: Tensor, quadratic: Tensor, constant: Tensor, inputs: Sequence[
 
 
 def _error_bounds(posterior: Posterior) -> tuple[float, float]:
-    """Bounds on the error from computing exponents by products, for x up to twice as far from the origin as the
-    farthest point.
+    """Return bounds on the error of mean and variance if exponents are computed by products, for x up to twice as far
+    from the origin as the farthest point.
 
     With delta the largest error of an exponent, the error of the mean is at most sigma_f^2 delta |beta|_1, in prior
-    standard deviations. That of the variance is 2 |L^-1 k| |L^-1 dk| <= 2 s sigma_f^2 delta sqrt(n) / sigma_n, in prior
-    variances; s^2 = sigma_f^2 + sigma_l^2 is the smallest prior variance. Mirror images double both. For an odd process
-    s^2 = sigma_f^2, because its variance is 0 on the mirror, where it is known.
+    standard deviations. The error of the variance is 2 |L^-1 k| |L^-1 dk| <= 2 s sigma_f^2 delta sqrt(n) / sigma_n, in
+    prior variances; s^2 = sigma_f^2 + sigma_l^2 is the smallest prior variance. Mirror images double both. For an odd
+    process s^2 = sigma_f^2, because its variance is 0 on the mirror, where its value is known.
     """
     hyper, (n, d) = posterior.hyper, posterior.x.shape
     reach = float((posterior.x / hyper.lengthscale).square().sum(1).max())

@@ -1,4 +1,4 @@
-"""Processes with many points: a few inducing points represent all of them, and everything else stays the same.
+"""Processes with many points: a few inducing points represent them all, with the same interface as an exact process.
 
 m of the n points are chosen, Z, by pivoted Cholesky: each is the one that the others explain least. With V = L^-1 k(Z,
 X), L L^T = k(Z, Z), and C = V V^T, the projected process (R&W (2006), section 8.3.4) predicts
@@ -7,8 +7,8 @@ X), L L^T = k(Z, Z), and C = V V^T, the projected process (R&W (2006), section 8
     var(x) = k(x, x) - k(x, Z) (F F^T)^-1 k(Z, x),  F = L chol(I + sigma_n^2 C^-1).
 
 So it is an exact process of the m points with the factor F, the values y_Z = F F^T weights, and the noise sigma_n^2 L
-C^-1 L^T, which is the remaining noise if n points are represented by m. It is served, stored, extended and sampled like
-any other process. Away from Z its variance returns to the prior's.
+C^-1 L^T, which is the noise that remains if m points represent n. It is served, stored, extended and sampled like any
+other process. Far from Z its variance returns to the prior's.
 
 Its m values are not data, because each represents many points. So leave-one-out errors are those of the n points, with
 h_i = (V^T (C + sigma_n^2 I)^-1 V)_ii:
@@ -29,29 +29,31 @@ from torch import Tensor
 from surrogym_server.gp.kernel import Hyperparameters, covariance, variance
 from surrogym_server.gp.posterior import BLOCK, LeftOut, Posterior, Sparse, condition, factorise
 
-MAX_EXACT = 2_000  # a process with more points is sparse
-INDUCING = 1_000
-NOISES = (1.0, 1e2)  # times the noise variance that was fitted
-SHARE = 1e-12  # least share that all other points have in a prediction
-EXPLAINED, BELOW_NOISE = 1e-10, 1e-3  # of the prior's and the noise variance: least variance to choose
+MAX_EXACT = 2_000  # a process with more points uses inducing points
+INDUCING = 1_000  # greatest number of inducing points, unless the caller gives another
+NOISES = (1.0, 1e2)  # noise variances to try, as multiples of the fitted one
+SHARE = 1e-12  # lower limit of 1 - h_i, the weight of all other points in the prediction at point i
+# No further inducing point is chosen below this unexplained variance, as a share of the prior's variance and of the
+# noise variance.
+EXPLAINED, BELOW_NOISE = 1e-10, 1e-3
 
 
 @dataclass(frozen=True)
 class Censored:
-    """Points of which only a side is known: side * f(x) is at least side * y."""
+    """Points for which only a bound of f is known: side * f(x) is at least side * y."""
 
     x: Tensor  # (k, d)
-    y: Tensor  # (k,)
-    side: Tensor  # (k,) 1 or -1
+    y: Tensor  # (k,) the bounds
+    side: Tensor  # (k,) 1 if y is a lower bound of f(x), -1 if it is an upper bound
 
     def log_probability(self, posterior: Posterior) -> float:
-        """Log probability of all sides, each by itself."""
+        """Return the sum of the log probabilities that each bound holds, point by point."""
         mean, variance = posterior.mean_and_variance(self.x)
         over = self.side * (mean - self.y) / (variance + posterior.hyper.noise_variance).sqrt()
         return float(torch.special.log_ndtr(over).sum())
 
     def misfit(self, posterior: Posterior) -> float:
-        """Sum of squares of what the mean falls short of y on the side."""
+        """Return the sum of squares by which the mean violates the bounds."""
         return float((self.side * (self.y - posterior.mean(self.x))).clamp_min(0).square().sum())
 
 
@@ -62,17 +64,20 @@ def condition_many(
     censored: Censored | None = None,
     earlier: Posterior | None = None,
 ) -> Posterior:
-    """Condition a process on x (n, d) and y (n,). Up to ``MAX_EXACT`` points this is exact, with the last
-    hyperparameters.
+    """Condition a process on x (n, d) and y (n,); with more than ``MAX_EXACT`` points through inducing points.
 
-    With more points it uses inducing points, and all points decide, because hyperparameters fitted to a subset may miss
-    rare points. Each point is predicted from the others, and ``censored`` points are predicted as well. The density
-    decides how large the noise is: inducing points leave errors that the fitted noise does not know. The mean squared
-    error decides between the hyperparameters, each with its best noise. R&W (2006), section 5.4.2. An ``earlier``
-    process through inducing points for the same x and y is compared with them.
+    Up to ``MAX_EXACT`` points the result is exact, with the last hyperparameters. With more, all points select the
+    hyperparameters, because a fit to a subset may miss rare points: each point, and each ``censored`` one, is predicted
+    from the others. The predictive density selects the noise, since inducing points leave errors that the fitted noise
+    does not contain. Then the mean squared error selects the hyperparameters. R&W (2006), section 5.4.2.
+
+    Args:
+        hypers: candidates, the last one fitted to the most points.
+        censored: points with a bound only, or None.
+        earlier: another process of the same points, compared with the candidates, or None.
 
     Raises:
-        NumericalFailure: as ``condition``.
+        NumericalFailure: no jitter makes a covariance positive definite.
     """
     if len(y) <= MAX_EXACT:
         return condition(hypers[-1], x, y)
@@ -93,18 +98,19 @@ def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor, most: int | N
     O(n m^2).
 
     Raises:
-        NumericalFailure: as ``condition``.
+        NumericalFailure: no jitter makes a covariance positive definite.
     """
     return _projected(hyper, x, y, _pivots(hyper, x, most))
 
 
 def pivots(hyper: Hyperparameters, x: Tensor, most: int) -> Tensor:
-    """Numbers of at most ``most`` of the points x (n, d): each is the one that those before it explain least, (m,)."""
+    """Return indices (m,) of at most ``most`` of the points x (n, d), each the one that those before it explain
+    least."""
     return _pivots(hyper, x, most)[0]
 
 
 def hardest(posterior: Posterior, x: Tensor, y: Tensor, most: int) -> Tensor:
-    """Numbers of ``most`` of the points x (n, d), y (n,) that are hard for a process of them, (most,).
+    """Return indices of at most ``most`` of the points x (n, d), y (n,) that a process of them predicts worst.
 
     Half are those that the others explain least, in the order of the pivoted Cholesky. The others have the largest
     residuals.
@@ -115,15 +121,16 @@ def hardest(posterior: Posterior, x: Tensor, y: Tensor, most: int) -> Tensor:
 
 
 def _with_noises(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Iterator[Posterior]:
-    """The same inducing points with several noise variances."""
+    """Yield the process through inducing points, once for each noise variance of ``NOISES``; the points are the
+    same."""
     pivots = _pivots(hyper, x)
     for noise in NOISES:
         yield _projected(replace(hyper, noise_variance=noise * hyper.noise_variance), x, y, pivots)
 
 
 def _projected(hyper: Hyperparameters, x: Tensor, y: Tensor, pivots: tuple[Tensor, Tensor, Tensor]) -> Posterior:
-    """The process through the inducing points of ``_pivots``."""
-    points, v, left = pivots  # (m,), V (m, n), (n,)
+    """Return the process of x (n, d) and y (n,) through inducing points; ``pivots`` is the result of ``_pivots``."""
+    points, v, left = pivots  # indices (m,), V (m, n), remaining variances (n,)
     inducing = x[points]
     lower = v[:, points].T.tril()
     noise = hyper.noise_variance
@@ -142,14 +149,14 @@ def _projected(hyper: Hyperparameters, x: Tensor, y: Tensor, pivots: tuple[Tenso
 
 
 def _left_out(v: Tensor, solid: Tensor, residual: Tensor, noise: float, left: Tensor) -> tuple[Tensor, Tensor]:
-    """Error and variance, noise included, of each of n points predicted from all others, (n,) each.
+    """Return error and variance, noise included, of each of n points predicted from all others, (n,) each.
 
     Args:
         v: V = L^-1 K of the m inducing points and all n, (m, n).
-        solid: factor of C + sigma_n^2 I, (m, m).
+        solid: Cholesky factor of C + sigma_n^2 I, (m, m).
         residual: y less the mean at every point, (n,).
         noise: sigma_n^2.
-        left: variance that the inducing points leave, (n,).
+        left: variance that the inducing points leave unexplained, (n,).
     """
     blocks = torch.split(v, BLOCK, dim=1)
     own = [torch.linalg.solve_triangular(solid, block, upper=False).square().sum(0) for block in blocks]
@@ -158,9 +165,11 @@ def _left_out(v: Tensor, solid: Tensor, residual: Tensor, noise: float, left: Te
 
 
 def _pivots(hyper: Hyperparameters, x: Tensor, most: int | None = None) -> tuple[Tensor, Tensor, Tensor]:
-    """Points in the order of their choice (m,), the rows V (m, n), and the variance that they leave at each (n,).
+    """Choose at most ``most`` inducing points of x (n, d), by default ``INDUCING``, by pivoted Cholesky.
 
-    At most ``most`` points are chosen, by default ``INDUCING``.
+    Returns:
+        Indices of the points in the order of their choice (m,), the rows V (m, n), and the variance that they leave
+        unexplained at each point (n,).
     """
     left, prior = variance(hyper, x), float(variance(hyper, x).mean())
     enough = max(BELOW_NOISE * hyper.noise_variance, EXPLAINED * prior)

@@ -11,14 +11,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-FEW, SOME = 150, 400  # points
+FEW, SOME = 150, 400  # numbers of points: to compare alternatives, and to fit the chosen one
 SEED = 0
 
 
 def spread(points: int, most: int) -> Tensor:
-    """Select points, in the order of their arrival: all n up to ``most``, else one from each of ``most`` equal
-    stretches, (m,). A fixed seed draws the point within its stretch, because equal distances could sample one phase of
-    a periodic sequence."""
+    """Select at most ``most`` of the points, as ascending indices (m,).
+
+    All are selected if there are no more than ``most``. Otherwise the sequence is cut into ``most`` equal stretches,
+    and a fixed seed draws one point of each: points at equal distances could sample one phase of a periodic sequence.
+    """
     if points <= most:
         return torch.arange(points)
     edges = np.linspace(0, points, most + 1).astype(np.int64)
