@@ -8,7 +8,7 @@ from surrogym_server.cli import serve
 
 
 def main() -> None:
-    """Run the commands of the server."""
+    """Run the command line of the server."""
     app = typer.Typer(name="surrogym-server", no_args_is_help=True, add_completion=False)
     app.callback()(_keep_names)
     serve.register(app)
@@ -16,7 +16,7 @@ def main() -> None:
 
 
 def _keep_names() -> None:
-    """The Surrogym server."""
+    """Run the Surrogym server."""
 
 
 if __name__ == "__main__":

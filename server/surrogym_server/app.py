@@ -1,4 +1,4 @@
-"""The app: the only place that builds things."""
+"""The ASGI app of the server: the only module that builds the storage, the engine and the services."""
 
 from __future__ import annotations
 
@@ -73,12 +73,14 @@ from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
 from surrogym_shared.spec import EnvironmentSpec
 
-FEATURES: tuple[Feature, ...] = (  # a server without one has no folder for it, and no line here
+# Optional features. To remove a feature, delete its folder and its line here.
+FEATURES: tuple[Feature, ...] = (
     policies,
     jobs,
     priors,
 )
-CLUSTERS: dict[str, Cluster] = {  # by the setting ``engine``
+# Clusters of machines, by the value of the setting ``engine`` that chooses them.
+CLUSTERS: dict[str, Cluster] = {
     "ray": ray,
 }
 
@@ -92,14 +94,15 @@ A sampler claims queries and adds samples; a trainer opens a session and steps i
 
 @dataclass(frozen=True)
 class DesignPort:
-    """Factory of the design's fits; tests replace it by a cheaper one."""
+    """The two functions of the design: ``plan`` chooses the first queries, and ``run`` computes a round (a fit and the
+    next queries). Tests replace them by cheaper ones."""
 
     plan: Plan = initial_queries
     run: Callable[[DesignJob], DesignResult] = run_design_job
 
 
 class State(TypedDict):
-    """State of the app for every request."""
+    """Objects that the app makes available to every request."""
 
     services: Services
     parts: Parts
@@ -107,7 +110,7 @@ class State(TypedDict):
 
 @dataclass(frozen=True)
 class _Process:
-    """Objects of a server process besides its services."""
+    """Objects of a server process on which its services are built."""
 
     storage: Storage
     definitions: Definitions
@@ -119,17 +122,17 @@ class _Process:
 
 
 def create_app(settings: Settings, design: DesignPort = DesignPort(), fits: Fits | None = None) -> FastAPI:
-    """The server as an ASGI app. Its database is open from here to the end of its lifespan.
+    """Create the server as an ASGI app. The app opens its database here and closes it at the end of its lifespan.
 
     Args:
         settings: the server's settings.
-        design: choice of the first queries, and computation of a round.
-        fits: processes that compute rounds, if they have started already. The app closes them.
+        design: functions that choose the first queries and compute a round.
+        fits: worker processes for rounds, if they have started already; None to start them. The app closes them.
 
     Raises:
-        InvalidInput: the address of the database can't be used, the device is not there, or the cluster is not, or is
-            another one than is expected.
-        Unavailable: the database is taken, or does not answer; or the cluster's session hosts do not.
+        InvalidInput: the address of the database can't be used, the device does not exist, or the cluster does not
+            exist or is not the expected one.
+        Unavailable: another server uses the database, or the database or the cluster's session hosts don't answer.
     """
     _check_device(settings.device)
     cluster = _cluster(settings.engine)
@@ -146,7 +149,8 @@ def create_app(settings: Settings, design: DesignPort = DesignPort(), fits: Fits
         docs_url=None,
         redoc_url=None,
         openapi_url=None,
-        telemetry={"tracing": False, "metrics": False, "logs": False},  # /metrics is ours; asking each time costs 5 us
+        # The app has its own /metrics. Without these hooks a request takes 5 us less.
+        telemetry={"tracing": False, "metrics": False, "logs": False},
     )
     app.state.gate = Gate(settings.tokens)
     app.state.max_body_bytes = settings.max_body_bytes
@@ -168,7 +172,8 @@ def create_app(settings: Settings, design: DesignPort = DesignPort(), fits: Fits
     if settings.loopback and not settings.tokens:
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", *settings.host_names}))
     app.add_middleware(Observed, metrics=app.state.metrics)
-    app.router.routes.extend(stepping.routes)  # tried first, and directly: an included router is another search
+    # Steps are the most frequent requests, so their routes come first and without the search in an included router.
+    app.router.routes.extend(stepping.routes)
     rooms = (sessions, service, metrics, surrogates, queries, samples, logs, models)
     for one in (*(room.router for room in rooms), *(feature.router for feature in FEATURES), events.router):
         app.include_router(one)
@@ -197,7 +202,7 @@ def _connected(cluster: Cluster, settings: Settings, storage: Storage) -> Sessio
 
 
 def say_goodbye(app: FastAPI) -> None:
-    """Let long polls and event streams end, so that a shutdown need not wait for them."""
+    """End all long polls and event streams, so that a shutdown need not wait for them."""
     if app.state.notices is not None:
         app.state.notices.close()
 
@@ -212,7 +217,7 @@ async def _lifespan(
     fits: Fits | None,
 ) -> AsyncIterator[State]:
     torch.set_num_threads(settings.threads)
-    threadpool_limits(settings.threads, user_api="blas")  # of NumPy, in which policies act
+    threadpool_limits(settings.threads, user_api="blas")  # NumPy computes the actions of policies
     process = _build_process(settings, design, storage, app.state.metrics, engine, fits)
     app.state.notices = process.notices
     services = _build_services(settings, design, process)
@@ -311,7 +316,7 @@ def _name_lacking(definitions: Definitions) -> None:
 
 
 def _define(spec: dict[str, Any]) -> EnvironmentDefinition:
-    """Convert a new specification, as JSON, to a definition. The wire types have checked it."""
+    """Convert a new specification (JSON that the wire types have checked) to an environment definition."""
     return definition_from_spec(EnvironmentSpec.model_validate(spec))
 
 

@@ -4,33 +4,33 @@ SurrogymError
 ├── InvalidInput            the caller sent something that can't be used; says what was expected and what came
 │   ├── InvalidSpec         a specification that contradicts itself, or a task the chosen preset can't represent
 │   └── TooLarge            more rows, lanes or bytes than the limit
-├── NotThere
+├── NotThere                the request names a thing that does not exist
 │   ├── UnknownSurrogate
 │   ├── UnknownQuery
 │   ├── UnknownModel
 │   ├── UnknownPolicy
 │   ├── UnknownJob
 │   ├── UnknownSession
-│   └── SessionExpired      it was there; open a new one
+│   └── SessionExpired      the session was idle for too long or lost in a crash; open a new one
 ├── Conflict                the request is well formed but does not fit the present state
 │   ├── SpecConflict        the name exists with another specification
-│   ├── IdempotencyConflict the same key with another body
+│   ├── IdempotencyConflict the same idempotency key came with another body
 │   ├── SeqConflict         neither the next seq nor a repeat of the last request; ``expected`` says which
 │   ├── ForeignLease        a lease token that was never given out for this query
 │   ├── LeaseExpired        renewing or failing under a lease that has ended
 │   ├── NotReset            a step before the first reset, or of a finished lane under autoreset disabled
 │   └── NoModel             nothing has been fitted yet
-├── Refused
-│   ├── Unauthenticated
-│   ├── Forbidden
+├── Refused                 the caller may not do this
+│   ├── Unauthenticated     no token, or an unknown one
+│   ├── Forbidden           the role of the token does not allow this
 │   └── BeyondBudget        more real steps than the budget has left, from a caller who may not raise it
 ├── Unavailable             storage or engine can't serve this now; try again later
 │   ├── Damaged             what is stored can't be read as it was written; whoever runs the server restores a copy
 │   ├── Overloaded          a queue or a cap is full; try again later
-│   └── DeadlineExceeded    its answer would come after the deadline it brought
+│   └── DeadlineExceeded    the answer would come after the deadline of the request
 ├── NotInstalled            a stored surrogate needs a plug-in that this server lacks; whoever runs it installs it
-├── PluginFailed            an acquisition or a family of models raised, or gave back what breaks its laws
-│   └── ChoiceFailed        an acquisition did: the model could be fitted, its next queries not chosen
+├── PluginFailed            an acquisition or a family of models raised an error or broke its invariants
+│   └── ChoiceFailed        an acquisition raised an error; the model was fitted, its next queries were not chosen
 └── NumericalFailure        a covariance matrix that no jitter repairs
 """
 
@@ -42,11 +42,11 @@ class SurrogymError(Exception):
 
 
 class InvalidInput(SurrogymError):
-    """The content of a request can't be used; nothing was changed."""
+    """The content of a request is invalid; nothing was changed. The message says what was expected and what came."""
 
 
 class InvalidSpec(InvalidInput):
-    """A specification that contradicts itself."""
+    """A specification contradicts itself, or the chosen preset can't represent it."""
 
 
 class TooLarge(InvalidInput):
@@ -58,15 +58,15 @@ class NotThere(SurrogymError):
 
 
 class UnknownSurrogate(NotThere):
-    """No surrogate of this name."""
+    """The surrogate that a request names does not exist."""
 
 
 class UnknownQuery(NotThere):
-    """No query of this number."""
+    """The surrogate has no query with the requested id."""
 
 
 class UnknownModel(NotThere):
-    """No model of this version."""
+    """The surrogate has no model with the requested version."""
 
 
 class UnknownPolicy(NotThere):
@@ -74,11 +74,11 @@ class UnknownPolicy(NotThere):
 
 
 class UnknownJob(NotThere):
-    """No job of this number."""
+    """The surrogate has no job with the requested id."""
 
 
 class UnknownSession(NotThere):
-    """No session of this id."""
+    """There is no session with the requested id."""
 
 
 class SessionExpired(NotThere):
@@ -86,11 +86,11 @@ class SessionExpired(NotThere):
 
 
 class Conflict(SurrogymError):
-    """The request does not fit the present state; nothing was changed."""
+    """The request is well formed but does not fit the present state; nothing was changed."""
 
 
 class SpecConflict(Conflict):
-    """The name exists with another specification."""
+    """A surrogate of this name exists with another specification."""
 
 
 class IdempotencyConflict(Conflict):
@@ -98,7 +98,8 @@ class IdempotencyConflict(Conflict):
 
 
 class SeqConflict(Conflict):
-    """The seq is neither the next one nor a repeat of the last request."""
+    """A session's request has a sequence number that is neither the next one (``expected``) nor that of the last
+    request."""
 
     def __init__(self, message: str, expected: int) -> None:
         super().__init__(message)
@@ -113,23 +114,23 @@ class ForeignLease(Conflict):
 
 
 class LeaseExpired(Conflict):
-    """The lease has ended; claim again."""
+    """The lease of a query or job has ended; claim the work again."""
 
 
 class NotReset(Conflict):
-    """A lane has to be reset before it can be stepped."""
+    """A lane of a session can't be stepped before it is reset."""
 
 
 class NoModel(Conflict):
-    """No model has been fitted yet."""
+    """The surrogate has no fitted model yet."""
 
 
 class Refused(SurrogymError):
-    """The caller may not do this."""
+    """The caller has no permission for the request."""
 
 
 class Unauthenticated(Refused):
-    """No token, or an unknown one."""
+    """The request has no token, or an unknown one."""
 
 
 class Forbidden(Refused):
@@ -137,11 +138,11 @@ class Forbidden(Refused):
 
 
 class BeyondBudget(Refused):
-    """More real steps than the budget has left; a caller with role admin may raise it."""
+    """The request needs more real steps than the budget has left; a caller with role admin may raise the budget."""
 
 
 class Unavailable(SurrogymError):
-    """The request can't be served now; nothing was changed; try again later."""
+    """The storage or the engine can't serve the request now; nothing was changed; try again later."""
 
 
 class Damaged(Unavailable):
@@ -149,7 +150,7 @@ class Damaged(Unavailable):
 
 
 class Overloaded(Unavailable):
-    """A queue or a cap is full; try again later."""
+    """A queue is full or a limit of the server is reached; try again later."""
 
 
 class DeadlineExceeded(Unavailable):
@@ -170,4 +171,4 @@ class ChoiceFailed(PluginFailed):
 
 
 class NumericalFailure(SurrogymError):
-    """A covariance matrix that no jitter makes positive definite."""
+    """A covariance matrix is not positive definite, and no jitter on its diagonal repairs it."""

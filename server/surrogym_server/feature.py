@@ -1,4 +1,4 @@
-"""What ``app.py`` needs of an optional feature, and what a feature gets of the core.
+"""Interface between ``app.py`` and the optional features.
 
 A feature is one folder of ``features``, with its routes, its service and its tables. It imports the core, and the core
 does not import it.
@@ -25,13 +25,13 @@ S = TypeVar("S")
 
 
 class Service(Protocol):
-    """What a feature does in a server process, whoever calls its routes."""
+    """Service of an optional feature in a server process: its periodic work and its metrics."""
 
     async def sweep(self) -> None:
-        """Called at every sweep, every ``sweep_seconds``."""
+        """Do the periodic work of the feature. The server calls this every ``sweep_seconds``."""
 
     def metrics(self) -> Iterable[Metric]:
-        """Series of the feature for ``/metrics``."""
+        """Return the metrics of the feature for ``/metrics``."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,12 @@ class Core:
     storage: Storage
     notices: Notices
     metrics: ProcessMetrics
-    complete: Complete  # a specification, as JSON, with every field that this program knows
+    complete: Complete  # adds the fields that a specification (JSON) of an older program lacks
 
 
 @dataclass(frozen=True)
 class Feature:
-    """Routes, and the service behind them, which ``start`` builds in a server process."""
+    """An optional feature: its routes, and the function that builds its service in a server process."""
 
     router: APIRouter
     start: Callable[[Core], Service]
@@ -55,10 +55,12 @@ class Feature:
 
 @dataclass(frozen=True)
 class Cluster:
-    """Other machines, where sessions and fits run; the setting ``engine`` names it.
+    """A cluster of machines for sessions and fits, chosen by the setting ``engine``.
 
-    ``check`` raises ``InvalidInput`` if this server can't use it. ``connect`` waits until it is ready, and returns its
-    engine. ``fits`` is None where fits run in processes of this server.
+    Attributes:
+        check: raises ``InvalidInput`` if this server can't use the cluster.
+        connect: waits until the cluster is ready, and returns its engine.
+        fits: returns what computes the fits in the cluster; None if fits run in processes of this server.
     """
 
     check: Callable[[Settings], None]
@@ -66,11 +68,11 @@ class Cluster:
     fits: Callable[[Settings, Callable[[DesignJob], DesignResult]], Compute | None]
 
 
-Parts = Mapping[type[Service], Service]  # of the features, by class
+Parts = Mapping[type[Service], Service]  # the services of the features, by class
 
 
 def part(kind: type[S]) -> Any:
-    """A route's dependency on the service of its feature."""
+    """Return a FastAPI dependency that gives a route the service of class ``kind``."""
 
     async def started(request: Request) -> S:
         found = request.state.parts[kind]

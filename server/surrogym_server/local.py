@@ -1,4 +1,4 @@
-"""LocalSurrogate: a surrogate stepped in this process, without a server. It needs the extra [server]."""
+"""``LocalSurrogate``: a surrogate whose sessions run in this process, without a server. It needs the extra [server]."""
 
 from __future__ import annotations
 
@@ -28,11 +28,13 @@ VERSION = 1
 
 
 class LocalSurrogate:
-    """One model behind the SurrogatePort; see its invariants. Errors are those of ``surrogym_server.errors``.
+    """A surrogate with one model, whose sessions run in this process. It implements ``SurrogatePort``.
+
+    Its methods raise the errors of ``surrogym_server.errors``.
 
     Args:
-        spec: the original environment.
-        model: a model of it; it is version 1, and the latest.
+        spec: specification of the original environment.
+        model: model of the original environment; its version is 1.
 
     Examples:
         >>> surrogate = LocalSurrogate.load("spec.json", "model.safetensors")
@@ -50,26 +52,30 @@ class LocalSurrogate:
         """Read a specification (JSON) and a model (safetensors) that the server exported.
 
         Raises:
-            OSError: a file that can't be read.
-            ValueError: a specification that contradicts itself.
-            InvalidInput: not a model of it.
+            OSError: a file can't be read.
+            ValueError: the specification contradicts itself.
+            InvalidInput: the model does not fit the specification.
         """
         read = EnvironmentSpec.model_validate_json(Path(spec).read_bytes())
         return cls.from_bytes(read, Path(model).read_bytes())
 
     @classmethod
     def from_bytes(cls, spec: EnvironmentSpec, model: bytes) -> Self:
-        """A surrogate from a specification and a model's file. Raises ``InvalidInput`` if the model does not fit."""
+        """Make a surrogate from a specification and the content of a model's file.
+
+        Raises:
+            InvalidInput: the model does not fit the specification.
+        """
         return cls(spec, from_bytes(stored_definition(spec), model))
 
     @classmethod
     def from_file(cls, path: str | Path) -> Self:
-        """Read a whole surrogate from the one file that ``surrogym export`` writes.
+        """Read a surrogate from a file that ``surrogym export`` wrote.
 
         Raises:
             OSError: the file can't be read.
-            NotASurrogateFile: it is not a surrogate's file.
-            InvalidInput: its model does not fit its specification.
+            NotASurrogateFile: the file is not one of ``surrogym export``.
+            InvalidInput: the model in the file does not fit its specification.
         """
         file = SurrogateFile.load(path)
         return cls.from_bytes(file.spec, file.model)
@@ -131,12 +137,12 @@ class LocalSurrogate:
         return outcome
 
     def submit_occupancy(self, session: str, checkpoint: str) -> SubmittedOccupancy:
-        """Return the number of visited states. They are not kept, because there is no design here that could
-        use them."""
+        """Return the number of states that the session visited. They are not stored, because a surrogate without a
+        server has no design that could use them."""
         return SubmittedOccupancy(checkpoint=checkpoint, states=len(self.visited(session)))
 
     def visited(self, session: str) -> NDArray[np.float64]:
-        """The states that a session with occupancy visited, (v, C)."""
+        """Return the states (v, C) that a session visited; it must have been opened with occupancy."""
         return visited_states(self._get(session))
 
     def close(self, session: str) -> None:
@@ -154,7 +160,7 @@ class LocalSurrogate:
 
 
 class _OneModel:
-    """The models of a surrogate with a single model."""
+    """Source of models for a surrogate that has one model only."""
 
     def __init__(self, model: DynamicsModel) -> None:
         self._model = model
@@ -169,4 +175,4 @@ class _OneModel:
 
 
 def _always() -> None:
-    """Let rollouts continue to their end."""
+    """Do nothing: the check that a rollout makes before each step never stops it here."""

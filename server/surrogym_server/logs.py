@@ -12,7 +12,7 @@ LogFormat = Literal["text", "json"]
 REQUEST_ID: ContextVar[str | None] = ContextVar("request_id", default=None)
 
 
-# A path or a name may contain a line break, and the text after it could imitate a line of this log.
+# Escapes for control characters: a line break in a logged path or name could imitate another line of the log.
 _ESCAPES = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160), 0x2028, 0x2029)}
 
 
@@ -40,7 +40,7 @@ class _JsonFormatter(logging.Formatter):
 
 
 def configure(level: str, form: LogFormat) -> None:
-    """Send all records of this process to standard error."""
+    """Send all log records of this process to standard error, from ``level`` on, as text or JSON."""
     handler = logging.StreamHandler()
     handler.setFormatter(_JsonFormatter() if form == "json" else _TextFormatter())
     root = logging.getLogger()

@@ -12,7 +12,8 @@ from surrogym_server.errors import InvalidSpec, SurrogymError
 from surrogym_shared import plugins
 
 T = TypeVar("T")
-TYPES: dict[Any, tuple[str, tuple[type, ...]]] = {  # of settings: in words, and the types in a specification
+# By the type of a setting: its name in messages, and the types of values that a specification may give for it.
+TYPES: dict[Any, tuple[str, tuple[type, ...]]] = {
     float: ("a number", (int, float)),
     int: ("a whole number", (int,)),
     bool: ("true or false", (bool,)),
@@ -22,17 +23,20 @@ TYPES: dict[Any, tuple[str, tuple[type, ...]]] = {  # of settings: in words, and
 
 @dataclass(frozen=True)
 class Choice:
-    """A member of a registry by its name, and its settings."""
+    """Choice of a class in a registry: the name of the class, and settings for its instance."""
 
     name: str
     settings: tuple[tuple[str, float | bool | str], ...] = ()
 
 
 class Registry(plugins.Registry[T]):
-    """Classes by name, and members made of them. Apart from the name, nothing in a request decides what is loaded."""
+    """Classes by name, and instances made from them. A request chooses a class only by its name."""
 
     def lack(self, choice: Choice) -> str | None:
-        """Describe what this machine lacks for a stored choice, to follow "it needs"; None if nothing."""
+        """Describe what must be installed or repaired before a stored choice can be made; None if nothing.
+
+        The text is a noun phrase that can follow "it needs".
+        """
         what = f"the {self.noun} {choice.name!r}"
         try:
             self.name_of(choice.name)
@@ -53,7 +57,7 @@ class Registry(plugins.Registry[T]):
         """Return the class with a name.
 
         Raises:
-            InvalidSpec: there is none, or its package is broken; the message lists the known names.
+            InvalidSpec: no class has this name, or its package is broken; the message lists the known names.
         """
         try:
             return super().get(name)
@@ -61,7 +65,7 @@ class Registry(plugins.Registry[T]):
             raise InvalidSpec(str(error)) from None
 
     def make(self, choice: Choice) -> T:
-        """Make the member with a name and its settings, which are the fields of a frozen dataclass.
+        """Make an instance of the chosen class, a frozen dataclass whose fields are the settings.
 
         Raises:
             InvalidSpec: an unknown name, an unknown setting, or an invalid value.
@@ -74,12 +78,11 @@ class Registry(plugins.Registry[T]):
 
 @contextmanager
 def guarded(what: str, failure: type[SurrogymError], *, interrupts: bool = False) -> Iterator[None]:
-    """Run code that may belong to another package. Every error becomes a ``failure`` whose message begins with
-    ``what``, except errors that the server raises on purpose.
+    """Return a context for code of another package: its errors become a ``failure`` whose message begins with ``what``.
 
-    This code refuses a specification by a ``ValueError``, so with ``InvalidSpec`` the message of a ``ValueError`` is
-    enough; for other errors the type is added. ``KeyboardInterrupt`` passes, for example while a package is loaded,
-    unless ``interrupts`` is set: in a server's requests, where a person's Ctrl-C arrives differently.
+    A ``SurrogymError`` passes unchanged. The message includes the type of the error, except that of a ``ValueError``
+    where ``failure`` is ``InvalidSpec``: plug-ins refuse a specification by a ``ValueError``. ``KeyboardInterrupt``
+    passes unless ``interrupts`` is set, which requests of a server do: there it is not a person's Ctrl-C.
     """
     try:
         yield
@@ -92,14 +95,13 @@ def guarded(what: str, failure: type[SurrogymError], *, interrupts: bool = False
 
 
 def failed(what: str, failure: type[SurrogymError], error: BaseException) -> SurrogymError:
-    """The error that ``guarded`` raises."""
+    """Return a ``failure`` that describes another package's ``error``; its message begins with ``what``."""
     refused = isinstance(error, ValueError) and failure is InvalidSpec
     return failure(f"{what}: {plugins.one_line(error, typed=not refused)}")
 
 
 def in_one_line(error: BaseException) -> str:
-    """Describe an error in one line: the message of an error of this package, or the type and message of
-    another one."""
+    """Describe an error in one line: its message, preceded by its type unless it is a ``SurrogymError``."""
     return plugins.one_line(error, typed=not isinstance(error, SurrogymError))
 
 
@@ -122,7 +124,7 @@ def _check_settings(kind: type, settings: dict[str, float | bool | str]) -> None
 
 
 def _types(kind: type) -> dict[str, Any]:
-    """Types of the fields of a class; empty if they name types that only a type checker imports."""
+    """Return the types of a class's fields by name; empty if they can't be resolved at run time."""
     try:
         return get_type_hints(kind)
     except Exception:

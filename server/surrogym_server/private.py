@@ -1,4 +1,4 @@
-"""Files with secrets: new ones are made private, and a warning at start names those that others can read."""
+"""Permissions of files with secrets: the database, the file of tokens, the TLS key."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ logger = logging.getLogger(__name__)
 
 
 def keep_private(settings: Settings) -> None:
-    """Make a new SQLite file readable for its owner alone, and warn of every secret file that others can read.
+    """Create a missing SQLite file readable for its owner alone, and log a warning for each secret file that others
+    can read.
 
-    SQLite gives the files beside it (``-wal``, ``-shm``) the same mode. An existing database keeps its mode.
+    SQLite gives the files ``-wal`` and ``-shm`` the mode of the database. An existing database keeps its mode.
     """
     database = _sqlite_file(settings.database_url)
     if database is not None:
-        with suppress(OSError):  # opening it raises the error, and an existing file stays unchanged
+        with suppress(OSError):  # the file exists, or opening the database later raises the error
             database.parent.mkdir(parents=True, exist_ok=True)
             os.close(os.open(database, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     for path in (database, settings.token_file, settings.tls_key):
@@ -34,6 +35,6 @@ def _sqlite_file(url: str) -> Path | None:
     try:
         parsed = sa.make_url(url)
     except sa.exc.ArgumentError:
-        return None  # refused when it is opened
+        return None  # opening the database refuses this address
     is_file = parsed.get_backend_name() == "sqlite" and parsed.database not in (None, "", ":memory:")
     return Path(str(parsed.database)) if is_file else None

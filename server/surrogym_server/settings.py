@@ -32,7 +32,7 @@ def _without_path(url: str) -> str:
 
 
 class Settings(BaseModel):
-    """Settings of a server. Every field can be given as ``SURROGYM_<FIELD>``."""
+    """Settings of a server. Each field can be set by the environment variable ``SURROGYM_<FIELD>``."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
 
@@ -106,7 +106,7 @@ class Settings(BaseModel):
 
     @property
     def loopback(self) -> bool:
-        """Whether the address is reachable from this machine alone."""
+        """Whether the server's address can be reached from this machine alone."""
         if self.host in LOCAL_NAMES:
             return True
         try:
@@ -116,7 +116,7 @@ class Settings(BaseModel):
 
     @property
     def host_names(self) -> tuple[str, ...]:
-        """The names that this server is called by: its own, and the public one where a proxy stands before it."""
+        """Host names by which clients address this server: its own, and that of ``public_url`` behind a proxy."""
         public = None if self.public_url is None else urlsplit(self.public_url).hostname
         return (self.host,) if public is None else (self.host, public)
 
@@ -127,15 +127,15 @@ class Settings(BaseModel):
 
 
 def read_settings(environment: Mapping[str, str], **options: Any) -> Settings:
-    """Settings from the environment, overruled by the options that are not None.
+    """Read the settings from environment variables; options that are not None override them.
 
     Args:
         environment: usually ``os.environ``. ``SURROGYM_TOKEN`` is an admin token, ``SURROGYM_TOKENS`` a list
             like ``sample:secret1,train:secret2``, ``SURROGYM_TOKEN_FILE`` a file with one such entry a line.
-        options: fields of ``Settings``, and ``token_file``.
+        options: values of fields of ``Settings``, usually from the command line.
 
     Raises:
-        InvalidInput: a value can't be used; says which, what was expected and what came.
+        InvalidInput: a value is invalid, or the file of tokens can't be read.
     """
     fields = {
         name: environment[PREFIX + name.upper()]

@@ -1,6 +1,6 @@
-"""Tensors in general: their device, caching, blocks of rows, order in memory, and inputs that are bent.
+"""Helpers for tensors: move to a device, cache, compute in blocks of rows, copy in row order, transform inputs.
 
-Arrays are placed on a device once; computations follow their inputs.
+Tensors are placed on a device once; computations run on the device of their inputs.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from torch import Tensor
 T = TypeVar("T")
 
 CPU = torch.device("cpu")
-STEEPEST = 2.0  # largest rate of a bent input
-EDGE = 2.0  # |z| beyond which ``bend`` follows no exponential
+STEEPEST = 2.0  # largest absolute rate g of the transformation ``bend``
+EDGE = 2.0  # |z| beyond which ``bend`` is linear or constant instead of exponential
 
 
 def to_device(value: T, device: torch.device) -> T:
-    """The same value with every tensor on a device, through frozen dataclasses, tuples and mappings.
+    """Copy a value to a device: its tensors, also those inside of dataclasses, tuples and mappings.
 
-    A ``torch.device`` among the fields is replaced too: it is the device of values that are derived later.
+    Each ``torch.device`` in the value is replaced by ``device`` too, because later tensors are created there.
     """
     result: Any = value
     match value:
@@ -43,14 +43,15 @@ def to_device(value: T, device: torch.device) -> T:
 
 
 def cached(make: Callable[[Any], T]) -> cached_property[T]:
-    """``cached_property`` for tensors, computed outside inference mode, so that autograd can use them later."""
+    """Make a ``cached_property`` of a method that returns tensors. It runs outside inference mode, so that autograd
+    can use the cached tensors later."""
     return cached_property(torch.inference_mode(False)(make))
 
 
 def in_blocks(rows: int, function: Callable[..., tuple[Tensor, ...]], *tensors: Tensor | None) -> tuple[Tensor, ...]:
-    """Apply ``function`` to the tensors (m, ...), at most ``rows`` rows at a time, and join its results.
+    """Apply ``function`` to blocks of at most ``rows`` rows of the tensors (m, ...), and concatenate its results.
 
-    A tensor that is None is None in every block.
+    An argument that is None is passed as None with every block.
     """
     count = next(len(t) for t in tensors if t is not None)
     if count <= rows:
@@ -62,27 +63,33 @@ def in_blocks(rows: int, function: Callable[..., tuple[Tensor, ...]], *tensors: 
 
 
 def in_rows(tensor: Tensor) -> Tensor:
-    """A copy in row order, without a gradient.
+    """Copy a tensor to row-major (C-contiguous) memory, without its gradient.
 
-    LAPACK returns columns, and even the stride of a dimension of size one changes the last bits of a product. So a new
-    model would differ from a loaded one.
+    LAPACK returns column-major tensors, and strides change the last bits of a product. Without the copy, a fitted
+    model and the same model loaded from a file would differ in these bits.
     """
     return tensor.detach().clone(memory_format=torch.contiguous_format)
 
 
 def bend(z: Tensor, rates: Tensor) -> Tensor:
-    """w(z) = (e^(g z) - 1) / g of inputs z (..., d) and rates g (d,); z where the rate is 0.
+    """Transform inputs z (..., d) with rates g (d,) by w(z) = (e^(g z) - 1) / g, and by w(z) = z where g is 0.
 
-    Beyond ``EDGE`` an exponential would overflow. There w is a line on the steep side, and constant on the flat side.
+    Beyond |z| = ``EDGE``, where the exponential could overflow, w is linear on the steep side and constant on the flat
+    side.
     """
     size, sign = rates.abs(), rates.sign()
-    along = (z * sign).clamp_min(-EDGE)  # grows towards the steep side
+    along = (z * sign).clamp_min(-EDGE)  # increases towards the steep side of the exponential
     beyond = (along - EDGE).clamp_min(0)
     bent = torch.expm1(size * along.clamp_max(EDGE)) / torch.where(size == 0, 1.0, size)
     return torch.where(rates == 0, z, sign * (bent + torch.exp(size * EDGE) * beyond))
 
 
 def amplitude(w: Tensor, rates: Tensor) -> Tensor:
-    """a(z) = prod_j e^(g_j z_j) = prod_j (1 + g_j w_j) of bent inputs w(z) (..., d) and rates g (d,), (...)."""
+    """Return the factor a(z) = prod_j e^(g_j z_j) = prod_j (1 + g_j w_j), of shape (...).
+
+    Args:
+        w: inputs (..., d) as ``bend`` transformed them.
+        rates: the rates g (d,).
+    """
     grown: Tensor = (1 + w * rates).prod(-1)
     return grown

@@ -1,6 +1,6 @@
-"""The page people look at: static files that read the API with a token kept in the browser tab alone.
+"""The dashboard: static files that call the API with a token, which is kept in the browser tab only.
 
-No build step: what lies here is what a browser gets. ``uplot`` is a copy of uPlot 1.6.32 with its licence.
+There is no build step: browsers receive these files unchanged. ``uplot`` is a copy of uPlot 1.6.32 with its licence.
 """
 
 from __future__ import annotations
@@ -32,5 +32,5 @@ FILES = {"/": ("index.html", "text/html"), **_parts()}
 
 
 def read(name: str) -> bytes:
-    """The content of one of ``FILES``."""
+    """Return the content of a file of the dashboard; ``name`` is a file name of ``FILES``."""
     return files(__name__).joinpath(name).read_bytes()

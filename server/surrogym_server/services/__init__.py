@@ -1,1 +1,1 @@
-"""Use cases: they orchestrate the core, the engine and storage, and know neither HTTP nor the wire."""
+"""Use cases of the API. They call the core, the engine and the storage, and depend on neither HTTP nor wire types."""

@@ -1,5 +1,4 @@
-"""Active callers, such as samplers: those whose last call is not long ago. They are kept in memory, and shown to
-people."""
+"""Callers that called recently, such as samplers. They are kept in memory, and shown in the dashboard."""
 
 from __future__ import annotations
 
@@ -12,23 +11,25 @@ from typing import Generic, TypeVar
 Clock = Callable[[], float]
 T = TypeVar("T")
 
-ALIVE_SECONDS = 75.0  # a caller that was silent for longer counts as gone; the longest claim waits for 60 s
-FORGET_AT = 256  # number of callers from which on silent ones are removed; to look for them at each call would be slow
-MOST_NAMES = 1_000  # most active callers of a surrogate; further ones are served, but not shown
+ALIVE_SECONDS = 75.0  # a caller without a call for longer is inactive; a long poll may last 60 s
+FORGET_AT = 256  # inactive callers are removed only when more callers are stored; a search at each call would be slow
+MOST_NAMES = 1_000  # largest number of active callers shown for a surrogate; further ones are served, but not shown
 
 
 class Alive(Generic[T]):
-    """When each caller was last heard of, and what it reported about itself (``T``). Any thread may use it."""
+    """Time of the last call of each caller, and the status (``T``) that the caller reported with it. Thread-safe."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock = clock
-        self._heard = defaultdict[str, dict[str, tuple[float, T]]](dict)  # by surrogate and name
+        self._heard = defaultdict[str, dict[str, tuple[float, T]]](dict)  # by surrogate and name of the caller
         self._forget_at = FORGET_AT
         self._lock = threading.Lock()
 
     def note(self, surrogate: str, name: str, status: T) -> bool:
-        """Note a call. Returns whether the caller is new, or was silent for so long that it counted as gone. A new
-        caller is not noted while ``MOST_NAMES`` others of the surrogate are active."""
+        """Record a call of the caller ``name``. Return whether the caller is new or was inactive before the call.
+
+        A new caller is not recorded while ``MOST_NAMES`` others of the surrogate are active; the result is then False.
+        """
         now = self._clock()
         with self._lock:
             names = self._heard[surrogate]
@@ -66,7 +67,7 @@ class Alive(Generic[T]):
 
 
 class Samplers(Alive[None]):
-    """When each sampler was last heard of."""
+    """Time of the last call of each sampler, by surrogate."""
 
     def heard(self, surrogate: str, sampler: str) -> None:
         self.note(surrogate, sampler, None)

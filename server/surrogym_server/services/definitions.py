@@ -1,4 +1,4 @@
-"""Definitions of stored surrogates, and the checks of requests against them."""
+"""Environment definitions of stored surrogates, and checks of requests against a definition."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ Define = Callable[[dict[str, Any]], EnvironmentDefinition]
 
 
 class Definitions:
-    """Definitions of surrogates by name; each is built once and cached.
+    """Environment definitions of stored surrogates by name; each is built once and cached.
 
-    A surrogate may outlive the package that provides its family of models or its acquisition. ``get`` works without the
-    package and is enough to read samples and states. ``for_model`` and ``for_design`` check that the package is
+    The package that provides a surrogate's model family or acquisition may have been uninstalled. ``get`` works
+    without the package and is enough to read samples and states. ``for_model`` and ``for_design`` check that it is
     installed.
     """
 
@@ -53,15 +53,23 @@ class Definitions:
             return definition
 
     def for_model(self, name: str) -> EnvironmentDefinition:
-        """Return the definition of a surrogate for a caller that reads a model. Raises ``UnknownSurrogate``, or
-        ``NotInstalled`` if the model's family is missing."""
+        """Return the definition of a surrogate for a caller that loads a model.
+
+        Raises:
+            UnknownSurrogate: there is no surrogate of this name.
+            NotInstalled: the package of its model family is not installed.
+        """
         definition = self.get(name)
         _require(name, MODELS.lack(definition.learning.model))
         return definition
 
     def for_design(self, name: str) -> EnvironmentDefinition:
-        """Return the definition of a surrogate for a caller that does a round. Raises like ``for_model``, and
-        ``NotInstalled`` if its acquisition is missing."""
+        """Return the definition of a surrogate for a caller that fits a model and chooses queries.
+
+        Raises:
+            UnknownSurrogate: there is no surrogate of this name.
+            NotInstalled: the package of its model family or of its acquisition is not installed.
+        """
         definition = self.for_model(name)
         _require(name, ACQUISITIONS.lack(definition.design.acquisition))
         return definition
@@ -77,7 +85,7 @@ class Definitions:
                 self.for_design(summary.name)
             except NotInstalled as error:
                 sentences.append(str(error))
-            except SurrogymError:  # it was deleted meanwhile, or is damaged, which any request for it reports
+            except SurrogymError:  # the surrogate was just deleted, or is damaged, which each request for it reports
                 continue
         return sentences
 
@@ -88,7 +96,7 @@ def _require(name: str, lack: str | None) -> None:
 
 
 def check_coordinates(definition: EnvironmentDefinition, what: str, rows: Array) -> Array:
-    """Return coordinates (n, C). Raises ``InvalidInput`` unless they have C entries."""
+    """Return ``rows`` if they are coordinates of shape (n, C), else raise ``InvalidInput``; ``what`` names them."""
     names = definition.coordinate_names
     if rows.ndim != 2 or rows.shape[1] != len(names):
         raise InvalidInput(f"{what}: expected (n, {len(names)}), one entry for each of {list(names)}, got {rows.shape}")
@@ -96,10 +104,10 @@ def check_coordinates(definition: EnvironmentDefinition, what: str, rows: Array)
 
 
 def check_points(definition: EnvironmentDefinition, q: Array, u: Array) -> tuple[Array, Array]:
-    """Check points (n, C) and their actions (n, F), and return them in the model's units.
+    """Check coordinates q (n, C) and actions u (n, F), and return both; actions as the model encodes them.
 
     Raises:
-        InvalidInput: another shape, another number of points than of actions, or an action out of bounds.
+        InvalidInput: a wrong shape, different numbers of coordinates and actions, or an action out of bounds.
     """
     q = check_coordinates(definition, "coordinates", q)
     if len(q) != len(u):
@@ -108,10 +116,10 @@ def check_points(definition: EnvironmentDefinition, q: Array, u: Array) -> tuple
 
 
 def check_steps(definition: EnvironmentDefinition, queries: Sequence[Query]) -> list[Query]:
-    """Check queries of single steps, and return them in the model's units.
+    """Check queries of single steps, and return them with actions as the model encodes them.
 
     Raises:
-        InvalidInput: another shape, a state to which a sampler does not set its environment, or an action out of
+        InvalidInput: a wrong shape, a state to which the original environment can't be set, or an action out of
             bounds.
     """
     q = check_settable(definition, np.array([query.coordinates for query in queries]))
@@ -120,10 +128,10 @@ def check_steps(definition: EnvironmentDefinition, queries: Sequence[Query]) -> 
 
 
 def check_rollouts(definition: EnvironmentDefinition, queries: Sequence[Query]) -> list[Query]:
-    """Check queries of rollouts, and return them in the model's units.
+    """Check queries of rollouts, and return them with actions as the model encodes them.
 
     Raises:
-        InvalidInput: a rollout that is too long, of another shape, or out of bounds.
+        InvalidInput: a rollout that is too long, or actions of a wrong shape or out of bounds.
     """
     longest = definition.max_rollout or 0
     for query in queries:
@@ -137,8 +145,8 @@ def check_settable(definition: EnvironmentDefinition, q: Array) -> Array:
     """Check that the original environment can be set to coordinates (n, C), and return them.
 
     Raises:
-        InvalidInput: another shape, or a value beyond a bound of the environment, or on a side without a bound beyond
-            the sampling range. A sampler does not set its environment to such states.
+        InvalidInput: a wrong shape, or a value beyond the coordinate's bound, or beyond its sampling range on a side
+            without a bound.
     """
     q = check_coordinates(definition, "coordinates", q)
     for index, coordinate in enumerate(definition.coordinates):

@@ -1,4 +1,4 @@
-"""The designer: fits every surrogate that is due, stores the model and the next queries, and wakes waiting samplers."""
+"""The designer: fits each surrogate that is due, stores the model and the next queries, and wakes waiting samplers."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ logger = logging.getLogger(__name__)
 
 FIT_LEASE_SECONDS = 30.0
 RENEWALS_PER_LEASE = 3
-ATTEMPTS = 5  # most attempts at a fit whose process died, or whose result could not be stored
-LONG_SECONDS = 60.0  # the log names a fit that takes longer
-PASSED_SECONDS = 5.0  # after this time, another fit may start beside a fit
-MOST_PASSED = 3  # most long fits that don't count towards ``fit_workers``; each is a process
-PAUSE_SECONDS = 1.0  # time between two checks whether a fit is still wanted
+ATTEMPTS = 5  # largest number of attempts at a fit whose process died, or whose result could not be stored
+LONG_SECONDS = 60.0  # a fit that takes longer is logged as a warning
+PASSED_SECONDS = 5.0  # a fit that takes longer no longer occupies one of the ``fit_workers`` places
+MOST_PASSED = 3  # largest number of long fits that run beyond ``fit_workers``; each has a process
+PAUSE_SECONDS = 1.0  # shortest time between two renewals of a fit's lease
 
 
 class _Turn:
-    """A turn to fit: a few fits run at a time. A long fit lets others start beside it."""
+    """A fit's place among the fits that run at a time. After a while, a long fit frees its place for another fit."""
 
     def __init__(self, usual: asyncio.Semaphore, passed: asyncio.Semaphore) -> None:
         self._usual, self._passed, self._current = usual, passed, usual
@@ -64,7 +64,7 @@ class _Turn:
         self._current.release()
 
     async def let_others_pass(self) -> None:
-        """Let other fits start beside this one after a while, as soon as there are few long ones."""
+        """After ``PASSED_SECONDS``, free the place for another fit, once fewer than ``MOST_PASSED`` long fits run."""
         await asyncio.sleep(PASSED_SECONDS)
         await self._passed.acquire()
         self._current = self._passed
@@ -76,11 +76,11 @@ class DesignerSettings:
     """Settings of a ``Designer``.
 
     Attributes:
-        owner: name of this server in the right to fit.
-        threads: number of torch's threads in a fit.
-        look_seconds: interval of searches for surrogates that became due without a notice.
+        owner: name of this server in the lease of a fit.
+        threads: number of torch threads in a fit.
+        look_seconds: time between searches for surrogates that became due without a notice.
         fit_seconds: a fit that takes longer is stopped and counts as failed.
-        fit_workers: number of fits at a time, not counting long ones.
+        fit_workers: number of fits that run at a time, long ones not counted.
     """
 
     owner: str
@@ -91,9 +91,9 @@ class DesignerSettings:
 
 
 class Designer:
-    """Fits the surrogates that are due, each under a right that no other server has at the same time."""
+    """Fits the surrogates that are due, each under a lease, which only one server can hold at a time."""
 
-    def __init__(  # eight parameters: seven parts of the server that a fit reads or informs, and the settings
+    def __init__(  # eight parameters: seven objects of the server that a fit reads or notifies, and the settings
         self,
         storage: Storage,
         definitions: Definitions,
@@ -104,15 +104,18 @@ class Designer:
         metrics: ProcessMetrics,
         settings: DesignerSettings,
     ) -> None:
-        """Args:
-        storage: holds the right to fit.
-        definitions: definitions of the surrogates in the storage.
-        plan: function that returns the first queries of a design, given its budget.
-        fits: runs the jobs.
-        models: is informed of each new version.
-        notices: wake this designer, and are posted after each fit.
-        metrics: counters of this process.
-        settings: how often to look for due surrogates, and how long and how many fits may run."""
+        """Keep the objects of the server that fits need.
+
+        Args:
+            storage: stores surrogates, samples and models, and the leases of fits.
+            definitions: environment definitions of the stored surrogates.
+            plan: function that returns the first queries of a design, given its budget.
+            fits: computes the jobs.
+            models: cache that gets the version of each new model.
+            notices: wake this designer; it posts a notice after each fit.
+            metrics: counters of this process.
+            settings: how often to search for due surrogates, and how long and how many fits may run.
+        """
         self._storage = storage
         self._definitions = definitions
         self._plan = plan
@@ -122,11 +125,11 @@ class Designer:
         self._metrics = metrics
         self._settings = settings
         self._usual, self._passed = asyncio.Semaphore(settings.fit_workers), asyncio.Semaphore(MOST_PASSED)
-        self._tasks: dict[str, asyncio.Task[None]] = {}  # fits that run or wait for their turn, by surrogate
-        self._unavailable: dict[str, int] = {}  # fits in succession that lacked a process or storage, by surrogate
+        self._tasks: dict[str, asyncio.Task[None]] = {}  # running and waiting fits, by surrogate
+        self._unavailable: dict[str, int] = {}  # consecutive fits that lost their process or storage
 
     async def run(self) -> None:
-        """Fit due surrogates until cancelled. Surrogates whose fit is cancelled stay due."""
+        """Fit surrogates as they become due, until cancelled. A surrogate whose fit is cancelled stays due."""
         try:
             with self._notices.listen() as listener:
                 while True:
@@ -134,7 +137,7 @@ class Designer:
                         await self._begin_all_due()
                     except Unavailable as error:
                         logger.warning("the storage is unavailable or damaged, so the design waits: %s", error)
-                    except Exception:  # an error of one surrogate must not end the fits of all others
+                    except Exception:  # an error with one surrogate must not stop the fits of the others
                         logger.exception("the search for due fits failed; it is repeated shortly")
                     await listener.wait(self._settings.look_seconds)
         finally:
@@ -144,7 +147,7 @@ class Designer:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def fit_all_due(self) -> None:
-        """Fit every surrogate that is due, and return when all of them are."""
+        """Fit each surrogate that is due, and return when all these fits have ended."""
         await self._begin_all_due()
         await asyncio.gather(*self._tasks.values())
 
@@ -160,13 +163,13 @@ class Designer:
             await asyncio.to_thread(self._ask_first, unbegun)
 
     async def _fit_in_turn(self, name: str) -> None:
-        """Run one fit. Its errors end this fit only."""
+        """Wait for a place, then fit the surrogate ``name``. Errors are logged and end this fit only."""
         try:
             async with _Turn(self._usual, self._passed) as turn:
                 await self._fit(name, turn)
         except Damaged as error:
             logger.warning("the design of %s waits: %s", name, error)
-        except SurrogymError as error:  # deleted or taken by another server meanwhile, or the storage is away
+        except SurrogymError as error:  # deleted, leased by another server, or without storage
             logger.debug("%s is not fitted: %s", name, error)
         except Exception:
             logger.exception("the fit of %s could not be started or finished; it is tried again shortly", name)
@@ -176,14 +179,18 @@ class Designer:
     def improve(
         self, name: str, queries: int, checkpoint: str | None, key: str | None, *, raise_budget: bool
     ) -> Granted:
-        """Request more queries from the next fit.
+        """Request that the next fit of the surrogate ``name`` chooses more queries.
 
-        The queries are weighted by the occupancy of a checkpoint (None: the latest, if any). With ``raise_budget`` the
-        budget is raised as far as the queries need.
+        Args:
+            name: name of the surrogate.
+            queries: number of further queries.
+            checkpoint: name of the submitted occupancy that weights the queries; None for the latest one, if any.
+            key: idempotency key of the request.
+            raise_budget: whether to raise the budget as far as the queries need.
 
         Raises:
-            InvalidInput: no occupancy was submitted under this name.
-            BeyondBudget: the budget has too few real steps left, and may not be raised.
+            InvalidInput: no occupancy was submitted under the name ``checkpoint``.
+            BeyondBudget: the budget has too few real steps left, and ``raise_budget`` is False.
         """
         if checkpoint is not None and self._storage.occupancy.get(name, checkpoint) is None:
             raise InvalidInput(
@@ -222,18 +229,21 @@ class Designer:
             self._notices.post(name)
 
     def _may_try_again(self, name: str) -> bool:
-        """Whether a fit that could not run now stays due. It does for a limited number of consecutive attempts."""
+        """Count a fit of the surrogate that lost its process or storage. Return whether fewer than ``ATTEMPTS`` such
+        fits came in succession, so that the fit may be repeated."""
         attempts = self._unavailable.pop(name, 0) + 1
         if attempts < ATTEMPTS:
             self._unavailable[name] = attempts
         return attempts < ATTEMPTS
 
     async def _result(self, lease: FitLease, turn: _Turn) -> DesignResult:
-        """Run the job of a lease, and return its result. The job is stopped if its result is not wanted any more,
-        because another server has the right to fit or the surrogate was deleted, or if it takes too long.
+        """Compute the design job of a leased fit, and return its result.
+
+        The job is stopped if it takes longer than ``fit_seconds``, loses its lease, or its surrogate is deleted.
 
         Raises:
-            LeaseExpired, UnknownSurrogate: the result is not wanted any more.
+            LeaseExpired: another server has the lease.
+            UnknownSurrogate: the surrogate was deleted.
             PluginFailed: the job took too long.
             Exception: any error of the job.
         """
@@ -258,8 +268,12 @@ class Designer:
             await asyncio.gather(work, keeper, passing, return_exceptions=True)
 
     async def _keep(self, lease: FitLease) -> None:
-        """Renew the right to fit while the fit is wanted, and log a long fit. Raises ``LeaseExpired`` or
-        ``UnknownSurrogate`` if the fit is not wanted any more."""
+        """Renew the lease of a fit until cancelled, and log a warning if the fit takes long.
+
+        Raises:
+            LeaseExpired: another server has the lease.
+            UnknownSurrogate: the surrogate was deleted.
+        """
         began, tell_after = time.monotonic(), LONG_SECONDS
         with self._notices.listen(lease.surrogate) as listener:
             while True:
@@ -268,7 +282,7 @@ class Designer:
                     await asyncio.to_thread(self._storage.designs.renew, lease, FIT_LEASE_SECONDS)
                 except (LeaseExpired, UnknownSurrogate):
                     raise
-                except SurrogymError as error:  # the commit will raise it
+                except SurrogymError as error:  # storing the result will raise it again
                     logger.debug("the right to fit %s is not renewed: %s", lease.surrogate, error)
                 if (took := time.monotonic() - began) > tell_after:
                     tell_after *= 2
@@ -300,7 +314,7 @@ class Designer:
             snapshots=self._storage.snapshots.all(name) if definition.snapshots else {},
             extra_queries=min(
                 lease.extra_queries, max(0, record.budget - spoken)
-            ),  # the budget may have been lowered since
+            ),  # the budget may have been lowered after the request
             occupancy=None if visits is None else visits.states,
             threads=self._settings.threads,
             prior=self._storage.priors.blob(name),
@@ -308,7 +322,7 @@ class Designer:
         )
 
     def _previous(self, name: str) -> bytes | None:
-        """Return the newest model as bytes; None if there is none, or if it is damaged."""
+        """Return the file of the surrogate's newest model; None if there is no model, or if it is damaged."""
         try:
             return self._storage.models.blob(name)
         except (NoModel, Damaged):
@@ -339,10 +353,10 @@ class Designer:
             self._storage.designs.abort(lease, error)
 
     def _give_up(self, hopeless: Sequence[str]) -> None:
-        """Fail the designs whose initial queries were all set aside, because they have nothing to fit or to
-        wait for."""
+        """Set the designs of these surrogates to "failed": all their initial queries were set aside or refused, so no
+        sample will come."""
         for name in hopeless:
-            with suppress(UnknownSurrogate):  # deleted meanwhile
+            with suppress(UnknownSurrogate):  # the surrogate was just deleted
                 set_aside = self._storage.queries.list(name, ("set_aside", "refused"))
                 refused = all(query.status == "refused" for query in set_aside)
                 how = "refused by the original environment" if refused else "set aside"
@@ -351,16 +365,16 @@ class Designer:
                 self._notices.post(name)
 
     def _ask_first(self, unbegun: Sequence[str]) -> None:
-        """Queue initial queries of designs that got a budget after they had been created without one."""
+        """Queue the initial queries of surrogates that were created without a budget and have one now."""
         for name in unbegun:
-            with suppress(SurrogymError):  # deleted meanwhile, or the storage is away
+            with suppress(SurrogymError):  # the surrogate was just deleted, or the storage does not answer
                 budget = self._storage.surrogates.get(name).budget
                 self._storage.designs.ask_first(name, self._plan(self._definitions.get(name), budget))
                 self._notices.post(name)
 
 
 def _failure(name: str, error: Exception) -> str:
-    """Reason why a round failed, and the way out, for the status of its surrogate."""
+    """Return the text for the surrogate's status that says why its fit failed and what to do."""
     match error:
         case NotInstalled():
             return f"{error}; then: surrogym change {name} --resume"

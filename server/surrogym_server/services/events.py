@@ -1,4 +1,4 @@
-"""Events of a surrogate, as a stream that waits for new ones."""
+"""Streams of a surrogate's events, which wait for new events."""
 
 from __future__ import annotations
 
@@ -15,37 +15,38 @@ from surrogym_server.storage.records import EventRecord
 T = TypeVar("T")
 
 SILENCE_SECONDS = 15.0
-CHANGE_SECONDS = 0.2  # least time between two pages of new events, and between two results of ``changes``
+CHANGE_SECONDS = 0.2  # shortest time between two pages of events, and between two results of ``changes``
 PAGE = 200
 RETRY_SECONDS = 2.0
-READING = 2  # most reads at a time, so that many streams that open together don't take all threads
+READING = 2  # reads of the database at a time; without a limit, many new streams would occupy all threads
 
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """Events in order. All streams that wait for the same events share one page."""
+    """Consecutive events of a surrogate. All streams that wait for the same events share one page."""
 
     events: tuple[EventRecord, ...]
 
 
 class EventService:
-    """Streams of events. Of all streams of a surrogate that wait, one reads the new events for all."""
+    """Streams of events. When new events come, one read serves all streams that wait for the same surrogate."""
 
     def __init__(self, storage: Storage, notices: Notices) -> None:
         self._storage = storage
         self._notices = notices
         self._turn = asyncio.Semaphore(READING)
-        self._shared: dict[str, tuple[tuple[int, int], asyncio.Task[Page]]] = {}  # the last page of each surrogate
+        self._shared: dict[str, tuple[tuple[int, int], asyncio.Task[Page]]] = {}  # last page by surrogate
 
     async def newest(self, name: str) -> int:
-        """Return the id of the last event, 0 before the first. Raises ``UnknownSurrogate``."""
+        """Return the id of a surrogate's last event, 0 if it has none. Raises ``UnknownSurrogate``."""
         newest = await self._read(lambda: self._storage.events.newest([name]))
         if name not in newest:
             raise UnknownSurrogate(f"expected the name of a surrogate, got {name!r}, which does not exist")
         return newest[name]
 
     async def changes(self) -> AsyncIterator[bool]:
-        """Yield True after an event of any surrogate, and False after a silence, until the server stops."""
+        """Yield True after events of any surrogate, and False after ``SILENCE_SECONDS`` without one, until the server
+        stops."""
         with self._notices.listen() as listener:
             while not self._notices.closing:
                 changed = await listener.wait(SILENCE_SECONDS)
@@ -54,8 +55,10 @@ class EventService:
                     await asyncio.sleep(CHANGE_SECONDS)
 
     async def follow(self, name: str, after: int) -> AsyncIterator[Page | None]:
-        """Yield the events with an id above ``after``, and None after a silence, until the surrogate is deleted or the
-        server stops."""
+        """Yield a surrogate's events with an id above ``after``, page by page, until it is deleted or the server stops.
+
+        Yields None after ``SILENCE_SECONDS`` without an event.
+        """
         try:
             with self._notices.listen(name) as listener:
                 while not self._notices.closing:
@@ -81,8 +84,10 @@ class EventService:
                 self._shared.pop(name, None)
 
     async def _page(self, name: str, after: int, version: int) -> Page:
-        """Return the events with an id above ``after``. Streams that ask for the same page at the same version of the
-        listener share it."""
+        """Return a surrogate's next events with an id above ``after``.
+
+        Streams share a page if they request the same events and ``version``, the number of the last notice, is equal.
+        """
         position, task = self._shared.get(name, (None, None))
         if task is None or position != (after, version):
             task = asyncio.create_task(self._read(lambda: Page(tuple(self._storage.events.list(name, after, PAGE)))))

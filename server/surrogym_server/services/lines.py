@@ -1,4 +1,4 @@
-"""Lines of claims that wait for work. The first in a line ask the database, and the others wait behind them."""
+"""Queues of claims that wait for work. The first few of a queue ask the database, and the others wait behind them."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from surrogym_server.services.notices import Listener, Notices
 
 T = TypeVar("T")
 
-FIRST = 4  # most claims of a line that ask the database at a time
+FIRST = 4  # claims of a line that may ask the database at a time
 LOOK_SECONDS = 2.0  # time between two checks whether the caller has closed its connection
 
 Present = Callable[[], Awaitable[None]]  # raises if the caller has closed its connection
 
 
 class _Line(Generic[T]):
-    """Claims for the same work. ``answer`` is the last answer without work, to a question asked at ``version``.
+    """Claims that wait for the same work.
 
-    The line listens to notices as long as it exists: while ``heard.version`` equals ``version``, the answer still
-    holds.
+    ``answer`` is the last answer without work, and ``version`` the number of the last notice before that answer. The
+    answer is still valid while ``heard.version`` equals ``version``.
     """
 
     def __init__(self, listening: ExitStack, heard: Listener) -> None:
@@ -35,12 +35,13 @@ class _Line(Generic[T]):
 
 
 class Lines(Generic[T]):
-    """Claims that wait, grouped by the work that they ask for.
+    """Claims that wait for work, in one line for each kind of work.
 
     Args:
-        notices: tell that a surrogate has changed. Whatever makes work claimable posts a notice or appends an event.
-        has_work: whether an answer ends the wait because it has work, which belongs to this claim alone.
-        ends: whether an answer without work ends the wait, given the answer known before it.
+        notices: notices of changes of a surrogate. All code that makes work available posts a notice or appends an
+            event.
+        has_work: returns whether an answer contains work; such an answer belongs to one claim and ends its wait.
+        ends: returns whether an answer without work ends the wait; its arguments are the earlier answer and this one.
     """
 
     def __init__(
@@ -54,13 +55,14 @@ class Lines(Generic[T]):
     async def claim(
         self, surrogate: str, kind: Hashable, ask: Callable[[], T], seconds: float, present: Present | None = None
     ) -> T:
-        """Ask for work, and wait for it up to ``seconds``. Returns an answer with work, or the last answer without any.
+        """Ask for work, and wait for it at most ``seconds``. Return an answer with work, or else the last answer.
 
         Args:
-            surrogate: name of the surrogate, whose notices tell of new work.
-            kind: claims of equal kinds can take the same work.
-            ask: asks the database, in a thread.
-            present: raises if the caller has closed its connection; called before each question.
+            surrogate: name of the surrogate whose notices announce new work.
+            kind: kind of work; claims of the same kind wait in one line.
+            ask: asks the database for work; called in a thread.
+            seconds: longest wait.
+            present: raises if the caller has closed its connection; called before each call of ``ask``.
         """
         deadline = time.monotonic() + seconds
         with self._place(surrogate, kind) as line:
@@ -82,7 +84,7 @@ class Lines(Generic[T]):
                 line.first.release()
 
     async def _answer(self, line: _Line[T], ask: Callable[[], T]) -> T:
-        """Return the line's last answer if nothing has happened since; else ask again."""
+        """Return the line's last answer if no notice has come since it was given; else call ``ask``."""
         if line.answer is not None and line.version == line.heard.version:
             return line.answer
         version, answer = line.heard.version, await asyncio.to_thread(ask)
@@ -108,7 +110,7 @@ class Lines(Generic[T]):
 
 
 async def _acquired(turn: asyncio.Semaphore, seconds: float) -> bool:
-    """Wait for a turn, at most ``seconds``."""
+    """Acquire a semaphore within ``seconds``, and return whether that succeeded."""
     try:
         async with asyncio.timeout(seconds):
             return await turn.acquire()

@@ -1,6 +1,6 @@
-"""Counters of the services of one server process since its start, for ``/metrics``.
+"""Counters of one server process since its start, for ``/metrics``.
 
-The engine counts steps. Counts that outlive a process are computed from storage.
+Counts of steps are in the engine. Counts that survive a restart are read from the storage.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from surrogym_server.engine.tallies import Durations
 
 @dataclass
 class ProcessMetrics:
-    """Counters that only grow. Written in the event loop's thread alone."""
+    """Counters of a server process, which only grow. Only the thread of the event loop changes them."""
 
     fits: Durations = field(default_factory=Durations)
     failed_fits: int = 0
     expired_leases: int = 0
-    requests: dict[tuple[str, str, int], Durations] = field(default_factory=dict)  # by method, route, status
+    requests: dict[tuple[str, str, int], Durations] = field(default_factory=dict)  # by method, route and status

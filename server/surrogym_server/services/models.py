@@ -1,4 +1,4 @@
-"""Models: history, export, import, and predictions at given points."""
+"""Use cases of models: list, export, import, and predict at given points."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Said(Generic[T]):
-    """A model's answer, and the version of the model."""
+    """A result that a model computed, with the model's version and the names of its outputs."""
 
     version: int
     outputs: tuple[str, ...]
@@ -41,12 +41,12 @@ class Said(Generic[T]):
 
 
 def load_model(storage: Storage, definitions: Definitions, surrogate: int, version: int) -> DynamicsModel:
-    """Load a stored model of the surrogate with this id.
+    """Load a stored model of the surrogate with the id ``surrogate``.
 
     Raises:
-        UnknownModel, UnknownSurrogate: as the classes say.
-        NotInstalled: its family is not installed.
-        Damaged: as ``stored_model``, or this program can't read it.
+        UnknownModel, UnknownSurrogate: there is no such model or surrogate.
+        NotInstalled: the package of the model's family is not installed.
+        Damaged: the stored file has changed since it was written, or this program can't read it.
     """
     name = storage.surrogates.name_of(surrogate)
     definition, data = definitions.for_model(name), stored_model(storage, name, version)
@@ -58,16 +58,18 @@ def load_model(storage: Storage, definitions: Definitions, surrogate: int, versi
 
 
 def stored_tolerances(storage: Storage, surrogate: int, version: int) -> tuple[float, ...]:
-    """Return the tolerances (O,) by which a stored model of the surrogate with this id was judged. Raises
-    ``UnknownModel`` or ``UnknownSurrogate``."""
+    """Return the tolerances (O,) with which the confidence of a stored model was computed, in the outputs' units.
+
+    ``surrogate`` is the id of the surrogate. Raises ``UnknownModel`` or ``UnknownSurrogate``.
+    """
     return tuple(storage.models.get(storage.surrogates.name_of(surrogate), version).tolerances)
 
 
 def stored_model(storage: Storage, name: str, version: int) -> bytes:
-    """Read a stored model as a file.
+    """Return the safetensors file of a stored model.
 
     Raises:
-        UnknownModel, UnknownSurrogate: as the classes say.
+        UnknownModel, UnknownSurrogate: there is no such model or surrogate.
         Damaged: the file has changed since it was stored. The model is set aside, the version before it is served, and
             a new fit becomes due.
     """
@@ -97,7 +99,7 @@ class ModelService:
         return self._storage.models.list(name)
 
     def get(self, name: str, version: int) -> ModelRecord:
-        """Return a model's record. Raises ``UnknownModel``."""
+        """Return the stored record of a model, without the model itself. Raises ``UnknownModel``."""
         return self._storage.models.get(name, version)
 
     def export(self, name: str, version: int) -> bytes:
@@ -105,11 +107,13 @@ class ModelService:
         return stored_model(self._storage, name, version)
 
     def add(self, name: str, data: bytes) -> ModelRecord:
-        """Import a safetensors file as the newest model, judged by this surrogate's tolerances.
+        """Import a safetensors file as the newest model of the surrogate ``name``, and return its record.
+
+        Its confidence is computed with the tolerances of this surrogate.
 
         Raises:
             InvalidInput: the file is not a model of this surrogate.
-            NotInstalled: its family is not installed.
+            NotInstalled: the package of the model's family is not installed.
         """
         record = self._storage.surrogates.get(name)
         definition = self._definitions.for_model(name).with_tolerances(record.tolerances)
@@ -124,12 +128,14 @@ class ModelService:
         return self._storage.models.get(name, version)
 
     def predict(self, name: str, q: Array, u: Array, version: int | None) -> Said[PointPrediction]:
-        """Predict one mean step from each of q (n, C) under u (n, F).
+        """Predict one step from each of the coordinates q (n, C) under the actions u (n, F), by the model's mean.
+
+        ``version`` is that of the model, None for the newest.
 
         Raises:
-            InvalidInput: wrong shape, or an action out of bounds.
-            NoModel, UnknownModel: as the classes say.
-            PluginFailed: the code of the model's family failed.
+            InvalidInput: a wrong shape, or an action out of bounds.
+            NoModel, UnknownModel: there is no model, or none of this version.
+            PluginFailed: the code of the model's family raised an error.
         """
         version, model = self._model(name, version)
         q, u = check_points(model.definition, q, u)
@@ -137,8 +143,8 @@ class ModelService:
             return Said(version, model.definition.outputs, predict_points(model, q, u))
 
     def query_uncertainty(self, name: str, q: Array, u: Array, version: int | None) -> Said[UncertaintyResult]:
-        """Return the uncertainty at q (n, C) under u (n, F), weighted by the latest occupancy. Raises like
-        ``predict``."""
+        """Return the model's uncertainty at coordinates q (n, C) under actions u (n, F), weighted by the latest
+        occupancy. Raises the errors of ``predict``."""
         version, model = self._model(name, version)
         q, u = check_points(model.definition, q, u)
         tolerances = np.array(self._storage.models.get(name, version).tolerances)
@@ -148,7 +154,18 @@ class ModelService:
             return Said(version, model.definition.outputs, query_uncertainty(model, q, u, tolerances, states))
 
     def imagine(self, name: str, q: Array, u: Array, *, draws: int, seed: int, version: int | None) -> Said[Imagined]:
-        """Imagine episodes from q (C,) under u (T, F). Raises like ``predict``."""
+        """Simulate episodes in the model from coordinates q (C,) under the actions u (T, F).
+
+        Args:
+            name: name of the surrogate.
+            q: coordinates (C,) at the start.
+            u: actions (T, F), one for each step.
+            draws: number of episodes, each along another posterior sample.
+            seed: seed of the posterior samples.
+            version: version of the model; None for the newest.
+
+        Raises the errors of ``predict``.
+        """
         version, model = self._model(name, version)
         start = check_coordinates(model.definition, "coordinates", q[None])[0]
         actions = model_actions(model.definition.action, u)

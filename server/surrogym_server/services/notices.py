@@ -1,4 +1,5 @@
-"""Notices of changes of a surrogate, which wake those who wait in this process and in other servers of the database."""
+"""Notices that a surrogate has changed. They wake waiting requests in this process and in other servers of the
+database."""
 
 from __future__ import annotations
 
@@ -9,11 +10,11 @@ from itertools import chain, islice
 
 from surrogym_server.storage.announcements import Alone, Announcements
 
-AT_ONCE = 50  # most listeners woken in one turn of the event loop; other requests are answered between the turns
+AT_ONCE = 50  # listeners woken in one iteration of the event loop, so that other requests are answered in between
 
 
 class Listener:
-    """A waiting service. A notice that comes while it does not wait is remembered."""
+    """A subscriber to notices. A notice that comes between two waits ends the next wait at once."""
 
     def __init__(self, audience: Audience) -> None:
         self._audience = audience
@@ -21,15 +22,14 @@ class Listener:
 
     @property
     def version(self) -> int:
-        """Number of the last notice that this listener could hear. If it is the same at two times, nothing has happened
-        in between."""
+        """Number of the last notice to this listener. If it is the same at two times, no notice came in between."""
         return self._audience.version
 
     def wake(self) -> None:
         self._event.set()
 
     async def wait(self, seconds: float) -> bool:
-        """Wait for the next notice since the last wait, at most ``seconds``. Returns whether there was one."""
+        """Wait at most ``seconds`` until a notice has come since the last wait. Return whether one has."""
         with suppress(TimeoutError):
             async with asyncio.timeout(seconds):  # wait_for of Python 3.11 can swallow a cancellation
                 await self._event.wait()
@@ -39,18 +39,20 @@ class Listener:
 
 
 class Audience:
-    """The listeners to one surrogate, or to all surrogates."""
+    """The listeners to one surrogate or to all surrogates, and the number of their last notice."""
 
     def __init__(self, version: int) -> None:
         self.version = version
-        self.listeners: dict[Listener, None] = {}  # in the order in which they came
+        self.listeners: dict[Listener, None] = {}  # a dictionary as an ordered set
 
 
 class Notices:
-    """Listeners by surrogate. ``post`` may be called from any thread, all other methods from the event loop's thread.
+    """Delivers notices of changed surrogates to listeners.
+
+    ``post`` may be called from any thread, all other methods only from the thread of the event loop.
 
     Args:
-        announcements: of the database, which carry notices between its servers.
+        announcements: carry notices between the servers of a database; None for a single server.
     """
 
     def __init__(self, announcements: Announcements | None = None) -> None:
@@ -58,18 +60,18 @@ class Notices:
         self._loop = asyncio.get_running_loop()
         self._audiences: dict[str, Audience] = {}
         self._everything = Audience(0)
-        self._newest: dict[str, int | None] = {}  # id of the newest event at the last look
+        self._newest: dict[str, int | None] = {}  # id of the newest event, as last compared
         self._count = 0
         self.closing = False
         self._announcements.listen(self._hear)
 
     def post(self, surrogate: str) -> None:
-        """Wake the listeners to a surrogate, and the listeners to all, in every server of the database."""
+        """Wake the listeners to this surrogate and those to all surrogates, in every server of the database."""
         self._hear(surrogate)
         self._announcements.announce(surrogate)
 
     def close(self) -> None:
-        """Wake everybody for good, because the server stops."""
+        """Wake all listeners, because the server stops; ``closing`` becomes True."""
         self.closing = True
         self._wake_all()
 
@@ -90,16 +92,16 @@ class Notices:
 
     @property
     def listened(self) -> list[str]:
-        """Names of the surrogates that somebody listens to."""
+        """Names of the surrogates that have a listener of their own."""
         return [*self._audiences]
 
     def compare(self, newest: dict[str, int]) -> None:
-        """Wake the listeners to the surrogates that have changed since the last comparison.
+        """Wake the listeners to the surrogates whose newest event has changed since the last comparison.
 
-        A notice of another server may be lost, and so may the first change of a surrogate that nobody listened to.
+        This replaces notices of other servers that were lost.
 
         Args:
-            newest: id of the newest event of each surrogate that was ``listened`` to and exists.
+            newest: id of the newest event of each surrogate in ``listened`` that exists.
         """
         before, self._newest = self._newest, {name: newest.get(name) for name in self._audiences}
         for name, id in self._newest.items():
@@ -107,9 +109,8 @@ class Notices:
                 self._wake(name)
 
     def _hear(self, surrogate: str | None) -> None:
-        """Wake the listeners of this process to a surrogate. None wakes all listeners, because notices may have been
-        lost."""
-        with suppress(RuntimeError):  # the loop has ended, and nobody listens any more
+        """Wake this process's listeners to a surrogate. None stands for lost notices and wakes all listeners."""
+        with suppress(RuntimeError):  # the event loop has ended, so there is no listener any more
             if surrogate is None:
                 self._loop.call_soon_threadsafe(self._wake_all)
             else:

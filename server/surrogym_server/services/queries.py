@@ -42,12 +42,20 @@ class QueryService:
         wait_seconds: float,
         present: Present | None = None,
     ) -> Claim:
-        """Lease up to ``limit`` queries. If there are none, wait until there are, or until the design ends.
+        """Lease up to ``limit`` queries to a sampler.
 
-        ``present`` raises if the sampler has disconnected meanwhile; then it gets no lease.
+        If no query is open, wait up to ``wait_seconds`` until one is, or until the design ends.
+
+        Args:
+            name: name of the surrogate.
+            sampler: name of the sampler.
+            limit: largest number of queries.
+            lease_seconds: duration of the leases.
+            wait_seconds: longest wait.
+            present: raises if the sampler has closed its connection, which then gets no lease.
 
         Raises:
-            UnknownSurrogate: there is no such surrogate, or it was deleted meanwhile.
+            UnknownSurrogate: the surrogate does not exist, or was deleted during the wait.
         """
 
         def claim() -> Claim:
@@ -61,7 +69,10 @@ class QueryService:
         return leases
 
     def renew(self, name: str, query_id: int, token: str, lease_seconds: float) -> None:
-        """Renew a lease. Raises ``UnknownQuery``, ``ForeignLease`` or ``LeaseExpired``."""
+        """Extend the lease of a query by ``lease_seconds`` from now.
+
+        Raises ``UnknownQuery``, ``ForeignLease`` or ``LeaseExpired``.
+        """
         self._storage.queries.renew(name, query_id, token, lease_seconds)
         if sampler := self._storage.queries.get(name, query_id).sampler:
             self._samplers.heard(name, sampler)
@@ -69,11 +80,14 @@ class QueryService:
     def fail(
         self, name: str, query_id: int, token: str, error: str, *, begun: bool, refused: bool = False
     ) -> QueryRecord:
-        """Return a leased query with an error. ``begun``: a step of it may have been taken. ``refused``: the
-        environment refused it.
+        """End the lease of a query that a sampler could not answer, with the sampler's ``error``.
+
+        ``begun`` is True if a real step may have been taken, ``refused`` if the original environment refused the query.
 
         Raises:
-            UnknownQuery, ForeignLease, LeaseExpired: as the storage says.
+            UnknownQuery: the surrogate has no such query.
+            ForeignLease: the token is not that of a lease of this query.
+            LeaseExpired: the lease has ended.
         """
         record = self._storage.queries.fail(name, query_id, token, error, begun=begun, refused=refused)
         self._notices.post(name)
@@ -82,12 +96,15 @@ class QueryService:
     def add(
         self, name: str, queries: Sequence[Query], key: str | None, *, purpose: Purpose = "manual"
     ) -> list[QueryRecord]:
-        """Queue queries by hand, or of an audit.
+        """Queue queries that a person or an audit (``purpose``) chose, and return their records.
+
+        ``key`` is the idempotency key: a repeat with the same key adds nothing.
 
         Raises:
-            InvalidInput: wrong shape, out of bounds, or a kind that the original environment can't answer.
-            IdempotencyConflict: the same key with other queries.
-            BeyondBudget: all audits together would take more real steps than the design may.
+            InvalidInput: a wrong shape, a value out of bounds, or a kind of query that the original environment can't
+                answer.
+            IdempotencyConflict: the same key came with other queries.
+            BeyondBudget: all audits of the surrogate together would take more real steps than its budget.
         """
         definition = self._definitions.get(name)
         kinds = {query.kind for query in queries}
@@ -108,8 +125,7 @@ class QueryService:
         return [self._storage.queries.get(name, id) for id in ids]
 
     def withdraw_audit(self, name: str, query_ids: Sequence[int]) -> int:
-        """Remove those of the given queries that belong to an audit and that no sampler has begun. Returns their
-        number."""
+        """Remove the given queries that belong to an audit and that no sampler has leased. Return their number."""
         pending = self._storage.queries.list(name, ("pending",))
         audits = [query.id for query in pending if query.purpose == "audit" and query.id in set(query_ids)]
         withdrawn = self._storage.queries.withdraw(name, audits) if audits else 0

@@ -1,4 +1,4 @@
-"""Samples: add, read; and the ledger of real steps."""
+"""Use cases of samples: add them, read them, and count real steps."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from surrogym_server.storage.records import LedgerRecord, LogPart, NewSample, Sa
 from surrogym_shared.nouns import Vector
 
 PAGE = 10_000
-BATCH = 500  # most steps of a log that one transaction stores
-LOG = "log"  # name that logged steps have in the place of a sampler's
+BATCH = 500  # steps of a log that one transaction stores
+LOG = "log"  # name of the sampler of logged steps
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,13 @@ class Added:
     ids: tuple[int, ...]
     duplicates: int
     ledger: LedgerRecord
-    digest: str | None = None  # of a log, see ``storage.records.AddedSamples``
+    digest: str | None = None  # hash of a log's steps so far, see ``storage.records.AddedSamples``
     restart: str | None = None
 
 
 @dataclass(frozen=True)
 class AddedLog:
-    stored: int  # new ones
+    stored: int  # steps of the log that were not stored before
     duplicates: int
 
 
@@ -58,15 +58,22 @@ class SampleService:
         key: str | None,
         log: LogPart | None = None,
     ) -> Added:
-        """Store real steps, all or nothing. They are committed when the call returns.
+        """Store real steps, all or none. They are committed when the call returns.
 
-        Steps of a ``log`` were recorded before the design. When the log is complete, the initial queries that it covers
-        are withdrawn.
+        Args:
+            name: name of the surrogate.
+            sampler: name of the sampler.
+            samples: the real steps, with the lease of their query if they answer one.
+            key: idempotency key; needed for steps that answer no query and belong to no log.
+            log: the part of a log that the steps are, if they were recorded earlier. With the last part, the initial
+                queries that the log covers are withdrawn.
 
         Raises:
-            InvalidInput: wrong shape, an action out of bounds, or samples without a query and without a key. The
-                message names the sample by its index.
-            UnknownQuery, ForeignLease, IdempotencyConflict: as the classes say.
+            InvalidInput: a wrong shape, an action out of bounds, or a missing key. The message names the sample by its
+                index.
+            UnknownQuery: the surrogate has no such query.
+            ForeignLease: the token is not that of a lease of this query.
+            IdempotencyConflict: the same key came with other samples.
         """
         definition = self._definitions.get(name)
         checked = [_checked(definition, index, sample) for index, sample in enumerate(samples)]
@@ -84,10 +91,10 @@ class SampleService:
         return Added(added.ids, added.duplicates, self._storage.ledger.read(name), added.digest, added.restart)
 
     def add_log(self, name: str, samples: Sequence[NewSample], origin: str | None = None) -> AddedLog:
-        """Store a whole log, batch by batch; a repeat stores what an earlier call did not. Raises as ``add``.
+        """Store all steps of a log, in batches. A repeat stores the steps that an earlier call did not.
 
-        ``origin`` distinguishes the log from others with the same numbers; with None, logs with the same numbers count
-        as one.
+        ``origin`` names the source of the log: logs of different origins are stored apart even if their numbers are
+        equal. Raises the errors of ``add``.
         """
         first, duplicates, after = 0, 0, origin
         while first < len(samples):
@@ -121,18 +128,18 @@ class SampleService:
         return self._storage.samples.page(name, after, limit)
 
     def snapshots(self, name: str) -> dict[str, Vector]:
-        """Return the coordinates (C,) of the snapshots that samplers hold, by name."""
+        """Return the coordinates (C,) of each snapshot that samplers hold, by the snapshot's name."""
         return self._storage.snapshots.all(name)
 
     def drop_snapshots(self, name: str, snapshots: Sequence[str]) -> int:
-        """Forget snapshots that no sampler holds any more, and return how many were known. Queries that begin there
-        are chosen anew."""
+        """Remove snapshots that no sampler holds any more, and return the number removed. Queries that begin at them
+        are replaced by new ones."""
         count = self._storage.snapshots.drop(name, snapshots)
         self._notices.post(name)
         return count
 
     def all(self, name: str) -> list[SampleRecord]:
-        """Return all samples, in order of arrival."""
+        """Return all samples of a surrogate, in order of arrival."""
         records = page = self.page(name, 0, PAGE)
         while len(page) == PAGE:
             page = self.page(name, page[-1].id, PAGE)
@@ -140,19 +147,19 @@ class SampleService:
         return records
 
     def coordinate_names(self, name: str) -> tuple[str, ...]:
-        """Return the names of the entries of a sample's coordinates."""
+        """Return the names of a surrogate's coordinates, in their order in a sample."""
         return self._definitions.get(name).coordinate_names
 
     def report_steps(self, name: str, steps: int, episodes: int, note: str, key: str) -> LedgerRecord:
-        """Count evaluation steps, once for each key."""
+        """Add real steps of an evaluation to the surrogate's counts, once for each key, and return the counts."""
         return self._storage.ledger.report(name, steps, key=key, episodes=episodes, note=note)
 
 
 def check_trajectories(samples: Sequence[NewSample]) -> None:
-    """Check that each step of a rollout begins where the one before it ended, and that no step follows an end.
+    """Check that each step of a rollout begins where its previous step ended, and that none follows an episode's end.
 
     Raises:
-        InvalidInput: names the sample.
+        InvalidInput: a step breaks this; the message names the sample by its index.
     """
     steps = {(s.query_id, s.lease_token, s.step): s for s in samples}
     for index, sample in enumerate(samples):

@@ -1,4 +1,4 @@
-"""Sessions: open, look at, submit occupancy, close; save at shutdown and restore at start. Steps go to the engine."""
+"""Use cases of sessions besides steps: open, describe, submit occupancy, close, save at shutdown, restore at start."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from surrogym_server.services.definitions import Definitions
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import SavedSession
 
-MOST_STARTS = 10_000  # states of real steps at which the episodes of a session start
+MOST_STARTS = 10_000  # largest number of real states that a session gets as starts of its episodes
 
 logger = logging.getLogger(__name__)
 
 
 class SessionService:
-    """Opens, describes, saves and restores sessions. It connects their engine with the storage."""
+    """Opens, describes, saves and restores sessions. It connects the session engine with the storage."""
 
     def __init__(self, storage: Storage, definitions: Definitions, engine: SessionEngine) -> None:
         self._storage = storage
@@ -36,22 +36,23 @@ class SessionService:
 
     @property
     def replay(self) -> int:
-        """Number of its last requests that a client should keep, to repeat them after a checkpoint."""
+        """Number of a session's last requests that a client should keep, to repeat them if the session goes back to a
+        checkpoint."""
         return self._engine.replay
 
     async def open(self, surrogate: str, opening: Opening) -> SessionInfo:
-        """Open a session; raises ``UnknownSurrogate``, and as ``SessionEngine.open``."""
+        """Open a session of a surrogate. Raises ``UnknownSurrogate``, and the errors of ``SessionEngine.open``."""
         return await self._engine.open(await asyncio.to_thread(self._request, surrogate, opening))
 
     async def get(self, id: str) -> SessionInfo:
         """Return a session's present state.
 
         Raises:
-            UnknownSession: the session does not exist, or it went back to a checkpoint before its last reply.
+            UnknownSession: the session does not exist, or it lost its last replies with its session host.
             SessionExpired: the session was idle for too long.
         """
         info = await self._engine.describe(id)
-        if info.behind:  # a caller that asks for the session's state has kept no requests to repeat
+        if info.behind:  # a caller that needs this description has kept no requests that it could repeat
             raise UnknownSession(f"session {id!r} lost its session host, and is behind its last reply: open a new one")
         return info
 
@@ -60,25 +61,27 @@ class SessionService:
         return await self._engine.coordinates(id)
 
     async def close(self, id: str) -> None:
-        """End a session; harmless when it has ended."""
+        """End a session. Does nothing if the session has ended already."""
         await self._engine.close(id)
 
     async def submit_occupancy(self, id: str, checkpoint: str) -> tuple[int, float]:
-        """Store the states that a session visited under a checkpoint's name. Return their number, and the confidence
-        index over them. The surrogate is found by its id, because another surrogate may have its name by now.
+        """Store the states that a session visited, under the name ``checkpoint``.
+
+        Returns the number of states, and the confidence index of the session's model over them.
 
         Raises:
             InvalidInput: the session was opened without occupancy.
-            NotReset: nothing was visited yet.
-            UnknownSurrogate: it was deleted by another server.
+            NotReset: the session has visited no state yet.
+            UnknownSurrogate: another server deleted the surrogate.
         """
         visits = await self._engine.submit(id)
+        # Another surrogate may have the session's name by now, so the surrogate is found by its id.
         name = await asyncio.to_thread(self._storage.surrogates.name_of, visits.surrogate_id)
         await asyncio.to_thread(self._storage.occupancy.put, name, checkpoint, visits.states)
         return len(visits.states), visits.confidence_index
 
     async def activity(self, surrogate: str) -> list[SessionActivity]:
-        """Return the activity of a surrogate's open sessions, oldest first. Raises ``UnknownSurrogate``."""
+        """Return what each open session of a surrogate is doing, oldest first. Raises ``UnknownSurrogate``."""
         await asyncio.to_thread(self._storage.surrogates.get, surrogate)
         return await self._engine.activity(surrogate)
 
@@ -89,8 +92,7 @@ class SessionService:
         return len(sessions)
 
     async def restore(self) -> int:
-        """Restore the saved sessions, and return how many were restored. The log names each session that can't be
-        restored, and why."""
+        """Restore the saved sessions, and return their number. Each session that can't be restored is logged."""
         try:
             saved_sessions = self._storage.sessions.take()
         except Damaged as error:
@@ -115,8 +117,10 @@ class SessionService:
         return Open(surrogate, record.id, definition, opening, rewards, starts)
 
     def _starts(self, surrogate: str, opening: Opening) -> Array | None:
-        """States of the surrogate's real steps, evenly spaced if there are more than ``MOST_STARTS``; None if the
-        session starts no episode there."""
+        """Return the states (n, C) of real steps at which the session may start episodes, at most ``MOST_STARTS``.
+
+        Returns None if the session's settings start no episode at such states.
+        """
         if opening.settings.start_visited == 0:
             return None
         states = self._storage.samples.arrays(surrogate).coordinates

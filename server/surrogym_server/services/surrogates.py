@@ -1,4 +1,4 @@
-"""Surrogates: create, look at, change, delete."""
+"""Use cases of surrogates: create, describe, change, delete."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ Plan = Callable[[EnvironmentDefinition, int], tuple[Query, ...]]
 Complete = Callable[[dict[str, Any]], dict[str, Any]]
 
 ABSENT = object()
-READS = 3  # most times that a status is read, while rounds are stored
-SHOWN = 120  # largest number of characters of a value in an error
+READS = 3  # largest number of attempts to read a consistent status while fits are stored
+SHOWN = 120  # largest number of characters of a value in an error message
 
 
 @dataclass(frozen=True)
 class Listed:
-    """Entry of a list: a surrogate, its samplers and its sessions."""
+    """Entry in the list of surrogates, with the active samplers and the number of open sessions."""
 
     summary: SurrogateSummary
-    samplers: tuple[str, ...]  # heard of within the last minute
-    sessions: int  # open
+    samplers: tuple[str, ...]  # names of the samplers that called within the last minute or so
+    sessions: int  # number of open sessions
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class SurrogateStatus(Listed):
 
 @dataclass(frozen=True)
 class Checked:
-    """Preview of what a registration would store."""
+    """Preview of a registration, of which nothing is stored."""
 
-    initial: int  # real steps of the initial queries
+    initial: int  # number of real steps of the initial queries
     outputs: tuple[str, ...]
-    exists: bool  # with the same spec
+    exists: bool  # whether the surrogate exists with the same specification
 
 
 class SurrogateService:
@@ -72,17 +72,18 @@ class SurrogateService:
         notices: Notices,
         samplers: Samplers,
     ) -> None:
-        """
+        """Keep the objects of the server that this service needs.
+
         Args:
             storage: stores the surrogates.
             definitions: definitions of the stored surrogates.
             define: returns the definition of a new specification; raises ``InvalidSpec`` if it needs a package that is
                 not installed.
-            complete: returns a specification with every field that this program knows, as JSON; one from an older
-                program may lack some.
+            complete: adds the fields that a specification (JSON) of an older program lacks.
             plan: returns the first queries of a design, given its budget.
-            engine: has the sessions of all surrogates.
-            notices, samplers: those of this process.
+            engine: runs the sessions of all surrogates.
+            notices: notices of this process.
+            samplers: active samplers that called this process.
         """
         self._storage = storage
         self._definitions = definitions
@@ -94,9 +95,16 @@ class SurrogateService:
         self._samplers = samplers
 
     def create(self, name: str, spec: dict[str, Any], budget: int, target: float) -> tuple[SurrogateStatus, bool]:
-        """Create a surrogate with its initial queries. The same name and specification again change nothing.
+        """Create a surrogate with its initial queries. A repeat with the same name and specification changes nothing.
 
-        Returns the surrogate's status, and whether this call created it.
+        Args:
+            name: name of the surrogate.
+            spec: specification as JSON.
+            budget: largest number of real steps of the design.
+            target: confidence index at which the design ends.
+
+        Returns:
+            The surrogate's status, and whether this call created it.
 
         Raises:
             SpecConflict: the name exists with another specification.
@@ -110,7 +118,7 @@ class SurrogateService:
         return self.status(name), created
 
     def check(self, name: str, spec: dict[str, Any], budget: int) -> Checked:
-        """Check what ``create`` would do, without doing it. Raises as ``create``."""
+        """Preview what ``create`` would store, without storing it. Raises the errors of ``create``."""
         definition = self._define(spec)
         initial = sum(query.steps for query in self._plan(definition, budget))
         try:
@@ -127,7 +135,7 @@ class SurrogateService:
         return self._status(self._storage.surrogates.get(name))
 
     def spec(self, name: str) -> dict[str, Any]:
-        """Return the stored specification. Raises ``UnknownSurrogate``."""
+        """Return the stored specification of a surrogate. Raises ``UnknownSurrogate``."""
         return self._storage.surrogates.get(name).spec
 
     def list(self, after: int, limit: int) -> list[Listed]:
@@ -147,11 +155,13 @@ class SurrogateService:
         target: float | None = None,
         tolerances: dict[str, float | None] | None = None,
     ) -> SurrogateStatus:
-        """Change the fields that are not None. A tolerance of None removes the one that was set for its output.
+        """Change the fields of a surrogate that are given (not None), and return its status.
+
+        ``tolerances`` are by output, in the output's unit; None for an output removes its tolerance.
 
         Raises:
-            UnknownSurrogate: there is none of this name.
-            InvalidInput: a tolerance for a name that is not an output.
+            UnknownSurrogate: there is no surrogate of this name.
+            InvalidInput: ``tolerances`` has a name that is not an output.
         """
         outputs = self._definitions.get(name).outputs
         if unknown := sorted(set(tolerances or ()) - set(outputs)):
@@ -161,7 +171,7 @@ class SurrogateService:
         return self.status(name)
 
     async def delete(self, name: str) -> None:
-        """Remove a surrogate with its samples, models and sessions; raises ``UnknownSurrogate``."""
+        """Delete a surrogate with its samples, models and sessions. Raises ``UnknownSurrogate``."""
         surrogate = await asyncio.to_thread(lambda: self._storage.surrogates.get(name).id)
         await asyncio.to_thread(self._storage.surrogates.delete, name)
         await self._engine.forget(surrogate)
@@ -180,13 +190,13 @@ class SurrogateService:
         )
 
     def _read(self, name: str) -> tuple[SurrogateSummary, ModelRecord | None, int]:
-        """Return the summary, the latest model, and the real steps that the budget has left, of the same moment.
+        """Return a surrogate's summary, its latest model, and the real steps left in its budget, all of one moment.
 
-        They are three reads. If a round was stored in between, all are repeated, a few times.
+        If a fit is stored between the three reads, all are repeated, at most ``READS`` times.
         """
         for _ in range(READS):
             left = self._storage.designs.left(name)
-            summary = self._storage.surrogates.summary(name)  # before the model, which is then never older
+            summary = self._storage.surrogates.summary(name)  # read before the model, which then can't be the older one
             try:
                 model = self._storage.models.get(name)
             except NoModel:

@@ -1,4 +1,5 @@
-"""The sweeper: ends expired leases and sessions, finds what other servers have changed, and removes old events."""
+"""The sweeper: periodic work that ends expired leases and sessions, finds changes of other servers and removes old
+events."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from surrogym_server.storage.port import Storage
 
 logger = logging.getLogger(__name__)
 
-EVENTS_KEPT = 10_000  # most events of a surrogate that are kept, the newest ones
+EVENTS_KEPT = 10_000  # number of newest events of a surrogate that are kept
 PRUNE_SECONDS = 60.0
 
 
@@ -30,7 +31,10 @@ class Sweeper:
         notices: Notices,
         others: Sequence[Callable[[], Awaitable[None]]] = (),
     ) -> None:
-        """``others`` are functions of features, called at each sweep."""
+        """Keep the objects to sweep.
+
+        ``seconds`` is the time between sweeps, and ``others`` are functions of optional features for each sweep.
+        """
         self._storage = storage
         self._engine = engine
         self._seconds = seconds
@@ -40,14 +44,18 @@ class Sweeper:
         self._pruned = -PRUNE_SECONDS
 
     async def run(self) -> None:
-        """Sweep in fixed intervals, until cancelled."""
+        """Sweep every ``seconds`` until cancelled."""
         while True:
             await self.sweep()
             await asyncio.sleep(self._seconds)
 
     async def sweep(self) -> None:
-        """Sweep once. The query of an expired lease goes to the next sampler or is set aside. A session whose surrogate
-        another server has deleted ends."""
+        """Do the periodic work once.
+
+        Queries of expired leases become open again or are set aside. Expired sessions end, and so do sessions whose
+        surrogate another server has deleted. Requests that wait for a changed surrogate are woken. Old events are
+        removed.
+        """
         await self._try(self._engine.sweep)
         for sweep in (self._sweep_leases, *self._others):
             await self._try(sweep)
@@ -58,8 +66,7 @@ class Sweeper:
         self._metrics.expired_leases += await asyncio.to_thread(self._storage.queries.sweep_expired)
 
     async def _find_changes(self) -> None:
-        """Wake those who wait for a surrogate that has changed, although the notice of the change was lost. One
-        statement asks for all surrogates."""
+        """Wake the requests that wait for a surrogate that has changed, in case the notice of the change was lost."""
         if names := self._notices.listened:
             self._notices.compare(await asyncio.to_thread(self._storage.events.newest, names))
 
@@ -68,12 +75,12 @@ class Sweeper:
             await sweep()
         except SurrogymError as error:
             logger.warning("a sweep stopped early; it is repeated shortly: %s", error)
-        except Exception:  # the next sweeps have to run, whatever error this one raises
+        except Exception:  # an error in one sweep must not stop the later ones
             logger.exception("a sweep failed; it is repeated shortly")
 
     def _prune(self) -> None:
-        """Once in ``PRUNE_SECONDS``, remove the oldest events of surrogates that have more than ``EVENTS_KEPT``, and
-        what a crash has left of deleted surrogates."""
+        """Every ``PRUNE_SECONDS``, remove the events of each surrogate beyond the newest ``EVENTS_KEPT``, and finish
+        deletions of surrogates that a crash interrupted."""
         now = time.monotonic()
         if now - self._pruned < PRUNE_SECONDS:
             return
