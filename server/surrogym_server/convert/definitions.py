@@ -1,4 +1,4 @@
-"""Derives a definition, with indices and defaults, from a specification, with names."""
+"""Conversion of a specification (names, optional fields) to an environment definition (indices, resolved defaults)."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from surrogym_server.plugins import Choice
 from surrogym_server.sampling.acquisition import check_acquisition
 from surrogym_shared import spec as wire
 
-MONTE_CARLO = 1024
-LONGEST_ROLLOUT = 200  # if the specification has none
+MONTE_CARLO = 1024  # number of Monte Carlo points if the specification has none
+LONGEST_ROLLOUT = 200  # largest number of steps of a rollout if the specification has none
 
 
 def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
-    """Convert the specification of a new design, with every default of its preset resolved.
+    """Convert the specification of a new surrogate; fields that it leaves open get the defaults of its preset.
 
     Raises:
-        InvalidSpec: the preset can't represent this environment, or an acquisition or a family of models is not
-            installed, does not take its settings, or does not fit this environment.
+        InvalidSpec: the preset can't represent this environment, or the acquisition or the model family is not
+            installed, refuses its settings, or does not fit this environment.
     """
     definition = stored_definition(spec)
     learner_of(definition.learning.model)
@@ -31,7 +31,7 @@ def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefiniti
 
 
 def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
-    """Convert a stored specification. Its plug-ins need not be installed any more; only their use would fail.
+    """Convert the specification of a stored surrogate. This works even if its plug-ins are no longer installed.
 
     Raises:
         InvalidSpec: the preset can't represent this environment.
@@ -64,7 +64,7 @@ def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
 
 
 def default_budget(spec: wire.EnvironmentSpec) -> int:
-    """Return the budget of the design: the specification's, or the preset's."""
+    """Return the budget of the design in real steps: that of the specification, or else that of its preset."""
     if spec.design.budget is not None:
         return spec.design.budget
     initial = _design(spec).initial
@@ -98,8 +98,8 @@ def _learning(spec: wire.EnvironmentSpec) -> core.LearningDefinition:
 
 
 def _model(spec: wire.EnvironmentSpec) -> Choice:
-    """The family of models. The preset chooses the settings of Gaussian processes that the specification
-    leaves open."""
+    """Return the model family and its settings. For Gaussian processes, the preset gives the settings that the
+    specification leaves open."""
     choice = in_full(_choice(spec.design.model, GAUSSIAN_PROCESS))
     if choice.name == GAUSSIAN_PROCESS:
         settings = {**spec.preset.gaussian_process, "symmetry": spec.design.symmetry, **dict(choice.settings)}
@@ -147,7 +147,7 @@ def _distribution(distribution: wire.Uniform | wire.Normal | wire.Fixed) -> dist
             return distributions.NormalDefinition(mean, std, *distribution.limits)
         case wire.Fixed(value=value):
             return distributions.FixedDefinition(value)
-    raise InvalidSpec(f"expected a distribution that this version knows, got {distribution!r}")
+    raise InvalidSpec(f"expected a uniform, normal or fixed distribution, got {distribution!r}")
 
 
 def _term(term: wire.Term, names: tuple[str, ...]) -> terms.TermDefinition:

@@ -1,4 +1,4 @@
-"""Conversion of logs: from text to checked rows, and from checked rows to samples and replies."""
+"""Conversion of logs: from CSV text to checked rows, and from checked rows to samples and replies."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from surrogym_shared.logs.text import table_of_text
 from surrogym_shared.spec import EnvironmentSpec
 
 MOST_ROWS = 50_000
-LONGEST_REASON = 300  # letters
+LONGEST_REASON = 300  # largest number of characters of the reason why a row was rejected
 WHERE = "the log"
 
 
 def drafted_log(body: wire.DraftLog) -> ReadLog:
-    """A log with a specification drafted from it. Raises ``InvalidInput`` if it can't be used."""
+    """Read a log and draft a specification from it. Raises ``InvalidInput`` if the log can't be used."""
     try:
         table, roles = _table(body)
         return draft_log(table, roles, body.environment, body.budget)
@@ -32,11 +32,11 @@ def drafted_log(body: wire.DraftLog) -> ReadLog:
 
 
 def checked_log(body: wire.AddLog, spec: dict[str, Any]) -> ReadLog:
-    """A log, checked against a stored specification.
+    """Read a log, and check it against the stored specification ``spec``.
 
     Raises:
-        InvalidInput: it can't be used.
-        Damaged: the specification can't be read.
+        InvalidInput: the log can't be used.
+        Damaged: the stored specification can't be read.
     """
     read = read_stored(EnvironmentSpec, "a stored specification", spec)
     try:
@@ -47,7 +47,7 @@ def checked_log(body: wire.AddLog, spec: dict[str, Any]) -> ReadLog:
 
 
 def logged_samples(log: ReadLog) -> list[NewSample]:
-    """The usable steps of a log, in its order."""
+    """Return the usable steps of a log as samples, in the order of the log."""
     steps = log.steps
     columns = (steps.q, steps.u, steps.q_next, log.reward, steps.terminated, steps.truncated)
     return [
@@ -67,7 +67,7 @@ def added_report(log: ReadLog, added: AddedLog) -> wire.AddedLog:
 def _table(body: wire.DraftLog | wire.AddLog) -> tuple[Table, Roles]:
     if "\0" in body.text or "\ufffd" in body.text:
         raise UnusableLog(
-            f"expected text in UTF-8 in {WHERE}, got another encoding: surrogym import reads more of them"
+            f"expected text in UTF-8 in {WHERE}, got another encoding: convert it, or use the command surrogym import"
         )
     table = table_of_text(body.text.removeprefix("\ufeff"), WHERE, MOST_ROWS)
     if not len(table):

@@ -12,15 +12,15 @@ from surrogym_server.errors import InvalidInput
 
 
 def numbers(what: str, rows: Sequence[Any]) -> NDArray[np.float64]:
-    """Convert nested lists to an array.
+    """Convert nested lists to an array; ``what`` names them in the error.
 
     Raises:
-        InvalidInput: rows of different lengths.
+        InvalidInput: the rows have different lengths.
     """
     try:
         return np.array(rows, dtype=np.float64)
     except (ValueError, TypeError) as error:
-        raise InvalidInput(f"{what}: expected rows of one length, got different ones") from error
+        raise InvalidInput(f"{what}: expected rows of one length, got rows of different lengths") from error
 
 
 def as_tuple(value: Any) -> Any:

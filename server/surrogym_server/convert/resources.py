@@ -1,4 +1,4 @@
-"""Conversion of surrogates, queries, samples, models and events: records to replies."""
+"""Conversion of surrogates, queries, samples, models and events from stored records to replies."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from surrogym_shared import spec as wire
 from surrogym_shared import wire as replies
 from surrogym_shared.nouns import Query, Vector
 
-FIDELITY = "the fidelity of a model"  # name in the error if it is damaged
+FIDELITY = "the fidelity of a model"  # name of this stored document in an error message
 
 
 def surrogate_list(listed: Sequence[Listed], limit: int) -> replies.SurrogateList:
-    """A page of ``limit`` surrogates. There is a next page if more are ``listed``."""
+    """Return the page of the first ``limit`` of the ``listed`` surrogates. If more are listed, there is a next page."""
     page, more = listed[:limit], len(listed) > limit
     surrogates = [_summary_fields(one) for one in page]
     return replies.SurrogateList.model_validate(
@@ -110,10 +110,10 @@ def _ledger_fields(record: LedgerRecord) -> dict[str, int]:
 
 
 def requested(body: replies.AddQueries) -> list[Query]:
-    """The queries that a person or a program chose: single steps, then rollouts.
+    """Return the queries of a request that adds queries: first the single steps, then the rollouts.
 
     Raises:
-        InvalidInput: rows of different lengths, or another number of actions than of coordinates.
+        InvalidInput: rows have different lengths, or the numbers of coordinates and actions differ.
     """
     q, u = numbers("coordinates", body.coordinates or ()), numbers("action", body.action or ())
     if len(q) != len(u):

@@ -1,4 +1,4 @@
-"""Conversion of sessions: requests to openings, and answers to replies and frames."""
+"""Conversion for sessions: requests to the engine's types, and the engine's answers to JSON replies and frames."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def session_view(session: SessionInfo, idle_seconds: float, replay: int = 0) -> 
 
 
 def session_coordinates(coordinates: Array) -> replies.SessionCoordinates:
-    """The reply with coordinates (N, C)."""
+    """Return the reply that holds the coordinates (N, C) of a session's lanes."""
     return replies.SessionCoordinates(coordinates=coordinates.tolist())
 
 
@@ -123,7 +123,7 @@ def lane_mask(mask: list[bool] | None) -> NDArray[np.bool_] | None:
 
 
 def reset_reply(reply: Reply) -> dict[str, Any]:
-    """The fields of ``ResetReply``, not validated, because this and ``step_reply`` are on the path of every step."""
+    """Return the fields of the JSON reply to a reset. They are not validated again, to keep replies fast."""
     assert isinstance(reply.outcome, ResetResult)
     result = reply.outcome
     return {
@@ -134,20 +134,20 @@ def reset_reply(reply: Reply) -> dict[str, Any]:
 
 
 def step_reply(reply: Reply) -> dict[str, Any]:
-    """The fields of ``StepReply``."""
+    """Return the fields of the JSON reply to a step. They are not validated again, because each step does this."""
     assert isinstance(reply.outcome, tuple)
     return _step_fields(reply.seq, reply.outcome[0])
 
 
 def rollout_steps(reply: Reply) -> Iterator[dict[str, Any]]:
-    """The fields of the steps of ``RolloutReply``, one by one. They all have the seq of the request."""
+    """Yield the fields of each step in the JSON reply to a rollout. All steps have the request's sequence number."""
     assert not isinstance(reply.outcome, ResetResult)
     steps = reply.outcome.steps() if isinstance(reply.outcome, PolicyRollout) else reply.outcome
     return (_step_fields(reply.seq, step) for step in steps)
 
 
 def rollout_actions(reply: Reply) -> dict[str, Any]:
-    """The fields of ``RolloutReply`` about a policy's actions; none without a policy."""
+    """Return the fields of the reply to a rollout that hold a policy's actions; empty if no policy chose them."""
     if not isinstance(reply.outcome, PolicyRollout):
         return {}
     log = reply.outcome.log_probability
@@ -155,13 +155,14 @@ def rollout_actions(reply: Reply) -> dict[str, Any]:
 
 
 def policy_run(request: replies.RolloutSession) -> PolicyRun:
-    """Read a policy's run from arrays. Raises ``InvalidInput`` if they don't fit together."""
+    """Read the policy and its settings from a JSON request for a rollout. Raises ``InvalidInput`` if the shapes of the
+    policy's arrays contradict each other."""
     assert request.policy is not None
     assert request.steps is not None
     given, dtype = request.policy, np.dtype(request.policy.precision)
 
     def array(name: str, rows: Any) -> NDArray[Any]:
-        with np.errstate(over="ignore"):  # values too large for float32 become infinite, and are refused as such
+        with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite, which is refused later
             return numbers(name, rows).astype(dtype)
 
     try:
@@ -179,13 +180,13 @@ def policy_run(request: replies.RolloutSession) -> PolicyRun:
 
 
 def framed_policy_run(request: frames.PolicyRequest, shape: frames.Shape) -> PolicyRun:
-    """Read a policy's run from a frame. Raises ``FrameError``."""
+    """Read the policy and its settings from a binary request for a rollout. Raises ``FrameError``."""
     policy, until = frames.policy_of(request, shape), frames.until_of(request, shape)
     return PolicyRun(policy, request.steps, frames.noise_of(request), until)
 
 
 def session_shape(session: SessionInfo) -> frames.Shape:
-    """The numbers of a session that its frames omit."""
+    """Return the sizes of a session's arrays, which its frames don't contain."""
     definition = session.definition
     return frames.Shape(
         lanes=session.settings.num_envs,

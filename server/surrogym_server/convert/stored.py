@@ -1,4 +1,4 @@
-"""Reading of stored documents with the wire's models."""
+"""Reading of stored JSON documents as pydantic models of the API."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def read_stored(model: type[M], what: str, stored: dict[str, Any]) -> M:
-    """Read a document as an instance of its model.
+    """Read a stored document as an instance of its pydantic model.
 
     Args:
-        model: the model that it was written from.
-        what: its name in the error, with an article.
-        stored: the document in the database.
+        model: pydantic model of the document.
+        what: name of the document for the error message, with an article.
+        stored: the document as it is in the database.
 
     Raises:
-        Damaged: the document does not fit the model; names the field.
+        Damaged: the document does not fit the model; the message names the field.
     """
     try:
         return model.model_validate(stored)

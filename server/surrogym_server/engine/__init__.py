@@ -1,1 +1,1 @@
-"""Live sessions, and the processes in which fits run."""
+"""Engines that run sessions, and the processes in which fits run."""

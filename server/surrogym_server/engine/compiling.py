@@ -19,17 +19,17 @@ import surrogym_server.virtual.compiled.step
 import surrogym_server.virtual.words
 """
 PACKAGE = "surrogym_server"
-LONGEST = 120.0  # seconds that a session waits for the compilation; then it compiles by itself
+LONGEST = 120.0  # longest wait of a session for the compilation, in seconds; after it, the session compiles itself
 
 
 class Compiling:
-    """A child process that compiles steps for the cache on the disk."""
+    """A child process that compiles the code of steps and stores it in the cache on the disk."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """Start the process, unless compiled steps can't be stored on the disk, or are there already."""
+        """Start the compilation, unless the cache on the disk can't be used or has compiled steps already."""
         is_cold = compiled.available() and disk_cache.folder(PACKAGE) is not None and not disk_cache.has_any(PACKAGE)
         if self._process is None and is_cold:
             self._process = subprocess.Popen(
@@ -37,13 +37,13 @@ class Compiling:
             )
 
     def wait(self) -> None:
-        """Wait until the process has ended, with or without success. It blocks, so call it in a thread."""
+        """Wait until the compilation has ended, at most ``LONGEST`` seconds. This blocks, so call it in a thread."""
         if self._process is not None:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(LONGEST)
 
     def close(self) -> None:
-        """End the process."""
+        """Kill the child process, if it was started."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()

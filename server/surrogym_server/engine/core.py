@@ -1,4 +1,4 @@
-"""Apply requests to sessions: pure functions, which every engine and ``LocalSurrogate`` call."""
+"""Pure functions that apply requests to sessions. Every engine and ``LocalSurrogate`` call them."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 SESSION_ID_BYTES = 16
-MAX_PARTICLES = 4_000_000  # most particles of all lanes of a session together
+MAX_PARTICLES = 4_000_000  # largest number of particles in all lanes of a session together
 MAX_PATHWISE_LANES = (
-    4_096  # most lanes of variant ``pathwise``, in which each has a sampled function of some thousand numbers
+    4_096  # largest number of lanes in variant ``pathwise``, in which a lane needs memory for a sampled function
 )
 
 
@@ -47,14 +47,14 @@ class Models(Protocol):
     """Source of models for sessions. ``engine.models.ModelCache`` implements it."""
 
     def get(self, surrogate: int, version: int, device: torch.device, /) -> DynamicsModel:
-        """Return the model of a version, on a device."""
+        """Return version ``version`` of a surrogate's model, with its tensors on ``device``."""
 
     def latest(self, surrogate: int, /) -> int:
-        """Return the version for new episodes."""
+        """Return the newest version of a surrogate's model, under which new episodes start."""
 
 
 def check_size(settings: VirtualSettings, max_lanes: int) -> None:
-    """Raise ``TooLarge`` if a session has more lanes or particles than the limit."""
+    """Raise ``TooLarge`` if a session would have more than ``max_lanes`` lanes or too many particles."""
     if settings.num_envs > max_lanes:
         raise TooLarge(f"expected at most {max_lanes} lanes, got {settings.num_envs}")
     particles = settings.num_envs * settings.particles
@@ -67,14 +67,14 @@ def check_size(settings: VirtualSettings, max_lanes: int) -> None:
 def opened(
     request: Open, definition: EnvironmentDefinition, model: DynamicsModel, version: int, digest: str, place: str = ""
 ) -> Session:
-    """Open a new session, which steps in the fastest form that its model has.
+    """Return a new session, which uses the fastest implementation of steps that its model has.
 
     Args:
-        request: the opening.
-        definition: definition of the surrogate, on the device of the lanes.
-        model: the version that the session begins with, on the same device.
-        version: number of this version.
-        digest: content hash of the opening, to recognise a repeat.
+        request: request to open the session.
+        definition: definition of the environment, on the device of the session.
+        model: the model that the session begins with, on the same device.
+        version: version of this model.
+        digest: content hash of the request, to recognise a repeat.
         place: suffix of the session's id.
     """
     opening = request.opening
@@ -98,10 +98,10 @@ def opened(
 
 
 def resolved(opening: Opening, definition: EnvironmentDefinition) -> VirtualSettings:
-    """Fill in what a trainer left open in the settings of its session, with the surrogate's values.
+    """Return the settings of a session; the time limit and the penalty default to those of the surrogate.
 
     Raises:
-        InvalidInput: sensor noise of an unknown coordinate, or a residual that does not fit the environment.
+        InvalidInput: the sensor noise names an unknown coordinate, or the residual does not fit the environment.
     """
     check_sensors(definition, opening.settings.sensor_noise)
     if opening.settings.residual is not None:
@@ -114,18 +114,18 @@ def resolved(opening: Opening, definition: EnvironmentDefinition) -> VirtualSett
 
 
 def limits_rewards(definition: EnvironmentDefinition) -> bool:
-    """Whether virtual rewards are limited by the samples' rewards.
+    """Whether rewards of virtual steps are limited to the range of the samples' rewards.
 
-    A declared reward is exact, so it is not limited. In preset ``paper`` no reward is.
+    They are not if the reward is declared, which makes it exact, or in preset ``paper``.
     """
     return definition.declared_reward is None and definition.learning.limits_rewards
 
 
 def _limited(settings: VirtualSettings, rewards: SampledRewards | None, model: DynamicsModel) -> VirtualSettings:
-    """Limit virtual rewards to the range of the sampled ones.
+    """Add limits of virtual rewards to the settings of a session, from the range of the samples' rewards.
 
-    They stay as they are if the reward is declared or unlimited by design, or if an imported model has learned from
-    samples that are not stored here.
+    There are no limits if the surrogate's rewards are not limited, or if the model has learned from more samples than
+    are stored, as an imported model may have.
     """
     if rewards is None or not limits_rewards(model.definition) or model.samples > rewards.samples:
         return settings
@@ -133,20 +133,22 @@ def _limited(settings: VirtualSettings, rewards: SampledRewards | None, model: D
 
 
 def _starts(settings: VirtualSettings, definition: EnvironmentDefinition, states: Array | None) -> Tensor | None:
-    """States of real steps, (k, C), at which a share of the episodes starts; None if the settings have no such share.
+    """Return the states (k, C) of real steps at which a share of the episodes starts; None if this share is 0.
 
     Raises:
-        InvalidInput: there are no real steps.
+        InvalidInput: the share is above 0, and the surrogate has no real steps.
     """
     if settings.start_visited == 0:
         return None
     if states is None or not len(states):
-        raise InvalidInput("start_visited: expected a surrogate with real steps, got one without, such as a file's")
+        raise InvalidInput(
+            "start_visited: expected a surrogate with real steps, got one without (a file has none): set it to 0"
+        )
     return torch.tensor(states, dtype=torch.float64, device=definition.device)
 
 
 def fingerprint_of(request: Advance) -> Fingerprint:
-    """Fingerprint of a request. Only a request with the same fingerprint is a repeat, on any transport."""
+    """Return the content hash of a request, by which a repeat is recognised. It does not depend on the transport."""
     match request:
         case Step():
             return Fingerprint("step", _columns(request.action, 2), request.mask, request.stds)
@@ -154,14 +156,14 @@ def fingerprint_of(request: Advance) -> Fingerprint:
             return Fingerprint("reset", request.seed, request.mask)
         case Rollout():
             return Fingerprint("rollout", _columns(request.actions, 3))
-        case PolicySteps():  # hashed at once, because a lazy hash would keep the policy in memory
+        case PolicySteps():  # computed now: a hash computed on first use would keep the policy in memory until then
             return Fingerprint(digest=digest_of("policy", *parts_of(request.run)))
         case _:
             assert_never(request)
 
 
 def steps_asked(request: Advance) -> int:
-    """Largest number of virtual steps that a request may take; a reset counts as one."""
+    """Return the largest number of virtual steps that a request may take; a reset counts as one."""
     match request:
         case Rollout():
             return len(request.actions)
@@ -174,25 +176,23 @@ def steps_asked(request: Advance) -> int:
 def carried_out(
     request: Advance, models: Models, require_wanted: Callable[[], None], interrupts: bool, session: Session
 ) -> tuple[Session, Outcome]:
-    """Apply a request to a session. Returns the new session and the outcome.
+    """Apply a reset, step or rollout to a session. Returns the new session and the outcome.
 
     Args:
-        request: the request.
-        models: models of the session's surrogate.
-        require_wanted: called before each step of a rollout; raises if its caller no longer waits.
-        interrupts: whether a ``KeyboardInterrupt`` from a model's code is a failure of that code. True in a server,
-            where Ctrl-C does not raise it.
+        request: the reset, step or rollout.
+        models: source of the models.
+        require_wanted: called before each step of a rollout; raises if the session was closed or the server stops.
+        interrupts: whether a ``KeyboardInterrupt`` from a model's code counts as a failure of that code. True in a
+            server, where Ctrl-C does not raise it.
         session: the session before the request.
 
     Raises:
-        InvalidInput: wrong shape, not finite, or out of bounds.
+        InvalidInput: actions have a wrong shape, are not finite, or are out of bounds.
         NotReset: a lane to step has not been reset.
-        TooLarge: a rollout of too many steps in all lanes.
-        PluginFailed: the code of the model's family failed.
+        TooLarge: the rollout has too many steps times lanes.
+        PluginFailed: the code of the model's family raised an error.
     """
-    if isinstance(
-        request, Step
-    ):  # checked first and without a pattern, because most requests are steps, and this is faster
+    if isinstance(request, Step):  # most requests are steps, and ``isinstance`` is faster than the pattern match below
         u = policy_actions(session.definition.action, request.action, session.settings.num_envs)
         after, result = _step(session, u, request.mask, request.stds, models, interrupts)
         return after, (result,)
@@ -209,7 +209,7 @@ def carried_out(
 
 
 def visited_states(session: Session) -> Array:
-    """The states that a session visited, (v, C).
+    """Return the states (v, C) that a session visited.
 
     Raises:
         InvalidInput: the session was opened without occupancy.
@@ -240,15 +240,15 @@ def _step(
         raise
     except (
         BaseException
-    ) as error:  # raised by a family of models, maybe a plug-in's; a context manager here would slow each step
+    ) as error:  # an error of a model family, perhaps of a plug-in; a context manager would slow each step
         if isinstance(error, KeyboardInterrupt) and not interrupts:
             raise
         raise failure_of(session.definition, error) from error
 
 
 def _columns(action: Array, dimensions: int) -> Array:
-    """Add the last axis to actions without it, so that all transports give the same fingerprint.
+    """Return actions with ``dimensions`` axes: add the last axis if it is missing.
 
-    Some transports omit that axis if it has one entry.
+    Some transports omit it if an action has one entry. All transports must give the same fingerprint.
     """
     return action[..., None] if action.ndim == dimensions - 1 else action

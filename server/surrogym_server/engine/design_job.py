@@ -1,4 +1,4 @@
-"""One round of the design as a picklable job on arrays: fit all outputs, judge the model, choose the next queries.
+"""One round of the design as a picklable job on arrays: fit a model, compute its confidence, choose the next queries.
 
 The result is a pure function of the job, so it can run in another process, and the same job gives the same result.
 """
@@ -33,7 +33,7 @@ from surrogym_shared.states import Phase, SamplePurpose, Verdict
 
 Array = NDArray[np.float64]
 
-UNCHOSEN: tuple[SamplePurpose, ...] = ("initial", "logged")  # samples that no model chose
+UNCHOSEN: tuple[SamplePurpose, ...] = ("initial", "logged")  # purposes of samples that no model chose
 
 
 @dataclass(frozen=True)
@@ -43,22 +43,22 @@ class DesignJob:
     definition: EnvironmentDefinition
     samples: RealSteps  # all real steps so far
     state: dict[str, Any]  # DesignState as JSON; {} before the first round
-    budget: int  # limit of the design's real steps
-    target: float  # confidence index to reach
+    budget: int  # largest number of real steps of the design
+    target: float  # confidence index at which the design ends
     pending: tuple[Query, ...] = ()  # queries without an answer: open, or set aside
-    open_steps: int = 0  # real steps of the pending queries that may still be taken
-    refused: tuple[Query, ...] = ()  # queries that the environment refused
+    open_steps: int = 0  # number of real steps of the open queries
+    refused: tuple[Query, ...] = ()  # queries that the original environment refused
     snapshots: dict[str, tuple[float, ...]] = field(default_factory=dict)  # coordinates (C,) of each snapshot, by name
-    extra_queries: int = 0  # real steps requested with improve, chosen even if the design has ended
+    extra_queries: int = 0  # number of further queries that a person requested, also after the end of the design
     occupancy: Array | None = None  # (m, C) states that policies visited
     threads: int = 1
-    previous: bytes | None = None  # model of the round before, to predict the samples that are new
-    prior: bytes | None = None  # model of what is known beforehand, such as one of a simulator
+    previous: bytes | None = None  # model of the previous round, which predicts the new samples
+    prior: bytes | None = None  # prior model, such as one learned from a simulator
 
 
 @dataclass(frozen=True)
 class DesignResult:
-    """Result of one round. ``model`` is complete (safetensors with a JSON header), so loading it recomputes nothing."""
+    """Result of one round of a design. ``model`` is a complete safetensors file: loading it recomputes nothing."""
 
     model: bytes
     description: dict[str, Any]
@@ -67,25 +67,28 @@ class DesignResult:
     state: dict[str, Any]
     verdict: Verdict
     seconds: float
-    queries: tuple[Query, ...] = ()  # queries that the next round waits for
+    queries: tuple[Query, ...] = ()  # the next queries; the next round begins when they are answered
 
     @property
     def phase(self) -> Phase:
-        """Next phase of the design: ``sampling`` if queries are chosen or open, else the verdict."""
+        """Next phase of the design: ``sampling`` if it continues or has next queries, else its verdict."""
         return "sampling" if self.verdict == "continue" or self.queries else self.verdict
 
 
 def run_design_job(job: DesignJob) -> DesignResult:
-    """Do one round: fit a model, judge it, choose queries. Raises like ``sampling.design.advance``."""
+    """Do one round of a design: fit a model, compute its confidence, choose queries.
+
+    Raises the errors of ``sampling.design.advance``.
+    """
     begin = time.perf_counter()
     torch.set_num_threads(job.threads)
-    with threadpool_limits(job.threads):  # matrix products are small: more threads would slow them
+    with threadpool_limits(job.threads):  # more threads would slow the small matrix products
         decision, samples = _decide(job)
     with plugin_calls(job.definition):
         model = to_bytes(decision.model)
     return DesignResult(
         model=model,
-        description=json.loads(json.dumps(decision.model.description)),  # a family's own types become JSON's
+        description=json.loads(json.dumps(decision.model.description)),  # plug-in types become JSON types
         fidelity=fidelity_fields(
             decision.model,
             decision.confidences,
@@ -102,12 +105,12 @@ def run_design_job(job: DesignJob) -> DesignResult:
 
 
 def judge_stored(job: DesignJob, data: bytes) -> DesignResult:
-    """Judge a stored model of the job's samples, without a fit and without choosing queries.
+    """Compute the confidence of a stored model (safetensors) and the verdict on the design, without a fit.
 
-    The verdict is ``continue`` if the model was fitted to other samples.
+    No queries are chosen. The verdict is ``continue`` if the model was fitted to other samples than those of the job.
 
     Raises:
-        InvalidInput: not a model of the job's definition.
+        InvalidInput: the model does not fit the job's environment definition.
     """
     begin = time.perf_counter()
     model, samples = from_bytes(job.definition, data), _samples(job)
@@ -140,9 +143,9 @@ def _decide(job: DesignJob) -> tuple[Decision, Samples]:
 
 
 def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
-    """Predict the latest samples by the model of the round before, which has not learned from them.
+    """Predict the latest samples by the model of the previous round, which has not learned from them.
 
-    Empty if that model is of other samples, for example an imported one.
+    The result is empty if there is no such model, or if it learned from other samples, as an imported model did.
     """
     if job.previous is None:
         return ()
@@ -158,12 +161,12 @@ def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
 
 
 def _samples(job: DesignJob) -> Samples:
-    """Samples of the job that a model can learn from, because all lags are known where they begin."""
+    """Return the samples of the job that a model can learn from: those whose lag coordinates are all known."""
     return Samples.of(job.samples).at(_is_known(job))
 
 
 def _is_known(job: DesignJob) -> torch.Tensor:
-    """Whether all lags are known where each of n samples begins, (n,) bool."""
+    """For each of the job's n samples, whether all lag coordinates of its first state are known; (n,) bool."""
     return job.definition.known(torch.from_numpy(job.samples.coordinates))
 
 

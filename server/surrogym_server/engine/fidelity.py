@@ -1,4 +1,4 @@
-"""Fidelity of a model as JSON, for models that a round fitted and for imported models."""
+"""Fidelity of a model (confidence index, tolerances, errors) as JSON, for fitted and for imported models."""
 
 from __future__ import annotations
 
@@ -21,7 +21,15 @@ def fidelity_fields(
     target: float,
     limits: Sequence[Limit] = (),
 ) -> dict[str, Any]:
-    """Return the fields of ``wire.Fidelity``, from confidences (O,), tolerances (O,), and the reached limits."""
+    """Return the fields of ``wire.Fidelity`` for a model.
+
+    Args:
+        model: the model.
+        confidences: (O,) confidence of each output.
+        tolerances: (O,) tolerance of each output, in its unit.
+        target: confidence index that the design aims at.
+        limits: limits of coordinates that samples have reached.
+    """
     rows = [
         {"name": name, "structure": structure, "tolerance": tolerance, **asdict(output)}
         for name, structure, output, tolerance in zip(
@@ -39,12 +47,12 @@ def fidelity_fields(
 
 
 def fidelity_of(model: DynamicsModel, defaults: Sequence[float], target: float) -> dict[str, Any]:
-    """Judge a model of a surrogate, and return the fields of ``wire.Fidelity``.
+    """Compute the confidence of a model, and return the fields of ``wire.Fidelity``.
 
     Args:
-        model: the model to judge.
-        defaults: (O,) default tolerances of the design, for outputs without a declared one. They are empty before its
-            first round, and then computed from the model's own scales.
+        model: the model.
+        defaults: (O,) tolerances for outputs without a declared one. If empty, as before the first round of a design,
+            they are computed from the model's own scales.
         target: confidence index that the design aims at.
     """
     defaults = defaults or default_tolerances(model.definition, model.scales.tolist())

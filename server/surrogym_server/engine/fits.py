@@ -24,13 +24,13 @@ from surrogym_server.engine.port import Compute
 from surrogym_server.errors import ChoiceFailed, PluginFailed, SurrogymError, Unavailable
 from surrogym_server.plugins import in_one_line
 
-NICENESS = 10  # nice value of fits; a step that shares a core with a fit gets nine tenths of the core
+NICENESS = 10  # nice value of fits: a step that shares a core with a fit gets nine tenths of its time
 Function = Callable[[DesignJob], DesignResult]
 
 
 @dataclass(frozen=True)
 class Failure:
-    """Error of a job, as text, because the exception might not pickle, or might end the process that receives it."""
+    """Error of a job as text. The exception itself might not pickle, or might end the process that receives it."""
 
     kind: type[PluginFailed]
     message: str
@@ -38,14 +38,13 @@ class Failure:
 
 
 class Fits(Compute):
-    """Runs each fit in a child process of its own. The children end with this process, however it ends.
+    """Runs each fit in a child process. The child processes end when this process ends, even by a crash.
 
     Args:
-        function: carries out a job.
+        function: computes a job.
         idle: number of idle child processes to keep for the next jobs.
-        forks: whether the first child is a fork of this process, where the system allows it. A fork need not import
-            anything again, which saves some three seconds of a core. It is only safe while this process runs no
-            other thread of Python, and has no connections that the child would hold open.
+        forks: whether the first child is a fork of this process, on Linux. A fork saves about three seconds of imports.
+            It is safe only while this process has no other Python thread and no open connection.
     """
 
     def __init__(self, function: Function = run_design_job, idle: int = 1, *, forks: bool = False) -> None:
@@ -56,12 +55,15 @@ class Fits(Compute):
         self._busy: list[_Process] = []
 
     def start(self) -> None:
-        """Start the first process, so that the first fit does not wait for it. Harmless if it has started."""
+        """Start the first child process, so that the first fit does not wait for it. Does nothing if one is idle."""
         if not self._idle:
             self._idle.append(_Process("fork" if self._forks else "spawn"))
 
     async def run(self, job: DesignJob) -> DesignResult:
-        """Run a job. If its process dies, the job runs once more in a new one. Raises like ``Compute.run``."""
+        """Run a job in a child process, and once more in a new one if the process dies.
+
+        Raises the errors of ``Compute.run``.
+        """
         for _ in range(2):
             process = self._idle.pop() if self._idle else _Process()
             self._busy.append(process)
@@ -71,7 +73,7 @@ class Fits(Compute):
                 whole = True
             except BrokenProcessPool:
                 continue
-            except Exception as error:  # raised if the result of the job can't be pickled
+            except Exception as error:  # the result of the job can't be pickled
                 raise PluginFailed(in_one_line(error)) from error
             finally:
                 self._give_back(process, whole)
@@ -79,17 +81,19 @@ class Fits(Compute):
                 raise error_of(outcome)
             return outcome
         raise Unavailable(
-            "the process that fits models died twice on the same job; perhaps the machine has too little memory"
+            "the child process of this fit died twice, perhaps because the machine has too little memory: free some, "
+            "then try again"
         )
 
     def close(self) -> None:
-        """End all child processes, even while they start or run a fit. Harmless if they have ended."""
+        """Kill all child processes, also those that start or run a fit. Does nothing if they have ended."""
         for process in (*self._idle, *self._busy):
             process.close()
         self._idle = []
 
     def _give_back(self, process: _Process, whole: bool) -> None:
-        """Keep a process for the next fit, or end it if enough idle ones are kept or it still runs a job."""
+        """Keep a child process for the next fit; end it if enough are idle or if its job has not ended (not
+        ``whole``)."""
         self._busy.remove(process)
         if whole and len(self._idle) < self._most_idle:
             self._idle.append(process)
@@ -98,16 +102,16 @@ class Fits(Compute):
 
 
 class _Process:
-    """One child process for fits, which ends when this process ends.
+    """One child process for fits, which ends when its parent process ends.
 
-    The child reads from a pipe that this process holds open and never writes to. When this process dies, the pipe
-    closes, and the child ends at once, even in the middle of a fit.
+    The child waits to read from a pipe that the parent holds open and never writes to. When the parent dies, the pipe
+    closes, and the child exits at once, even in the middle of a fit.
     """
 
     def __init__(self, method: Literal["fork", "spawn"] = "spawn") -> None:
         context = get_context(method)
         theirs, self._lifeline = context.Pipe(duplex=False)
-        ours = self._lifeline if method == "fork" else None  # a fork has our end too, and has to close it
+        ours = self._lifeline if method == "fork" else None  # a fork inherits this end, and has to close it
         self.pool = ProcessPoolExecutor(1, mp_context=context, initializer=_live_with, initargs=(theirs, ours))
         self._closing = Lock()
         others = active_children()
@@ -116,7 +120,7 @@ class _Process:
         self._processes: list[BaseProcess] = [child for child in active_children() if child not in others]
 
     def close(self) -> None:
-        """End the process, even while it starts or runs a job. Harmless if it has ended. Any thread may call this."""
+        """Kill the child process, even while it runs a job. Does nothing if it has ended. Thread-safe."""
         with self._closing:
             for process in self._processes:
                 process.kill()
@@ -126,7 +130,7 @@ class _Process:
 
 
 def done(function: Function, job: DesignJob) -> DesignResult | Failure:
-    """Carry out a job in a child process. Return any exception as a failure, even one that would end the process."""
+    """Compute a job in a child process. Return any exception as a ``Failure``, even one that would end the process."""
     try:
         return function(job)
     except BaseException as error:
@@ -136,7 +140,7 @@ def done(function: Function, job: DesignJob) -> DesignResult | Failure:
 
 
 def error_of(outcome: Failure) -> PluginFailed:
-    """Return the exception that a failure stands for, with its traceback as a note."""
+    """Convert a ``Failure`` back to an exception, with the traceback as a note."""
     failure = outcome.kind(outcome.message)
     if outcome.details:
         failure.add_note(outcome.details)
@@ -145,9 +149,9 @@ def error_of(outcome: Failure) -> PluginFailed:
 
 @contextmanager
 def _terminal_blocked() -> Iterator[None]:
-    """Context in which new processes inherit a block of the signals that a terminal sends: Ctrl-C, and its closing.
+    """Return a context in which new child processes start with SIGINT and SIGHUP blocked, the signals of a terminal.
 
-    This process receives its own signals when the context ends.
+    This process receives such signals when the context ends.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
     try:
@@ -159,7 +163,7 @@ def _terminal_blocked() -> Iterator[None]:
 def _live_with(lifeline: Connection, others_end: Connection | None) -> None:
     if others_end is not None:
         others_end.close()
-    gc.enable()  # the parent process starts children with its collector off
+    gc.enable()  # a fork inherits the parent's disabled garbage collector
     os.nice(NICENESS)
     Thread(target=_exit_when_closed, args=(lifeline,), daemon=True).start()
 

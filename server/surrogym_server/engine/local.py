@@ -1,4 +1,4 @@
-"""LocalEngine: the sessions of one process, stepped in its event loop or in threads."""
+"""``LocalEngine``: runs sessions in this process, short requests in the event loop and long ones in threads."""
 
 from __future__ import annotations
 
@@ -45,23 +45,23 @@ from surrogym_server.tensors import CPU
 from surrogym_server.virtual import expected_bytes
 
 STEP_THREADS, ROLLOUT_THREADS = 4, 2
-Tolerances = Callable[[int, int], tuple[float, ...]]  # from surrogate id and version to tolerances (O,)
+Tolerances = Callable[[int, int], tuple[float, ...]]  # from a surrogate's id and a model version to tolerances (O,)
 
 
 class LocalEngine(SessionEngine):
-    """Sessions of this process. All methods but ``counts`` belong to the event loop's thread.
+    """Engine that runs sessions in this process. Only ``counts`` may be called outside the event loop's thread.
 
     Args:
         models: models of all surrogates.
-        tolerances: function from a surrogate's id and a version to the tolerances of that model.
+        tolerances: function from a surrogate's id and a model version to the tolerances (O,) of that model.
         limits: limits of all sessions together.
         max_lanes: largest number of lanes of one session.
-        idle_seconds: a session that is not used for so long expires.
-        device: device on which sessions step; requests and replies are on the CPU.
-        place: suffix of the ids of its sessions, which tells engines in several processes apart.
+        idle_seconds: a session without requests for this long expires.
+        device: device that computes steps; requests and replies are on the CPU.
+        place: suffix of the session ids, which distinguishes the engines of several processes.
     """
 
-    def __init__(  # seven parameters, because each comes from another setting or part of the server
+    def __init__(  # seven parameters, because each comes from a different setting or object of the server
         self,
         models: ModelCache,
         tolerances: Tolerances,
@@ -137,11 +137,11 @@ class LocalEngine(SessionEngine):
         self.end(session)
 
     def end(self, session: str) -> None:
-        """End a session like ``close``, for callers outside of a coroutine."""
+        """End a session, for callers that are no coroutine; ``close`` does the same."""
         self._live.close(session)
 
     def session(self, id: str) -> Session:
-        """Return a session's present, immutable state. Raises ``UnknownSession`` or ``SessionExpired``."""
+        """Return a session's present state, which is immutable. Raises ``UnknownSession`` or ``SessionExpired``."""
         return self._live.get(id)
 
     def sessions(self) -> list[Session]:
@@ -194,7 +194,7 @@ class LocalEngine(SessionEngine):
         return None if request.within is None else self._live.clock() + request.within
 
     def _tally(self, request: Advance, answer: Answer, began: float) -> Reply:
-        """Count a request and its steps, and return the reply. A repeated request counts, but its steps don't."""
+        """Count a request with its duration and its steps, and return the reply. Steps of a repeat are not counted."""
         reply = Reply(answer.seq, answer.outcome)
         tally = self._tallies.of(request.session)
         if isinstance(request, Reset):

@@ -1,6 +1,6 @@
-"""Cache of loaded models by surrogate and version. It keeps the most recently used ones.
+"""Cache of loaded models, which keeps the most recently used ones.
 
-A surrogate is identified by its id, because its name may be deleted and used again, here or by another server.
+Surrogates are identified by their ids, because a name may be used again after its surrogate was deleted.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ CAPACITY = 64
 
 
 class ModelCache:
-    """Models of all surrogates. Any thread may call it. A model is loaded when it is first needed."""
+    """Cache of the models of all surrogates. A model is loaded when it is first needed. Thread-safe."""
 
     def __init__(
         self,
@@ -27,10 +27,14 @@ class ModelCache:
         newest: Callable[[], Mapping[int, int]],
         capacity: int = CAPACITY,
     ) -> None:
-        """Args:
-        load: returns the model of a version; raises ``UnknownModel``, ``UnknownSurrogate`` or ``Damaged``.
-        newest: returns the newest stored version of each surrogate that has one, without those that were set aside.
-        capacity: number of models that are kept; a copy on another device than the CPU counts too."""
+        """Create an empty cache.
+
+        Args:
+            load: loads a model, given a surrogate's id and a version; raises ``UnknownModel``, ``UnknownSurrogate`` or
+                ``Damaged``.
+            newest: returns the newest stored version by surrogate id, without damaged models that were set aside.
+            capacity: number of models to keep; the copy of a model on a GPU counts as one more.
+        """
         self._load = load
         self._newest = newest
         self._capacity = capacity
@@ -39,7 +43,10 @@ class ModelCache:
         self._lock = Lock()
 
     def get(self, surrogate: int, version: int, device: torch.device = CPU) -> DynamicsModel:
-        """Return the model of a version, on a device. Raises ``UnknownModel``, ``UnknownSurrogate`` or ``Damaged``."""
+        """Return a surrogate's model of version ``version`` on ``device``.
+
+        Raises ``UnknownModel``, ``UnknownSurrogate`` or ``Damaged``.
+        """
         key = (surrogate, version, device)
         with self._lock:
             if model := self._models.get(key):
@@ -54,22 +61,22 @@ class ModelCache:
             return self._load(surrogate, version)
         except Damaged:
             with self._lock:
-                self._latest.pop(surrogate, None)  # the damaged version may be the one that was known as the newest
+                self._latest.pop(surrogate, None)  # the damaged version may be the newest known one
             raise
 
     def latest(self, surrogate: int) -> int:
-        """Return the newest version that this process knows. Raises ``NoModel`` or ``UnknownSurrogate``."""
+        """Return the newest model version that this process knows. Raises ``NoModel`` or ``UnknownSurrogate``."""
         with self._lock:
             if version := self._latest.get(surrogate):
                 return version
         return self.refresh(surrogate)
 
     def refresh(self, surrogate: int) -> int:
-        """Look in the storage for the newest version that is not damaged, and return it.
+        """Read the newest model version of a surrogate that is not damaged from the storage, and return it.
 
         Raises:
-            NoModel, UnknownSurrogate: as the classes say.
-            Damaged: the model can't be read, and was not set aside.
+            NoModel, UnknownSurrogate: the surrogate has no model, or does not exist.
+            Damaged: the newest model can't be read, and could not be set aside.
         """
         while (version := self._newest().get(surrogate)) is not None:
             try:
@@ -80,10 +87,10 @@ class ModelCache:
         raise NoModel("the surrogate has no model yet: start surrogym sample, or import a log")
 
     def look(self) -> list[int]:
-        """Publish the versions that other servers have stored of the surrogates in this cache.
+        """Publish newer models that other servers have stored, for the surrogates in this cache.
 
         Returns:
-            The ids of deleted surrogates. Their models stay until ``forget``, so that their sessions can end first.
+            The ids of surrogates that were deleted. Their models stay in the cache until ``forget``.
         """
         with self._lock:
             versions = list(self._latest.items())
@@ -96,14 +103,14 @@ class ModelCache:
         return [surrogate for surrogate, _ in versions if surrogate not in newest]
 
     def publish(self, surrogate: int, version: int) -> int:
-        """Make a version the newest for lanes that reset, unless a newer one is known. Returns the newest version."""
+        """Load a model, and make its version the newest unless a newer one is known. Return the newest version."""
         self.get(surrogate, version)
         with self._lock:
             self._latest[surrogate] = max(version, self._latest.get(surrogate, 0))
             return self._latest[surrogate]
 
     def forget(self, surrogate: int) -> None:
-        """Drop the models of a deleted surrogate."""
+        """Remove the models of a deleted surrogate from the cache."""
         with self._lock:
             self._latest.pop(surrogate, None)
             for key in [key for key in self._models if key[0] == surrogate]:

@@ -14,10 +14,10 @@ CAPACITY = 4_096
 
 @dataclass(frozen=True)
 class Reservoir:
-    """Uniform sample of the coordinates that a session visited: the ``CAPACITY`` visits of highest priority.
+    """Uniform random sample of at most ``CAPACITY`` of the states that a session visited: those of highest priority.
 
-    The priority of the t-th visit is the t-th random number of a generator keyed by ``seed``. So the sample does not
-    depend on how the visits were divided into requests.
+    The priority of the t-th visit is the t-th random number of a generator with the key ``seed``. So the sample does
+    not depend on how the visits were divided into requests.
     """
 
     seed: int
@@ -41,7 +41,10 @@ class Reservoir:
 
 
 def _priorities(seed: int, first: int, count: int) -> Array:
-    """Random numbers ``first`` to ``first + count - 1`` of the stream of ``seed``. A Philox block has four of them."""
+    """Return random numbers ``first`` to ``first + count - 1`` of the stream with the key ``seed``.
+
+    The Philox generator can only start at a block of four numbers, so up to three are dropped.
+    """
     block, offset = divmod(first, 4)
     generator = np.random.Generator(np.random.Philox(key=seed, counter=block))
     return generator.random(offset + count)[offset:]

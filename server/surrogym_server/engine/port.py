@@ -1,8 +1,7 @@
-"""Two ports: ``SessionEngine`` for live sessions, and ``Compute`` for rounds of designs.
+"""Two interfaces: ``SessionEngine`` runs sessions, and ``Compute`` computes rounds of designs.
 
-Requests and replies are data; an engine owns everything between them.
-
-The docstrings state laws. Functions in ``surrogym_server.testing`` test an implementation of a port by them.
+Requests and replies are plain data. The docstrings state laws that each implementation has to keep, and functions in
+``surrogym_server.testing`` test them.
 """
 
 from __future__ import annotations
@@ -24,47 +23,50 @@ from surrogym_server.engine.tallies import Counts, SessionActivity
 
 
 class SessionEngine(ABC):
-    """Live sessions by id. The engine owns their models, locks, deadlines, visited states and tallies.
+    """Interface of an engine, which runs sessions: it has their models, locks, deadlines, visited states and counts.
 
-    Laws: a request is carried out once. The same seq with the same body gets the same reply, bit for bit, even while
-    the first is still running. Another seq, or another body, is a ``SeqConflict`` that names the expected seq. A
-    refused request uses no seq and changes nothing. Replies of a session depend only on how it was opened, on its seed
-    and on its requests. Requests, replies and errors pickle.
+    Laws: a request is carried out once. A repeat with the same sequence number (seq) and body gets the same reply, bit
+    for bit, even while the first request still runs. Another seq or body raises ``SeqConflict``, which has the expected
+    seq. A refused request uses no seq and changes nothing. The replies of a session depend only on its opening, its
+    seed and its requests. Requests, replies and errors pickle.
 
-    Every method that names a session raises ``UnknownSession`` or ``SessionExpired`` if the session does not exist.
+    Each method with a session's id raises ``UnknownSession`` or ``SessionExpired`` if the session does not exist.
     """
 
     idle_seconds: float  # a session without requests for this long expires
     lasting: bool = False  # whether sessions outlive this process and are open to other processes
-    replay: int = 0  # number of last requests that a client should keep, to repeat them after a checkpoint
+    replay: int = 0  # number of last requests that a client should keep, to repeat them after a checkpoint is restored
 
     @abstractmethod
     async def open(self, request: Open) -> SessionInfo:
-        """Open a session. The same idempotency key with the same opening returns the session that was opened first.
+        """Open a session. A repeat with the same idempotency key and settings returns the session opened before.
 
         Raises:
-            NoModel, UnknownModel, NotInstalled, IdempotencyConflict, Overloaded: as the classes say.
-            TooLarge: more lanes, particles or memory than the limit.
+            NoModel, UnknownModel: the surrogate has no model, or none of this version.
+            NotInstalled: the package of the model's family is not installed.
+            IdempotencyConflict: the same key came with other settings.
+            TooLarge: the session would have more lanes, particles or memory than the limit.
+            Overloaded: all sessions together have reached a limit.
         """
 
     @abstractmethod
     async def advance(self, request: Advance) -> Reply:
-        """Reset, step or roll out.
+        """Carry out a reset, step or rollout of a session.
 
         Raises:
-            SeqConflict: the seq is neither the next one nor a repeat.
+            SeqConflict: the sequence number is neither the next one nor that of the last request.
             InvalidInput: the action has the wrong shape, is not finite, or is out of bounds.
             NotReset: a lane to step has not been reset.
-            TooLarge: a rollout of too many steps.
+            TooLarge: the rollout has too many steps.
             DeadlineExceeded: the request would take longer than the caller waits, so it was not begun.
             Overloaded: too many requests are running or waiting.
-            PluginFailed, NotInstalled: code of the model's family failed, or is not installed.
+            PluginFailed, NotInstalled: code of the model's family raised an error, or is not installed.
         """
 
     def try_now(self, request: Advance) -> Reply | None:
-        """Do ``advance`` at once if that is possible without waiting; otherwise do nothing and return None.
+        """Carry out a reset, step or rollout at once if that needs no waiting; otherwise do nothing and return None.
 
-        Raises like ``advance``.
+        Raises the errors of ``advance``.
         """
         del request
         return None
@@ -88,19 +90,19 @@ class SessionEngine(ABC):
 
     @abstractmethod
     async def close(self, session: str) -> None:
-        """End a session. Does nothing if it does not exist."""
+        """End a session. Does nothing if the session does not exist."""
 
     @abstractmethod
     async def forget(self, surrogate: int) -> None:
-        """End all sessions of a surrogate that was deleted, and drop its models."""
+        """End all sessions of a deleted surrogate (``surrogate`` is its id), and remove its models."""
 
     @abstractmethod
     async def activity(self, surrogate: str) -> list[SessionActivity]:
-        """Return the activity of a surrogate's open sessions, oldest first."""
+        """Return the steps, returns and idle time of each open session of a surrogate, oldest first."""
 
     @abstractmethod
     def counts(self) -> Counts:
-        """Return counts over all sessions. Any thread may call this."""
+        """Return counts of sessions, lanes, requests and steps over all sessions. Thread-safe."""
 
     @abstractmethod
     async def sweep(self) -> None:
@@ -108,15 +110,15 @@ class SessionEngine(ABC):
 
     @abstractmethod
     async def start(self) -> None:
-        """Prepare the engine. Called once, before the first request."""
+        """Prepare the engine. The server calls this once, before the first request."""
 
     @abstractmethod
     async def stop(self) -> None:
-        """Refuse further requests. Running ones are completed; long ones end as ``Unavailable``."""
+        """Stop the engine: it refuses new requests, completes short ones, and ends long ones with ``Unavailable``."""
 
     @abstractmethod
     async def save(self) -> list[Saved]:
-        """Return all sessions as bytes. Usually called after ``stop``."""
+        """Return all sessions in a form that can be stored and restored. Usually called after ``stop``."""
 
     @abstractmethod
     async def restore(self, request: Restore) -> None:
@@ -124,23 +126,23 @@ class SessionEngine(ABC):
 
         Raises:
             InvalidInput: the session was saved by another version of this program.
-            UnknownSession: its surrogate was deleted, and another one has its name.
-            Damaged: the bytes differ from those that were saved.
+            UnknownSession: the session's surrogate was deleted, and another one has its name.
+            Damaged: the saved bytes have changed.
             TooLarge, Overloaded: the session exceeds a limit of the engine.
         """
 
 
 class Compute(ABC):
-    """Computation of design rounds, separate from sessions.
+    """Interface of what computes the rounds of designs (a fit and the next queries), in other processes or machines.
 
-    Laws: a result equals that of ``run_design_job``, bit for bit. Jobs that run at the same time do not wait for each
-    other. Any error of a job returns as text, and ends nothing else. Cancelling ends the job at any point, and no other
-    one.
+    Laws: a result equals that of ``run_design_job``, bit for bit. Jobs run at the same time without waiting for each
+    other. An error of a job affects no other job, and its exception has the error's text. A job can be cancelled at any
+    time, which affects no other job.
     """
 
     @abstractmethod
     def start(self) -> None:
-        """Prepare for the first job, for example by starting a process."""
+        """Prepare for the first job, for example by starting a process for it."""
 
     @abstractmethod
     async def run(self, job: DesignJob) -> DesignResult:
@@ -148,10 +150,10 @@ class Compute(ABC):
 
         Raises:
             Unavailable: the process or machine of the job died, and the job can't run again now.
-            PluginFailed: the job raised an error; its notes have the traceback of an unexpected one.
-            ChoiceFailed: the job itself raised this.
+            PluginFailed: the job raised an error. The notes of the exception have the traceback if it was unexpected.
+            ChoiceFailed: the acquisition could not choose the next queries.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """End all jobs, if any run. It may block, so callers run it in a thread."""
+        """End all running jobs. This may block, so call it in a thread."""

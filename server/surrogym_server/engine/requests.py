@@ -1,4 +1,4 @@
-"""Requests and replies of a session engine: frozen data that pickle, without callables.
+"""Requests and replies of a session engine: frozen dataclasses that can be pickled.
 
 Shapes: N lanes, C coordinates, F action entries, T steps.
 """
@@ -21,9 +21,9 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Opening:
-    """What a trainer chooses for its session.
+    """Settings that a trainer chooses for its session.
 
-    A time limit or penalty of None takes the surrogate's. A seed of None is replaced by a random one.
+    A time limit or penalty of None stands for that of the surrogate, a seed of None for a random one.
     """
 
     settings: VirtualSettings
@@ -36,9 +36,9 @@ class Opening:
 
 @dataclass(frozen=True)
 class SampledRewards:
-    """Lowest and highest reward in a surrogate's samples, and the number of samples.
+    """Lowest and highest reward in a surrogate's samples, and the number of the samples.
 
-    Virtual rewards are limited to this range, widened as in ``virtual.limits.reward_limits``.
+    Rewards of virtual steps are limited to this range, widened by ``virtual.limits.reward_limits``.
     """
 
     low: float
@@ -54,7 +54,7 @@ class Open:
     surrogate_id: int
     definition: EnvironmentDefinition
     opening: Opening
-    rewards: SampledRewards | None = None  # None: virtual rewards have no limits
+    rewards: SampledRewards | None = None  # range of the samples' rewards; None: virtual rewards have no limits
     visited: Array | None = None  # (k, C) states of real steps, for a session that starts episodes there
 
 
@@ -63,7 +63,7 @@ class Reset:
     """Request for new episodes in the lanes of a mask, or in all lanes."""
 
     session: str
-    seq: int | None  # sequence number, the session's next one; None gives up replay
+    seq: int | None  # the session's next sequence number; None: a repeat of the request can't be recognised
     seed: Seeds = None
     mask: Bools | None = None  # (N,) lanes that take part; None: all
     within: float | None = None  # seconds that the caller will wait for the reply
@@ -71,7 +71,7 @@ class Reset:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Request for one step of the lanes of a mask, or of all lanes."""
+    """Request for one step in the lanes of a mask, or in all lanes."""
 
     session: str
     seq: int | None
@@ -83,7 +83,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """Request for T steps with these actions; either all steps are taken or none."""
+    """Request for T steps with given actions; either all steps are taken or none."""
 
     session: str
     seq: int | None
@@ -126,7 +126,7 @@ class SessionInfo:
     versions: Versions  # (N,) model version of each lane's episode
     seq: int  # sequence number of the last answered request
     behind: bool = (
-        False  # the session was restored from a checkpoint, so its client has to repeat its requests since then
+        False  # True if the session went back to a checkpoint, so that its client has to repeat its last requests
     )
 
 
@@ -141,7 +141,7 @@ class Visited:
 
 @dataclass(frozen=True)
 class Saved:
-    """A saved session as bytes. The environment's definition is not stored in it, because the surrogate has it."""
+    """A saved session as bytes, without the environment's definition, which is stored with the surrogate."""
 
     id: str
     surrogate: str
@@ -150,7 +150,10 @@ class Saved:
 
 @dataclass(frozen=True)
 class Restore:
-    """Request to restore a saved session, under the surrogate that has its surrogate's name now."""
+    """Request to restore a saved session.
+
+    ``surrogate_id`` and ``definition`` are those of the surrogate that now has the name in ``saved``.
+    """
 
     saved: Saved
     surrogate_id: int

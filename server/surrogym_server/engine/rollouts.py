@@ -22,11 +22,11 @@ from surrogym_shared.port import PolicyRollout, StepResult
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-OneStep = Callable[[Session, Floats], tuple[Session, StepResult]]  # steps with actions (N, F) in the model's units
+OneStep = Callable[[Session, Floats], tuple[Session, StepResult]]  # takes a step with actions (N, F) of the model
 
 
 def parts_of(run: PolicyRun) -> tuple[object, ...]:
-    """Return what determines a policy's rollout, for the fingerprint of its request."""
+    """Return all values that determine a policy's rollout, from which the content hash of its request is computed."""
     policy = run.policy
     arrays = (policy.mean, policy.deviation, policy.vector, policy.log_deviations, run.until)
     return (run.steps, policy.units, policy.activation, run.noise, *arrays)
@@ -35,9 +35,11 @@ def parts_of(run: PolicyRun) -> tuple[object, ...]:
 def roll(session: Session, actions: NDArray[np.float64], step: OneStep) -> tuple[Session, tuple[StepResult, ...]]:
     """Take T steps with actions (T, N, F), or (T, N) if F = 1; either all steps are taken or none.
 
+    ``step`` takes one step. All actions are checked before the first step.
+
     Raises:
-        InvalidInput: wrong shape, not finite, or out of bounds; found before the first step.
-        TooLarge: too many steps in all lanes.
+        InvalidInput: actions have a wrong shape, are not finite, or are out of bounds.
+        TooLarge: the number of steps times lanes is too large.
     """
     lanes, results = session.settings.num_envs, []
     _check_steps(len(actions), lanes)
@@ -48,12 +50,12 @@ def roll(session: Session, actions: NDArray[np.float64], step: OneStep) -> tuple
 
 
 def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Session, PolicyRollout]:
-    """Take steps with the actions of a policy; either all steps are taken or none.
+    """Take steps with the actions of a policy; either all steps are taken or none. ``step`` takes one step.
 
     Raises:
-        InvalidInput: the policy has other observations or actions, ``until`` has another length, or actions are not
-            finite.
-        TooLarge: too many steps in all lanes, or a layer that is too wide for so many lanes.
+        InvalidInput: the policy's observation or action size differs from the session's, ``until`` has not one entry
+            for each lane, or actions are not finite.
+        TooLarge: the number of steps times lanes, or of a layer's units times lanes, is too large.
     """
     definition, lanes = session.definition, session.settings.num_envs
     _check_steps(run.steps, lanes)

@@ -1,4 +1,4 @@
-"""Convert a session to bytes and back: arrays in NPZ form with a JSON header. Nothing is pickled."""
+"""Conversion of a session to bytes and back: an NPZ file with a JSON header. Nothing is pickled."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
 
 FORMAT = 2
 MALFORMED = (BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, ValueError, LookupError, TypeError)
-RAGGED = ("final_lanes", "final_observation")  # arrays whose length differs from step to step
+RAGGED = ("final_lanes", "final_observation")  # fields of a step's result whose length differs from step to step
 
 Arrays = dict[str, NDArray[Any]]
 
 
 def session_to_bytes(session: Session) -> bytes:
-    """Convert a session to bytes. Its definition is not stored, because its surrogate has it."""
+    """Convert a session to bytes, without the environment's definition, which is stored with the surrogate."""
     header: dict[str, Any] = {
         "format": FORMAT,
         "id": session.id,
@@ -56,16 +56,16 @@ def session_to_bytes(session: Session) -> bytes:
 
 
 def session_from_bytes(definition: EnvironmentDefinition, data: bytes, surrogate_id: int = 0) -> Session:
-    """Restore the session that ``session_to_bytes`` saved. Its next step is the same, bit for bit.
+    """Restore a session that ``session_to_bytes`` saved. Its next step is the same, bit for bit.
 
     Args:
-        definition: definition of the session's surrogate.
+        definition: environment definition of the session's surrogate.
         data: the saved bytes.
         surrogate_id: id of the surrogate that now has the name of the session's surrogate.
 
     Raises:
         InvalidInput: the session was saved by another version of this program.
-        UnknownSession: its surrogate was deleted, and another surrogate has its name.
+        UnknownSession: the session's surrogate was deleted, and another surrogate has its name.
         Damaged: the bytes have changed; each array is stored with a checksum.
     """
     try:
@@ -79,9 +79,12 @@ def _read(definition: EnvironmentDefinition, data: bytes, surrogate_id: int) -> 
         arrays: Arrays = {name: file[name] for name in file.files}
     header = json.loads(arrays["header"].tobytes())
     if header["format"] != FORMAT:
-        raise InvalidInput(f"expected a session saved in format {FORMAT}, got {header['format']}")
+        raise InvalidInput(
+            f"expected a session saved in format {FORMAT}, got format {header['format']}, which is of another version "
+            "of surrogym: open a new session"
+        )
     if header["surrogate_id"] != surrogate_id:
-        raise UnknownSession(f"the surrogate of session {header['id']!r} was deleted")
+        raise UnknownSession(f"the surrogate of session {header['id']!r} was deleted: open a new session")
     opened_by = header["opened_by"]
     return Session(
         id=header["id"],

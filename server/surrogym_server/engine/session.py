@@ -1,4 +1,4 @@
-"""One live session as one frozen, serialisable object, and the pure functions that advance it.
+"""A session as a frozen, serialisable object, and the pure functions that reset and step it.
 
 Shapes: N lanes, D observation entries, F action entries, C coordinates.
 """
@@ -33,15 +33,16 @@ LANE_BYTES = 48  # memory of one lane in a step's result, without observation an
 
 
 class Fingerprint:
-    """Content hash of a request, equal on every transport; computed on first use.
+    """Content hash of a request, by which a repeat is recognised; equal on every transport.
 
-    Most requests are never repeated, and a digest takes as long as the rest of a small step.
+    It is computed on first use, because most requests are never repeated, and computing it takes as long as a small
+    step.
     """
 
     __slots__ = ("_digest", "_parts")
 
     def __init__(self, *parts: object, digest: str | None = None) -> None:
-        """Take the digest of a request, or the parts from which it is computed later. The parts must not change."""
+        """Keep the hash of a request, or the values from which it is computed later; these must not change."""
         self._parts = parts
         self._digest = digest
 
@@ -61,7 +62,7 @@ class Fingerprint:
 
 @dataclass(frozen=True)
 class Answer:
-    """The last answer of a session, kept for a repeat of its request."""
+    """The last answer of a session, kept so that a repeat of its request gets the same answer."""
 
     seq: int
     request: Fingerprint
@@ -70,7 +71,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Session:
-    """One trainer's virtual environment, with everything on which its next step depends."""
+    """One trainer's virtual environment, with all state on which its next step depends."""
 
     id: str
     surrogate: str
@@ -108,10 +109,11 @@ def steps_of(outcome: Outcome) -> int:
 
 
 def replay(session: Session, seq: int | None, request: Fingerprint) -> Answer | None:
-    """Return the kept answer if the request repeats the last one, or None if it is the next one.
+    """Return the last answer of a session if the request repeats its last request, or None if the request is the next
+    one.
 
     Raises:
-        SeqConflict: it is neither.
+        SeqConflict: the request is neither, by its sequence number ``seq`` and its content hash.
     """
     if seq is None or seq == session.seq + 1:
         return None
@@ -123,13 +125,13 @@ def replay(session: Session, seq: int | None, request: Fingerprint) -> Answer | 
 
 
 def answered(session: Session, request: Fingerprint, outcome: Outcome) -> tuple[Session, Answer]:
-    """Return the session with this outcome as its last answer."""
+    """Store the outcome of a request as the session's last answer. Return the new session and the answer."""
     answer = Answer(session.seq + 1, request, outcome)
     return _with(session, answer=answer), answer
 
 
 def reset_session(session: Session, seed: Seeds, mask: Bools | None, latest: int) -> tuple[Session, ResetResult]:
-    """Start new episodes in the lanes of the mask, under version ``latest``."""
+    """Start new episodes in the lanes of ``mask`` (None: in all lanes), under the model version ``latest``."""
     lanes, observation = reset(session.definition, session.settings, session.lanes, seed, mask)
     lanes_reset = np.ones(session.settings.num_envs, dtype=bool) if mask is None else mask
     versions = np.where(lanes_reset, latest, session.versions)
@@ -145,9 +147,11 @@ def step_session(
     model_of: ModelOf,
     latest: int,
 ) -> tuple[Session, StepResult]:
-    """Step the lanes of the mask with actions (N, F) in the model's units.
+    """Step the lanes of ``mask`` (None: all lanes) with actions (N, F) as the model encodes them.
 
-    Every lane steps under its own version. A lane whose episode ended and began again continues under ``latest``.
+    Each lane steps under the model version of its episode. A lane that begins a new episode in this step continues
+    under the version ``latest``. ``model_of`` returns the model of a version. With ``stds``, the result has standard
+    deviations.
     """
     if mask is not None:
         _check_mask(mask, session.settings.num_envs)
@@ -182,7 +186,7 @@ def _step_versions(
 
 
 def _join(parts: Sequence[tuple[NDArray[np.intp], LaneTransition]]) -> LaneTransition:
-    """Join the transitions of disjoint groups of lanes to one of all lanes; each group has its lane numbers."""
+    """Join the transitions of disjoint sets of lanes, given with the indices of each set, to one of all lanes."""
     order = np.argsort(np.concatenate([index for index, _ in parts]))
 
     def lanewise(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -237,18 +241,18 @@ def _check_mask(mask: Bools, num_envs: int) -> None:
 
 
 def check_opening(session: Session, digest: str) -> Session:
-    """Return the session that an idempotency key opened, if its opening had the same body.
+    """Return the session if the request that opened it had the content hash ``digest``.
 
     Raises:
-        IdempotencyConflict: the body was different.
+        IdempotencyConflict: the session was opened with other settings under the same idempotency key.
     """
     if session.opened_by is None or session.opened_by[1] != digest:
-        raise IdempotencyConflict("this idempotency key opened a session with another body: use a new key")
+        raise IdempotencyConflict("this idempotency key has opened a session with other settings: use a new key")
     return session
 
 
 def digest_of(operation: str, *parts: object) -> str:
-    """Hash of a request's content, equal on every transport."""
+    """Return the SHA-256 hash of a request, from its operation and its values; equal on every transport."""
     return hashlib.sha256(b"|".join([operation.encode(), *map(_bytes_of, parts)])).hexdigest()
 
 
@@ -261,7 +265,7 @@ def _bytes_of(part: object) -> bytes:
 def _with(session: Session, **changes: Any) -> Session:
     """Return a copy of a session with some fields changed.
 
-    This takes a fifth of the time of ``dataclasses.replace``, and every step does it twice.
+    This takes a fifth of the time of ``dataclasses.replace``, and each step does it twice.
     """
     changed = object.__new__(Session)
     changed.__dict__.update(session.__dict__, **changes)

@@ -1,6 +1,6 @@
-"""The live sessions of this process. Other parts of the program only know their ids.
+"""The open sessions of this process by id: expiry, limits, deadlines, and threads for long requests.
 
-All methods but ``check_wanted`` belong to the event loop's thread.
+Only ``check_wanted`` may be called outside the event loop's thread.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ from surrogym_shared.port import PolicyRollout
 
 logger = logging.getLogger(__name__)
 
-# Requests predicted to be shorter run in the event loop. A thread would add about 70 us, and several times that on a
-# busy machine; other sessions don't notice a wait of two milliseconds.
+# Requests that are predicted to be shorter run in the event loop. A thread would add about 70 us, and several times
+# that
+# on a busy machine; two milliseconds hardly delay other sessions.
 INLINE_SECONDS = 2e-3
 MEBIBYTE = 2**20
 REMEMBERED_EXPIRED = 10_000
@@ -43,7 +44,7 @@ class _Live:
     session: Session
     last_use: float
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
-    reserved: int = 0  # bytes that the session may grow to
+    reserved: int = 0  # expected size of the session in bytes, from when it was opened
     seconds_per_step: float = float("inf")  # moving average of measurements; infinite before the first step
     requests: int = 0  # requests of this session that run or wait
 
@@ -54,7 +55,7 @@ class _Live:
 
 @dataclass
 class Threads:
-    """Pool of threads for long requests, with the predicted time of its queue."""
+    """Pool of threads for long requests, with the predicted duration of each request in it."""
 
     executor: Executor
     workers: int  # number of threads
@@ -62,7 +63,7 @@ class Threads:
 
     @property
     def wait(self) -> float:
-        """Predicted seconds until a new request would begin in this pool."""
+        """Predicted time in seconds until a new request would begin in this pool."""
         return sum(self.queued) / self.workers if len(self.queued) >= self.workers else 0.0
 
 
@@ -76,14 +77,14 @@ class Limits:
 
 
 class LiveSessions:
-    """Sessions by id. Each runs one request at a time, and long ones in a thread.
+    """The open sessions by id. A session runs one request at a time; a long request runs in a thread.
 
     Args:
-        threads: for long steps and resets.
-        rollouts: for long rollouts, which may take minutes, so that steps don't queue behind them.
-        limits: requests beyond them are refused.
+        threads: threads for long steps and resets.
+        rollouts: threads for long rollouts, which may take minutes, so that steps don't wait behind them.
+        limits: limits of all sessions together, beyond which requests are refused.
         idle_seconds: a session without requests for this long expires.
-        clock: seconds, also for deadlines.
+        clock: returns the time in seconds, also for deadlines.
     """
 
     def __init__(
@@ -128,7 +129,7 @@ class LiveSessions:
         self._check_memory(nbytes)
 
     def add(self, session: Session, reserved: int = 0) -> Session:
-        """Add an open session, which may grow to ``reserved`` bytes. Raises like ``check_room``."""
+        """Add an open session, with memory for ``reserved`` bytes. Raises the errors of ``check_room``."""
         live = _Live(session, self.clock(), reserved=reserved)
         self.check_room(live.nbytes)
         self._live[session.id] = live
@@ -139,7 +140,11 @@ class LiveSessions:
         return self._get(id).session
 
     def opened_by(self, surrogate: str, key: str, digest: str) -> Session | None:
-        """Return the session that an idempotency key opened, or None. Raises ``IdempotencyConflict``."""
+        """Return the session of a surrogate that was opened with this idempotency key; None if there is none.
+
+        Raises:
+            IdempotencyConflict: the content hash of its opening is not ``digest``.
+        """
         for session in self:
             if session.opened_by is not None and (session.surrogate, session.opened_by[0]) == (
                 surrogate,
@@ -149,7 +154,8 @@ class LiveSessions:
         return None
 
     def prompt(self, id: str, steps: int = 1) -> bool:
-        """Whether ``advance`` would take ``steps`` of a session at once: nothing waits, and the steps are short."""
+        """Whether a request of ``steps`` steps can run at once: the session has no other request, and the steps are
+        short."""
         live = self._live.get(id)
         if live is None or live.requests or self._requests >= self._limits.requests:
             return False
@@ -158,7 +164,7 @@ class LiveSessions:
     def advance_now(
         self, id: str, seq: int | None, request: Fingerprint, work: Work, steps: int = 1, deadline: float | None = None
     ) -> Answer:
-        """Do ``advance`` at once, in the caller's thread. Allowed only if ``prompt`` has returned True."""
+        """Carry out a request like ``advance``, but at once in the caller's thread. Needs ``prompt`` to be True."""
         live = self._get(id)
         live.last_use = self.clock()
         if repeat := replay(live.session, seq, request):
@@ -170,24 +176,24 @@ class LiveSessions:
     async def advance(
         self, id: str, seq: int | None, request: Fingerprint, work: Work, steps: int = 1, deadline: float | None = None
     ) -> Answer:
-        """Carry a request out once, and keep its outcome as the session's last answer.
+        """Carry out a request once, and keep its outcome as the session's last answer.
 
-        A repeat, with the same seq and fingerprint, gets that answer, even if it arrives while the first request is
-        still being computed. A request that raises an error changes nothing.
+        A repeat, with the same sequence number and content hash, gets that answer, even if it arrives while the first
+        request still runs. A request that raises an error changes nothing.
 
         Args:
-            id: the session's id.
-            seq: sequence number of the request, the session's next one; None gives up replay.
-            request: fingerprint of the request.
+            id: id of the session.
+            seq: sequence number of the request, the session's next one; None if a repeat need not be recognised.
+            request: content hash of the request.
             work: pure function from the session to the new session and the outcome.
             steps: number of virtual steps, to predict the duration.
-            deadline: time by the clock; a request that would end later is not begun.
+            deadline: time of ``clock``; a request that would end later is not begun.
 
         Raises:
-            SeqConflict: neither the next seq nor a repeat.
+            SeqConflict: ``seq`` is neither the next sequence number nor that of the last request.
             Overloaded: too many requests are running or waiting.
-            DeadlineExceeded: it would end after the deadline.
-            SessionExpired, UnknownSession: as the classes say.
+            DeadlineExceeded: the request would end after the deadline.
+            SessionExpired, UnknownSession: the session has expired, or does not exist.
         """
         live = self._get(id)
         if self._requests >= self._limits.requests:
@@ -207,27 +213,27 @@ class LiveSessions:
             live.requests -= 1
 
     def check_wanted(self, id: str) -> None:
-        """Check, between two steps of a long request, that it may continue. Any thread may call it.
+        """Check, between two steps of a long request, that the request may continue. Thread-safe.
 
         Raises:
-            UnknownSession: the session was closed meanwhile.
+            UnknownSession: the session was closed during the request.
             Unavailable: this process shuts down.
         """
         if self._stopping:
             raise Unavailable("the server is stopping and took no step of this request: send it again")
         if id not in self._live:
-            raise UnknownSession(f"session {id!r} was closed during this request")
+            raise UnknownSession(f"session {id!r} was closed during this request: open a new one")
 
     def stop(self) -> None:
-        """Make running long requests end at their next call of ``check_wanted``."""
+        """Stop long requests: their next call of ``check_wanted`` raises ``Unavailable``."""
         self._stopping = True
 
     def close(self, id: str) -> None:
-        """End a session. Harmless if it has ended."""
+        """End a session. Does nothing if the session has ended already."""
         self._live.pop(id, None)
 
     def close_all_of(self, surrogate: int) -> None:
-        """End the sessions of a surrogate, by its id."""
+        """End all sessions of a surrogate; ``surrogate`` is its id."""
         for session in self:
             if session.surrogate_id == surrogate:
                 self.close(session.id)
@@ -295,7 +301,7 @@ class LiveSessions:
         def in_time(session: Session) -> tuple[Session, Outcome]:
             self._check_deadline(
                 deadline, expected
-            )  # checked again, because the wait may have been longer than predicted
+            )  # a second check, because the wait may have been longer than predicted
             return work(session)
 
         threads.queued.append(expected)
@@ -316,9 +322,9 @@ class LiveSessions:
 def _with_measurement(
     live: _Live, result: tuple[Session, Outcome], seconds: float, steps: int
 ) -> tuple[Session, Outcome]:
-    """Update the session's predicted seconds per step by a measurement, and pass the result on."""
+    """Update the session's predicted time per step by a measured duration, and return ``result`` unchanged."""
     outcome = result[1]
-    count = len(outcome) if isinstance(outcome, PolicyRollout) else steps  # a policy's rollout may have stopped early
+    count = len(outcome) if isinstance(outcome, PolicyRollout) else steps  # a policy's rollout may end early
     each = seconds / count
     average = live.seconds_per_step if live.seconds_per_step < float("inf") else each
     live.seconds_per_step = (1 - FORGETTING) * average + FORGETTING * each
@@ -336,12 +342,15 @@ def _timed(work: Work, session: Session) -> tuple[tuple[Session, Outcome], float
 
 
 class OpeningLocks:
-    """A lock for each surrogate: its sessions are opened one after the other, so that a repeat finds the session of its
-    key. Openings of other surrogates don't wait: a large model takes long to load and to draw functions from."""
+    """One lock for each surrogate, so that its sessions are opened one after the other.
+
+    A repeated request then finds the session that its idempotency key has opened. Sessions of other surrogates open at
+    the same time, because loading a large model takes long.
+    """
 
     def __init__(self) -> None:
         self._locks = WeakValueDictionary[int, asyncio.Lock]()
 
     def of(self, surrogate: int) -> asyncio.Lock:
-        """The lock of a surrogate, by its id. It exists as long as somebody holds it or waits for it."""
+        """Return the lock of the surrogate with this id. The lock exists as long as a request holds or awaits it."""
         return self._locks.setdefault(surrogate, asyncio.Lock())

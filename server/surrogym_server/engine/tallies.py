@@ -1,4 +1,4 @@
-"""Activity of an engine's sessions, which the page and the metrics show. Only the event loop's thread writes it.
+"""Counts of an engine's sessions, for the dashboard and the metrics. Only the event loop's thread changes them.
 
 Shapes: N lanes, T steps.
 """
@@ -20,16 +20,16 @@ from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
 
 Clock = Callable[[], float]
 
-RATE_SECONDS = 10.0  # steps per second are an exponential average over about this time
+RATE_SECONDS = 10.0  # time constant of the exponential average of steps per second
 KEPT_EPISODES = 100
-FOLD_STEPS = 32  # requests' steps that are collected before they are summed, so that each step stays fast
-FOLD_LANE_STEPS = 16_384  # steps of all lanes that are collected before they are summed
+FOLD_STEPS = 32  # results are collected up to this number of steps and then summed at once, so that a step stays fast
+FOLD_LANE_STEPS = 16_384  # results are summed earlier if their steps times lanes reach this number
 BUCKETS = (1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 60.0)
 
 
 @dataclass
 class Durations:
-    """Histogram of durations in seconds. Adding a duration costs one lookup in a table."""
+    """Histogram of durations in seconds, with the bounds of ``BUCKETS``, and their sum."""
 
     sum: float = 0.0
     _counts: list[int] = field(default_factory=lambda: [0] * (len(BUCKETS) + 1))
@@ -39,7 +39,7 @@ class Durations:
         self.sum += seconds
 
     def cumulative(self) -> Iterator[tuple[str, int]]:
-        """Pairs of an upper bound in seconds and the number of durations up to it; the last bound is infinite."""
+        """Yield each upper bound in seconds (as text, "+Inf" the last) and the number of durations up to it."""
         total = 0
         for bound, count in zip((*map(str, BUCKETS), "+Inf"), self._counts, strict=True):
             total += count
@@ -58,7 +58,7 @@ class Durations:
 
 @dataclass(frozen=True)
 class Episode:
-    """A finished episode. ``reward`` is the imagined return, ``penalty`` the part subtracted for uncertainty."""
+    """A finished virtual episode. ``reward`` is its return, from which ``penalty`` was subtracted for uncertainty."""
 
     reward: float
     penalty: float
@@ -66,10 +66,10 @@ class Episode:
 
 @dataclass(frozen=True)
 class SessionActivity:
-    """A session with its counts since this process opened or restored it."""
+    """A session, with counts since this process opened or restored it."""
 
     session: SessionInfo
-    steps: int  # virtual steps of all lanes
+    steps: int  # number of virtual steps, summed over the lanes
     steps_per_second: float
     episodes: int
     recent: tuple[Episode, ...]  # latest episodes, oldest first
@@ -77,7 +77,7 @@ class SessionActivity:
 
 
 class Tally:
-    """Counts and sums over the steps of one session."""
+    """Counts of one session: steps, steps per second, and the returns of its latest episodes."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -92,7 +92,7 @@ class Tally:
         self._recent: deque[Episode] = deque(maxlen=KEPT_EPISODES)
 
     def stepped(self, answer: Reply) -> None:
-        """Count the steps of an answer, unless it was counted before."""
+        """Add the steps of an answer to the counts, unless it repeats an answer that was counted before."""
         if answer.seq <= self._seq or isinstance(answer.outcome, ResetResult):
             return
         self._seq = answer.seq
@@ -107,7 +107,7 @@ class Tally:
             self._fold()
 
     def reset(self, mask: NDArray[np.bool_] | None) -> None:
-        """Forget the running episodes in the lanes of the mask (N,): they were reset, so their returns don't count."""
+        """Discard the sums of the running episodes in the lanes of ``mask`` (N,), because these lanes were reset."""
         self._fold()
         if self._sums is not None:
             self._sums[:, slice(None) if mask is None else mask] = 0.0
@@ -148,14 +148,14 @@ class Tally:
 
 
 class Tallies:
-    """The tallies of all live sessions, by id."""
+    """The counts of all open sessions, by session id."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock = clock
         self._tallies: dict[str, Tally] = {}
 
     def of(self, id: str) -> Tally:
-        """Return the tally of a session, and make one if it has none."""
+        """Return the counts of a session; they start at zero if the session is new."""
         tally = self._tallies.get(id)
         if tally is None:
             tally = self._tallies[id] = Tally(self._clock)
@@ -165,18 +165,18 @@ class Tallies:
         return [self.of(session.id).read(session) for session in alive]
 
     def forget_all_but(self, alive: Iterable[str]) -> None:
-        """Drop the tallies of all sessions except these ids."""
+        """Remove the counts of all sessions whose ids are not in ``alive``."""
         ids = set(alive)
         self._tallies = {id: tally for id, tally in self._tallies.items() if id in ids}
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Counts of an engine: what is open now, and totals since its start."""
+    """Counts of an engine: its open sessions and requests now, and totals since its start."""
 
     sessions: Mapping[str, int]  # number of open sessions, by the name of the surrogate
     lanes: int  # lanes of all open sessions
     requests: int  # requests that run or wait
     steps: Durations  # durations of requests with steps, from arrival to reply
-    lane_steps: int  # virtual steps, counted in each lane
-    expired: int  # sessions that were ended because they were idle for too long
+    lane_steps: int  # number of virtual steps, summed over the lanes
+    expired: int  # number of sessions that ended because they were idle for too long
