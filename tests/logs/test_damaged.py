@@ -37,7 +37,7 @@ def test_lists_of_different_lengths_are_refused(tmp_path: Path, odd: list[float]
     lists: list[list[float] | None] = [[1.0, 2.0]] * 60
     lists[place] = odd
     path = parquet(tmp_path / "log.parquet", obs=lists, **COLUMNS)
-    with pytest.raises(UnusableLog, match="expected lists of one length in the column obs"):
+    with pytest.raises(UnusableLog, match="expected lists of the same length in the column obs"):
         read_log(path)
 
 

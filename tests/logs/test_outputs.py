@@ -98,11 +98,12 @@ def test_rejected_rows_never_replace_a_file_of_somebody_else(damaged: Path, caps
     other = damaged.with_name("log.rejected.csv")
     other.write_text(FOREIGN)
     said = refusal(capsys, damaged)
-    assert "1 row of the log can't be used, and" in said
-    assert "is no file of rejected rows: name another one (--rejected)" in said
+    assert "1 row of the log can't be used" in said
+    assert str(other) in said
+    assert "--rejected" in said
     assert other.read_text() == FOREIGN
     log = read_log(damaged)
-    with pytest.raises(UnusableLog, match="no file of rejected rows"):
+    with pytest.raises(UnusableLog, match="--rejected"):
         keep_rejected(damaged, log)
     assert keep_rejected(damaged, log, other) == other, "a file that was named is replaced"
     assert keep_rejected(damaged, log) == other, "and is one of rejected rows then"
@@ -119,7 +120,7 @@ def test_a_log_without_usable_rows_says_both(damaged: Path):
     lines = damaged.read_text().splitlines()
     damaged.write_text("\n".join([lines[0], lines[5]]))
     damaged.with_name("log.rejected.csv").write_text(FOREIGN)
-    with pytest.raises(UnusableLog, match=r"expected two usable steps .* no file of rejected rows"):
+    with pytest.raises(UnusableLog, match=r"expected two usable steps .*--rejected"):
         import_log(damaged)
     assert damaged.with_name("log.rejected.csv").read_text() == FOREIGN
 

@@ -130,7 +130,7 @@ TANK = {
         ({"SP": {"Ca": ["a"] * 10}}, "expected SP of Ca to be a list"),
         ({"SP": {"Ca": [[0.8, 0.9]] * 10}}, "expected SP of Ca to be a list"),
         ({"SP": {"Ca": [0.85] * 9}}, "expected SP of Ca to have a value for each of the N = 10 samples, got 9"),
-        ({"disturbances": {"Ti": [350] * 10}}, "expected disturbance_bounds"),
+        ({"disturbances": {"Ti": [350] * 10}}, "no disturbance_bounds"),
         ({"N": 1}, "expected N to be a whole number from 2 to 100,000, got 1"),
         ({"N": 10.5}, "expected N to be a whole number"),
         ({"N": "10"}, "expected N to be a whole number"),
@@ -152,7 +152,7 @@ def test_a_value_of_a_process_that_cannot_be_used_is_named(
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"model": "nope"}, "expected model to be one of .*cstr.*, got 'nope'"),
+        ({"model": "nope"}, "expected the parameter model to be one of .*cstr.*, got 'nope'"),
         ({"SP": {"Zz": [0.85] * 10}}, "expected names of SP among Ca, T, got Zz"),
         ({"x0": [0.8, 330]}, "expected x0 to have 3 values .*states Ca, T, then setpoints of Ca.* got 2"),
         ({"SP": {"Ca": [0.85] * 10, "T": [330] * 10}}, "expected low and high of o_space to have 4 values"),

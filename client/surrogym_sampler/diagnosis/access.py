@@ -19,14 +19,14 @@ from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealS
 from surrogym_sampler.original.simulator import Simulated
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 
-PLACES = 3  # number of states that are set, and of steps of an episode
-EXACT = 1e-6  # of a range; a smaller error is rounding
-CLOSE = 1e-2  # of a range: the largest error of a state that can be set
-FEW = 3.0  # factor for noise that was estimated from few steps
+PLACES = 3  # number of states to set, and of steps in each test episode
+EXACT = 1e-6  # share of a coordinate's range; a smaller difference is rounding
+CLOSE = 1e-2  # share of a coordinate's range: the largest error of a state that counts as set
+FEW = 3.0  # factor on the measured noise, which is estimated from few steps
 
 
 class CheckFailed(StepFailed):
-    """The environment failed after ``steps`` real steps had begun."""
+    """The environment failed during the checks; ``steps`` counts the real steps taken by then."""
 
     def __init__(self, message: str, steps: int) -> None:
         super().__init__(message)
@@ -39,8 +39,8 @@ class CheckFailed(StepFailed):
 
 @dataclass(frozen=True)
 class Access:
-    """Results of repeated steps and resets. Errors are shares of the sampling ranges, the largest of all. None if the
-    environment lacks the methods.
+    """Results of repeated steps and resets. Each error is the largest difference, as a share of a coordinate's sampling
+    range; None if the environment lacks the methods that the comparison needs.
 
     Attributes:
         steps: number of real steps.
@@ -69,12 +69,14 @@ class Access:
 
     @property
     def noise(self) -> float:
-        """The error between equal steps; 0 if none were compared."""
+        """The larger difference between steps that should be equal, as a share of the range; 0 if no steps were
+        compared."""
         return max(self.repeat_error or 0.0, self.replay_error or 0.0)
 
     @property
     def can_set(self) -> bool:
-        """Whether the state can be set completely."""
+        """Whether the environment can be set to a state so completely that the next step is the same as in
+        an episode."""
         if self.set_error is None or self.set_error > CLOSE:
             return False
         return self.memory_error is None or self.memory_error <= self._allowed
@@ -86,23 +88,28 @@ class Access:
 
     @property
     def _allowed(self) -> float:
-        """The largest error of a step that is repeated from the same state."""
+        """The largest difference at which two steps from the same state count as equal; larger if the environment is
+        random."""
         random = self.replay_error is None or self.replay_error > EXACT
         return max(CLOSE, FEW * self.noise) if random else CLOSE
 
     @property
     def mode(self) -> str:
-        """The recommended mode."""
+        """The recommended access to the environment, with the option that registers it."""
         if self.can_set:
             return "set any state"
         return "snapshots (--access snapshot)" if self.can_restore else "reset only (--access reset)"
 
 
 def examine(environment: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> Access:
-    """Take some real steps twice.
+    """Set, save and restore states of the environment, and compare steps that should be equal.
+
+    Args:
+        environment: the opened original environment; some 20 real steps are taken in it.
+        spec: its specification; states are set only if it declares step queries.
 
     Raises:
-        CheckFailed: a step failed for a reason that does not depend on the mode.
+        CheckFailed: a step failed, though the specification declares the access that it needs.
     """
     looking = _Looking(environment, spec)
     try:
@@ -116,7 +123,7 @@ def examine(environment: IsolatedEnvironment | Executable | Simulated, spec: Env
 
 
 class _Looking:
-    """The checks of one environment."""
+    """The checks of one environment, with the number of its real steps and the largest error of each kind so far."""
 
     def __init__(self, environment: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> None:
         self._environment, self._spec = environment, spec
@@ -125,11 +132,11 @@ class _Looking:
         self._errors: dict[str, float] = {}
 
     def access(self) -> Access:
-        """The results."""
+        """Return the results of the checks that were made."""
         return Access(self._steps, self._resets, **self._errors)
 
     def set_states(self) -> None:
-        """Set states and read them back. Take two steps from each."""
+        """Set random states and read them back; take the same step twice from each."""
         for _ in range(PLACES):
             q, u = draw(self._spec, self._rng, wide=True), self._action()
             first, again = self._step_from(q, u), self._step_from(q, u)
@@ -144,7 +151,7 @@ class _Looking:
         except StepFailed:
             if self._spec.query == "rollout":
                 raise
-            return  # it has no reset
+            return  # an environment of step queries need not have a reset
         self._note("reset_error", self._apart(starts[0], starts[1]))
         self._note("replay_error", self._between(*episodes))
         inside = [step for step in episodes[1] if self._is_inside(step)]
@@ -154,7 +161,7 @@ class _Looking:
             self._note("memory_error", self._between([wanted], [again]))
 
     def come_back(self) -> None:
-        """Take a step from a saved state, go on, return to the state and repeat the step."""
+        """Save a state, take a step, continue, restore the state and repeat the step."""
         if not self._spec.snapshots and not self._can_save():
             return
         action = self._action()
@@ -168,7 +175,7 @@ class _Looking:
         except StepFailed:
             if self._spec.snapshots:
                 raise
-            return  # nobody declared that it returns to a state
+            return  # the specification declares no snapshots, so restoring may fail
         again = self._act(action)
         self._note("restore_error", self._apart(back, first.coordinates))
         self._note("restore_error", self._between([first], [again]))
@@ -199,13 +206,14 @@ class _Looking:
         return self._environment.step_from(coordinates, action)
 
     def _is_inside(self, step: RealStep) -> bool:
-        """Whether a step began where the specification allows a state to be set."""
+        """Return whether a step began in a state that the specification allows to be set."""
         ends = np.array([c.settable for c in self._spec.coordinates])
         at = np.asarray(step.coordinates)
         return bool(((at >= ends[:, 0]) & (at <= ends[:, 1])).all())
 
     def _between(self, ones: Sequence[RealStep], others: Sequence[RealStep]) -> float:
-        """The largest difference between the results of steps; that of the rewards if the states are equal."""
+        """Return the largest difference between two lists of steps, in next states (share of the range) or rewards
+        (relative)."""
         if len(ones) != len(others):
             return 1.0  # one episode ended earlier
         states = [self._apart(a.next_coordinates, b.next_coordinates) for a, b in zip(ones, others, strict=True)]
@@ -226,7 +234,7 @@ class _Looking:
 
 
 def random_action(spec: EnvironmentSpec, rng: np.random.Generator) -> Array:
-    """Draw an action (F,) from the whole action space."""
+    """Draw an action (F,) uniformly from the action space."""
     action = spec.action
     if isinstance(action, BoxAction):
         return rng.uniform(action.low, action.high)
@@ -235,7 +243,8 @@ def random_action(spec: EnvironmentSpec, rng: np.random.Generator) -> Array:
 
 
 def apart(spec: EnvironmentSpec, one: object, other: object) -> float:
-    """Return the largest difference between coordinates (C,), as a share of the sampling range."""
+    """Return the largest difference between two states (C,), as a share of the sampling range; angles differ by the
+    shorter way."""
     difference = np.asarray(one, dtype=np.float64) - np.asarray(other, dtype=np.float64)
     for i, coordinate in enumerate(spec.coordinates):
         if coordinate.kind == "angle":

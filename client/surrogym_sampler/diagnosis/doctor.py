@@ -1,4 +1,5 @@
-"""Checks for a first step: one finding for each thing that has to be in order."""
+"""Checks of an installation, a server and an original environment before first use: one finding for each
+checked thing."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ from surrogym_shared.wire import PROTOCOL, StepQuery
 
 ROUND_TRIPS = 20
 NEEDS = "see docs/how-to/own-environment.md for what an environment needs"
-REGISTRIES = {  # by the group of their entry points; they load only where what they register can run
+# Entry point group to the registry that it extends. A registry is imported only where its packages are installed.
+REGISTRIES = {
     "surrogym.policy_searches": "surrogym_trainer.training.search:SEARCHES",
     "surrogym.acquisitions": "surrogym_server.sampling.acquisition:ACQUISITIONS",
     "surrogym.models": "surrogym_server.models.registry:MODELS",
@@ -50,8 +52,14 @@ REGISTRIES = {  # by the group of their entry points; they load only where what 
 
 @dataclass(frozen=True)
 class Finding:
-    """One checked thing. ``way_out`` says what to do about a problem; None if there is none. ``notable``: no problem,
-    and a person has to know it."""
+    """The result of one check.
+
+    Attributes:
+        name: the checked thing.
+        said: the result in words.
+        way_out: what to do about a problem; None if there is no problem.
+        notable: whether the result is no problem but should be shown to a person.
+    """
 
     name: str
     said: str
@@ -60,7 +68,7 @@ class Finding:
 
 
 def installation() -> Iterator[Finding]:
-    """Python, and the packages of this program."""
+    """Report the Python version, the installed packages, the extras that are missing, and broken plug-ins."""
     yield Finding("python", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
     packages = ", ".join(f"{name} {number}" for name, number in versions().items() if name != "python")
     lacking = [extra for extra, modules in EXTRAS.items() if not all(find_spec(module) for module in modules)]
@@ -73,13 +81,13 @@ def installation() -> Iterator[Finding]:
 
 
 def _registries() -> Iterator[Registry[Any]]:
-    """Registries to which installed packages add. Some load torch, so one is read only if a package adds to it."""
+    """Yield the registries that installed plug-ins extend. The others are not imported, because some of them load
+    torch."""
     for group, place in REGISTRIES.items():
         module, _, name = place.partition(":")
         if entry_points(group=group):
-            with suppress(
-                ImportError
-            ):  # what they register can't run on this machine, so nothing would use the package
+            # Without the registry's own package, which is optional, nothing would use the plug-ins.
+            with suppress(ImportError):
                 yield getattr(import_module(module), name)
 
 
@@ -87,7 +95,7 @@ def service(api: Api) -> Iterator[Finding]:
     """Check whether the server answers, is ready, speaks this protocol and accepts this token, and measure a round
     trip.
 
-    Findings that depend on a failed one are left out.
+    A check that depends on a failed one yields no finding.
     """
     try:
         health = api.health()
@@ -111,12 +119,14 @@ def service(api: Api) -> Iterator[Finding]:
 def environment(
     opened: Callable[[], IsolatedEnvironment | Executable | Simulated], history: int = 0
 ) -> Iterator[Finding]:
-    """The original environment: whether it can be opened, takes a step, and can be set to a state. The steps are real,
-    but they don't enter a ledger.
+    """Check whether the original environment can be opened, can take a step, and can be set to a state.
+
+    The checks take real steps, which no ledger counts.
 
     Args:
-        opened: opens it.
-        history: further real steps, to find how far one has to look back to tell what happens next; 0 takes none.
+        opened: opens the environment.
+        history: number of further real steps, to find how many earlier changes and actions the next change depends on;
+            0 takes none.
     """
     try:
         with closing(opened()) as original:
@@ -134,7 +144,7 @@ def environment(
 
 
 def _access_of(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> Iterator[Finding]:
-    """Exactness of the environment, and the recommended mode."""
+    """Report how exactly the environment can be set, reset and restored, and the recommended access."""
     try:
         access = examine(original, spec)
     except CheckFailed as error:
@@ -157,7 +167,7 @@ def _access_of(original: IsolatedEnvironment | Executable | Simulated, spec: Env
 
 
 def _resets(access: Access) -> Finding:
-    """Whether a seed repeats a start."""
+    """Report whether a reset with the same seed gives the same start, and the same actions the same episode."""
     same, alike = _error(access.reset_error), _error(access.replay_error)
     if not access.ignores_seed:
         return Finding("resets", f"two with one seed: {same}; the same actions from there: {alike}")
@@ -170,7 +180,7 @@ def _resets(access: Access) -> Finding:
 
 
 def _history_of(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec, steps: int) -> Finding:
-    """How far one has to look back, beside the declared lags."""
+    """Report how many earlier changes and actions, beyond the declared lags, the next change depends on."""
     if spec.query != "rollout":
         return Finding("history", "not looked for: an environment that is set to a state has no past")
     try:
@@ -194,13 +204,13 @@ def _history_of(original: IsolatedEnvironment | Executable | Simulated, spec: En
 
 
 def _declaring(found: History) -> str:
-    """What to declare."""
+    """Return the advice that names the call which declares this history."""
     moving = ", with at_start if a reset leaves it moving" if found.changes else ""
     return f"declare {found.call}{moving}; see docs/how-to/history.md"
 
 
 def _way_out(spec: EnvironmentSpec, access: Access) -> str | None:
-    """What to do if the environment can't do what its specification declares."""
+    """Return what to do if the environment lacks the access that its specification declares; None if it has it."""
     if spec.access == "any" and not access.can_set:
         other = "snapshot" if access.can_restore else "reset"
         return f"register it with --access {other}; what it remembers must be a coordinate for more"
@@ -210,7 +220,7 @@ def _way_out(spec: EnvironmentSpec, access: Access) -> str | None:
 
 
 def _error(share: float | None) -> str:
-    """An error in words; shares are of the sampling range."""
+    """Return a difference in words; ``share`` is a share of the sampling range, None if nothing was compared."""
     if share is None:
         return "not compared"
     return "equal" if share <= EXACT else f"{100 * share:.2g} % of the range apart"
@@ -242,7 +252,7 @@ def _timed(api: Api) -> float:
 
 
 def _one_step(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> Finding:
-    """A step from anywhere in the sampling range, or from a reset if the state can't be set."""
+    """Report one real step: from a random state of the sampling range, or from a reset if the state can't be set."""
     start, action = draw(spec, np.random.default_rng(0), wide=True), _middle(spec)
     begun = time.perf_counter()
     try:
@@ -260,7 +270,7 @@ def _one_step(original: IsolatedEnvironment | Executable | Simulated, spec: Envi
 
 
 def _check(step: RealStep, start: Array, action: Array) -> None:
-    """Raise ``StepFailed`` for a step that a sampler could not submit."""
+    """Raise ``StepFailed`` if a sampler could not submit this step as a sample."""
     query = StepQuery(
         id=1,
         number=0,
@@ -275,7 +285,7 @@ def _check(step: RealStep, start: Array, action: Array) -> None:
 
 
 def _middle(spec: EnvironmentSpec) -> Array:
-    """The action (F,) in the middle of the bounds; the first of discrete ones."""
+    """Return the action (F,) in the middle of the bounds; zeros if the actions are discrete."""
     if isinstance(spec.action, BoxAction):
         middle: Array = (np.array(spec.action.low) + np.array(spec.action.high)) / 2
         return middle

@@ -1,10 +1,11 @@
-"""How far back one has to look to tell what happens next, from some random episodes of real steps.
+"""A test of how many earlier changes and actions the next change depends on, made with random episodes of real steps.
 
 A linear regression predicts the next change of each coordinate from the coordinates, the action, and earlier changes
 and actions. Histories are compared by errors of left-out steps. A linear regression can't show everything, but it
 clearly shows a dead time or a hidden speed.
 
-Shapes: n steps, C coordinates, M of them moving, F action entries, d inputs.
+Shapes: n steps, T steps of one episode, C coordinates, R of them read from the environment and not lags, M of those
+moving, F action entries, d inputs.
 """
 
 from __future__ import annotations
@@ -23,27 +24,27 @@ from surrogym_shared.spec import EnvironmentSpec
 
 Bools = NDArray[np.bool_]
 
-LONGEST = 5  # steps to look back
-EPISODE = 20  # steps, at most
-HELD = 4  # longest time that an action is held
-RIDGE = 1e-6  # of the inputs' variance
-ENOUGH = 0.05  # of the deviation of a change: a smaller error needs no explanation
-SLACK = 1.2  # times the smallest error
-EXPLAINED = 0.5  # of the deviation: a regression with a larger error tells nothing
-WIDER = 1.5  # times the largest observed change
+LONGEST = 5  # largest number of earlier changes or actions that is tried
+EPISODE = 20  # largest number of steps in an episode
+HELD = 4  # largest number of steps for which a random action is held
+RIDGE = 1e-6  # ridge term of the regression, relative to the inputs' variance
+ENOUGH = 0.05  # share of a change's standard deviation; a smaller error needs no longer history
+SLACK = 1.2  # a history is good enough if its error is below this multiple of the smallest error
+EXPLAINED = 0.5  # share of a change's standard deviation; a regression with a larger error shows nothing
+WIDER = 1.5  # factor on the largest observed change, for the range of a declared change
 
 
 @dataclass(frozen=True)
 class History:
-    """How many earlier changes and actions predict the next change. Errors are shares of a change's standard deviation.
+    """The shortest history that predicts the next change. Errors are shares of a change's standard deviation.
 
     Attributes:
-        steps: number of real steps.
-        changes: number of earlier changes.
-        actions: number of earlier actions.
-        error: with them.
-        error_without: without any.
-        largest: largest observed change of each moving coordinate, widened.
+        steps: number of real steps taken for the test.
+        changes: number of earlier changes in the history.
+        actions: number of earlier actions in the history.
+        error: prediction error with this history.
+        error_without: prediction error without earlier changes or actions.
+        largest: by name, the largest observed change of each moving coordinate, widened by ``WIDER``.
     """
 
     steps: int
@@ -55,12 +56,12 @@ class History:
 
     @property
     def told(self) -> bool:
-        """Whether the steps show how far one has to look back."""
+        """Whether the regression predicts well enough to show which history is needed."""
         return self.error <= EXPLAINED
 
     @property
     def call(self) -> str:
-        """The call that declares this history."""
+        """The call of ``with_history`` that declares this history, as source text."""
         largest = ", ".join(f'"{name}": {most:.2g}' for name, most in self.largest.items())
         named = f", largest={{{largest}}}" if self.changes else ""
         return f"with_history(spec, changes={self.changes}, actions={self.actions}{named})"
@@ -68,14 +69,22 @@ class History:
 
 @dataclass(frozen=True)
 class _Episode:
-    """Coordinates that the environment reads (T + 1, R), and actions (T, F)."""
+    """One episode: the coordinates read from the environment at each time (T + 1, R), and the actions (T, F)."""
 
     read: Array
     action: Array
 
 
 def look_back(environment: RolloutEnvironment, spec: EnvironmentSpec, steps: int) -> History | None:
-    """Take random episodes, and find the shortest history that tells the next changes. None if they are too short.
+    """Take random episodes, and find the shortest history that predicts the next changes.
+
+    Args:
+        environment: the opened environment; its episodes take ``steps`` real steps.
+        spec: its specification.
+        steps: number of real steps.
+
+    Returns:
+        The history, or None if the episodes are too short for the regression.
 
     Raises:
         StepFailed: a step failed.
@@ -102,7 +111,7 @@ def look_back(environment: RolloutEnvironment, spec: EnvironmentSpec, steps: int
 
 
 def declared(spec: EnvironmentSpec) -> tuple[int, int]:
-    """Number of earlier changes and of earlier actions that a specification declares as lags."""
+    """Return the number of earlier changes and of earlier actions that the specification declares as lags."""
     ages: dict[str, tuple[int, int]] = {}
     for c in spec.coordinates:
         if c.lag is not None and c.lag.kind != "steps":
@@ -113,7 +122,7 @@ def declared(spec: EnvironmentSpec) -> tuple[int, int]:
 
 
 def _episodes(environment: RolloutEnvironment, spec: EnvironmentSpec, steps: int) -> Iterator[_Episode]:
-    """Episodes with ``steps`` steps in all, whose random actions are held for random times."""
+    """Yield episodes with ``steps`` real steps in all; each random action is held for a random number of steps."""
     rng, seed = np.random.default_rng(0), 0
     columns = [spec.coordinate_names.index(name) for name in read_names(spec)]
     while steps > 0:
@@ -133,7 +142,17 @@ def _episodes(environment: RolloutEnvironment, spec: EnvironmentSpec, steps: int
 
 
 def _rows(episode: _Episode, changes: int, actions: int, turning: Bools, moving: Bools) -> tuple[Array, Array]:
-    """Inputs (n, d) and next changes (n, M) of an episode's steps, all with the longest history behind them."""
+    """Return the regression's inputs (n, d) and next changes (n, M) from one episode.
+
+    Every history uses the same steps, those that ``LONGEST`` others precede, so that their errors can be compared.
+
+    Args:
+        episode: the episode.
+        changes: number of earlier changes among the inputs.
+        actions: number of earlier actions among the inputs.
+        turning: which coordinates (R,) are angles; they enter as cosine and sine.
+        moving: which coordinates (R,) are not constant.
+    """
     change, first = _changes(episode, turning)[:, moving], LONGEST
     times = np.arange(first, len(episode.action))
     read = episode.read[times]
@@ -144,15 +163,15 @@ def _rows(episode: _Episode, changes: int, actions: int, turning: Bools, moving:
 
 
 def _changes(episode: _Episode, turning: Bools) -> Array:
-    """Change in each step (T, R), of angles by the shorter way."""
+    """Return the change of each coordinate in each step (T, R); an angle changes by the shorter way."""
     change: Array = np.diff(episode.read, axis=0)
     change[:, turning] = (change[:, turning] + np.pi) % (2 * np.pi) - np.pi
     return change
 
 
 def _left_out_error(x: Array, y: Array) -> float:
-    """Error of changes y (n, M) by a linear regression on inputs x (n, d), each step left out in turn: the root mean
-    square, as a share of the changes' standard deviation; the largest of the coordinates."""
+    """Return the leave-one-out error of a linear regression of changes y (n, M) on inputs x (n, d): the root mean
+    square as a share of the changes' standard deviation, the largest over the coordinates."""
     spread, size = x.std(0), y.std(0)
     z = np.hstack([np.ones((len(x), 1)), (x - x.mean(0)) / np.where(spread > 0, spread, 1.0)])
     gram = z.T @ z + RIDGE * len(z) * np.eye(z.shape[1])

@@ -1,4 +1,4 @@
-"""Outcomes of checks, and the comparison that a check consists of."""
+"""Outcomes of checks, and the comparison of an expected value with the one that came."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Outcome:
-    """One check.
+    """The outcome of one check.
 
     Attributes:
         name: what has to hold.
-        failure: what was expected and what came; None if the check passed, or was left out.
+        failure: what was expected and what came; None if the check passed or does not apply.
         left_out: why the check does not apply; None if it was made.
     """
 
@@ -25,7 +25,12 @@ class Mismatch(Exception):
 
 
 def expect(what: str, expected: object, came: object) -> None:
-    """Compare two values.
+    """Compare the value that came with the expected one.
+
+    Args:
+        what: the compared thing in words, for the message.
+        expected: the value that the protocol requires.
+        came: the value that was observed.
 
     Raises:
         Mismatch: they differ.

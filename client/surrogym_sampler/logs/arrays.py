@@ -1,4 +1,5 @@
-"""Arrays of a file to columns: one row a step each; what is no column is ignored with its reason."""
+"""Conversion of a file's arrays to the columns of a log, with one row per step. Other arrays are ignored, with the
+reason."""
 
 from __future__ import annotations
 
@@ -22,30 +23,30 @@ NEXT = ("next_coordinates", "next_observations", "next_observation", "next_state
 
 
 def table_of_arrays(path: Path, arrays: dict[str, Any], names: Sequence[str] = ()) -> Table:
-    """The table of a file's arrays: (n,) each, or (n, k) of states, actions and next states.
+    """Return the table of a log from a file's arrays: (n,) each, or (n, k) for states, actions and next states.
 
     Args:
-        path: of the file, for messages.
-        arrays: by name.
-        names: of the coordinates; without them they are called ``s0``, ``s1``, ...
+        path: the file, for messages.
+        arrays: the arrays by name.
+        names: names of the coordinates; the default is ``s0``, ``s1``, ...
 
     Raises:
-        UnusableLog: states, actions or next states are not (n, k), a reward or the like is not one value a step,
+        UnusableLog: states, actions or next states are not (n, k), a reward or the like is not one value per step,
             columns differ in their length, two arrays have the same columns, or the names don't fit the states.
     """
     for name, array in arrays.items():
         if name in (*STATES, *ACTIONS, *NEXT) and array.ndim > 2:
             raise UnusableLog(
-                f"expected one row a step, got shape {array.shape} for {name} in {path}: give (steps, dims), and the "
-                "episodes as an array of their own, such as episode"
+                f"expected shape (steps, entries) for the array {name} in {path}, got {array.shape}: give one row "
+                "for each step, and the number of its episode in a further array called episode"
             )
     _require_names(path, arrays, names)
     ignored = {name: _shape(array) for name, array in arrays.items() if array.ndim not in (1, 2)}
     columns = {name: _columns(name, array, names) for name, array in arrays.items() if name not in ignored}
     if not columns:
         raise UnusableLog(
-            f"expected arrays of one row a step in {path}, got {ignored or 'none'}: name them states, actions "
-            "and rewards"
+            f"expected arrays with one row for each step in {path}, got {ignored or 'none'}: save arrays called "
+            "states, actions and rewards"
         )
     rows = _rows(columns)
     marked = any(name in STATES or STATE.match(name) for name in columns)
@@ -58,29 +59,32 @@ def table_of_arrays(path: Path, arrays: dict[str, Any], names: Sequence[str] = (
     lengths = {name: len(arrays[name]) for name in columns}
     if len(set(lengths.values())) > 1:
         raise UnusableLog(
-            f"expected arrays of the same number of rows in {path}, got {lengths}: cut them to the same steps"
+            f"expected arrays with the same number of rows in {path}, got {lengths}: cut them to the same steps"
         )
     return Table(flat, np.arange(1, 1 + rows), unnamed=tuple(filter(is_unnamed, flat)), ignored=ignored)
 
 
 def require_shapes(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Refuse arrays that are too many or too large, before any of them is read. Raises ``UnusableLog``."""
+    """Raise ``UnusableLog`` if a file has too many arrays or too large ones, before any of them is read."""
     if len(shapes) > MOST_COLUMNS:
-        raise UnusableLog(f"expected at most {MOST_COLUMNS:,} arrays in {path}, got {len(shapes):,}")
+        raise UnusableLog(
+            f"expected at most {MOST_COLUMNS:,} arrays in {path}, got {len(shapes):,}: save only those of the log"
+        )
     require_sizes(
         path, max((shape[0] for shape in shapes.values() if shape), default=0), sum(map(prod, shapes.values()))
     )
 
 
 def _require_names(path: Path, arrays: Mapping[str, Cells], names: Sequence[str]) -> None:
-    """Raise ``UnusableLog`` unless the names of the coordinates are different, and as many as the states have."""
+    """Raise ``UnusableLog`` unless the given names of coordinates are different, and as many as the columns of each
+    array of states."""
     if len(set(names)) < len(names):
-        raise UnusableLog(f"expected different names in coordinate_names in {path}, got {list(names)}: rename some")
+        raise UnusableLog(f"expected different names in coordinate_names of {path}, got {list(names)}: rename some")
     for name, array in arrays.items():
         if names and name in (*STATES, *NEXT) and array.ndim == 2 and array.shape[1] != len(names):
             raise UnusableLog(
-                f"expected {array.shape[1]} names in coordinate_names in {path}, one for each column of {name}, got "
-                f"{list(names)}"
+                f"expected {array.shape[1]} names in coordinate_names of {path}, one for each column of {name}, got "
+                f"{list(names)}: correct coordinate_names"
             )
 
 
@@ -92,14 +96,16 @@ def _flat(path: Path, columns: Mapping[str, dict[str, Cells]]) -> dict[str, Cell
         for column, cells in found.items():
             if column in flat:
                 raise UnusableLog(
-                    f"expected one array for the column {column!r} in {path}, got two: {source[column]} and {array}"
+                    f"expected one array for the column {column!r} in {path}, got two, {source[column]} and "
+                    f"{array}: drop one"
                 )
             flat[column], source[column] = cells, array
     return flat
 
 
 def _columns(name: str, array: Cells, names: Sequence[str]) -> dict[str, Cells]:
-    """An array (n,) as it is, one (n, k) as k columns: ``q.s0`` or ``q.<name>``, ``action.0``, ``next.s0``."""
+    """Return an array's columns by name: one for (n,), k for (n, k), named ``q.s0`` or ``q.<name>``, ``action.0``,
+    ``next.s0``."""
     if array.ndim == 1:
         return {name: array}
     count = array.shape[1]
@@ -110,13 +116,16 @@ def _columns(name: str, array: Cells, names: Sequence[str]) -> dict[str, Cells]:
         return {f"{'q' if name in STATES else 'next'}.{one}": array[:, i] for i, one in enumerate(own)}
     if _is_single(name):
         if count != 1:
-            raise UnusableLog(f"expected one value a step for {name}, got an array of shape {array.shape}")
+            raise UnusableLog(
+                f"expected one value for each step in {name}, got an array of shape {array.shape}: save it as (steps,)"
+            )
         return {name: array[:, 0]}
     return {f"{name}.{i}": array[:, i] for i in range(count)}
 
 
 def _rows(columns: dict[str, dict[str, Cells]]) -> int:
-    """Rows of the log: those of its actions, and without known ones the most frequent length."""
+    """Return the number of rows of the log: the length of its actions or, without an array of actions, the most
+    frequent length."""
     lengths = {name: len(next(iter(found.values()), ())) for name, found in columns.items()}
     known = [length for name, length in lengths.items() if name in ACTIONS or ACTION.match(name)]
     return known[0] if known else Counter(lengths.values()).most_common(1)[0][0]

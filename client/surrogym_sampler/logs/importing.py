@@ -1,4 +1,4 @@
-"""A log into a surrogate: read, checked, drafted, and sent in batches that may be sent again."""
+"""Import of a log into a surrogate: read the file, check its rows, draft a specification, send the steps in batches."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from surrogym_shared.words import counted
 
 BATCH = 2_000  # steps between two reports of progress
 SAMPLER = "log"
-MOST_KNOWN = 2_000  # samples of a surrogate that show how large its rewards are
+MOST_KNOWN = 2_000  # number of a surrogate's samples whose rewards are compared with those of the log
 
 Progress = Callable[[float, str], None]
 Mapping_ = Mapping[str, Any]
@@ -36,7 +36,15 @@ Mapping_ = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Imported:
-    """Result of an import."""
+    """The result of an import.
+
+    Attributes:
+        log: the log that was read, with its usable and its rejected rows.
+        surrogate: name of the surrogate; None if no step was sent.
+        sent: number of steps that were sent.
+        duplicates: number of those that the surrogate had already.
+        rejected_file: file of the rejected rows; None if there is none.
+    """
 
     log: ReadLog
     surrogate: str | None = None
@@ -46,27 +54,28 @@ class Imported:
 
     @property
     def taken(self) -> int:
-        """Steps that are new to the surrogate."""
+        """Number of steps that are new to the surrogate."""
         return self.sent - self.duplicates
 
 
 @dataclass(frozen=True)
 class Options:
-    """How a log is read. Raises nothing by itself."""
+    """Options for reading a log."""
 
-    mapping: Path | Mapping_ | None = None  # file, or what stands in one; None goes by the names of the columns
-    spec: EnvironmentSpec | None = None  # that the log is checked against; None drafts one
-    budget: int | None = None  # of the design; None is that of ``spec``, or 0
-    name: str = ""  # of its environment; the file's by default
+    # roles of the columns: a file or its content; None infers the roles from the columns' names
+    mapping: Path | Mapping_ | None = None
+    spec: EnvironmentSpec | None = None  # specification to check the rows against; None drafts one
+    budget: int | None = None  # number of real steps for the design; None takes that of the specification, or 0
+    name: str = ""  # name of the environment in a drafted specification; the default is the file's name
     progress: Progress = field(default=lambda _share, _words: None)
 
 
 def read_log(path: str | Path, options: Options | None = None) -> ReadLog:
-    """Read a log and check its rows; nothing is sent.
+    """Read a log and check its rows; nothing is sent to a server.
 
     Raises:
-        UnusableLog: no log, or columns without a clear role.
-        TooFewSteps: no usable step, or a single one where a specification is to be drafted.
+        UnusableLog: the file is not a log, or has columns whose role is not clear.
+        TooFewSteps: no step is usable, or only one, though a specification is to be drafted.
         OSError: a file can't be read.
     """
     path, options = Path(path), options or Options()
@@ -85,9 +94,19 @@ def _with_budget(spec: EnvironmentSpec, budget: int | None) -> EnvironmentSpec:
 
 
 def send(api: Api, name: str, log: ReadLog, progress: Progress = lambda _share, _words: None) -> tuple[int, int]:
-    """Send the usable steps of a log to a surrogate; returns how many, and how many were there before.
+    """Send the usable steps of a log to a surrogate, in batches of ``BATCH``.
 
-    It may be interrupted, and sent again: the server knows the log by its beginning, and adds only what is missing.
+    An interrupted transfer can be repeated: the server recognises the log by its first steps and adds only those that
+    it lacks.
+
+    Args:
+        api: the connection to the server.
+        name: name of the surrogate.
+        log: the log that was read.
+        progress: called with the share of steps sent, in [0, 1], and a few words.
+
+    Returns:
+        The number of steps sent, and how many of those the surrogate had before.
     """
     steps, reward = log.steps, log.reward
     after = log.steps.origin
@@ -119,27 +138,30 @@ def import_log(
     token: str | None = None,
     progress: Progress = lambda _share, _words: None,
 ) -> Imported:
-    """Check a log of real steps, and give its usable steps to a surrogate on a server.
+    """Check a log of real steps, and send its usable steps to a surrogate on a server.
 
     Args:
-        path: CSV, NPZ or Parquet, or the name of a Minari data set.
-        register: name of a new surrogate, with the drafted specification, or with ``spec``.
-        to: name of a surrogate that is there, by whose specification the rows are checked.
-        mapping: what the columns are: a JSON or TOML file, or the same as a dictionary; None goes by their names.
-        spec: the specification that the rows are checked against; None drafts one.
-        budget: real steps that the design may ask for; 0 without a machine. None is that of ``spec``, or 0.
-        rejected: where the rows go that can't be used; by default beside the log.
-        draft: file to which the specification is written, before anything is sent.
-        url, token: of the server, as ``Api`` takes them.
+        path: a CSV, NPZ, Parquet or HDF5 file, or the name or folder of a Minari data set.
+        register: name of a new surrogate, created with ``spec`` or with the drafted specification.
+        to: name of an existing surrogate, against whose specification the rows are checked.
+        mapping: roles of the columns: a JSON or TOML file, or the same as a dictionary; None infers them from the
+            names.
+        spec: the specification to check the rows against; None drafts one.
+        budget: number of real steps that the design may take; 0 if no environment can take any. None takes that of
+            ``spec``, or 0.
+        rejected: file for the rows that can't be used; the default is a file beside the log.
+        draft: file to which the specification is written before anything is sent.
+        url: the server's address, as for ``Api``.
+        token: the server's access token, as for ``Api``.
         progress: called with a share in [0, 1] and a few words.
 
     Raises:
-        ValueError: both ``register`` and ``to``, or ``to`` with ``spec``.
-        UnusableLog: no log, columns without a clear role, ``register`` is no name of a surrogate, ``rejected`` is
-            the log or the mapping, the file beside the log is not one of rejected rows, or ``draft`` is a file with
-            another specification.
-        TooFewSteps: no usable step, or a single one where a specification is to be drafted.
-        SurrogymClientError: as every request.
+        ValueError: both ``register`` and ``to`` are given, or ``to`` with ``spec``.
+        UnusableLog: the file is not a log, the role of a column is not clear, ``register`` is not a valid name,
+            ``rejected`` is the log or the mapping, the file beside the log is not one of rejected rows, or ``draft`` is
+            a file with another specification.
+        TooFewSteps: no step is usable, or only one, though a specification is to be drafted.
+        SurrogymClientError: the server can't be reached, or refuses a request.
 
     Examples:
         >>> import_log("reactor.csv", register="reactor").taken
@@ -185,18 +207,26 @@ def _require_name(name: str) -> None:
 
 
 def _require_reward_unit(log: ReadLog, api: Api, name: str) -> None:
-    """Refuse rewards that seem to be in another unit than those of the surrogate's samples. A declared reward
-    is not learned, so the log may pay by another rule."""
+    """Refuse a log whose rewards seem to be in another unit than those of the surrogate's samples. A declared reward is
+    computed and not learned, so then the rewards of the log don't matter."""
     if log.spec.reward.kind == "learned" and not log.table.evaluated:
         known = [sample.reward for sample in islice(api.samples(name), MOST_KNOWN)]
         require_reward_unit(log.reward, np.array(known), name)
 
 
 def keep_rejected(path: Path, log: ReadLog, where: str | Path | None = None) -> Path | None:
-    """Write the rows that were set aside beside the log; None where there are none and no such file stands there.
+    """Write the rejected rows of a log to a file, and return its path.
+
+    Args:
+        path: the log.
+        log: the log that was read.
+        where: the file; the default is beside the log.
+
+    Returns:
+        The file; None if no row was rejected and no earlier file of rejected rows exists.
 
     Raises:
-        UnusableLog: the file beside the log is another one, and ``where`` names none.
+        UnusableLog: the default file exists and does not contain rejected rows.
     """
     return _keep(path, log.table, log.steps, where)
 
@@ -208,15 +238,17 @@ def _keep(path: Path, table: Table, steps: Transitions, where: str | Path | None
         return None
     if foreign:
         raise UnusableLog(
-            f"{counted(len(steps.rejected), 'row')} of the log can't be used, and {file}, where they would go, is no "
-            "file of rejected rows: name another one (--rejected)"
+            f"{counted(len(steps.rejected), 'row')} of the log can't be used and would be written to {file}, but that "
+            "file "
+            "exists and does not contain rejected rows: give another file with --rejected"
         )
     write_rejected(file, table, steps)
     return file
 
 
 def _read_or_keep(path: Path, options: Options, where: str | Path | None) -> tuple[ReadLog, Path | None]:
-    """The log, and the file of the rows that were set aside, which is written in any case."""
+    """Read a log, and return it with the file of its rejected rows. The file is written even if the log has too few
+    usable steps."""
     try:
         log = read_log(path, options)
     except TooFewSteps as error:

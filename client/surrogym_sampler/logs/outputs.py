@@ -1,4 +1,4 @@
-"""Files that an import writes: each is checked before anything is read, stored or written."""
+"""Checks of the files that an import writes, before anything is read, stored or written."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.spec import EnvironmentSpec
 
 PICTURES = (".png", ".svg", ".pdf")
-DATA = "data"  # folder of a Minari data set with its files
+DATA = "data"  # folder inside a Minari data set that contains its files
 
 Files = Mapping[str, Path | None]
 
 
 def rejected_file(log: Path, given: str | Path | None) -> Path:
-    """Return the file for the rows that can't be used: the given one, or LOG.rejected.csv beside the log."""
+    """Return the file for rows that can't be used: the given one, or LOG.rejected.csv beside the log."""
     if given is not None:
         return Path(given)
-    log = log if log.name else log.resolve()  # "." is the folder of a data set too
+    log = log if log.name else log.resolve()  # the path "." has no name, but may be the folder of a data set
     return log.with_name(f"{log.stem}.rejected.csv")
 
 
@@ -27,12 +27,12 @@ def require_outputs(outputs: Files, inputs: Files, perhaps: Files | None = None)
     """Refuse outputs that would overwrite an input or each other, or that can't be written.
 
     Args:
-        outputs: files to write, by the words that a message names them by; None is no file.
-        inputs: files to read, likewise.
-        perhaps: files that are written only if they are needed, likewise. Their folder may be write-protected.
+        outputs: files to write, by the words for each in a message; None is ignored.
+        inputs: files to read, by the same kind of words.
+        perhaps: files that are written only if needed, by the same kind of words. Their folder may be write-protected.
 
     Raises:
-        UnusableLog: an output is an input, equals another output, or has no folder to be written to.
+        UnusableLog: an output is an input, equals another output, or can't be written to its folder.
     """
     read = {words: file for words, file in inputs.items() if file is not None}
     written: dict[str, Path] = {}
@@ -41,23 +41,25 @@ def require_outputs(outputs: Files, inputs: Files, perhaps: Files | None = None)
             continue
         for other, one in (read | written).items():
             if _same(file, one):
-                raise UnusableLog(f"{words}: expected another file than {other}, got {file} for both")
+                raise UnusableLog(
+                    f"{words}: expected another file than {other}, got {file} for both: give another name"
+                )
         if words in outputs:
             _require_writable(words, file)
         written[words] = file
 
 
 def require_picture(words: str, file: Path) -> None:
-    """Raise ``UnusableLog`` if the ending of a picture's name is of no known kind."""
+    """Raise ``UnusableLog`` unless the name of a picture ends in .png, .svg or .pdf."""
     if file.suffix not in PICTURES:
         raise UnusableLog(f"{words}: expected a name that ends in .png, .svg or .pdf, got {file.name!r}")
 
 
 def write_draft(file: Path, spec: EnvironmentSpec) -> None:
-    """Write a drafted specification, and never over another one, which may have been edited.
+    """Write a drafted specification to a file, unless the file holds another one, which a person may have edited.
 
     Raises:
-        UnusableLog: the file exists, and is another specification.
+        UnusableLog: the file exists and holds another specification.
         OSError: the file can't be written.
     """
     text = spec.model_dump_json(indent=2) + "\n"
@@ -71,7 +73,8 @@ def write_draft(file: Path, spec: EnvironmentSpec) -> None:
 
 
 def _same(output: Path, other: Path) -> bool:
-    """Return whether two paths are one file. A device, such as /dev/null, is no file."""
+    """Return whether writing to ``output`` would overwrite ``other``. A device, such as /dev/null, can't be
+    overwritten."""
     if output.exists() and not output.is_file():
         return False
     if other.is_dir():
@@ -83,8 +86,10 @@ def _same(output: Path, other: Path) -> bool:
 
 def _require_writable(words: str, file: Path) -> None:
     if file.is_dir():
-        raise UnusableLog(f"{words}: expected a file, got the folder {file}")
+        raise UnusableLog(f"{words}: expected a file, got the folder {file}: add a file name")
     if not file.parent.is_dir():
-        raise UnusableLog(f"{words}: expected a file in a folder that exists, got {file}")
+        raise UnusableLog(f"{words}: expected a file in a folder that exists, got {file}: make the folder first")
     if not os.access(file if file.exists() else file.parent, os.W_OK):
-        raise UnusableLog(f"{words}: expected a file that can be written, got {file}, which is write-protected")
+        raise UnusableLog(
+            f"{words}: expected a file that can be written, got {file}, which is write-protected: give another"
+        )

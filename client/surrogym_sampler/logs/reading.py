@@ -1,4 +1,4 @@
-"""Files to tables: text, NPZ, Parquet, HDF5, Minari. What a file is, is decided by what is in it."""
+"""Readers of logs: CSV, NPZ, Parquet, HDF5 and Minari. The content of a file, not its name, decides its format."""
 
 from __future__ import annotations
 
@@ -22,23 +22,29 @@ from surrogym_shared.logs.text import table_of_text
 from surrogym_shared.logs.writing import EVALUATED
 from surrogym_shared.words import listed
 
-MINARI_FILE = "main_data.hdf5"  # of a data set
+MINARI_FILE = "main_data.hdf5"  # file of a Minari data set that contains its arrays
 Format = Literal["csv", "npz", "parquet", "hdf5", "minari", "surrogate"]
 
-MOST_BYTES = 1024**3  # of the arrays in an NPZ file
+MOST_BYTES = 1024**3  # largest total size of the arrays in an NPZ file
 HDF5 = b"\x89HDF\r\n\x1a\n"
+# First entry of a zip file that is not an NPZ, and what the file is.
 OFFICE = {
     "[Content_Types].xml": "a workbook of Excel or another file of Microsoft Office",
     "_rels/.rels": "a workbook of Excel or another file of Microsoft Office",
     "mimetype": "a file of LibreOffice or OpenDocument",
     "modelDescription.xml": "an FMU",
     "META-INF/MANIFEST.MF": "a Java archive",
-}  # first entries of zips that are no NPZ
+}
 SURROGATE = ".surrogate"
 
 
 def format_of(path: Path) -> Format:
-    """The format of a log, or that of a surrogate's file."""
+    """Return the format of the log at a path, or ``surrogate`` if it is an exported surrogate.
+
+    Raises:
+        FileNotFoundError: there is neither such a file nor a Minari data set of this name.
+        UnusableLog: it is a folder without a Minari data set.
+    """
     if path.suffix == SURROGATE:
         return "surrogate"
     if path.is_dir():
@@ -62,10 +68,12 @@ def format_of(path: Path) -> Format:
 
 
 def read(path: Path) -> Table:
-    """The log at a path. Raises ``UnusableLog`` where it is none, or has no rows."""
+    """Read the log at a path. Raises ``UnusableLog`` if it is not a log or has no rows."""
     kind = format_of(path)
     if kind == "surrogate":
-        raise UnusableLog(f"expected a log, got a surrogate's file: surrogym import {path} without options for logs")
+        raise UnusableLog(
+            f"expected a log, got a surrogate's file: run surrogym import {path} without options for logs"
+        )
     readers = {"csv": read_csv, "npz": read_npz, "parquet": read_parquet, "hdf5": read_hdf5, "minari": read_minari}
     table = readers[kind](path)
     if not len(table):
@@ -77,13 +85,13 @@ def read(path: Path) -> Table:
 
 
 def read_csv(path: Path) -> Table:
-    """A table of text with a heading, in UTF-8 or an encoding that the file shows."""
+    """Read a CSV file with a heading, in UTF-8 or in the encoding that its first bytes or its content show."""
     text, remarks = decoded(path.read_bytes(), str(path))
     return table_of_text(text, str(path), remarks=remarks)
 
 
 def read_npz(path: Path) -> Table:
-    """The arrays of an NPZ file, as ``table_of_arrays`` has them. Nothing is unpickled."""
+    """Read the arrays of an NPZ file, with the names that ``table_of_arrays`` knows. Nothing is unpickled."""
     _require_npz(path)
     try:
         arrays = read_arrays(path, MOST_BYTES, lambda headers: require_shapes(path, _shapes(headers)))
@@ -101,7 +109,8 @@ def _shapes(headers: Mapping[str, Header]) -> dict[str, tuple[int, ...]]:
 
 
 def _require_npz(path: Path) -> None:
-    """Raise ``UnusableLog`` if a zip is damaged, or another kind of file. Its first entry is read even if it is cut."""
+    """Raise ``UnusableLog`` if a zip file is damaged, or is of another kind, such as a workbook. The name of its first
+    entry shows the kind, even if the file was cut off."""
     with path.open("rb") as file:
         head = file.read(512)
     first = head[30 : 30 + int.from_bytes(head[26:28], "little")].decode("utf-8", "replace")
@@ -115,10 +124,11 @@ def _require_npz(path: Path) -> None:
 
 
 def read_hdf5(path: Path) -> Table:
-    """The data sets at the top of an HDF5 file, such as those of D4RL. Groups, such as infos and metadata, are ignored.
+    """Read the data sets at the top level of an HDF5 file, such as those of D4RL. Groups, such as infos and metadata,
+    are ignored.
 
-    D4RL marks the end of an episode by ``terminals``, and by ``timeouts`` if it was cut off. The observation in the row
-    after such an end begins another episode.
+    D4RL marks the end of an episode by ``terminals``, and by ``timeouts`` if the episode was cut off. The observation
+    in the row after such an end belongs to the next episode.
     """
     try:
         import h5py
@@ -131,7 +141,8 @@ def read_hdf5(path: Path) -> Table:
             require_shapes(path, {name: one.shape for name, one in found.items()})
             if not found:
                 raise UnusableLog(
-                    f"expected data sets of one row a step at the top of {path}, got only the groups {listed(groups)}: "
+                    f"expected data sets with one row per step at the top of {path}, got only the groups "
+                    f"{listed(groups)}: "
                     "move the data sets to the top, or save them as CSV or NPZ"
                 )
             table = table_of_arrays(path, {name: _cells(one[()]) for name, one in found.items()})
@@ -145,13 +156,13 @@ def read_hdf5(path: Path) -> Table:
 
 
 def _cells(array: Any) -> Cells:
-    """Return an array of HDF5 with its text as text."""
+    """Convert an HDF5 array to NumPy; bytes become text."""
     cells = np.asarray(array)
     return np.char.decode(cells.astype(np.bytes_), "utf-8", "replace") if cells.dtype.kind in "SO" else cells
 
 
 def read_parquet(path: Path) -> Table:
-    """The columns of a Parquet file; lists of one length become columns of their own."""
+    """Read the columns of a Parquet file; a column of lists of the same length k becomes k columns."""
     try:
         from pyarrow import ArrowException, parquet, types
     except ModuleNotFoundError as error:
@@ -161,7 +172,7 @@ def read_parquet(path: Path) -> Table:
         _require_parquet(path, file.metadata)
         kinds = {field.name: field.type for field in file.schema_arrow}
         ignored = {
-            name: f"its type {kind} is not one value a step" for name, kind in kinds.items() if not _is_plain(kind)
+            name: f"its type {kind} is not one value per step" for name, kind in kinds.items() if not _is_plain(kind)
         }
         texts = [name for name, kind in kinds.items() if types.is_string(kind) or types.is_large_string(kind)]
         columns = parquet.ParquetFile(path, read_dictionary=texts).read([name for name in kinds if name not in ignored])
@@ -177,18 +188,24 @@ def read_parquet(path: Path) -> Table:
 
 
 def _require_parquet(path: Path, metadata: Any) -> None:
-    """Raise ``UnusableLog`` if a Parquet file is too large, before anything of it is decompressed."""
+    """Raise ``UnusableLog`` if the metadata of a Parquet file announce too many columns, rows or bytes, before anything
+    is decompressed."""
     if len(metadata.schema) > MOST_COLUMNS:
-        raise UnusableLog(f"expected at most {MOST_COLUMNS:,} columns in {path}, got {len(metadata.schema):,}")
+        raise UnusableLog(
+            f"expected at most {MOST_COLUMNS:,} columns in {path}, got {len(metadata.schema):,}: save only those of "
+            "the log"
+        )
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     chunks = [group.column(i) for group in groups for i in range(group.num_columns)]
     require_sizes(path, metadata.num_rows, sum(chunk.num_values for chunk in chunks))
     if (size := sum(chunk.total_uncompressed_size for chunk in chunks)) > MOST_BYTES:
-        raise UnusableLog(f"expected at most {MOST_BYTES:,} bytes inside {path}, got {size:,}")
+        raise UnusableLog(
+            f"expected at most {MOST_BYTES:,} bytes in the columns of {path}, got {size:,}: split the log by episodes"
+        )
 
 
 def _is_plain(kind: Any) -> bool:
-    """Whether a type of Parquet is one value, or a list of numbers."""
+    """Return whether a Parquet type is a single value or a list of numbers."""
     from pyarrow import types
 
     inner = (
@@ -200,7 +217,8 @@ def _is_plain(kind: Any) -> bool:
 
 
 def _of_column(path: Path, name: str, column: Any) -> Cells:
-    """Return a column of Parquet (n,) or (n, k). A long text is refused; equal texts share their memory."""
+    """Return a Parquet column as an array (n,), or (n, k) if its cells are lists. Equal texts share their memory; a
+    text that is too long raises ``UnusableLog``."""
     from pyarrow import compute, types
 
     if not types.is_dictionary(column.type):
@@ -211,7 +229,9 @@ def _of_column(path: Path, name: str, column: Any) -> Cells:
         longest = compute.max(compute.binary_length(chunk.dictionary)).as_py() if len(chunk.dictionary) else 0
         if types.is_string(chunk.dictionary.type) and longest > LONGEST_CELL:
             raise UnusableLog(
-                f"expected cells of at most {LONGEST_CELL:,} letters in the column {name!r} of {path}, got {longest:,}"
+                f"expected cells of at most {LONGEST_CELL:,} letters in the column {name!r} of {path}, got "
+                f"{longest:,}: "
+                "shorten or drop the column"
             )
         words = np.array([*map(str, chunk.dictionary.to_pylist()), ""], dtype=object)
         parts.append(words[chunk.indices.fill_null(len(words) - 1).to_numpy()])
@@ -219,14 +239,16 @@ def _of_column(path: Path, name: str, column: Any) -> Cells:
 
 
 def _of_objects(path: Path, name: str, cells: Cells) -> Cells:
-    """Return lists of one length as an array (n, k), and other cells as text (n,)."""
+    """Return cells as an array: lists of the same length k as (n, k), other cells as text (n,)."""
     lists = [isinstance(cell, np.ndarray) for cell in cells]
     if not any(lists):
         return np.array(["" if cell is None else str(cell) for cell in cells], dtype=object)
     shapes = {cell.shape if one else None for cell, one in zip(cells, lists, strict=True)}
     if len(shapes) > 1:
         raise UnusableLog(
-            f"expected lists of one length in the column {name} of {path}, got lists of different lengths"
+            f"expected lists of the same length in the column {name} of {path}, got different lengths: write each "
+            "entry "
+            "to a column of its own"
         )
     return np.stack(list(cells))
 
@@ -237,7 +259,8 @@ def _line(error: Exception) -> str:
 
 
 def read_minari(path: Path) -> Table:
-    """All episodes of a Minari data set, by its name or its folder. Observations and actions have to be vectors."""
+    """Read all episodes of the Minari data set with this name or in this folder. Its observations and actions must be
+    vectors."""
     minari = _minari()
     try:
         data = minari.MinariDataset(path / "data") if path.is_dir() else minari.load_dataset(str(path))
@@ -252,7 +275,13 @@ def read_minari(path: Path) -> Table:
 
 
 def _episodes(path: Path, data: Any, width: int) -> list[dict[str, Cells]]:
-    """Return the arrays of each episode. Their sizes are read before them."""
+    """Return the arrays of each episode by name, after a check of their total size.
+
+    Args:
+        path: the data set, for messages.
+        data: the opened data set.
+        width: number of entries of an observation.
+    """
     try:
         _require_minari(path, data)
         episodes = [_of_episode(episode, width) for episode in data.iterate_episodes()]
@@ -263,12 +292,13 @@ def _episodes(path: Path, data: Any, width: int) -> list[dict[str, Cells]]:
             f"expected a Minari data set in {path}, got one with an episode that can't be read: record it again"
         ) from error
     if not episodes:
-        raise UnusableLog(f"expected a Minari data set with episodes in {path}, got none")
+        raise UnusableLog(f"expected a Minari data set with episodes in {path}, got one without: record some")
     for number, arrays in enumerate(episodes):
         rows = {name: len(array) for name, array in arrays.items()}
         if len(set(rows.values())) > 1:
             raise UnusableLog(
-                f"expected an action, a reward and an end for each step in episode {number} of {path}, got {rows}"
+                f"expected an action, a reward and an end for each step in episode {number} of {path}, got {rows} "
+                "values: record the episode again"
             )
     return episodes
 
@@ -289,10 +319,10 @@ def _of_episode(episode: Any, width: int) -> dict[str, Cells]:
 
 
 def _require_minari(path: Path, data: Any) -> None:
-    """Raise ``UnusableLog`` if the arrays of a data set are too large, before one of them is read. Its metadata may
-    name other sizes."""
+    """Raise ``UnusableLog`` if the arrays of a Minari data set are too large, before any is read. The sizes come from
+    the HDF5 file, because the metadata may be wrong."""
     file = Path(data.storage.data_path) / MINARI_FILE
-    if not file.exists():  # another form of storage
+    if not file.exists():  # the data set is not stored as HDF5, so only its metadata tell the size
         require_sizes(path, data.total_steps, data.total_steps * (2 * prod(data.observation_space.shape) + 1))
         return
     import h5py
@@ -304,18 +334,24 @@ def _require_minari(path: Path, data: Any) -> None:
 
 
 def _width(path: Path, space: Any) -> int:
-    """Return the length of an observation. A column, (n, 1), is a vector too; a label of Discrete is none."""
+    """Return the number of entries of an observation. Its space must be a Box of shape (n,) or (n, 1); others raise
+    ``UnusableLog``."""
     if not isinstance(space, Box) or sum(size > 1 for size in space.shape) > 1:
-        raise UnusableLog(f"expected observations that are vectors (a Box) in {path}, got the space {space}")
+        raise UnusableLog(
+            f"expected observations that are vectors (a Box) in {path}, got the space {space}: record vectors"
+        )
     return prod(space.shape)
 
 
 def _declared(path: Path, space: Any) -> dict[str, Any]:
-    """Return what a declared space says of the actions: whether they are discrete, and their limits."""
+    """Return what the action space of a data set declares: whether actions are discrete, and their finite limits by
+    index."""
     if isinstance(space, Discrete) and space.start == 0:
         return {"discrete": True, "limits": {"0": (0.0, float(space.n - 1))}}
     if not isinstance(space, Box) or len(space.shape) > 1:
-        raise UnusableLog(f"expected actions of a Box (n,), or of a Discrete from 0, in {path}, got the space {space}")
+        raise UnusableLog(
+            f"expected actions of a Box (n,) or of a Discrete from 0 in {path}, got {space}: convert them"
+        )
     ends = zip(space.low.reshape(-1).tolist(), space.high.reshape(-1).tolist(), strict=True)
     return {"discrete": False, "limits": {str(i): pair for i, pair in enumerate(ends) if np.isfinite(pair).all()}}
 
@@ -333,7 +369,7 @@ def _minari() -> Any:
 
 
 def _require_data_set(folder: Path) -> None:
-    """A folder is a log where Minari keeps a data set: with its metadata, or with its HDF5 file."""
+    """Raise ``UnusableLog`` unless a folder contains a Minari data set, with its metadata or its HDF5 file."""
     if not any((folder / "data" / name).is_file() for name in ("main_data.hdf5", "metadata.json")):
         raise UnusableLog(
             f"expected a CSV, Parquet or NPZ file, or a Minari data set, got the folder {folder}, which has no "
@@ -342,7 +378,8 @@ def _require_data_set(folder: Path) -> None:
 
 
 def _minari_has(path: Path) -> bool:
-    """Whether there is a Minari data set of this name here; the package is asked only for what looks like one."""
+    """Return whether a local Minari data set has this name. Minari is imported only for a name with a version, such as
+    ``x-v0``."""
     if path.suffix or path.is_absolute() or "-v" not in path.name:
         return False
     return str(path) in _minari().list_local_datasets()

@@ -14,22 +14,28 @@ from surrogym_shared.spec.actions import Action
 
 
 def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], num_envs: int) -> Array:
-    """Convert a policy's actions to those of the environment, (N, F). Bins are converted to continuous values.
+    """Convert a policy's actions for N environments to those of the original environment, (N, F). Bins become
+    continuous values.
 
     Raises:
-        ValueError: wrong shape.
+        ValueError: the actions have the wrong shape, are not finite, or are not numbers of existing bins or values.
     """
     rows = np.asarray(raw, dtype=np.float64)
     if rows.size != num_envs * spec.action.size:
-        raise ValueError(f"expected actions of shape ({num_envs}, {spec.action.size}), got {np.shape(raw)}")
+        raise ValueError(
+            f"expected actions of shape ({num_envs}, {spec.action.size}), got {np.shape(raw)}: give one row per "
+            "environment"
+        )
     rows = rows.reshape(num_envs, spec.action.size)
     if isinstance(spec.action, BoxAction) and spec.action.bins is None:
         if not np.isfinite(rows).all():
-            raise ValueError(f"expected finite actions, got {rows.tolist()}")
+            raise ValueError(f"expected finite actions, got {rows.tolist()}: correct the policy that gave them")
         return np.clip(rows, spec.action.low, spec.action.high)
     counts = np.array(_counts(spec.action))
     if not ((rows >= 0) & (rows < counts) & (rows == np.round(rows))).all():
-        raise ValueError(f"expected whole numbers from 0 to below {counts.tolist()}, got {rows.tolist()}")
+        raise ValueError(
+            f"expected actions that are whole numbers from 0 to below {counts.tolist()}, got {rows.tolist()}"
+        )
     if not isinstance(spec.action, BoxAction):
         return rows
     low, high = np.array(spec.action.low), np.array(spec.action.high)
@@ -37,10 +43,10 @@ def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], num_envs: int) -> A
 
 
 def explored(spec: EnvironmentSpec, action: Array, share: float, rng: np.random.Generator) -> Array:
-    """Change an action (F,) of the environment at random.
+    """Return an action (F,) of the environment after a random change.
 
     A continuous entry gets normal noise with a standard deviation of ``share`` times half its range, and stays within
-    its bounds. An entry with a finite number of values becomes a random one of them with probability ``share``.
+    its bounds. With probability ``share``, an entry with a finite number of values becomes a random one of them.
     """
     size = spec.action.size
     if isinstance(spec.action, BoxAction):
@@ -53,18 +59,25 @@ def explored(spec: EnvironmentSpec, action: Array, share: float, rng: np.random.
 
 
 def require_same_action(name: str, declared: Action, own: Action) -> None:
-    """Refuse a declared action that the environment can't take. It may have fewer values, and other bounds.
+    """Refuse a declared action that the environment can't take. It may have fewer values than the environment's own,
+    and other bounds.
+
+    Args:
+        name: the environment, for messages.
+        declared: the action of the specification.
+        own: the action of the environment.
 
     Raises:
-        UnknownEnvironment: it has another kind, another number of entries, or more values.
+        UnknownEnvironment: the declared action has another kind, another number of entries, or more values.
     """
     fits = declared.kind == own.kind and declared.size == own.size
     if fits and not isinstance(own, BoxAction):
         fits = all(asked <= there for asked, there in zip(_counts(declared), _counts(own), strict=True))
     if not fits:
         raise UnknownEnvironment(
-            f"the specification has {_words_of(declared)}, but {name} takes {_words_of(own)}: write the latter in its "
-            "action"
+            f"the specification declares {_words_of(declared)}, but {name} takes {_words_of(own)}: declare the latter "
+            "as "
+            "the action"
         )
 
 
@@ -76,7 +89,7 @@ def _words_of(action: Action) -> str:
 
 
 def _counts(action: BoxAction | DiscreteAction | MultiDiscreteAction) -> tuple[int, ...]:
-    """Number of values in each dimension of a policy's action."""
+    """Return the number of values of each entry of a policy's action; empty if the entries are continuous."""
     match action:
         case BoxAction(bins=bins):
             return bins or ()

@@ -1,4 +1,5 @@
-"""Gymnasium's classic control tasks and the swing-up of this package: specifications, and access to their state.
+"""Gymnasium's classic control tasks and the swing-up tasks of this package: their specifications, and access to their
+state.
 
 The source of every number is the task's Gymnasium class. Angles are in radians. Gymnasium's mountain cars have no unit
 of time, so no sampling period.
@@ -37,11 +38,14 @@ CIRCLE = Uniform(low=-math.pi, high=math.pi)
 
 @dataclass(frozen=True)
 class Task:
-    """One known environment.
+    """A known environment, with access to its state.
 
-    ``write`` puts coordinates (C,) into the unwrapped environment and clears its memory of earlier steps.
-    ``perturbable`` names the physical attributes that ``--perturb`` may change; ``settle`` recomputes the attributes
-    that depend on them.
+    Attributes:
+        spec: makes its specification.
+        write: puts coordinates (C,) into the unwrapped environment, and clears its memory of earlier steps.
+        read: returns the coordinates (C,) of the unwrapped environment.
+        perturbable: names of the physical attributes that ``--perturb`` may change.
+        settle: recomputes the attributes that depend on those; None if there are none.
     """
 
     spec: Callable[[], EnvironmentSpec]
@@ -52,7 +56,7 @@ class Task:
 
 
 def pendulum() -> EnvironmentSpec:
-    """Pendulum-v1: swing up and stay. The reward is that of the state before the step."""
+    """Return the specification of Pendulum-v1: swing up and stay. The reward depends on the state before the step."""
     return EnvironmentSpec(
         environment="Pendulum-v1",
         coordinates=(
@@ -74,7 +78,8 @@ def pendulum() -> EnvironmentSpec:
 
 
 def cartpole() -> EnvironmentSpec:
-    """CartPole-v1: keep the pole up. The reward is 1 for each step, including the failing one."""
+    """Return the specification of CartPole-v1: keep the pole up. The reward is 1 for each step, including the failing
+    one."""
     return _cartpole(
         x=2.4,
         pole=math.radians(12),
@@ -90,7 +95,8 @@ def cartpole() -> EnvironmentSpec:
 
 
 def cartpole_of_the_paper() -> EnvironmentSpec:
-    """CartPole as in the paper's section 5.2: twice the range, a learned reward of 0 or 1, no termination."""
+    """Return the specification of CartPole as in the paper's section 5.2: twice the range, a learned reward of 0 or 1,
+    no termination."""
     return _cartpole(x=4.8, pole=math.radians(24), termination=(), time_limit=200, min_steps=195)
 
 
@@ -123,16 +129,18 @@ def _cartpole(
 
 
 def mountain_car_continuous() -> EnvironmentSpec:
-    """MountainCarContinuous-v0: reach the right hill; 100 on arrival, minus the squared force.
+    """Return the specification of MountainCarContinuous-v0: reach the right hill; 100 on arrival, minus the squared
+    force.
 
-    Positions are sampled up to 0.52, from where no step reaches the right wall at 0.6, so that only the left
-    wall, which also stops the car, has to be declared.
+    Positions are sampled up to 0.52, from where no step reaches the right wall at 0.6, so that only the left wall,
+    which also stops the car, has to be declared.
     """
     return _mountain_car("MountainCarContinuous-v0", BoxAction(low=(-1.0,), high=(1.0,)), goal=0.45, time_limit=999)
 
 
 def mountain_car() -> EnvironmentSpec:
-    """MountainCar-v0: like MountainCarContinuous-v0, with three actions and a reward of -1 for each step."""
+    """Return the specification of MountainCar-v0: reach the right hill with one of three actions; the reward is -1 for
+    each step."""
     return _mountain_car("MountainCar-v0", DiscreteAction(n=3), goal=0.5, time_limit=200)
 
 
@@ -163,7 +171,8 @@ def _mountain_car(
 
 
 def acrobot() -> EnvironmentSpec:
-    """Acrobot-v1: swing the tip one link's length above the bar. The reward is -1 for each step, and 0 for the last."""
+    """Return the specification of Acrobot-v1: swing the tip one link's length above the bar. The reward is -1 for each
+    step, and 0 for the last."""
     height = -1 * Term.cos(theta1=1) + -1 * Term.cos(theta1=1, theta2=1)
     speeds = {"speed1": (2.5, 4 * math.pi), "speed2": (5.0, 9 * math.pi)}
     return EnvironmentSpec(
@@ -222,7 +231,8 @@ def _write_cartpole(env: Native, coordinates: Array) -> None:
 
 def _write_cartpole_of_the_paper(env: Native, coordinates: Array) -> None:
     _write_state(env, coordinates)
-    env.steps_beyond_terminated = 1  # past the first failure the reward outside the limits is 0, as in eq. 17
+    # with 1, Gymnasium counts the pole as fallen before, and pays 0 outside the limits, as in eq. 17
+    env.steps_beyond_terminated = 1
 
 
 def _settle_cartpole(env: Native) -> None:
@@ -249,7 +259,7 @@ TASKS: dict[str, Task] = {
     SWING_UP_NARROW: Task(swing_up_narrow, _write_state, _read_state, _SWING_UP_PHYSICS),
 }
 
-# Tasks that the paper defines differently from Gymnasium.
+# The tasks that the paper on Active Uncertainty Reduction defines differently from Gymnasium.
 PAPER_TASKS: dict[str, Task] = {
     "CartPole-v1": Task(
         cartpole_of_the_paper, _write_cartpole_of_the_paper, _read_state, _CARTPOLE_PHYSICS, _settle_cartpole

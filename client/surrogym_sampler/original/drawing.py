@@ -1,4 +1,4 @@
-"""Pictures by numpy alone: a stroke colours each pixel by its distance.
+"""Drawing with NumPy alone: a stroke colours each pixel by the pixel's distance from a line.
 
 Shapes: a frame is (height, width, 3) float64, 0 to 255. Points are in the world's units, y upwards from the middle.
 """
@@ -16,12 +16,12 @@ WHITE = 255.0
 
 
 class Canvas:
-    """A white frame for strokes.
+    """A white frame on which strokes are drawn.
 
     Args:
-        width: pixels.
-        height: pixels.
-        scale: pixels of a unit of the world, whose origin is in the middle.
+        width: width in pixels.
+        height: height in pixels.
+        scale: pixels for each unit of the world, whose origin is in the middle.
     """
 
     def __init__(self, width: int, height: int, scale: float) -> None:
@@ -37,9 +37,10 @@ class Canvas:
         along = ((self._x - ax) * dx + (self._y - ay) * dy) / max(dx**2 + dy**2, 1e-12)
         nearest = np.clip(along, 0.0, 1.0)
         away = np.hypot(self._x - ax - nearest * dx, self._y - ay - nearest * dy) - thickness / 2
-        cover = np.clip(0.5 - away * self._scale, 0.0, 1.0)[..., None]  # edges are as wide as a pixel
+        # share of each pixel that the stroke covers; its edges are one pixel wide
+        cover = np.clip(0.5 - away * self._scale, 0.0, 1.0)[..., None]
         self._frame += cover * (np.array(colour) - self._frame)
 
     def picture(self) -> NDArray[np.uint8]:
-        """The frame as (height, width, 3) uint8."""
+        """Return the frame as (height, width, 3) uint8."""
         return np.round(self._frame).astype(np.uint8)

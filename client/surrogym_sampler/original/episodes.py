@@ -1,4 +1,4 @@
-"""Whole episodes in an original environment, for evaluation.
+"""Whole episodes in an original environment, for evaluations.
 
 Shapes: C coordinates, D observation entries, F action entries.
 """
@@ -30,19 +30,19 @@ from surrogym_shared.terms import observe
 
 @dataclass(frozen=True)
 class Moment:
-    """Results of one step of an episode."""
+    """The result of a reset or of one step of an episode."""
 
     observation: Array  # (D,)
     reward: float
     terminated: bool
     coordinates: Array  # (C,)
-    truncated: bool = False  # by the environment itself, which then takes no further step
+    truncated: bool = False  # whether the environment itself ended the episode without termination
 
 
 class Episode(ABC):
     """The running episode of one instance of an environment.
 
-    To begin the next one, call ``perturb`` if needed, then ``reset`` or ``place``, then ``step``.
+    To begin the next episode, call ``perturb`` if needed, then ``reset`` or ``place``, then ``step``.
     """
 
     parallel = False  # whether several instances may be open at once
@@ -52,32 +52,33 @@ class Episode(ABC):
 
     @abstractmethod
     def reset(self, seed: int) -> Moment:
-        """Start as the environment does."""
+        """Begin an episode by the environment's own reset, with a seed."""
 
     @abstractmethod
     def place(self, coordinates: Array) -> Moment:
-        """Start at coordinates (C,)."""
+        """Begin an episode at coordinates (C,)."""
 
     @abstractmethod
     def step(self, action: Array) -> Moment:
-        """Apply action (F,)."""
+        """Apply an action (F,), and return the result."""
 
     @abstractmethod
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
-        """Multiply the physical attributes by normal factors with mean 1 and standard deviation sigma."""
+        """Multiply the physical attributes by normal factors with mean 1 and standard deviation ``sigma``."""
 
     @abstractmethod
     def close(self) -> None:
-        """Release what the episode holds."""
+        """Close the environment and release its resources."""
 
     def _shown(self, coordinates: Array) -> Array:
-        """The declared observation (D,)."""
+        """Return the declared observation (D,) of coordinates (C,)."""
         shown: Array = observe(self.spec, coordinates[None])[0]
         return shown
 
 
 class GymnasiumEpisode(Episode):
-    """An episode of a Gymnasium environment with a built-in adapter. Its observation is the environment's own."""
+    """An episode of a Gymnasium task with a built-in specification. The observation is the environment's own if the
+    specification declares the same one."""
 
     parallel = True
 
@@ -94,7 +95,7 @@ class GymnasiumEpisode(Episode):
         return gymnasium.make(self.spec.environment).unwrapped
 
     def _read_physics(self) -> Any:
-        """The attributes that ``perturb`` changes, with their original values."""
+        """Return the attributes that ``perturb`` changes, with their original values."""
         return {name: getattr(self._env, name) for name in self._task.perturbable}
 
     def _read(self) -> Array:
@@ -135,7 +136,7 @@ class GymnasiumEpisode(Episode):
 class SimulatedEpisode(Episode):
     """An episode of a simulator that an adapter opened. ``perturb`` changes the masses of all bodies.
 
-    Its observation is the environment's own if the built-in specification shows the same.
+    The observation is the environment's own if the built-in specification shows the same.
     """
 
     def __init__(self, environment: Simulated) -> None:
@@ -171,7 +172,7 @@ class SimulatedEpisode(Episode):
 
 
 class OwnEpisode(Episode):
-    """An episode of a user's environment."""
+    """An episode of an environment that a user wrote."""
 
     def __init__(self, environment: Environment) -> None:
         super().__init__(environment.spec())
@@ -180,7 +181,9 @@ class OwnEpisode(Episode):
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
         del rng, sigma
         raise NotPerturbable(
-            "only environments with a built-in adapter can be perturbed: write a changed class, and name it by --env"
+            "expected an environment with a built-in adapter for a perturbation, got one of your own: write a class "
+            "with "
+            "changed physics, and give it with --env"
         )
 
     def _started(self, coordinates: Array) -> Moment:
@@ -190,13 +193,14 @@ class OwnEpisode(Episode):
         reached, reward = np.asarray(step.next_coordinates, dtype=np.float64), float(step.reward)
         if reached.shape != (size := len(self.spec.coordinates),) or not np.isfinite([*reached, reward]).all():
             raise StepFailed(
-                f"expected {size} finite coordinates and a finite reward, got {reached.tolist()} and {reward}"
+                f"expected a step of the environment to give {size} finite coordinates and a finite reward, got "
+                f"{reached.tolist()} and {reward}: correct the environment"
             )
         return Moment(self._shown(reached), reward, bool(step.terminated), reached, bool(step.truncated))
 
 
 class RolloutEpisode(OwnEpisode):
-    """An episode of an environment that can't be set to a state."""
+    """An episode of a user's environment that can only be reset, not set to a state."""
 
     def __init__(self, environment: RolloutEnvironment) -> None:
         super().__init__(environment)
@@ -216,7 +220,7 @@ class RolloutEpisode(OwnEpisode):
 
 
 class SteppedEpisode(OwnEpisode):
-    """An episode of real steps, each from the end of the one before."""
+    """An episode of a user's environment that can be set to a state: each step begins where the previous one ended."""
 
     def __init__(self, environment: OriginalEnvironment) -> None:
         super().__init__(environment)
@@ -240,8 +244,13 @@ class SteppedEpisode(OwnEpisode):
 
 
 def open_episode(name: str, spec: EnvironmentSpec | None, factory: Factory) -> Episode:
-    """Open an episode of the environment called ``name``. ``factory`` makes the environment if no adapter knows the
-    name."""
+    """Open an episode of an environment.
+
+    Args:
+        name: the environment's name.
+        spec: a specification that replaces the environment's own; None keeps that.
+        factory: makes the environment, unless the name is that of a built-in Gymnasium task.
+    """
     if opens_task(name, spec):
         return GymnasiumEpisode(spec or factory().spec())
     made = factory()
@@ -257,10 +266,10 @@ def draw(spec: EnvironmentSpec, rng: np.random.Generator, *, wide: bool, scale: 
     """Draw start coordinates (C,), from the start distribution or from the whole sampling range.
 
     Args:
-        spec: of the environment.
+        spec: the environment's specification.
         rng: random generator.
-        wide: draw from the sampling range.
-        scale: factor for the distance from the middle of each start distribution; bounds are kept.
+        wide: whether to draw from the sampling range.
+        scale: factor on the distance from the middle of each start distribution; bounds are kept.
     """
     if spec.starts and not wide and scale == 1:
         return np.array(spec.starts[rng.integers(len(spec.starts))])

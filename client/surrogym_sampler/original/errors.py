@@ -25,7 +25,8 @@ import os
 import traceback
 
 MORE_TIME = "a larger --step-limit gives it more time"
-RAISED = (Exception, SystemExit)  # what the code of somebody's environment raises; Ctrl-C is not its own
+# what the code of a user's environment may raise; KeyboardInterrupt is the user's own and passes through
+RAISED = (Exception, SystemExit)
 
 
 class OriginalError(Exception):
@@ -33,7 +34,7 @@ class OriginalError(Exception):
 
 
 class UnknownEnvironment(OriginalError):
-    """No original environment can be made of this name."""
+    """The name stands for no original environment that can be made and specified."""
 
 
 class NotPerturbable(OriginalError):
@@ -61,19 +62,19 @@ class SnapshotGone(OriginalError):
 
 
 class SnapshotNotKept(OriginalError):
-    """A state could not be saved or written. The step before it counts all the same."""
+    """A state could not be saved or written. The step before it is still counted."""
 
 
 class UnusableFolder(OriginalError):
-    """The folder for snapshots can't be made, or not written to."""
+    """The folder for snapshots can't be made or written to."""
 
 
 class MachineFails(OriginalError):
-    """The environment failed at several different queries in a row. Claimed queries went back into the queue."""
+    """The environment failed at several different queries in a row. The claimed queries were returned to the queue."""
 
 
 class EvaluationFailed(OriginalError):
-    """An error (see ``__cause__``) occurred after ``steps`` real steps had been begun."""
+    """An evaluation failed after ``steps`` real steps; ``__cause__`` is the error."""
 
     def __init__(self, steps: int, cause: BaseException) -> None:
         super().__init__(f"the evaluation failed after {steps} real steps: {sentence(cause)}")
@@ -97,9 +98,9 @@ class EnvironmentDied(StepFailed):
 
 
 class StepRefused(StepFailed):
-    """Raise it in an environment's method to refuse a step before anything moves.
+    """The environment refused a step before anything moved; an environment's method may raise it.
 
-    The query then counts neither as an attempt nor towards the budget, and the design asks elsewhere.
+    The query then counts neither as an attempt nor towards the budget, and the design chooses another state and action.
 
     Examples:
         >>> def step_from(coordinates, action):
@@ -109,7 +110,8 @@ class StepRefused(StepFailed):
 
 
 class RequestRefused(StepFailed):
-    """An environment's program answered a request with an error. ``code`` is "unsupported", or another word of it."""
+    """An environment's program answered a request with an error. ``code`` is "unsupported", or another code of the
+    program's answer."""
 
     def __init__(self, message: str, code: str = "failed") -> None:
         super().__init__(message)
@@ -121,8 +123,8 @@ class RequestRefused(StepFailed):
 
 
 def message_of(error: BaseException) -> str:
-    """The message of somebody's exception, as text that can be sent and printed. Never raises, whatever its own code
-    does."""
+    """Return the message of a foreign exception, as text that can be sent and printed. Never raises, even if the
+    exception's own code does."""
     try:
         said = str(error)
     except RAISED as failed:
@@ -131,8 +133,9 @@ def message_of(error: BaseException) -> str:
 
 
 def sentence(error: BaseException) -> str:
-    """Describe an exception of somebody's environment: its type, its message, and the line that raised it."""
-    if isinstance(error, OriginalError):  # complete by itself; the line does not help the environment's author
+    """Describe an exception of a user's environment: its type, its message, and the line that raised it."""
+    # the package's own errors are complete sentences, and their line would not help the environment's author
+    if isinstance(error, OriginalError):
         return message_of(error)
     frame = traceback.extract_tb(error.__traceback__)[-1:]
     where = f" ({os.path.basename(frame[0].filename)}:{frame[0].lineno})" if frame else ""

@@ -1,4 +1,4 @@
-"""Checks of a server of this protocol from outside. One small surrogate is created, used and deleted."""
+"""Checks that a server follows the protocol, made through its API. One small surrogate is created, used and deleted."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ Check = Callable[[Target], None]
 
 
 def conformance(url: str | None, token: str | None, surrogate: str) -> Iterator[Outcome]:
-    """Run every check in turn.
+    """Run every check of a server in turn, and yield its outcome.
 
     Args:
         url: the server's address; default ``SURROGYM_URL``, then http://127.0.0.1:8000.
-        token: of the role admin, if the server has tokens.
+        token: a token of the role admin, if the server requires tokens.
         surrogate: an unused name on the server; the surrogate is deleted at the end.
 
     Raises:
-        SurrogymClientError: the name is taken, or the surrogate gets no model, so that nothing can be checked.
+        SurrogymClientError: the name is taken, or the surrogate gets no model, so that sessions can't be checked.
     """
     with Target(url, token, surrogate) as target:
         for check in leases.CHECKS:
@@ -37,6 +37,7 @@ def _outcome(check: Check, target: Target) -> Outcome:
         check(target)
     except (Mismatch, SurrogymClientError) as failure:
         return Outcome(name, str(failure))
-    except (LookupError, TypeError, ValueError) as failure:  # a reply without the fields of the protocol
+    # raised by reading a reply that lacks fields of the protocol
+    except (LookupError, TypeError, ValueError) as failure:
         return Outcome(name, f"expected a reply that follows the protocol, got one that causes {failure!r}")
     return Outcome(name, None)

@@ -12,8 +12,8 @@ from surrogym_sampler.diagnosis.outcomes import expect
 from surrogym_shared.wire import OpenSession
 
 BACK = [[-1.0], [-1.0]]
-ON_AND_BACK = [[1.0], [-1.0]]  # the first lane terminates, the second does not
-ROLLED = 5  # steps, more than an episode has
+ON_AND_BACK = [[1.0], [-1.0]]  # actions that end the episode of the first lane, not of the second
+ROLLED = 5  # number of steps; an episode is shorter, so that a reset is among them
 
 
 def the_same_seq_and_body_get_the_same_reply(target: Target) -> None:

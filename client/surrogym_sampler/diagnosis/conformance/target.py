@@ -1,4 +1,4 @@
-"""The server under test, with a surrogate that learns from a handful of exact samples."""
+"""The server under test, and a small surrogate on it that learns from a handful of noise-free samples."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ SPEC = EnvironmentSpec(
 
 
 class Target:
-    """Plain requests, because the raw replies are checked. ``api`` serves the steps that are not checked."""
+    """A server under test and its surrogate. Checked requests are sent as plain HTTP, so that the raw reply can be
+    compared; ``api`` sends the others."""
 
     def __init__(self, url: str | None, token: str | None, surrogate: str) -> None:
         self.surrogate = surrogate
@@ -53,25 +54,34 @@ class Target:
             self.api.create_surrogate(self.surrogate, SPEC)
             return self
         self._close()
-        raise SurrogymClientError(f"expected a free name, got {self.surrogate!r}, a surrogate of this server")
+        raise SurrogymClientError(
+            f"expected an unused surrogate name, got {self.surrogate!r}, which exists on this server: choose another"
+        )
 
     def __exit__(self, *_: object) -> None:
         self.api.delete_surrogate(self.surrogate)
         self._close()
 
     def post(self, path: str, body: object) -> httpx.Response:
-        """POST below /v1."""
+        """POST ``body`` as JSON to ``path`` below /v1, and return the reply. Raises ``Mismatch`` if there is none."""
         try:
             return self._http.post(f"/v1/{path}", json=body, timeout=60)
         except httpx.TransportError as failure:
             raise Mismatch(f"{path}: expected a reply, got {failure!r}") from failure
 
     def post_text(self, path: str, body: str) -> httpx.Response:
-        """POST a text that may not be JSON."""
+        """POST a text, which may be invalid JSON, to ``path`` below /v1, and return the reply."""
         return self._http.post(f"/v1/{path}", content=body, headers={"Content-Type": "application/json"})
 
     def refused(self, what: str, reply: httpx.Response, status: int, code: str) -> dict[str, Any]:
-        """The problem body of a request that must be refused."""
+        """Check that a request was refused with this status and error code, and return the problem body of the reply.
+
+        Args:
+            what: the request in words, for messages.
+            reply: the server's reply.
+            status: the expected HTTP status.
+            code: the expected ``code`` of the problem.
+        """
         expect(f"status of {what}", status, reply.status_code)
         expect(f"media type of {what}", "application/problem+json", reply.headers.get("content-type"))
         problem: dict[str, Any] = reply.json()
@@ -79,21 +89,28 @@ class Target:
         return problem
 
     def open(self, **options: object) -> str:
-        """Open a session of two lanes, and return its id."""
+        """Open a session of two lanes (environments that step together), and return its id."""
         reply = self.post(f"surrogates/{self.surrogate}/sessions", {"num_envs": 2, "seed": 7, **options})
         expect("status of opening", True, reply.is_success)
         session: str = reply.json()["id"]
         return session
 
     def act(self, session: str, what: str, **body: object) -> dict[str, Any]:
-        """A reset or step that must succeed."""
+        """Send a reset or a step, which must succeed, and return the reply's body.
+
+        Args:
+            session: the id of the session.
+            what: ``reset`` or ``step``.
+            body: fields of the request.
+        """
         reply = self.post(f"sessions/{session}/{what}", body)
         expect(f"status of {what}", 200, reply.status_code)
         answer: dict[str, Any] = reply.json()
         return answer
 
     def claim(self, lease_seconds: float = wire.LEASE_SECONDS) -> wire.StepQuery:
-        """Claim one query, which must exist."""
+        """Claim one query of the surrogate under a lease of ``lease_seconds``. Raises ``Mismatch`` if there is none
+        within 5 s."""
         claimed = self.api.claim(self.surrogate, "conformance", lease_seconds=lease_seconds, wait_seconds=5.0)
         expect("number of claimed queries", 1, len(claimed.queries))
         query = claimed.queries[0]
@@ -101,16 +118,17 @@ class Target:
         return query
 
     def teach(self) -> None:
-        """Answer all queries until a model is served.
+        """Answer the surrogate's queries until the server has a model of it.
 
         Raises:
-            SurrogymClientError: there is no model in time.
+            SurrogymClientError: there is no model within ``LEARNING_SECONDS``.
         """
         deadline = time.monotonic() + LEARNING_SECONDS
         while self.api.surrogate(self.surrogate).model_version is None:
             if time.monotonic() > deadline:
                 raise SurrogymClientError(
-                    f"expected a model within {LEARNING_SECONDS:g} s of the last sample, got none"
+                    f"expected a model of surrogate {self.surrogate!r} within {LEARNING_SECONDS:g} s, got none: "
+                    "see the server's log"
                 )
             for query in self.api.claim(self.surrogate, "conformance", max_queries=6, wait_seconds=1.0).queries:
                 if isinstance(query, wire.StepQuery):
@@ -122,7 +140,7 @@ class Target:
 
 
 def answer(query: wire.StepQuery) -> wire.NewSample:
-    """The exact step: x' = x + 0.4 u, reward -x^2."""
+    """Return the noise-free sample that answers a query: x' = x + 0.4 u, reward -x^2."""
     x, u = query.coordinates[0], query.action[0]
     return wire.NewSample(
         query_id=query.id,

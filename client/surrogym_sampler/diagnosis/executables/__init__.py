@@ -1,4 +1,4 @@
-"""Checks of a program that is an original environment: docs/how-to/executables.md has the protocol."""
+"""Checks that a program can serve as an original environment; docs/how-to/executables.md describes its protocol."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ FIRST = "spec answers with protocol 1 and a valid specification"
 
 
 def conformance(command: str, seconds: float) -> Iterator[Outcome]:
-    """Run every check in turn on one program. Without a valid specification, no further check is made.
+    """Run every check in turn on one program, and yield its outcome. Without a valid specification, only the first
+    check is made.
 
     Args:
         command: the program and its arguments, quoted as for a shell.
-        seconds: time for each answer.
+        seconds: time allowed for each answer.
 
     Raises:
         UnknownEnvironment: the command is empty, or its quotes don't match.
@@ -49,5 +50,5 @@ def _outcome(check: Callable[[Subject], None], way_out: str, subject: Subject) -
 
 
 def _own(error: Exception) -> str:
-    """Return the message without the advice to run this very command."""
+    """Return the error's message without its advice to run the very command that is running."""
     return str(error).removesuffix(f"; {CHECK}")

@@ -1,4 +1,4 @@
-"""Checks of a program's end: by the request, and by the end of its input."""
+"""Checks that a program ends on the request ``close``, and when its standard input ends."""
 
 from __future__ import annotations
 

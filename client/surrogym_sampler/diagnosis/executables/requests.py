@@ -1,4 +1,4 @@
-"""Checks of a program's answers: their form, and errors for requests that it can't answer."""
+"""Checks of a program's answers: their form, and the errors for requests that it can't answer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from surrogym_sampler.diagnosis.outcomes import Mismatch, expect
 from surrogym_sampler.original.errors import RequestRefused
 from surrogym_sampler.original.executables.messages import PROTOCOL, decode, encode
 
-NUMBERS = (1_000_003, 17)  # of requests
+NUMBERS = (1_000_003, 17)  # arbitrary ids of requests, which the answers must repeat
 NONSENSE = b"this is no request\n"
 SURPLUS_SECONDS = 0.2
 STEPS = 3

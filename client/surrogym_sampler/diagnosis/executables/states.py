@@ -16,10 +16,10 @@ from surrogym_sampler.original.executables.messages import action_entries, text,
 from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import Fixed, limits
 
-PLACES = 3  # number of states
+PLACES = 3  # number of random states in a check
 SEEDS = 5
-WANDERING = 5  # steps
-TINY = 1e-6  # of a range; Python writes such a number with an exponent
+WANDERING = 5  # number of steps that lead away from a state
+TINY = 1e-6  # share of a range; Python writes such a number with an exponent, which the program must be able to read
 
 
 def a_reset_without_a_seed_gives_a_state(subject: Subject) -> None:
@@ -55,8 +55,9 @@ def get_gives_the_state_that_was_set(subject: Subject) -> None:
 
 
 def a_step_depends_on_nothing_but_state_and_action(subject: Subject) -> None:
-    """Compare a step after the same step with one after other steps. If a step differs from the same step before it
-    although that one followed the same step too, the plant is noisy, and its memory can't be told from noise."""
+    """Take a step three times in a row, then once more after other steps. Any difference means that the program
+    remembers more than its state. If the second and third differ already, the plant is noisy and the check does not
+    apply."""
     for _ in range(PLACES):
         state, action = subject.random_state(), subject.random_action()
         _, first, again = (_step_from(subject, state, action) for _ in range(3))
@@ -84,7 +85,7 @@ def a_program_that_was_started_anew_is_the_same(subject: Subject) -> None:
 
 
 def _tiny(subject: Subject) -> Array:
-    """A state (C,) that is nearly 0 in each coordinate whose range includes 0."""
+    """Return a random state (C,) that is almost 0 in each coordinate whose range includes 0."""
     ranges = [limits(coordinate.sampling) for coordinate in subject.spec.coordinates]
     drawn = subject.random_state()
     return np.array(
@@ -98,7 +99,7 @@ def _step_from(subject: Subject, state: Array, action: Array) -> Array:
 
 
 def _wander(subject: Subject) -> None:
-    """Take some steps of an episode, or all of a shorter one."""
+    """Reset, and take ``WANDERING`` random steps or fewer if the episode ends."""
     subject.reset(0)
     for _ in range(WANDERING):
         reply = subject.ask("step", action=action_entries(subject.spec.action, subject.random_action()))
@@ -107,7 +108,8 @@ def _wander(subject: Subject) -> None:
 
 
 def _difference(subject: Subject, one: Array, other: Array) -> float:
-    """The difference between steps (C + 1,): of states as a share of the range, or of rewards."""
+    """Return the largest difference between two results of a step, each a next state and a reward (C + 1,): of states
+    as a share of the range, of rewards relative."""
     paid = abs(one[-1] - other[-1]) / max(1.0, abs(one[-1]))
     return max(apart(subject.spec, one[:-1], other[:-1]), float(paid))
 

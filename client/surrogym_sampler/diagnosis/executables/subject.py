@@ -1,4 +1,4 @@
-"""The program under test.
+"""The program under test, with requests that check its answers.
 
 Shapes: C coordinates, F action entries.
 """
@@ -32,15 +32,15 @@ UNSUPPORTED = "unsupported"
 
 
 class LeftOut(Exception):
-    """The check does not apply; the message says why."""
+    """The check does not apply to this program; the message is the reason."""
 
 
 class Subject:
-    """A program, its specification, and random states and actions for it.
+    """A program under test, its specification, and random states and actions for it.
 
     Args:
         command: the program and its arguments, quoted as for a shell.
-        seconds: time for each answer.
+        seconds: time allowed for each answer.
     """
 
     spec: EnvironmentSpec
@@ -60,14 +60,14 @@ class Subject:
 
     @property
     def deadline(self) -> float:
-        """When the next answer must be there, on the monotonic clock."""
+        """The time on the monotonic clock by which an answer to a request sent now must arrive."""
         return time.monotonic() + self.seconds
 
     def start(self) -> None:
-        """Start the program, and read its specification.
+        """Start the program, and read its specification into ``spec``.
 
         Raises:
-            UnknownEnvironment: there is no such program, or no valid specification.
+            UnknownEnvironment: there is no such program, or its specification is invalid.
             StepFailed: the program did not answer.
         """
         self.program.start()
@@ -79,14 +79,14 @@ class Subject:
             self.start()
 
     def ask(self, method: str, **fields: object) -> Reply:
-        """Send one request, and return the result."""
+        """Send the request ``method`` with these fields, and return the result."""
         return self.program.ask(method, self.deadline, **fields)
 
     def ask_if_supported(self, method: str, **fields: object) -> Reply:
-        """Send a request that a program need not support.
+        """Send a request that a program need not support, and return the result.
 
         Raises:
-            LeftOut: it does not.
+            LeftOut: the program does not support it.
         """
         try:
             return self.ask(method, **fields)
@@ -96,7 +96,7 @@ class Subject:
             raise
 
     def refused(self, method: str, **fields: object) -> RequestRefused:
-        """Send a request that must get an error, and return the error."""
+        """Send a request that must be answered with an error, and return the error."""
         try:
             result = self.ask(method, **fields)
         except RequestRefused as error:
@@ -104,41 +104,42 @@ class Subject:
         raise Mismatch(f"expected an error for {method}, got the result {result}")
 
     def reset(self, seed: int | None) -> Array:
-        """Reset; the coordinates (C,)."""
+        """Reset the program with a seed, and return the coordinates (C,) of the start."""
         return self.state(self.ask("reset", seed=seed))
 
     def set(self, state: Array) -> Array:
-        """Set the state (C,); the coordinates (C,) that were reached.
+        """Set the program to a state (C,), and return the coordinates (C,) that it reports.
 
         Raises:
-            LeftOut: the program declares rollout queries.
+            LeftOut: the program declares rollout queries, so its state can't be set.
         """
         if self.spec.query == "rollout":
             raise LeftOut("its specification declares rollout queries")
         return self.state(self.ask("set", state=[float(entry) for entry in state]))
 
     def begin(self) -> None:
-        """Go to a state from which a step can be taken."""
+        """Bring the program into a state from which a step can be taken: a reset, or a random state that is set."""
         if self.spec.query == "rollout":
             self.reset(0)
         else:
             self.set(self.random_state())
 
     def step(self, action: Array) -> Array:
-        """Apply an action (F,); the coordinates (C,) after it and the reward, with every field checked."""
+        """Apply an action (F,), check every field of the answer, and return the next coordinates and the reward (C +
+        1,)."""
         reply = self.ask("step", action=action_entries(self.spec.action, action))
         truth(reply, "terminated")
         truth(reply, "truncated")
         return np.append(self.state(reply), number(reply, "reward"))
 
     def state(self, reply: Reply) -> Array:
-        """The coordinates (C,) of a reply."""
+        """Return the coordinates (C,) in a reply."""
         return numbers(reply, "state", len(self.spec.coordinates))
 
     def random_state(self) -> Array:
-        """Coordinates (C,) within the sampling range."""
+        """Return random coordinates (C,) within the sampling ranges."""
         return draw(self.spec, self._rng, wide=True)
 
     def random_action(self) -> Array:
-        """An action (F,)."""
+        """Return a random action (F,) of the action space."""
         return random_action(self.spec, self._rng)

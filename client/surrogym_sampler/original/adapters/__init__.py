@@ -1,5 +1,5 @@
-"""Simulators by name: any Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL`` or ``pcgym:FILE.json``,
-``fmu:PLANT.fmu`` or ``fmu:PLANT.json``.
+"""Adapters that open a simulator by its name: any Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL`` or
+``pcgym:FILE.json``, ``fmu:PLANT.fmu`` or ``fmu:PLANT.json``.
 
 Each adapter opens one kind of simulator. Its packages are an optional extra, imported when a name needs them.
 """
@@ -17,7 +17,8 @@ from surrogym_sampler.original.simulator import Simulator
 from surrogym_shared.environments import GYMNASIUM_ID
 from surrogym_shared.faults import first_fault
 
-WITH_SPECIFICATION = re.compile(r"exec:.*|[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # a program, or package.module:factory
+# names that bring their own specification: a program, or package.module:factory
+WITH_SPECIFICATION = re.compile(r"exec:.*|[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
 class Adapter(NamedTuple):
@@ -26,9 +27,9 @@ class Adapter(NamedTuple):
     Attributes:
         module: Python module of the adapter, which is imported when it is needed.
         names: pattern of the names of environments that the adapter opens.
-        trusted: pattern of the names that a client also opens when only a server gave the name. They can open nothing
-            but the package's own environments.
-        extra: extra of pip that installs the package.
+        trusted: pattern of the names that a client also opens if only a server gave the name. Such names can open
+            nothing but the package's own environments.
+        extra: pip extra that installs the package.
         separate: whether its simulators run in processes of their own.
     """
 
@@ -62,25 +63,25 @@ ADAPTERS = (
 
 
 def adapter_of(name: str) -> Adapter | None:
-    """The adapter that opens a name; None for ``package.module:factory`` and for other texts."""
+    """Return the adapter that opens this name; None for ``package.module:factory`` and for other texts."""
     return next((adapter for adapter in ADAPTERS if adapter.names.fullmatch(name)), None)
 
 
 def is_trusted(name: str) -> bool:
-    """Whether a name from a server may be opened without further consent: it can only open environments of known
-    packages."""
+    """Return whether a name that came from a server may be opened without consent: it can open only environments of
+    known packages."""
     return any(adapter.trusted.fullmatch(name) for adapter in ADAPTERS)
 
 
 def with_colon(name: str) -> str:
-    """Suggest ``module:Class`` for ``module.Class``, as the end of a message; empty for other names."""
+    """Return the end of a message that suggests ``module:Class`` for ``module.Class``; empty for other names."""
     module, _, attribute = name.rpartition(".")
     is_dotted = all(part.isidentifier() for part in (*module.split("."), attribute))
     return f"; did you mean {module}:{attribute}?" if is_dotted else ""
 
 
 def open_simulator(name: str) -> Simulator:
-    """Open the simulator of a name.
+    """Open the simulator with this name.
 
     Raises:
         UnknownEnvironment: no adapter knows the name, its package is not installed, or the simulator fails or can't be

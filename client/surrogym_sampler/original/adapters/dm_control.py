@@ -1,4 +1,4 @@
-"""Tasks of the DeepMind Control Suite by ``dm_control:DOMAIN-TASK``."""
+"""The adapter for tasks of the DeepMind Control Suite, named ``dm_control:DOMAIN-TASK``."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ NAME = re.compile(r"dm_control:([a-z0-9_]+)-([a-z0-9_]+)")
 
 
 def open_simulator(name: str) -> Simulator:
-    """Open a task.
+    """Open a task named ``dm_control:DOMAIN-TASK``.
 
     Raises:
         UnknownEnvironment: there is no such task, or dm_control does not work with the installed MuJoCo.
         ImportError: dm_control is not installed.
     """
-    os.environ.setdefault("MUJOCO_GL", "disable")  # no pictures are made here, and a machine may have no display
+    os.environ.setdefault("MUJOCO_GL", "disable")  # rendering is not needed, and the machine may have no display
     try:
         from dm_control import suite
     except ImportError:
@@ -50,7 +50,8 @@ def _tasks_of(tasks: Any, domain: str) -> str:
 
 
 class ControlSuite(OfParts):
-    """One task. A step is that of ``control.Environment``, without its counter of steps."""
+    """One task of the DeepMind Control Suite. Its step does what ``control.Environment.step`` does, but counts no steps
+    and so never ends by the time limit."""
 
     def __init__(self, name: str, env: Any) -> None:
         self._name, self._env = name, env
@@ -61,7 +62,7 @@ class ControlSuite(OfParts):
         self._substeps = round(env.control_timestep() / self._physics.timestep())
         bounds = env.action_spec()
         self.action = BoxAction(low=tuple(map(float, bounds.minimum)), high=tuple(map(float, bounds.maximum)))
-        limit = float(env._step_limit)  # there is no public name
+        limit = float(env._step_limit)  # dm_control has no public attribute for the time limit
         self.time_limit = round(limit) if np.isfinite(limit) else None
 
     def reset(self, seed: int | None) -> Array:

@@ -1,7 +1,7 @@
-"""Gymnasium environments by id. The state is MuJoCo's, or an attribute ``state``. An environment with neither can only
-be reset.
+"""The adapter for Gymnasium environments, named by their id.
 
-The goal of a goal environment (Gymnasium-Robotics) is a part of the state, in its attribute ``goal``.
+Their state is MuJoCo's, or the attribute ``state``. An environment with neither can only be reset. The goal of a goal
+environment (Gymnasium-Robotics) is a part of the state, in its attribute ``goal``.
 """
 
 from __future__ import annotations
@@ -26,16 +26,18 @@ from surrogym_sampler.original.state_parts import (
     mujoco_parts,
 )
 
-ROBOTICS = "gymnasium_robotics"  # a name of it from a server is opened without consent, so never from anywhere
-SYMBOLS = ("Discrete", "MultiDiscrete", "MultiBinary", "Text", "Graph", "Sequence")  # spaces without numbers
+# a server's name of this package is opened without consent, so the working directory is not searched for it
+ROBOTICS = "gymnasium_robotics"
+# spaces whose values are not numbers that change gradually
+SYMBOLS = ("Discrete", "MultiDiscrete", "MultiBinary", "Text", "Graph", "Sequence")
 STEP = ("observation", "reward", "terminated", "truncated", "info")
 
 
 def open_simulator(name: str) -> Simulator:
-    """Open a Gymnasium environment.
+    """Open the Gymnasium environment with this id.
 
     Raises:
-        UnknownEnvironment: it can't be made, or its spaces can't be used.
+        UnknownEnvironment: the environment can't be made, or its spaces can't be used.
     """
     env = make(name)
     if type(env.observation_space).__name__ in SYMBOLS:
@@ -44,13 +46,14 @@ def open_simulator(name: str) -> Simulator:
             "write a class that gives such numbers (docs/how-to/own-environment.md)"
         )
     limit = env.spec.max_episode_steps
-    wrapped = getattr(env.spec, "additional_wrappers", ())  # these may change observations and rewards
+    # wrappers may change observations and rewards, so the unwrapped environment is not used
+    wrapped = getattr(env.spec, "additional_wrappers", ())
     simulator = None if wrapped else settable(name, env.unwrapped, limit)
     return simulator or ResetOnly(name, env, limit)
 
 
 def settable(name: str, env: Any, limit: int | None = None) -> GymnasiumSimulator | None:
-    """The unwrapped environment if it can be set to a state; None if its state can't be read."""
+    """Return a simulator of an unwrapped environment that can be set to a state; None if its state can't be read."""
     if hasattr(env, "model") and hasattr(env, "data"):
         return GymnasiumSimulator(name, env, _mujoco(env), env.model, env.data, limit=limit)
     if holds_numbers(env, "state"):
@@ -59,10 +62,11 @@ def settable(name: str, env: Any, limit: int | None = None) -> GymnasiumSimulato
 
 
 def make(name: str) -> Any:
-    """Make the environment, and reset it once. The package of ``package:Id-v0`` may be in the working directory.
+    """Make a Gymnasium environment, and reset it once. In ``package:Id-v0``, the package may be in the working
+    directory.
 
     Raises:
-        UnknownEnvironment: it can't be made.
+        UnknownEnvironment: the environment can't be made.
     """
     import gymnasium
 
@@ -90,7 +94,7 @@ def _way_out(name: str) -> str:
 
 
 class _Gymnasium(Simulator):
-    """Resets and steps of a Gymnasium environment. It keeps the latest observation."""
+    """Resets and steps of a Gymnasium environment; the latest observation is kept."""
 
     def __init__(self, name: str, env: Any, limit: int | None) -> None:
         self._name, self._env, self._over = name, env, False
@@ -100,13 +104,13 @@ class _Gymnasium(Simulator):
         self.period = period_of(env.unwrapped)
 
     def reset(self, seed: int | None) -> Array:
-        observation, _ = _entries(self._env.reset(seed=seed), "its reset", ("observation", "info"))
+        observation, _ = _entries(self._env.reset(seed=seed), "the environment's reset", ("observation", "info"))
         self._last, self._over = flat(self._name, observation), False
         return self._last
 
     def step(self, action: Array) -> Taken:
         given = self._env.step(native_action(self.action, action))
-        observation, reward, terminated, truncated, _ = _entries(given, "its step", STEP)
+        observation, reward, terminated, truncated, _ = _entries(given, "the environment's step", STEP)
         self._last, self._over = flat(self._name, observation), bool(terminated or truncated)
         return Taken(self._last, _reward(reward), bool(terminated), bool(truncated))
 
@@ -136,7 +140,8 @@ class GymnasiumSimulator(_Gymnasium, OfParts):
         self.reset(0)
 
     def write(self, state: Array) -> None:
-        if self._over:  # Gymnasium allows no step after the end of an episode. CartPole then pays nothing for a fall
+        # Gymnasium allows no step after an episode has ended; CartPole, for example, would pay 0 for a fall.
+        if self._over:
             self.reset(None)
         super().write(state)
 
@@ -150,8 +155,8 @@ class GymnasiumSimulator(_Gymnasium, OfParts):
 
 
 class ResetOnly(_Gymnasium):
-    """A Gymnasium environment whose state can't be read. Its observation is used as the state, and it can only be
-    reset."""
+    """A Gymnasium environment whose state can't be read. Its observation serves as the state, and it can
+    only be reset."""
 
     settable = False
     shows = False
@@ -176,19 +181,26 @@ class ResetOnly(_Gymnasium):
 
 
 def _entries(given: Any, whose: str, expected: tuple[str, ...]) -> tuple[Any, ...]:
-    """What a reset or a step returned.
+    """Return the values that an environment's reset or step returned, if their number is right.
+
+    Args:
+        given: what the environment returned.
+        whose: the reset or the step, for messages.
+        expected: the names of the values that Gymnasium prescribes.
 
     Raises:
-        StepFailed: it is no tuple of as many values as Gymnasium expects.
+        StepFailed: ``given`` is not a tuple of that many values.
     """
     if isinstance(given, tuple) and len(given) == len(expected):
         return given
     came = f"{len(given)} values" if isinstance(given, tuple) else f"a {type(given).__name__}"
-    raise StepFailed(f"expected {whose} to return {len(expected)} values ({', '.join(expected)}), got {came}")
+    raise StepFailed(
+        f"expected {whose} to return {len(expected)} values ({', '.join(expected)}), got {came}: correct it"
+    )
 
 
 def _limits_of(space: Any) -> Array | None:
-    """Limits (D, 2) of an observation; None if its space is no box."""
+    """Return the limits (D, 2) of an observation space; None if it is not a Box."""
     if type(space).__name__ != "Box":
         return None
     limits: Array = np.stack([np.ravel(space.low), np.ravel(space.high)], axis=1).astype(np.float64)
@@ -198,7 +210,10 @@ def _limits_of(space: Any) -> Array | None:
 def _reward(given: Any) -> float:
     number = np.asarray(given)
     if number.size != 1 or number.dtype.kind not in "fiub":
-        raise StepFailed(f"expected its reward to be a number, got {given!r:.60}: wrap it in a class of your own")
+        raise StepFailed(
+            f"expected the environment's reward to be a number, got {given!r:.60}: wrap the environment in a class of "
+            "your own"
+        )
     return float(number.item())
 
 

@@ -1,4 +1,4 @@
-"""Simulators whose state consists of parts."""
+"""Simulators whose state is read and set in several parts, such as positions, velocities and goals."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from surrogym_shared.spec.actions import Action
 
 
 class OfParts(Simulator):
-    """A simulator with a state of parts. The first part is written last, because MuJoCo's kinematics depend on the
-    others."""
+    """A simulator whose state consists of parts. The first part is written last, because writing it runs MuJoCo's
+    kinematics, which depend on the other parts."""
 
     def __init__(self, parts: Sequence[StatePart], model: Any = None, data: Any = None) -> None:
         self._parts = tuple(parts)
@@ -46,12 +46,12 @@ class OfParts(Simulator):
         return self._data is not None and int(self._data.ncon) > 0
 
     def parameters(self) -> dict[str, float]:
-        """The parameters of a MuJoCo model: ``mass.BODY``, ``damping.JOINT``, ``friction.GEOM`` (sliding), and
-        ``gear.ACTUATOR``. Names are those of the model; parts without a name or with a value of 0 have none."""
+        """Return the parameters of a MuJoCo model by name: ``mass.BODY``, ``damping.JOINT``, ``friction.GEOM``
+        (sliding) and ``gear.ACTUATOR``. Elements without a name or with a value of 0 are left out."""
         return {} if self._model is None else {name: float(rows[at]) for name, rows, at in _parameters(self._model)}
 
     def set_parameters(self, values: Mapping[str, float]) -> None:
-        """Change parameters. A body's inertia grows with its mass."""
+        """Change parameters of the MuJoCo model, by name. A body's inertia changes in proportion to its mass."""
         import mujoco
 
         places = {name: (rows, at) for name, rows, at in _parameters(self._model)}
@@ -73,7 +73,7 @@ class OfParts(Simulator):
 
 
 def _parameters(model: Any) -> list[tuple[str, Any, Any]]:
-    """Name, array and place of each parameter of a MuJoCo model."""
+    """Return name, array and index into the array of each parameter of a MuJoCo model."""
     found: list[tuple[str, Any, Any]] = []
     for kind, count, read, rows, entry in (
         ("mass", model.nbody, model.body, model.body_mass, None),
@@ -90,10 +90,14 @@ def _parameters(model: Any) -> list[tuple[str, Any, Any]]:
 
 
 def action_of(name: str, space: Any) -> Action:
-    """Convert the action space of Gymnasium to a specification's action.
+    """Convert a Gymnasium action space to a specification's action.
+
+    Args:
+        name: the environment, for messages.
+        space: the action space.
 
     Raises:
-        UnknownEnvironment: a space, or bounds, that no specification can express.
+        UnknownEnvironment: no specification can express the space or its bounds.
     """
     kind = type(space).__name__
     shape: tuple[int, ...] = getattr(space, "shape", None) or ()
@@ -115,10 +119,11 @@ def action_of(name: str, space: Any) -> Action:
 
 
 def flat(name: str, observation: Any) -> Array:
-    """An observation as one row of numbers (D,). Entries of a dictionary are in the order of their names.
+    """Return an observation as one row of numbers (D,). Entries of a dictionary are in alphabetical order of their
+    names.
 
     Raises:
-        UnknownEnvironment: it contains an image, or a value that is not a number.
+        UnknownEnvironment: the observation contains an image, or a value that is not a number.
     """
     entries = [observation[key] for key in sorted(observation)] if isinstance(observation, dict) else [observation]
     arrays = [np.asarray(entry) for entry in entries]

@@ -1,6 +1,6 @@
-"""Draft a specification of an undescribed simulator from a few episodes, whose steps are counted.
+"""Draft the specification of a simulator that has none, from a few episodes whose steps are counted.
 
-The steps show ranges, limits and coordinates. The file asks a person for everything that steps can't show.
+The steps show ranges, limits and coordinates. The drafted file asks a person for everything that steps can't show.
 """
 
 from surrogym_sampler.original.describing.description import Description, DescriptionInterrupted, describe

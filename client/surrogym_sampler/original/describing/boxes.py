@@ -1,9 +1,10 @@
-"""Find a region that several levels bound, such as a box: all of some inequalities hold in it.
+"""Search for a region of states that several inequalities bound, such as a box, given points of its boundary.
 
-A face of the region is a level of one quantity, with the region on one side. At least two points of the boundary share
-the level. Two points may do so by chance, but a few faces that hold most points don't.
+A face is the part of the boundary where one quantity has one value (its level); the region is on one side of it. A face
+has at least two points of the boundary. Two points may share a level by chance, but a few faces that hold most points
+don't.
 
-Shapes: n states, K points of the boundary.
+Shapes: n states, K points of the boundary, C coordinates.
 """
 
 from __future__ import annotations
@@ -18,28 +19,42 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import EnvironmentSpec, Inequality, Term
 from surrogym_shared.terms import evaluate, holds
 
-LEVEL = 1e-5  # largest distance of a point from the boundary, as a share of the boundary's size
-SHARED = 2  # points of a face, at least
-SURE = 3  # points that share no level by chance
+LEVEL = 1e-5  # largest difference between points of the same level, as a share of the quantity's range
+SHARED = 2  # smallest number of points of a face
+SURE = 3  # number of points that don't share a level by chance
 MOST_FACES = 6
-ALMOST_ALL = 0.75  # of the points: the others may lie where the state jumps, as at a contact
+# smallest share of the points that must lie on faces; the others may be where the state jumps, as at a contact
+ALMOST_ALL = 0.75
 
 
 @dataclass(frozen=True)
 class _Face:
     term: Term
     level: float
-    points: NDArray[np.bool_]  # of the boundary that lie on it (K,)
+    points: NDArray[np.bool_]  # which points of the boundary lie on the face (K,)
 
 
 def has_face(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: Array) -> bool:
-    """Whether three of the points ``bounds`` (K, C) share a level of one of the terms, whose ranges ``states`` (n, C)
-    give."""
+    """Return whether at least three points of the boundary share a level of one quantity.
+
+    Args:
+        spec: the environment.
+        terms: quantities that may have levels.
+        bounds: points of the boundary (K, C).
+        states: states (n, C) that show the range of each quantity.
+    """
     return any(face.points.sum() >= SURE for face in _faces(spec, terms, bounds, states))
 
 
 def alone(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: Array) -> NDArray[np.bool_]:
-    """Which of the points ``bounds`` (K, C) share no level with another."""
+    """Return which points of the boundary share no level with another point (K,).
+
+    Args:
+        spec: the environment.
+        terms: quantities that may have levels.
+        bounds: points of the boundary (K, C).
+        states: states (n, C) that show the range of each quantity.
+    """
     left = np.ones(len(bounds), dtype=bool)
     for face in _faces(spec, terms, bounds, states):
         left &= ~face.points
@@ -49,16 +64,17 @@ def alone(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: A
 def box(
     spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: Array, inside: NDArray[np.bool_]
 ) -> tuple[Inequality, ...]:
-    """Inequalities that all hold in the region, and that most points of its boundary touch; empty if there are none.
+    """Return inequalities that all hold in the region, and on whose faces most points of its boundary lie; empty if
+    there are none.
 
-    A face of two points is left out if the others already exclude all states outside.
+    A face of two points is left out if the other faces already exclude all states outside the region.
 
     Args:
         spec: the environment.
         terms: quantities that may have levels.
         bounds: points of the boundary (K, C).
-        states: other states (n, C).
-        inside: which of them are in the region (n,).
+        states: states inside and outside the region (n, C).
+        inside: which of these states are in the region (n,).
     """
     left, chosen = np.ones(len(bounds), dtype=bool), list[tuple[int, Inequality]]()
     sided = [
@@ -81,7 +97,7 @@ def box(
 
 
 def contains(spec: EnvironmentSpec, when: Sequence[Inequality], states: Array) -> NDArray[np.bool_]:
-    """Which of the states (n, C) are in the region."""
+    """Return which of the states (n, C) fulfil all inequalities ``when`` (n,)."""
     return np.asarray(np.all([holds(spec, one, states) for one in when], axis=0))
 
 
@@ -96,7 +112,8 @@ def _faces(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: 
 
 
 def _side(spec: EnvironmentSpec, face: _Face, inside: Array) -> str:
-    """The relation that holds for all states (n, C) of the region, or an empty string if they lie on both sides."""
+    """Return the relation between a face's quantity and its level that holds for all states ``inside`` (n, C) of the
+    region; an empty string if they lie on both sides of the face."""
     x = evaluate(spec, face.term, inside)
     if (x >= face.level).all():
         return ">="

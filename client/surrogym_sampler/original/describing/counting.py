@@ -1,4 +1,4 @@
-"""A simulator whose real steps are counted, and whose failures say how many there were.
+"""A simulator whose real steps are counted, and whose errors tell the number of steps before them.
 
 Shapes: V variables of the state, C coordinates, F action entries, D observation entries.
 """
@@ -14,10 +14,11 @@ from surrogym_sampler.original.simulator import Simulator, Taken
 
 
 class Counted:
-    """A simulator whose real steps and resets are counted. A description calls the environment only through it.
+    """A simulator whose real steps and resets are counted.
 
-    Whatever the environment raises, ``sys.exit`` too, becomes ``StepFailed`` with the number of real steps before it.
-    ``simulator`` is for what is known without a call, such as the variables.
+    Whatever the environment raises, including ``SystemExit``, becomes ``StepFailed`` with the number of real steps
+    before it. The attribute ``simulator`` is only for properties that need no call of the environment, such as the
+    variables.
     """
 
     def __init__(self, simulator: Simulator, name: str = "the environment") -> None:
@@ -27,20 +28,20 @@ class Counted:
         self.name = name
 
     def reset(self, seed: int) -> Array:
-        """Begin an episode. Returns the state (V,)."""
+        """Begin an episode with a seed, and return the state (V,)."""
         self.resets += 1
         with self._failures(self.steps):
             self.simulator.reset(seed)
             return self._read()
 
     def step(self, action: Array) -> Taken:
-        """Take a step with action (F,)."""
+        """Take a step with an action (F,), and return its results."""
         self.steps += 1
         with self._failures(self.steps - 1):
             return self.simulator.step(action)
 
     def read(self) -> Array:
-        """The state (V,)."""
+        """Return the state (V,)."""
         with self._failures(self.steps):
             return self._read()
 
@@ -50,28 +51,29 @@ class Counted:
             self.simulator.write(state)
 
     def place(self, columns: list[int], coordinates: Array) -> None:
-        """Set some variables to coordinates (C,), the others to rest."""
+        """Set the variables at the indices ``columns`` to coordinates (C,), and the others to their values at rest."""
         with self._failures(self.steps):
             self.simulator.place(columns, coordinates)
 
     def observe(self) -> Array:
-        """The observation (D,) of the state as it is."""
+        """Return the observation (D,) of the current state."""
         with self._failures(self.steps):
             return self.simulator.observe()
 
     def touches(self) -> bool:
-        """Whether bodies touch in the state as it is."""
+        """Return whether bodies touch each other in the current state."""
         with self._failures(self.steps):
             return self.simulator.touches()
 
     def step_from(self, state: Array, action: Array) -> tuple[Array, Taken]:
-        """Set the state (V,) and take a step. Returns the next state and the step's results."""
+        """Set the state (V,) and take a step. Returns the next state (V,) and the step's results."""
         self.write(state)
         taken = self.step(action)
         return self.read(), taken
 
     def close(self) -> tuple[str, ...]:
-        """Close the environment. Returns a sentence if that fails, because the steps were taken all the same."""
+        """Close the environment. Returns a sentence about a failure, instead of an error, because the steps taken are
+        still valid."""
         try:
             self.simulator.close()
         except RAISED as error:
@@ -81,7 +83,9 @@ class Counted:
     def _read(self) -> Array:
         state, expected = self.simulator.read(), len(self.simulator.variables)
         if len(state) != expected:
-            raise StepFailed(f"expected a state of {expected} numbers, as after its first reset, got {len(state)}")
+            raise StepFailed(
+                f"expected the state to have {expected} numbers, as after the first reset, got {len(state)}"
+            )
         return state
 
     @contextmanager

@@ -1,4 +1,4 @@
-"""Convert findings about a simulator to a specification, with questions to a person."""
+"""Conversion of what random steps showed about a simulator to a drafted specification, with questions to a person."""
 
 from __future__ import annotations
 
@@ -33,29 +33,38 @@ from surrogym_shared.spec import (
     limits,
 )
 
-MOSTLY = 0.5  # of all steps with the same reward; then other rewards are met only by luck
-PLACES = 300  # at which an observation is read, without a step
-UNKNOWN_LIMIT = 200  # steps of an episode if the simulator has no limit
+MOSTLY = 0.5  # share of steps with the same reward, above which other rewards are found only by luck
+PLACES = 300  # number of random states whose observation is read, without a step
+UNKNOWN_LIMIT = 200  # assumed time limit of an episode, if the simulator has none
 
 
 @dataclass(frozen=True)
 class Description:
-    """A specification, with its source."""
+    """A drafted specification, with the steps that it is based on.
+
+    Attributes:
+        spec: the specification.
+        found: findings about the environment, one sentence each.
+        asked: questions that only a person can answer, one sentence each.
+        steps: number of real steps that were taken.
+        resets: number of resets.
+        pays: whether the environment has a reward of its own.
+    """
 
     spec: EnvironmentSpec
     found: tuple[str, ...]
     asked: tuple[str, ...]
     steps: int
     resets: int
-    pays: bool = True  # whether the environment has a reward of its own
+    pays: bool = True
 
     def words(self) -> list[str]:
-        """Lines for the terminal: the real steps, the findings, and the questions to the reader."""
+        """Return lines for the terminal: the real steps, the findings, and the questions to a person."""
         took = f"{self.spec.environment}: described by {self.steps} real steps and {self.resets} resets"
         return [took, *(f"  found: {line}" for line in self.found), *(f"  to decide: {line}" for line in self.asked)]
 
     def text(self) -> str:
-        """A JSON document with the findings, the questions to the reader, and the specification."""
+        """Return a JSON document with the findings, the questions to a person, and the specification."""
         return json.dumps(
             {
                 "real_steps": self.steps,
@@ -69,17 +78,17 @@ class Description:
 
 
 def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
-    """Describe an environment that an adapter opens.
+    """Draft the specification of an environment that an adapter can open.
 
     Args:
         name: a Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL`` or ``fmu:PLANT.fmu``.
-        steps: real steps of the episodes. Some more steps check the findings.
-        seed: of the random actions.
+        steps: number of real steps of random episodes. Some more steps check the findings.
+        seed: seed of the random actions.
 
     Raises:
         UnknownEnvironment: no adapter knows the name, or no specification can express the environment.
-        StepFailed: the environment failed at a reset or a step, after a number of real steps.
-        DescriptionInterrupted: Ctrl-C was pressed; real steps so far are counted.
+        StepFailed: the environment failed at a reset or a step; the message has the number of real steps.
+        DescriptionInterrupted: Ctrl-C was pressed; the exception has the number of real steps so far.
     """
     counted = Counted(open_simulator(name), name)
     try:
@@ -96,7 +105,7 @@ def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
 
 
 def _described(name: str, counted: Counted, steps: int, rng: np.random.Generator) -> Description:
-    """Describe an open environment. Arguments and errors as ``describe``."""
+    """Draft the specification of an open environment. Arguments and errors are those of ``describe``."""
     simulator = counted.simulator
     seen = explore(counted, steps, rng)
     lived = ~seen.ended_at_once
@@ -111,7 +120,7 @@ def _described(name: str, counted: Counted, steps: int, rng: np.random.Generator
 
 
 class DescriptionInterrupted(KeyboardInterrupt):
-    """Ctrl-C interrupted a description after ``steps`` real steps had begun."""
+    """Ctrl-C interrupted a description; ``steps`` is the number of real steps taken by then."""
 
     def __init__(self, steps: int) -> None:
         super().__init__()
@@ -119,7 +128,7 @@ class DescriptionInterrupted(KeyboardInterrupt):
 
 
 class _Draft:
-    """The specification of one simulator."""
+    """The draft of one simulator's specification, its findings and its questions."""
 
     def __init__(self, name: str, counted: Counted, seen: Seen, probed: Probed) -> None:
         self._name, self._counted, self._seen, self._probed = name, counted, seen, probed
@@ -130,7 +139,8 @@ class _Draft:
         require_coordinates(name, len(self._kept), len(seen.rewards))
 
     def spec(self, rng: np.random.Generator) -> EnvironmentSpec:
-        """The specification, with the observation in terms of the coordinates."""
+        """Return the specification. Its observation is expressed by the coordinates; ``rng`` draws the states at which
+        it is read."""
         variables = [self._simulator.variables[i] for i in self._kept]
         ranges = Ranges(self._simulator, self._seen, self._probed, self._all)
         coordinates = tuple(ranges.coordinate(i) for i in self._kept)
@@ -151,12 +161,13 @@ class _Draft:
         return EnvironmentSpec.model_validate({**frame.model_dump(), "observation": observation})
 
     def known_reward(self, spec: EnvironmentSpec, rng: np.random.Generator) -> DeclaredReward | None:
-        """A reward that can be declared, or None."""
+        """Return a formula that gives every reward exactly, so that the specification can declare it; None if none is
+        found."""
         usable = self._simulator.pays and self._probed.settable and not self._probed.noisy
         return known_reward(self._counted, self._seen, self._kept, spec, rng) if usable else None
 
     def found(self, spec: EnvironmentSpec, steps: int) -> tuple[str, ...]:
-        """Findings, one sentence each."""
+        """Return the findings, one sentence each; ``steps`` is the number of random steps."""
         probed, kept = self._probed, set(spec.coordinate_names)
         still = [v.name for v in self._simulator.variables if v.name not in kept | probed.shifts]
         kinds = {kind: [c.name for c in spec.coordinates if c.kind == kind] for kind in ("angle", "constant")}
@@ -198,7 +209,7 @@ class _Draft:
         return tuple(lines)
 
     def asked(self, spec: EnvironmentSpec) -> tuple[str, ...]:
-        """Questions to a person, one sentence each."""
+        """Return the questions about ``spec`` that only a person can answer, one sentence each."""
         guessed = [
             c.name
             for i, c in zip(self._kept, spec.coordinates, strict=True)
@@ -260,7 +271,8 @@ class _Draft:
         )
 
     def _chosen(self) -> list[int]:
-        """Indices of the variables that become coordinates."""
+        """Return the indices of the variables that become coordinates: those that move or differ between episodes, and
+        repeat no other."""
         kept: list[int] = []
         unmoved = {f"{name}{VELOCITY}" for name in self._unmoved}
         for i, variable in enumerate(self._simulator.variables):
@@ -272,7 +284,7 @@ class _Draft:
 
     @property
     def _unmoved(self) -> list[str]:
-        """Joints that no random action moved although they can move: each reset gave them another position."""
+        """The joints that no random action moved although they can move: each reset gave them another position."""
         moved = (self._seen.states != self._seen.next_states).any(0)
         differs = moved_by(self._seen.starts) > 0
         return [
@@ -306,7 +318,8 @@ class _Draft:
         return list(shown.values())
 
     def _observed(self, frame: EnvironmentSpec, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Coordinates (n, C) and the simulator's observations there (n, D)."""
+        """Return states (n, C) and the simulator's observations in them (n, D): random states of the sampling ranges if
+        states can be set, else those of the explored steps."""
         counted = self._counted
         if not (self._simulator.shows and self._probed.settable):
             return self._seen.next_states[:, self._kept], self._seen.observations
@@ -321,5 +334,6 @@ class _Draft:
 
 
 def _raw(term: Term) -> set[str]:
-    """The coordinates that a term reads directly. Such a term jumps where an angle wraps."""
+    """Return the names of coordinates that a term reads directly, without cosine or sine. Such a term jumps where an
+    angle wraps."""
     return {name for part in term.parts if part.function == "linear" for name in part.weights}

@@ -1,4 +1,4 @@
-"""Episodes of a simulator under random actions. Every step is counted.
+"""Exploration of a simulator by episodes of random actions, whose steps are counted.
 
 Shapes: n steps, R resets, V variables of the state, F action entries, D observation entries.
 """
@@ -18,27 +18,27 @@ from surrogym_shared.spec import BoxAction, DiscreteAction
 from surrogym_shared.spec.actions import Action
 
 STEPS = 400
-EPISODES = 4  # that share the steps if none ends early
-RESETS = 32  # for the range of starts
-LONGEST_HOLD = 10  # steps in a row under one action
-ROUNDING = 1e-9  # of a variable's size or of 1: what moves by less than this moves by rounding only
-FEWEST_EQUAL = 3  # episodes of one length that show a limit
-PLACES_TRIED = 20  # random starts, of which the ones without contacts can be taken
+EPISODES = 4  # number of episodes among which the steps are divided, if none ends early
+RESETS = 32  # number of resets that show the range of start states
+LONGEST_HOLD = 10  # largest number of steps for which an action is held
+ROUNDING = 1e-9  # share of a variable's largest value, or of 1 if that is larger; a smaller change is rounding
+FEWEST_EQUAL = 3  # smallest number of episodes of the same length that show a time limit
+PLACES_TRIED = 20  # number of random positions from which a start without contacts is chosen
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Data of the explored episodes.
+    """The data of the explored episodes.
 
     Attributes:
-        starts: (R, V) after resets.
-        states: (n, V) before each step.
-        actions: (n, F).
-        next_states: (n, V).
-        rewards: (n,).
-        terminated: (n,).
-        observations: (n, D) after each step, as the simulator showed them.
-        episodes: (n,) number of the episode.
+        starts: states after the resets (R, V).
+        states: states before each step (n, V).
+        actions: actions (n, F).
+        next_states: states after each step (n, V).
+        rewards: rewards (n,).
+        terminated: which steps ended their episode by a termination (n,).
+        observations: observations after each step (n, D), as the simulator returned them.
+        episodes: number of the episode of each step (n,).
         limit: number of steps after which every episode ended; None if they ended at different steps, or not at all.
     """
 
@@ -54,7 +54,7 @@ class Seen:
 
     @property
     def ended_at_once(self) -> NDArray[np.bool_]:
-        """Which steps (n,) ended an episode of one step, because it began in an impossible state."""
+        """Which steps (n,) ended an episode at its first step; such an episode began in an impossible state."""
         first = np.append(True, self.episodes[1:] != self.episodes[:-1])
         last = np.append(self.episodes[1:] != self.episodes[:-1], True)
         ended: NDArray[np.bool_] = first & last & self.terminated
@@ -62,18 +62,18 @@ class Seen:
 
 
 def moved_by(values: Array) -> Array:
-    """The range of each column (n, ...), and 0 where it is so small that rounding explains it."""
+    """Return the range of each column of values (n, ...); 0 if it is so small that rounding explains it."""
     ranges = np.ptp(values, axis=0)
     small: Array = np.where(ranges > ROUNDING * np.maximum(1.0, np.abs(values).max(0)), ranges, 0.0)
     return small
 
 
 def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
-    """Take random steps.
+    """Take ``steps`` real steps in random episodes, after ``RESETS`` resets.
 
-    Half of the episodes start from resets. The others start at rest from positions within limits that are far from all
-    positions so far. The reason: random actions leave a state of high energy and don't return to it, so the positions
-    that they did not reach are those from which something falls fastest.
+    Half of the episodes start from resets. If the state can be set, the others start at rest from positions within the
+    limits that are far from all positions so far. The reason: random actions leave a state of high energy and don't
+    return to it, so the positions that they did not reach are those from which something falls fastest.
     """
     simulator = counted.simulator
     require_variables(counted.name, simulator.variables)
@@ -81,7 +81,7 @@ def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
     require_numbers(counted.name, (starts,), np.zeros(0))
     require_few(counted.name, simulator.variables, moved_by(starts) > 0)
     rows: list[tuple[Array, Array, Array, float, bool, Array, int]] = []
-    lengths: list[int] = []  # of the episodes that the environment ended
+    lengths: list[int] = []  # lengths of the episodes that the environment ended itself
     length, number = max(1, -(-steps // EPISODES)), 0
     while len(rows) < steps:
         state = counted.reset(RESETS + number)
@@ -100,23 +100,30 @@ def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     seen = Seen(starts, *columns)
     limit = _common_length(lengths, int(np.bincount(seen.episodes).max()))
-    # the end of the time is no state: nothing is to be learned from it
+    # A time limit ends an episode in any state, so these ends are not terminations that a model could learn.
     return seen if limit is None else replace(seen, limit=limit, terminated=np.zeros_like(seen.terminated))
 
 
 def _common_length(lengths: Sequence[int], longest: int) -> int | None:
-    """Length of several random episodes that all ended after the same number of steps; None otherwise. Such episodes
-    end by a counter."""
+    """Return the length of the episodes if the environment ended all of them, at least three, after the same number of
+    steps; None otherwise. A time limit ends episodes in this way."""
     if len(lengths) < FEWEST_EQUAL or set(lengths) != {longest} or longest == 1:
         return None
     return longest
 
 
 def _far_from(counted: Counted, visited: Array, state: Array, rng: np.random.Generator) -> Array:
-    """Of random positions within their limits without contacts, the one that is farthest from visited states (n, V).
+    """Set the simulator to a position far from the visited states, and return its state (V,).
 
-    A distance is the norm of the positions' differences, each as a share of its range. If all have contacts, the state
-    stays unchanged.
+    Of random positions within their limits and without contacts, the one farthest from all visited states is chosen. A
+    distance is the norm of the positions' differences, each as a share of its range. If all positions have contacts,
+    ``state`` is set again.
+
+    Args:
+        counted: the simulator.
+        visited: states (n, V) of the steps so far.
+        state: the state (V,) after the reset.
+        rng: draws the positions.
     """
     variables = counted.simulator.variables
     turns = np.array([v.motion == "turn" and not v.limited for v in variables])
@@ -132,7 +139,7 @@ def _far_from(counted: Counted, visited: Array, state: Array, rng: np.random.Gen
         if counted.touches():
             continue
         shares = (visited[:, at] - placed[at]) / np.maximum(high - low, 1e-12)
-        shares = np.where(turns[at], shares - np.round(shares), shares)  # the shorter way round
+        shares = np.where(turns[at], shares - np.round(shares), shares)  # distance of angles by the shorter way round
         distance = float(np.sqrt((shares**2).sum(1)).min())
         if distance > farthest:
             best, farthest = counted.read(), distance
@@ -141,7 +148,8 @@ def _far_from(counted: Counted, visited: Array, state: Array, rng: np.random.Gen
 
 
 def _actions(space: Action, number: int, count: int, rng: np.random.Generator) -> list[Array]:
-    """Random actions of one episode: new at each step, held for some steps, or held at the ends of their range."""
+    """Return ``count`` random actions (F,) of one episode. By its number, they are new at each step, held for some
+    steps, or held at the ends of their range."""
     longest = (1, LONGEST_HOLD, LONGEST_HOLD, 1)[number % 4]
     actions: list[Array] = []
     while len(actions) < count:

@@ -1,6 +1,6 @@
-"""Express observation entries as sums of terms, by least squares on 1, q, and sin and cos of turning coordinates.
+"""Expression of observation entries as sums of terms, by least squares on 1, q, and sin and cos of turning coordinates.
 
-Shapes: n places, C coordinates, D observation entries.
+Shapes: n states, C coordinates, D observation entries.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import EnvironmentSpec, ObservationEntry, Term
 from surrogym_shared.terms import evaluate
 
-TOLERANCE = 1e-7  # of an entry's own size
-DIGITS = 6  # of a weight, if these explain the entry
-FEW_TURNS = 4  # with at most this many turning coordinates, sums of three of them are tried as well
-CLIPPED = 0.02  # share of places at a limit that indicates a clipped entry
+TOLERANCE = 1e-7  # largest error of an expression, as a share of the entry's largest value
+DIGITS = 6  # decimal digits of a rounded weight, which is used if it still explains the entry
+FEW_TURNS = 4  # number of turning coordinates up to which sums of three of them are tried as well
+CLIPPED = 0.02  # share of states at the smallest or largest value above which an entry counts as clipped
 
 
 def express(
     frame: EnvironmentSpec, turning: Sequence[str], coordinates: Array, observed: Array
 ) -> list[ObservationEntry | None]:
-    """Express the entries of an observation as terms of the coordinates. The result has None for an entry that never
-    changes, or that can't be expressed.
+    """Express the entries of an observation as terms of the coordinates; None for an entry that never changes or can't
+    be expressed.
 
     Args:
         frame: a specification, of which only the coordinates are used.
         turning: names of coordinates that enter by their sine and cosine.
-        coordinates: (n, C) places.
-        observed: (n, D) observations there.
+        coordinates: states (n, C).
+        observed: the observations in these states (n, D).
     """
     basis = _basis(frame, turning)
     design = np.stack([evaluate(frame, term, coordinates) for term in basis], axis=1)
@@ -47,7 +47,7 @@ def express(
 
 
 def shown_by_itself(name: str, *, angle: bool) -> list[ObservationEntry]:
-    """Terms that show a coordinate directly; an angle by its cosine and sine."""
+    """Return the observation entries that show a coordinate directly: its value, or the cosine and sine of an angle."""
     if not angle:
         return [ObservationEntry(name=name, term=Term.linear(**{name: 1.0}))]
     pairs = (("cos", Term.cos(**{name: 1.0})), ("sin", Term.sin(**{name: 1.0})))
@@ -55,7 +55,7 @@ def shown_by_itself(name: str, *, angle: bool) -> list[ObservationEntry]:
 
 
 def names_in(term: Term) -> set[str]:
-    """The coordinates that a term reads."""
+    """Return the names of the coordinates that a term reads."""
     return {name for part in term.parts for name in part.weights}
 
 
@@ -68,10 +68,10 @@ def _basis(frame: EnvironmentSpec, turning: Sequence[str]) -> list[Term]:
 
 
 def _weights(design: Array, entry: Array, tolerance: float) -> Array | None:
-    """Weights (b,) of the terms of a basis (n, b) that explain an entry (n,): of a single term if one does.
+    """Return weights (b,) with which the terms of a basis (n, b) explain an entry (n,), or None.
 
-    Single precision makes each entry a little wrong. Then many terms together explain its rounding errors too, so a
-    single term and short weights come first.
+    An observation in single precision has rounding errors, which many terms together would explain too. So a single
+    term is tried first, then rounded weights of all terms, then exact ones.
     """
     single = np.round(design.T @ entry / np.maximum((design**2).sum(0), TOLERANCE), DIGITS)
     best = int(np.abs(design * single - entry[:, None]).max(0).argmin())
@@ -88,7 +88,8 @@ def _sum(basis: Sequence[Term], weights: Array) -> Term | None:
 
 
 def _clip_of(frame: EnvironmentSpec, coordinates: Array, entry: Array) -> Term | None:
-    """The coordinate that an entry shows, clipped to limits, or None."""
+    """Return the term of the one coordinate that an entry shows, clipped at the entry's limits; None if
+    there is none."""
     low, high = float(entry.min()), float(entry.max())
     for index, name in enumerate(frame.coordinate_names):
         if np.allclose(np.clip(coordinates[:, index], low, high), entry, atol=TOLERANCE):
@@ -98,7 +99,8 @@ def _clip_of(frame: EnvironmentSpec, coordinates: Array, entry: Array) -> Term |
 
 
 def _name_of(term: Term) -> str | None:
-    """Name of an entry that shows one coordinate, or its sine or cosine, directly."""
+    """Return the name of an observation entry whose term is one coordinate, its sine or its cosine; None for other
+    terms."""
     if len(term.parts) != 1 or len(term.parts[0].weights) != 1 or term.parts[0].coefficient != 1.0:
         return None
     (name,) = term.parts[0].weights

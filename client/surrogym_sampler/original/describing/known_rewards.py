@@ -1,4 +1,5 @@
-"""Find a reward that can be declared: by the steps of a description, and further ones that decide.
+"""Search for a formula of the reward that a specification can declare, from the steps of a description and some further
+ones.
 
 Shapes: n steps, C coordinates, F action entries.
 """
@@ -29,18 +30,18 @@ from surrogym_shared.spec import BoxAction, DeclaredReward, EnvironmentSpec, lim
 def known_reward(
     counted: Counted, seen: Seen, kept: Sequence[int], spec: EnvironmentSpec, rng: np.random.Generator
 ) -> DeclaredReward | None:
-    """A reward that is exact for all steps, or None.
+    """Return a declared reward that is exact for all steps, or None.
 
-    If most of the explored steps allow a quadratic function, further steps from random states decide, because explored
-    states may vary too little, and an episode may follow a schedule. Half of the further steps are kept for the check.
-    If the explored rewards have two values at most, further steps look for the boundary between two values.
+    If a quadratic function explains most explored steps, further steps from random states decide, because explored
+    states may vary too little, and an episode may follow a schedule. Half of the further steps check the fit to the
+    others. If the explored rewards have at most two values, further steps look for the boundary between the two.
 
     Args:
         counted: a simulator that can be set exactly.
-        seen: explored steps.
-        kept: variables that are coordinates.
+        seen: the explored steps.
+        kept: indices of the variables that are coordinates.
         spec: the specification so far.
-        rng: of further states and actions.
+        rng: draws further states and actions.
     """
     if not isinstance(spec.action, BoxAction):
         return None
@@ -59,7 +60,7 @@ def known_reward(
 
 @dataclass(frozen=True)
 class _Anywhere:
-    """Steps from states that are set."""
+    """Real steps from random states, which the simulator is set to."""
 
     counted: Counted
     kept: list[int]
@@ -68,13 +69,13 @@ class _Anywhere:
     rng: np.random.Generator
 
     def drawn(self, count: int) -> tuple[Array, Array]:
-        """Random states (n, C) of the sampling ranges, and actions (n, F)."""
+        """Return random states (n, C) of the sampling ranges, and random actions (n, F)."""
         low, high = np.array([limits(c.sampling) for c in self.spec.coordinates]).T
         size = count, self.action.size
         return self.rng.uniform(low, high, (count, len(low))), self.rng.uniform(self.action.low, self.action.high, size)
 
     def steps(self, places: Array, actions: Array) -> Paid:
-        """Steps from states (n, C) with actions (n, F). Those that end an episode are left out."""
+        """Take steps from states (n, C) with actions (n, F), and return them without those that end an episode."""
         counted, n = self.counted, len(actions)
         read, reward = np.zeros((n, 2, len(self.kept))), np.full(n, np.nan)
         for i, (place, u) in enumerate(zip(places, actions, strict=True)):

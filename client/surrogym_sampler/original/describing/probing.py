@@ -1,4 +1,5 @@
-"""Steps repeated from states that were set: whether this is exact, and which shifts change nothing.
+"""Tests of a simulator by repeated steps: whether its state can be set exactly, and which shifts of a variable change
+nothing.
 
 Shapes: V variables of the state.
 """
@@ -17,14 +18,14 @@ from surrogym_sampler.original.errors import StepFailed
 from surrogym_sampler.original.protocol import Array
 from surrogym_sampler.original.simulator import Taken
 
-PLACES = 4  # number of states for each question
-EXACT = 1e-6  # of a variable's observed range
-SETTABLE = 1e-3  # of the same range: the largest error of a state that can be set
-FEW = 3.0  # factor for noise that was estimated from few steps
-FARTHEST = 3.0  # largest shift of a position
+PLACES = 4  # number of states in each test
+EXACT = 1e-6  # share of a variable's observed range; a smaller difference is rounding
+SETTABLE = 1e-3  # share of a variable's observed range: the largest error of a state that counts as set
+FEW = 3.0  # factor on the measured noise, which is estimated from few steps
+FARTHEST = 3.0  # largest shift of a position in a test, in the simulator's unit
 TURN = 2 * np.pi
-PART = 1.0  # rad, of a turn
-ANYWHERE = 32  # states within the limits from which a step is taken
+PART = 1.0  # shift of a variable by a part of a turn, in radians
+ANYWHERE = 32  # number of states within the limits from which a step is taken
 
 
 @dataclass(frozen=True)
@@ -35,10 +36,10 @@ class Probed:
         set_error: between a step of an episode and the same step from a state that was set.
         repeat_error: between two steps from the same state.
         replay_error: between two episodes from one seed under the same actions.
-        shifts: positions whose shift changes nothing.
-        turns: angles whose whole turn changes nothing.
+        shifts: names of positions whose shift changes nothing.
+        turns: names of angles whose whole turn changes nothing.
         leaving: share of the steps from random states within declared limits that lead outside by more than the width
-            of the limits; 0 if it was not asked.
+            of the limits; 0 if this was not tested.
     """
 
     set_error: float
@@ -50,24 +51,30 @@ class Probed:
 
     @property
     def stays(self) -> bool:
-        """Whether the environment stays near its declared limits if it begins within them."""
+        """Whether no step from within the declared limits led far outside of them."""
         return self.leaving == 0
 
     @property
     def noisy(self) -> bool:
-        """Whether the environment is random: equal episodes differ, not only steps from states that were set."""
+        """Whether the environment is random: even episodes with the same seed and actions differ."""
         return self.replay_error > EXACT
 
     @property
     def settable(self) -> bool:
-        """Whether the state can be set completely. An error that two equal episodes don't explain means
-        hidden memory."""
+        """Whether the state can be set completely. An error that is larger than the difference of equal episodes means
+        that the environment remembers more than its state."""
         noise = FEW * max(self.replay_error, self.repeat_error) if self.noisy else 0.0
         return self.set_error <= max(SETTABLE, noise)
 
 
 def probe(counted: Counted, seen: Seen, rng: np.random.Generator) -> Probed:
-    """Repeat some of the steps."""
+    """Repeat some explored steps, and shift variables, to test how the simulator's state can be set.
+
+    Args:
+        counted: the simulator, whose state can be set.
+        seen: the explored steps.
+        rng: draws states and shifts.
+    """
     simulator, scale = counted.simulator, _scale(seen)
     at = np.unique(np.linspace(0, len(seen.states) - 1, PLACES + 1).astype(int)[1:])
     taken = [(seen.states[i], seen.actions[i], seen.next_states[i], float(seen.rewards[i])) for i in at]
@@ -99,10 +106,12 @@ def probe(counted: Counted, seen: Seen, rng: np.random.Generator) -> Probed:
 
 
 class _Alike(NamedTuple):
-    """What a shift of a variable leaves alike in one step.
+    """Which results of a step stay the same after one variable was shifted.
 
-    ``itself``: its own next value, which has the shift, apart from whole turns. ``others``: the other variables, the
-    reward and the end. ``shown``: the observation.
+    Attributes:
+        itself: the variable's own next value, less the shift and whole turns.
+        others: the other variables, the reward and the termination.
+        shown: the observation.
     """
 
     itself: bool
@@ -111,9 +120,13 @@ class _Alike(NamedTuple):
 
 
 class _Shifted:
-    """Steps from some places with one variable shifted, compared with the same steps without the shift.
+    """Steps from some states with one variable shifted, compared with the same steps without the shift.
 
-    ``places``: state (V,), action (F,), next state (V,), and the step's results.
+    Args:
+        counted: the simulator.
+        places: for each step its state (V,), action (F,), next state (V,) and results.
+        scale: observed range of each variable and of the reward (V + 1,).
+        same: largest difference that counts as none, as a share of ``scale``.
     """
 
     def __init__(
@@ -122,30 +135,32 @@ class _Shifted:
         self._counted, self._places, self._scale, self._same = counted, places, scale, same
 
     def changes_nothing(self, index: int, shift: float) -> bool:
-        """Whether neither the motion nor the observation changes."""
+        """Return whether a shift of the variable ``index`` changes neither the motion nor the observation."""
         return all(all(alike) for alike in self._compared(index, shift))
 
     def turns(self, index: int) -> bool:
-        """Whether a whole turn changes nothing about the motion."""
+        """Return whether a whole turn of the variable ``index`` changes nothing about the motion."""
         return all(alike.itself and alike.others for alike in self._compared(index, TURN))
 
     def is_angle(self, index: int) -> bool:
-        """Whether whole turns change nothing about a variable of an unknown kind, and a part of a turn does.
+        """Return whether the variable ``index``, of unknown kind, is an angle: a whole turn changes nothing, and a part
+        of a turn does.
 
-        Without the part, a position on which nothing depends would pass for an angle. The variable's own next value is
-        no such change: it may forget the shift, such as that of an action that the state remembers.
+        Without the test of a part, a position on which nothing depends would count as an angle. Only changes of other
+        variables, the reward or the observation count, because the variable's own next value may lose the shift, as a
+        remembered action does.
         """
         whole = []
         for shift in (TURN, -2 * TURN):
             for alike in self._compared(index, shift):
                 if not (alike.itself and alike.others):
-                    return False  # the other places would cost real steps
+                    return False  # not an angle, so the steps from the other states can be saved
                 whole.append(alike.shown)
         part = list(self._compared(index, PART))
         return not all(alike.others for alike in part) or (all(whole) and not all(alike.shown for alike in part))
 
     def _compared(self, index: int, shift: float) -> Iterator[_Alike]:
-        """The comparison at each place."""
+        """Yield the comparison of the shifted step with the original one, for each state."""
         for state, action, reached, got in self._places:
             moved = state.copy()
             moved[index] += shift
@@ -155,7 +170,8 @@ class _Shifted:
                 yield _Alike(itself=False, others=False, shown=False)
                 continue
             wrong = there[index] - shift - reached[index]
-            wrong -= TURN * np.round(wrong / TURN)  # it may be read without whole turns
+            # The simulator may wrap the angle, so compare modulo one turn.
+            wrong -= TURN * np.round(wrong / TURN)
             there[index] = reached[index]
             others = _error(there, reached, self._scale, step.reward, got.reward) <= self._same
             yield _Alike(
@@ -166,11 +182,11 @@ class _Shifted:
 
 
 def _leaving(counted: Counted, seen: Seen, rng: np.random.Generator) -> float:
-    """Share of the steps from random states within declared limits that lead far outside of them.
+    """Return the share of steps from random states within declared limits that lead far outside of them.
 
     Every second state is a corner of the limits, because a state that runs away most likely does so at an extreme.
 
-    Mechanical variables are not asked: their limits are those of joints.
+    Mechanical variables are not tested: their limits are those of joints.
     """
     simulator = counted.simulator
     limited = [i for i, v in enumerate(simulator.variables) if v.motion == "other" and v.limited]
@@ -192,7 +208,7 @@ def _leaving(counted: Counted, seen: Seen, rng: np.random.Generator) -> float:
 
 
 def _replayed(counted: Counted, seen: Seen, scale: Array) -> float:
-    """Repeat the first episode, with its seed and actions."""
+    """Repeat the first episode with its seed and actions, and return the largest error of its first steps."""
     counted.reset(RESETS)
     rows = np.flatnonzero(seen.episodes == 0)[:PLACES]
     errors = []
@@ -204,7 +220,7 @@ def _replayed(counted: Counted, seen: Seen, scale: Array) -> float:
 
 
 def _scale(seen: Seen) -> Array:
-    """Observed range of each variable (V,), followed by that of the reward."""
+    """Return the observed range of each variable and, as the last entry, of the reward (V + 1,)."""
     moved = np.append(moved_by(np.concatenate([seen.states, seen.next_states])), np.ptp(seen.rewards))
     return np.where(moved > 0, moved, 1.0)
 

@@ -1,4 +1,4 @@
-"""Coordinates with their sampling ranges and starts, from what a simulator declares and what random steps reached.
+"""Sampling ranges and starts of coordinates, from what a simulator declares and what random steps reached.
 
 Shapes: n values, V variables of the state, D observation entries.
 """
@@ -15,24 +15,28 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_sampler.original.simulator import Simulator
 from surrogym_shared.spec import Coordinate, Fixed, Uniform, limits
 
-FASTER = 1.5  # times the largest observed speed: what a policy may reach
-MARGIN = 0.25  # of the observed range, on each side
+FASTER = 1.5  # factor on the largest observed speed, because a policy may be faster than random actions
+MARGIN = 0.25  # margin on each side of the observed range, as a share of it
 SINGLE = 1e-6  # relative error of an observation in single precision
-SHORT_WAY = 0.05  # of the way between two stops; a step that is longer may meet a stop from anywhere
-UNKNOWN_SPEED = 1.0  # of a variable that never moved, in the simulator's unit
+SHORT_WAY = 0.05  # share of the way between two stops; steps that are longer may meet a stop from any position
+UNKNOWN_SPEED = 1.0  # assumed largest speed of a variable that never moved, in the simulator's unit
 
 
 class Ranges:
-    """The ranges of one simulator's variables, which are given by their indices.
+    """The ranges of one simulator's variables, which are identified by their indices.
 
-    ``visited``: (n, V) all states of the explored episodes.
+    Args:
+        simulator: the simulator.
+        seen: the explored steps.
+        probed: results of repeated steps.
+        visited: all states of the explored episodes (n, V).
     """
 
     def __init__(self, simulator: Simulator, seen: Seen, probed: Probed, visited: Array) -> None:
         self._simulator, self._seen, self._probed, self._visited = simulator, seen, probed, visited
 
     def coordinate(self, index: int) -> Coordinate:
-        """The coordinate of a variable, with its kind and sampling range."""
+        """Return the coordinate of the variable ``index``, with its kind and sampling range."""
         variable = self._simulator.variables[index]
         if variable.name in self._probed.turns:
             circle = Uniform(low=-math.pi, high=math.pi)
@@ -42,8 +46,8 @@ class Ranges:
         return Coordinate(name=variable.name, kind=kind, sampling=Uniform(low=low, high=high))
 
     def start(self, index: int, coordinate: Coordinate) -> Uniform | Fixed:
-        """The range of starts: that of a schedule, or else the seen one. The latter is widened, because the range of n
-        uniform draws is too narrow on average."""
+        """Return the distribution of starts of a coordinate: the range of its schedule, or else that of the observed
+        starts. The latter is widened, because the range of n uniform draws is too narrow on average."""
         if coordinate.name in self._simulator.scheduled:
             low, high = self._simulator.scheduled[coordinate.name]
             return Uniform(low=low, high=high) if low < high else Fixed(value=low)
@@ -61,7 +65,7 @@ class Ranges:
         return Uniform(low=low - wider, high=high + wider)
 
     def _is_constant(self, index: int) -> bool:
-        """Whether a variable is constant in every episode, and differs between episodes."""
+        """Return whether a variable is constant in every episode and may differ between episodes."""
         variable, seen = self._simulator.variables[index], self._seen
         if variable.motion in ("slide", "turn", "speed"):
             return False
@@ -69,7 +73,7 @@ class Ranges:
         return variable.motion == "held" or not moved
 
     def _range(self, index: int, *, constant: bool) -> tuple[float, float]:
-        """The sampling range of a variable. It ends at the limits with which the environment shows the variable."""
+        """Return the sampling range of a variable, cut to the limits that the observation space declares for it."""
         low, high = self._reached(index, constant=constant)
         for shown, ends in zip(self._seen.observations.T, self._shown_limits(), strict=True):
             within = ends[0] <= self._visited[:, index].min() and self._visited[:, index].max() <= ends[1]
@@ -78,19 +82,21 @@ class Ranges:
         return low, high
 
     def _shown_limits(self) -> Array:
-        """Limits (D, 2) of the observation's entries."""
+        """Return the limits (D, 2) of the observation's entries; infinite if none are declared."""
         given, entries = self._simulator.shown_limits, self._seen.observations.shape[1]
         fits = given is not None and given.shape == (entries, 2)
         return given if given is not None and fits else np.tile([-np.inf, np.inf], (entries, 1))
 
     def _reached(self, index: int, *, constant: bool) -> tuple[float, float]:
-        """The sampling range of a variable by its own limits, or by what random actions reached."""
+        """Return the sampling range of a variable from its declared limits, or else from the values that random actions
+        reached."""
         variable, seen = self._simulator.variables[index], self._visited[:, index]
         low, high = float(seen.min()), float(seen.max())
         if variable.motion == "speed":
             fastest = FASTER * max(abs(low), abs(high)) or UNKNOWN_SPEED
             return -fastest, fastest
-        pushed = variable.motion == "slide" and not variable.driven  # its limits may be far away
+        # an object that actions move only indirectly; its limits may be far away
+        pushed = variable.motion == "slide" and not variable.driven
         trusted = not pushed and (self._probed.stays or constant)
         if variable.low is not None and variable.high is not None and trusted:
             if variable.motion in ("slide", "turn"):
@@ -104,10 +110,11 @@ class Ranges:
         return low - margin, high + margin
 
     def _before_the_stops(self, index: int, low: float, high: float) -> tuple[float, float]:
-        """The sampling range of a joint with stops. A step that meets a stop is not smooth.
+        """Return the sampling range of a joint with stops at ``low`` and ``high``. A step that meets a stop is not
+        smooth.
 
-        The range therefore ends before each stop, by the longest way of one step. It always has all starts. If
-        that way is a large part of the whole, stops are met everywhere, and nothing is left out.
+        The range therefore ends before each stop, by the longest way of one step. It always contains all starts. If
+        that way is a large part of the whole, stops are met from everywhere, and the range is the whole.
         """
         seen, starts = self._seen, self._seen.starts[:, index]
         way = FASTER * float(np.abs(seen.next_states[:, index] - seen.states[:, index]).max())
@@ -117,9 +124,9 @@ class Ranges:
 
 
 def _on_an_arc(angles: Array) -> Array:
-    """The same angles (n,), with whole turns added, so that they lie on the shortest arc that has them all.
+    """Return the same angles (n,) with whole turns added so that they lie on the shortest arc that contains them all.
 
-    Its middle is within half a turn of 0. Angles near half a turn are read on both sides of the jump there.
+    The middle of the arc is within half a turn of 0. This undoes the jump of wrapped angles at half a turn.
     """
     turn = 2 * math.pi
     placed = np.sort(np.mod(angles, turn))

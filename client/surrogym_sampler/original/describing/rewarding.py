@@ -1,6 +1,6 @@
-"""Find a reward that is a quadratic function of coordinates, cosines, sines and the action.
+"""Search for a reward that is a quadratic function of coordinates, cosines, sines and the action.
 
-Setpoints and costs of control are of this kind. The fit is
+Distances to setpoints and costs of control are of this kind. The fit is
 
     r = c + b . z + z' A z
 
@@ -26,18 +26,25 @@ from surrogym_shared.spec.base import MAX_TERM_PARTS
 from surrogym_shared.spec.terms import Part
 from surrogym_shared.terms import evaluate
 
-MOST = 120  # most coefficients of a fit
-ENOUGH = 1.5  # steps for each coefficient
-MOSTLY = 0.9  # share of an episode's steps: a schedule that a state does not show may decide about the others
-TRIMS = 5  # fits to the steps that the fit before explained best
-NOTHING = 1e-10  # size of a term that is rounding, as a share of the reward's range
+MOST = 120  # largest number of coefficients of a fit
+ENOUGH = 1.5  # smallest number of steps for each coefficient
+MOSTLY = 0.9  # share of steps that a reward must explain; the others may depend on a schedule that is not in the state
+TRIMS = 5  # number of repeated fits, each to the steps that the previous fit explained best
+NOTHING = 1e-10  # size below which a term is rounding, as a share of the reward's range
 
 Timing = Literal["after", "before"]
 
 
 @dataclass(frozen=True)
 class Paid:
-    """Steps with their rewards: q (n, C), u (n, F), q_next (n, C), reward (n,)."""
+    """Steps with their rewards.
+
+    Attributes:
+        q: states before the steps (n, C).
+        u: actions (n, F).
+        q_next: states after the steps (n, C).
+        reward: rewards (n,).
+    """
 
     q: Array
     u: Array
@@ -51,11 +58,11 @@ class Paid:
         return self.at(slice(number, number + 1))
 
     def before(self) -> Array:
-        """The states (n, C) before the steps."""
+        """Return the states (n, C) before the steps."""
         return self.q
 
     def after(self) -> Array:
-        """The states (n, C) after the steps."""
+        """Return the states (n, C) after the steps."""
         return self.q_next
 
     def joined(self, other: Paid) -> Paid:
@@ -67,18 +74,18 @@ class Paid:
 
 
 def coefficients(spec: EnvironmentSpec) -> int:
-    """Number of coefficients of a fit."""
+    """Return the number of coefficients of the quadratic function of this environment."""
     k = len(_quantities(spec))
     return (k + 1) * (k + 2) // 2
 
 
 def quadratic_reward(spec: EnvironmentSpec, fitted: Paid, checked: Paid) -> DeclaredReward | None:
-    """Fit a reward to some steps, and return it if it explains these and others exactly; None otherwise.
+    """Fit a quadratic reward to some steps, and return it if it explains these and others exactly; None otherwise.
 
     Args:
-        spec: the environment. Its actions are continuous, or the result is None.
+        spec: the environment. The result is None unless its actions are continuous.
         fitted: steps for the fit.
-        checked: steps that the fit does not see.
+        checked: steps that only check the fit.
     """
     size = float(np.ptp(fitted.reward))
     enough = ENOUGH * coefficients(spec) <= len(fitted) and coefficients(spec) <= MOST
@@ -93,7 +100,7 @@ def quadratic_reward(spec: EnvironmentSpec, fitted: Paid, checked: Paid) -> Decl
 
 
 def may_be_quadratic(spec: EnvironmentSpec, steps: Paid) -> bool:
-    """Whether a quadratic function explains most of the rewards exactly."""
+    """Return whether a quadratic function explains most of the rewards exactly."""
     if not isinstance(spec.action, BoxAction) or not ENOUGH * coefficients(spec) <= MOSTLY * len(steps):
         return False
     size, kept = float(np.ptp(steps.reward)), round(MOSTLY * len(steps))
@@ -112,7 +119,7 @@ def may_be_quadratic(spec: EnvironmentSpec, steps: Paid) -> bool:
 
 
 def error_of(spec: EnvironmentSpec, reward: DeclaredReward, steps: Paid) -> float:
-    """Largest error of a reward over some steps."""
+    """Return the largest absolute error of a declared reward over some steps."""
     declared = spec.model_copy(update={"reward": reward})
     ended = np.zeros(len(steps), dtype=bool)
     return float(np.abs(declared_reward(declared, steps.q, steps.u, steps.q_next, ended) - steps.reward).max())
@@ -136,10 +143,11 @@ def _fitted(spec: EnvironmentSpec, steps: Paid, timing: Timing, size: float) -> 
 
 
 def _fewest(columns: Array, reward: Array, tolerance: float) -> Array | None:
-    """Weights of the columns (n, k) that still explain the reward (n,) without many of the others, which are 0.
+    """Return weights (k,) of the columns (n, k) that explain the reward (n,), as many of them 0 as possible; None if
+    all columns together don't explain it.
 
-    Columns are left out one by one, that with the smallest share first. So no rounding remains, and nothing that
-    cancels, such as squares of a cosine and a sine. None if all columns together don't explain the reward.
+    Columns are left out one by one, that with the smallest contribution first. This removes rounding errors and terms
+    that cancel, such as squares of a cosine and a sine.
     """
     kept = np.ones(columns.shape[1], dtype=bool)
 
@@ -160,31 +168,32 @@ def _fewest(columns: Array, reward: Array, tolerance: float) -> Array | None:
 
 
 def _read(spec: EnvironmentSpec, q: Array, u: Array) -> Array:
-    """The entries of x at states (n, C) and actions (n, F): (n, k)."""
+    """Return the entries of x in states (n, C) under actions (n, F): (n, k)."""
     return np.stack([_values(spec, one, q, u) for one in _quantities(spec)], axis=1)
 
 
 def _scaled(x: Array) -> tuple[Array, Array, Array]:
-    """z (n, k), and the centre (k,) and reach (k,) by which x was scaled."""
+    """Return z (n, k), which is x (n, k) centred and scaled, the centre (k,), and the scale (k,)."""
     centre, reach = x.mean(0), np.where(np.ptp(x, axis=0) > 0, x.std(0), 1.0)
     return (x - centre) / reach, centre, reach
 
 
 def _columns(z: Array) -> Array:
-    """1, the entries of z (n, k), and their products."""
+    """Return the columns of the fit: 1, the entries of z (n, k), and the products of two entries."""
     first, second = np.triu_indices(z.shape[1])
     return np.concatenate([np.ones((len(z), 1)), z, z[:, first] * z[:, second]], axis=1)
 
 
 def _parts(weights: Array, k: int) -> tuple[float, Array, Array]:
-    """c, b (k,) and the symmetric A (k, k) of the weights of ``_columns``."""
+    """Split the weights of the columns of ``_columns`` into c, b (k,) and the symmetric A (k, k)."""
     a = np.zeros((k, k))
     a[np.triu_indices(k)] = weights[1 + k :]
     return float(weights[0]), weights[1 : 1 + k], (a + a.T) / 2
 
 
 def _squares(quantities: Sequence[Quantity], a: Array, reach: Array) -> Iterator[RewardTerm]:
-    """x' A x as squares along the eigenvectors of A (k, k), which is scaled by the reach (k,) of each entry of x."""
+    """Yield x' A x as weighted squares, one for each eigenvector of ``a`` (k, k), which is A scaled by the ``reach``
+    (k,) of each entry of x."""
     values, vectors = np.linalg.eigh(a)
     for value, vector in zip(values, vectors.T, strict=True):
         if abs(value) > EXACT**2 * np.abs(values).max():
@@ -195,7 +204,7 @@ def _squares(quantities: Sequence[Quantity], a: Array, reach: Array) -> Iterator
 
 
 def _rest(quantities: Sequence[Quantity], c: float, b: Array) -> Iterator[RewardTerm]:
-    """The terms of c + b . x."""
+    """Yield the terms of c + b . x."""
     if b.any():
         yield RewardTerm(shape="linear", of=(_sum(quantities, b),))
     if c:
@@ -203,7 +212,7 @@ def _rest(quantities: Sequence[Quantity], c: float, b: Array) -> Iterator[Reward
 
 
 def _sum(quantities: Sequence[Quantity], weights: Array) -> Quantity:
-    """Weighted sum of quantities."""
+    """Return the weighted sum of quantities; ``weights`` has one entry for each."""
     parts: tuple[Part, ...] = ()
     action = np.zeros(max(len(one.action) for one in quantities))
     for one, weight in zip(quantities, weights, strict=True):
@@ -216,7 +225,7 @@ def _sum(quantities: Sequence[Quantity], weights: Array) -> Quantity:
 
 
 def _quantities(spec: EnvironmentSpec) -> list[Quantity]:
-    """The entries of x: coordinates, cosines and sines of angles, and action entries."""
+    """Return the entries of x: coordinates, cosines and sines of angles, and action entries."""
     terms: list[Term] = []
     for coordinate in spec.coordinates:
         terms.append(Term.linear(**{coordinate.name: 1.0}))

@@ -1,8 +1,8 @@
-"""Find a reward of two values that changes at a level of an observation entry, at an ellipsoid or at a box of some.
+"""Search for a reward of two values that changes at a level of an observation entry, at an ellipsoid or at a box.
 
 Bonuses for being near a goal or above a height are of this kind. Bisections between a step with one value and a step
-with the other give points x of the boundary. One end of most bisections is in a random state, so that the points
-lie on all sides. A form is found if all points satisfy
+with the other give points x of the boundary. One end of most bisections is in a random state, so that the points lie on
+all sides. A form is found if all points satisfy
 
     x_i = level,   or   sum_i ((x_i - c_i) / r_i)^2 = 1
 
@@ -27,19 +27,21 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Inequality, Quantity, RewardTerm, Term
 from surrogym_shared.terms import evaluate
 
-SEEK = 200  # most steps from random states that look for the second value
+SEEK = 200  # largest number of steps from random states to find the second value
 BATCH = 12
-ENOUGH = 4  # steps with the rarer value, at which bisections begin
-POINTS = 12  # of the boundary: twice the numbers of an ellipsoid of three entries
+ENOUGH = 4  # number of steps with the rarer value that are enough to start bisections
+POINTS = 12  # number of boundary points: twice the unknowns of an ellipsoid of three entries
 HALVINGS = 24
-COARSE = 10  # halvings after which a step is still far enough from the boundary to check a form
-NEAR = 0.02  # of the range of states: how far the end of a bisection moves for a point beside another
-FLAT = 1e-3  # a share of the largest singular value: with one below it, points lie on more than one ellipsoid
-MOST = 5_000  # groups of entries
+COARSE = 10  # number of first halvings whose steps are far enough from the boundary to check a form
+NEAR = 0.02  # share of the range of states by which the end of a bisection moves to find a neighbouring point
+FLAT = 1e-3  # share of the largest singular value; with a smaller one, the points lie on more than one ellipsoid
+MOST = 5_000  # largest number of groups of entries that are tried
 READS: dict[Timing, Callable[[Paid], Array]] = {"after": Paid.after, "before": Paid.before}
 
-Steps = Callable[[Array, Array], Paid]  # from states (n, C) with actions (n, F), without those that end an episode
-Drawn = Callable[[int], tuple[Array, Array]]  # n random states (n, C) and actions (n, F)
+# Takes steps from states (n, C) with actions (n, F), and returns those that don't end an episode.
+Steps = Callable[[Array, Array], Paid]
+# Draws n random states (n, C) and actions (n, F).
+Drawn = Callable[[int], tuple[Array, Array]]
 
 
 def threshold_reward(spec: EnvironmentSpec, seen: Paid, step: Steps, draw: Drawn) -> DeclaredReward | None:
@@ -47,7 +49,7 @@ def threshold_reward(spec: EnvironmentSpec, seen: Paid, step: Steps, draw: Drawn
 
     Args:
         spec: the environment.
-        seen: steps so far, of few episodes.
+        seen: the steps so far, from few episodes.
         step: takes real steps.
         draw: draws states and actions for further steps.
     """
@@ -67,7 +69,15 @@ def threshold_reward(spec: EnvironmentSpec, seen: Paid, step: Steps, draw: Drawn
 
 
 def _smooth(spec: EnvironmentSpec, bounds: Paid, steps: Paid, rare: float, usual: float) -> Iterator[DeclaredReward]:
-    """Rewards whose boundary is a level or an ellipsoid."""
+    """Yield the rewards of two values whose boundary is a level or an ellipsoid through all its points ``bounds``.
+
+    Args:
+        spec: the environment.
+        bounds: steps next to the boundary.
+        steps: other steps, which show the range of each quantity.
+        rare: the reward that fewer steps have.
+        usual: the other reward.
+    """
     for timing, reads in READS.items():
         for group in itertools.islice(_groups(spec), MOST):
             for inside in regions(spec, group, reads(bounds), reads(steps)):
@@ -76,10 +86,11 @@ def _smooth(spec: EnvironmentSpec, bounds: Paid, steps: Paid, rare: float, usual
 
 
 def _boxes(spec: EnvironmentSpec, boundary: _Boundary, steps: Paid) -> Iterator[DeclaredReward]:
-    """Rewards whose boundary has faces. If the points so far share a level, as many are added, and then a neighbour of
-    each that shares none, to find the quantity that has a level there.
+    """Yield rewards whose boundary has faces. If points share a level, as many points are added again, and then a
+    neighbour of each point that shares no level, to find the quantity that has a level there.
 
-    A face that no point meets leaves steps inside whose reward is that of outside. The way to one of them crosses it.
+    If a face has no point yet, the region still contains steps with the outside reward. A bisection towards such a step
+    crosses the missing face.
     """
     terms, values = _single(spec), np.unique(steps.reward)
     timings = [time for time, reads in READS.items() if has_face(spec, terms, reads(boundary.points), reads(steps))]
@@ -101,7 +112,8 @@ def _boxes(spec: EnvironmentSpec, boundary: _Boundary, steps: Paid) -> Iterator[
 
 
 def _with_both_values(steps: Paid, step: Steps, draw: Drawn) -> Paid:
-    """Take a batch of further steps, and then up to ``SEEK`` until the rarer of two values was met ``ENOUGH`` times."""
+    """Take a batch of further steps, and then up to ``SEEK`` until the rarer of two values was met ``ENOUGH`` times.
+    Returns all steps."""
     for taken in range(0, SEEK, BATCH):
         counts = np.unique(steps.reward, return_counts=True)[1]
         if len(counts) > 2 or (taken and len(counts) == 2 and counts.min() >= ENOUGH):
@@ -111,22 +123,23 @@ def _with_both_values(steps: Paid, step: Steps, draw: Drawn) -> Paid:
 
 
 class _Boundary:
-    """Steps next to the boundary, by bisection between steps with the rare value and others.
+    """Steps next to the boundary between two rewards, found by bisection between steps with the rare reward and others.
 
-    The first ``explored`` steps are those of few episodes. All of them that have the rare value may be neighbours, and
-    a small part of a boundary does not tell its form. So one end of most bisections is in a random state.
+    The first ``explored`` steps come from few episodes. All of them that have the rare reward may be neighbours, and a
+    small part of a boundary does not show its form. So one end of most bisections is in a random state.
     """
 
     def __init__(self, steps: Paid, explored: int, rare: NDArray[np.bool_], step: Steps) -> None:
-        self.points = self.passed = steps.at(slice(0))  # near the boundary, and on the way to it
+        # the steps next to the boundary, and the earlier steps of the bisections
+        self.points = self.passed = steps.at(slice(0))
         self._steps, self._step = steps, step
-        self._ends: list[tuple[Paid, Paid]] = []  # of the bisection of each point
+        self._ends: list[tuple[Paid, Paid]] = []  # the two ends of the bisection that found each point
         few, others = ([steps.one(i) for i in _spread(np.flatnonzero(of), explored)] for of in (rare, ~rare))
-        self._paired = 0  # points that have a neighbour, or were tried
+        self._paired = 0  # number of points for which a neighbour was found or tried
         self._pairs = ((few[n % len(few)], others[(n + n // len(few)) % len(others)]) for n in itertools.count())
 
     def more(self) -> Paid:
-        """Add at most ``POINTS`` points, of at most twice as many bisections, and return all."""
+        """Add at most ``POINTS`` points, by at most twice as many bisections, and return all points."""
         enough = len(self.points) + POINTS
         for one, other in itertools.islice(self._pairs, 2 * POINTS):
             self.between(one, other)
@@ -135,7 +148,7 @@ class _Boundary:
         return self.points
 
     def beside(self, chosen: NDArray[np.bool_]) -> None:
-        """Add a point near each of some points (K,), once."""
+        """Add a neighbouring point for each of the chosen points (K,) that has none yet."""
         width = np.ptp(self._steps.q, axis=0)
         new = self._paired + np.flatnonzero(chosen[self._paired :])
         self._paired = len(chosen)
@@ -143,17 +156,18 @@ class _Boundary:
             self.between(*self._ends[number], shift=NEAR * width * np.where(np.arange(len(width)) % 2, 1, -1))
 
     def between(self, one: Paid, other: Paid, shift: Array | float = 0.0) -> None:
-        """Add a point between two steps with different values. The state of the other one is shifted (C,)."""
+        """Add the boundary point between two steps with different rewards. The state of the other step is first shifted
+        by ``shift`` (C,)."""
         found = self._bisected(one, other, shift)
         self.points = self.points.joined(found)
         self._ends += [(one, other)] * len(found)
 
     def _bisected(self, one: Paid, other: Paid, shift: Array | float) -> Paid:
-        """The step next to the boundary between two steps, with state and action between theirs. The state of the
-        other step is shifted (C,).
+        """Return the step next to the boundary between two steps, found by bisection of state and action. The state of
+        the other step is first shifted by ``shift`` (C,).
 
-        None if a step ends an episode, or all have the same reward: then one of the two steps can't be repeated
-        exactly, or the shifted end is on the same side.
+        The result is empty if a step ends an episode, or if all have the same reward: then one of the two steps can't
+        be repeated exactly, or the shifted end is on the same side of the boundary.
         """
         q, u, q_other, u_other = one.q[0], one.u[0], other.q[0] + shift, other.u[0]
         last, met = self._steps.at(slice(0)), set[bool]()
@@ -173,13 +187,20 @@ class _Boundary:
 
 
 def _spread(chosen: NDArray[np.int64], explored: int) -> NDArray[np.int64]:
-    """Indices of the steps from random states, and then of at most ``POINTS`` explored ones, evenly spread."""
+    """Return indices of the steps from random states, followed by those of at most ``POINTS`` evenly spread explored
+    steps.
+
+    Args:
+        chosen: indices of the steps to choose from.
+        explored: number of explored steps; smaller indices are theirs.
+    """
     near, anywhere = chosen[chosen < explored], chosen[chosen >= explored]
     return np.append(anywhere, near[np.linspace(0, len(near) - 1, min(POINTS, len(near))).astype(int)])
 
 
 def _groups(spec: EnvironmentSpec) -> Iterator[tuple[Term, ...]]:
-    """Groups of one to three terms whose level may be the boundary, the simplest ones first."""
+    """Yield groups of one to three terms, the simplest first; the boundary may be a level or an ellipsoid of such a
+    group."""
     shown = _shown(spec)
     yield from ((term,) for term in _single(spec))
     yield from itertools.combinations(shown, 2)
@@ -188,7 +209,8 @@ def _groups(spec: EnvironmentSpec) -> Iterator[tuple[Term, ...]]:
 
 
 def _single(spec: EnvironmentSpec) -> list[Term]:
-    """Terms that may be at a level each: what is observed, coordinates, cosines and sines, and differences."""
+    """Return the terms whose level may be the boundary: observation entries, coordinates, cosines and sines, and
+    differences."""
     own: list[Term] = []
     for coordinate in spec.coordinates:
         own.append(Term.linear(**{coordinate.name: 1.0}))
@@ -206,9 +228,14 @@ def _differences(shown: Sequence[Term]) -> list[Term]:
 
 
 def regions(spec: EnvironmentSpec, group: Sequence[Term], bounds: Array, states: Array) -> Iterator[RewardTerm]:
-    """Terms that are 1 on one side of the boundary, if the points ``bounds`` (K, C) of it agree.
+    """Yield reward terms that are 1 on one side of the boundary and 0 on the other, if all its points agree with the
+    form.
 
-    ``states`` (n, C) give the size of an entry's range.
+    Args:
+        spec: the environment.
+        group: the terms whose level or ellipsoid may be the boundary.
+        bounds: states (K, C) on the boundary.
+        states: states (n, C) that show the range of each term.
     """
     x, elsewhere = (np.stack([evaluate(spec, term, q) for term in group], axis=1) for q in (bounds, states))
     if len(group) == 1 and np.ptp(x) <= LEVEL * np.ptp(elsewhere):
@@ -219,15 +246,20 @@ def regions(spec: EnvironmentSpec, group: Sequence[Term], bounds: Array, states:
 
 
 def _ellipsoid(group: Sequence[Term], x: Array, elsewhere: Array) -> tuple[Quantity, ...] | None:
-    """The quantities (x_i - c_i) / r_i of an ellipsoid through the points x (K, k), or None.
+    """Return the quantities (x_i - c_i) / r_i of the ellipsoid through all points, or None.
 
-    None also if other ellipsoids go through them, or if all other states are on it: x holds ``elsewhere`` (n, k) there.
-    A cosine and a sine do this.
+    The result is also None if more than one ellipsoid goes through the points, or if all other states lie on it, as
+    with the cosine and the sine of one angle.
+
+    Args:
+        group: the terms (k) that the points are values of.
+        x: points of the boundary (K, k).
+        elsewhere: the values of other states (n, k).
     """
     middle, reach = x.mean(0), x.std(0)
     if (reach <= LEVEL * np.ptp(elsewhere, axis=0)).any():
         return None
-    # 0 is inside of the ellipsoid, so a . z^2 + b . z = 1 on it, where z is centred and scaled
+    # With z centred and scaled, 0 is inside of the ellipsoid, so its points fulfil a . z^2 + b . z = 1.
     columns, others = (np.concatenate([z**2, z], axis=1) for z in ((x - middle) / reach, (elsewhere - middle) / reach))
     weights, _, rank, _ = np.linalg.lstsq(columns, np.ones(len(x)), rcond=FLAT)
     a, b = np.split(weights, 2)
@@ -244,7 +276,7 @@ def _ellipsoid(group: Sequence[Term], x: Array, elsewhere: Array) -> tuple[Quant
 
 
 def _paying(timing: Timing, inside: RewardTerm, within: float, elsewhere: float) -> DeclaredReward:
-    """A reward of two values."""
+    """Return a reward of two values: ``within`` in the region of the term ``inside``, ``elsewhere`` outside."""
     bonus = inside.model_copy(update={"weight": within - elsewhere})
     terms = (bonus, RewardTerm(weight=elsewhere, shape="one")) if elsewhere else (bonus,)
     return DeclaredReward(kind="declared", timing=timing, terms=terms)

@@ -1,4 +1,4 @@
-"""Refusals of environments that no specification can express, before their real steps where this is possible.
+"""Refusals of environments that no specification can express, before their real steps if possible.
 
 Shapes: n steps, R resets, V variables of the state.
 """
@@ -19,7 +19,7 @@ OWN_CLASS = "in a class of your own (docs/how-to/own-environment.md)"
 
 
 def require_variables(name: str, variables: Sequence[Variable]) -> None:
-    """Raise ``UnknownEnvironment`` if a state has no numbers."""
+    """Raise ``UnknownEnvironment`` if the state of an environment has no variables."""
     if not variables:
         raise UnknownEnvironment(
             f"{name} shows no state and observes nothing: expected a state of 1 to {MAX_DIMENSIONS} numbers; declare "
@@ -28,9 +28,9 @@ def require_variables(name: str, variables: Sequence[Variable]) -> None:
 
 
 def require_few(name: str, variables: Sequence[Variable], moved: NDArray[np.bool_]) -> None:
-    """Raise ``UnknownEnvironment`` if too many variables moved, (V,).
+    """Raise ``UnknownEnvironment`` if too many variables moved, given which of them did (V,).
 
-    Those that a description may leave out don't count: variables that are held, and slides without limits.
+    Variables that a description may leave out don't count: those that are held, and slides without limits.
     """
     needed = np.array([v.motion != "held" and (v.motion != "slide" or v.limited) for v in variables])
     _require_at_most(name, int((moved & needed).sum()))
@@ -50,12 +50,12 @@ def require_numbers(name: str, states: Sequence[Array], rewards: Array) -> None:
 
 
 def require_coordinates(name: str, count: int, steps: int) -> None:
-    """Raise ``UnknownEnvironment`` if ``count`` variables are no number of coordinates.
+    """Raise ``UnknownEnvironment`` if a description would have no coordinates, or too many.
 
     Args:
-        name: of the environment.
-        count: variables that are needed.
-        steps: random steps that showed it.
+        name: the environment.
+        count: number of variables that would become coordinates.
+        steps: number of random steps that were taken.
     """
     if not count:
         raise UnknownEnvironment(

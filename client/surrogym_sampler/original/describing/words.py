@@ -1,4 +1,4 @@
-"""Words of a description's findings."""
+"""Sentences for the findings of a description."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from surrogym_shared.spec import DeclaredReward
 
 
 def words_of_reward(reward: DeclaredReward) -> str:
-    """What a declared reward is."""
+    """Return in words what kind of function a declared reward is."""
     bonus = reward.terms[0]
     if bonus.when:
         several = f"{len(bonus.when)} thresholds of quantities of the state, all met at once,"
@@ -24,7 +24,12 @@ def words_of_reward(reward: DeclaredReward) -> str:
 
 
 def words_of_access(probed: Probed, fixed: str) -> str:
-    """Where an environment can begin; ``fixed`` says why it can't be set to a state."""
+    """Return a sentence about the states in which an environment can begin.
+
+    Args:
+        probed: results of repeated steps.
+        fixed: the sentence for an environment that can't be set to a state.
+    """
     if not np.isfinite(probed.set_error):
         return fixed
     if not probed.settable:
@@ -38,5 +43,5 @@ def words_of_access(probed: Probed, fixed: str) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names in one row."""
+    """Return the names separated by commas."""
     return ", ".join(names)

@@ -1,4 +1,4 @@
-"""The original environment behind a program.
+"""An original environment that is a program, which answers each line of JSON with a line of JSON.
 
 Shapes: C coordinates, F action entries.
 """
@@ -25,17 +25,19 @@ from surrogym_sampler.original.protocol import Array, RealStep
 from surrogym_shared.spec import EnvironmentSpec
 
 PREFIX = "exec:"
-START_LIMIT = 120.0  # seconds until the specification is there; a simulator may start slowly
+START_LIMIT = 120.0  # seconds until the program must have given its specification; a simulator may start slowly
 
 
 class Executable:
-    """A program that can be reset and acted on. If it dies, hangs or prints something else than an answer, the query
-    fails, and the next query starts it anew, once.
+    """An original environment that is a program which can be reset and acted on.
+
+    If the program dies, hangs or prints something other than an answer, the query fails, and the next query starts it
+    once more.
 
     Args:
-        program: has answered with a specification.
-        own: the specification that it answered with.
-        spec: the specification that is used: its own, or one that a person gave.
+        program: the started program.
+        own: the specification that the program declares.
+        spec: the specification to use: the program's own, or one that a person gave.
         step_limit: seconds that one step, or one reset, may take.
     """
 
@@ -50,32 +52,34 @@ class Executable:
         return self._spec
 
     def begin(self, seed: int | None = None) -> Array:
-        """Reset the program; the coordinates (C,) it starts at."""
+        """Reset the program, and return the start coordinates (C,)."""
         self._at = None
         self._revive()
         self._at = self._state(self._ask("reset", self._deadline(), seed=seed))
         return self._at
 
     def act(self, action: Array) -> RealStep:
-        """Take the next step of the running episode, with action (F,).
+        """Take the next step of the running episode, with an action (F,).
 
         Raises:
             StepFailed: no episode is running, or the program did not give a step.
         """
         before, self._at = self._at, None
         if before is None:
-            raise StepFailed("expected an action in a running episode, got one after its end or before a reset")
+            raise StepFailed(
+                "expected an action in a running episode, got one after its end or before a reset: reset first"
+            )
         step = self._stepped(before, action, self._deadline())
         if not (step.terminated or step.truncated):
             self._at = step.next_coordinates  # type: ignore[assignment]  # an array (C,), from _stepped
         return step
 
     def save(self) -> bytes:
-        """The program's snapshot: the text that it answered with, as bytes."""
+        """Return the program's snapshot of the current state: the text of its answer, as bytes."""
         return text(self._ask("save", self._deadline()), "snapshot").encode()
 
     def restore(self, snapshot: bytes) -> Array:
-        """Let the program return to a snapshot; the coordinates (C,) there."""
+        """Let the program return to a snapshot, and return the coordinates (C,) there."""
         self._at = None
         self._revive()
         reply = self._ask("restore", self._deadline(), snapshot=snapshot.decode(errors="replace"))
@@ -83,7 +87,7 @@ class Executable:
         return self._at
 
     def close(self) -> None:
-        """Ask the program to close, and end it if it does not."""
+        """Ask the program to close, and kill it if it does not."""
         self._program.close()
 
     def _stepped(self, before: Array, action: Array, deadline: float) -> RealStep:
@@ -102,8 +106,8 @@ class Executable:
         return wrapped(self._spec, numbers(reply, "state", len(self._spec.coordinates)))
 
     def _revive(self) -> None:
-        """Start the program anew if it has ended. Only a query's first request may do so, because the others depend on
-        the state."""
+        """Start the program again if it has ended. Only the first request of a query may do so, because the others
+        depend on the state."""
         if self._program.running:
             return
         try:
@@ -114,7 +118,8 @@ class Executable:
         if own != self._own:
             self._program.end()
             raise EnvironmentDied(
-                "expected the same specification from the program that was started anew, got another one"
+                "expected the program to give the same specification when it is started again, got another one: "
+                "correct the program"
             )
 
     def _ask(self, method: str, deadline: float, **fields: object) -> Reply:
@@ -128,10 +133,10 @@ class Executable:
 
 
 class SettableExecutable(Executable):
-    """A program that can be set to any state as well."""
+    """An original environment that is a program whose state can be set."""
 
     def step_from(self, coordinates: Array, action: Array) -> RealStep:
-        """Set the program to coordinates (C,), apply action (F,). Both together have one time limit."""
+        """Set the program to coordinates (C,) and apply an action (F,). One time limit holds for both together."""
         self._revive()
         deadline = self._deadline()
         achieved = self._state(self._ask("set", deadline, state=[float(c) for c in coordinates]))
@@ -139,12 +144,12 @@ class SettableExecutable(Executable):
 
 
 def is_executable(name: str) -> bool:
-    """Whether a name is ``exec:COMMAND``."""
+    """Return whether a name has the form ``exec:COMMAND``."""
     return name.startswith(PREFIX)
 
 
 def name_of(command: str) -> str:
-    """The environment's name of a command."""
+    """Return the environment name ``exec:COMMAND`` of a command."""
     return f"{PREFIX}{command}"
 
 
@@ -154,11 +159,11 @@ def open_executable(
     choose: Callable[[EnvironmentSpec], EnvironmentSpec] = lambda spec: spec,
     step_limit: float = 30.0,
 ) -> Executable:
-    """Start the program of ``exec:COMMAND``.
+    """Start the program of ``exec:COMMAND``, and return it as an environment.
 
     Args:
-        name: of the environment.
-        spec: replaces the specification that the program declares.
+        name: the environment's name.
+        spec: a specification that replaces the program's own.
         choose: changes the specification.
         step_limit: seconds that one step, or one reset, may take.
 

@@ -1,4 +1,4 @@
-"""Ends a program whose parent was killed and could not end it."""
+"""A guard that kills a program after the process that started it was killed."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import math
 import subprocess
 
 SHELL = "/bin/sh"
-SCRIPT = 'read -r _; sleep "$1"; kill -s KILL -- "-$0"'  # its input ends with the process that holds the other end
+# The pipe to the shell's input closes when this process ends; then `read` returns.
+SCRIPT = 'read -r _; sleep "$1"; kill -s KILL -- "-$0"'
 
 
 class Guard:
     """A shell that waits for the end of this process, and then kills a process group.
 
-    Nothing in this process needs to run for that, so it also works after SIGKILL, on Linux and macOS.
+    The shell is a process of its own, so it also works after SIGKILL of this process, on Linux and macOS.
 
     Args:
         group: id of the process group.
@@ -32,7 +33,7 @@ class Guard:
         )
 
     def dismiss(self) -> None:
-        """End the guard. Call this before the group's id can belong to other processes."""
+        """End the guard. Call this before the process group's id can be given to other processes."""
         assert self._shell.stdin is not None
         self._shell.kill()
         self._shell.wait()

@@ -1,1 +1,2 @@
-"""Models of pc-gym, each by its name or a file of parameters. ``adapter`` opens them, ``file`` reads the file."""
+"""The adapter for models of pc-gym: ``adapter`` opens a model by its name or a file of parameters, ``file`` checks such
+a file."""

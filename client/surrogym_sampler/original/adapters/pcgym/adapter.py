@@ -1,6 +1,7 @@
-"""Process control by pc-gym: ``pcgym:cstr``, its documented stirred tank, or ``pcgym:FILE.json`` with its parameters.
+"""The adapter for process control by pc-gym: ``pcgym:cstr``, its documented stirred tank, or ``pcgym:FILE.json`` with
+parameters.
 
-The state is the attribute ``state``. Setpoints and disturbances follow a schedule in an episode. After a state is set,
+The state is the attribute ``state``. In an episode, setpoints and disturbances follow a schedule. After a state is set,
 they keep the values that were set.
 """
 
@@ -22,7 +23,7 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_sampler.original.simulator import Simulator, Taken, Variable
 from surrogym_sampler.original.state_parts import StatePart
 
-STIRRED_TANK: dict[str, Any] = {  # the quick start of pc-gym 0.1.8
+STIRRED_TANK: dict[str, Any] = {  # The parameters in the quick start of pc-gym 0.1.8.
     "model": "cstr",
     "N": 100,
     "tsim": 25,
@@ -31,7 +32,7 @@ STIRRED_TANK: dict[str, Any] = {  # the quick start of pc-gym 0.1.8
     "o_space": {"low": [0.7, 300.0, 0.8], "high": [1.0, 350.0, 0.9]},
     "x0": [0.8, 330.0, 0.8],
 }
-SCHEDULES = ("SP", "disturbances")  # of which only the first N values count
+SCHEDULES = ("SP", "disturbances")  # parameters that list one value per sample; only the first N values count
 REFUSED = {
     "a_delta": "actions are changes, and their sum is not part of the state",
     "uncertainty_percentages": "its parameters are drawn by a generator that can't be seeded",
@@ -40,10 +41,10 @@ REFUSED = {
 
 
 def open_simulator(name: str) -> Simulator:
-    """Open a process.
+    """Open a process of pc-gym.
 
     Raises:
-        UnknownEnvironment: the parameters don't exist, or can't be used here.
+        UnknownEnvironment: the file of parameters does not exist, or its parameters can't be used.
         ImportError: pc-gym is not installed.
     """
     parameters = parameters_of(name.partition(":")[2])
@@ -59,7 +60,7 @@ def open_simulator(name: str) -> Simulator:
         return Process(name, env)
     except (ImportError, OriginalError):
         raise
-    except Exception as error:  # pc-gym raises any kind
+    except Exception as error:  # pc-gym may raise an exception of any class
         raise UnknownEnvironment(
             f"pc-gym refused the parameters of {name}: {type(error).__name__}: {error}; its documentation lists what "
             "make_env needs"
@@ -68,7 +69,8 @@ def open_simulator(name: str) -> Simulator:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Silence warnings that a user of pc-gym can do nothing about: of its packages' syntax, and of its own spaces."""
+    """Silence warnings that a user of pc-gym can do nothing about: about the syntax of its packages, and about its own
+    spaces."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SyntaxWarning)
         warnings.filterwarnings("ignore", ".*precision lowered by casting", UserWarning)
@@ -76,25 +78,26 @@ def _silence() -> Iterator[None]:
 
 
 def _as_before() -> None:
-    """Let CasADi answer calls of NumPy as when pc-gym was written. Newer versions do so with a warning otherwise."""
+    """Set CasADi to the NumPy behaviour for which pc-gym was written. Newer versions of CasADi warn about
+    it otherwise."""
     from casadi import GlobalOptions
 
-    with suppress(AttributeError):  # older versions know no other way
+    with suppress(AttributeError):  # older versions have no such setting and always behave so
         GlobalOptions.setNumpyMode(-1)
 
 
 def _require_model(name: str, model: str, classes: Any) -> None:
     found = [key for key, value in vars(classes).items() if isinstance(value, type) and hasattr(value, "info")]
-    known = sorted(key for key in found if key.islower())  # make_env knows no others
+    known = sorted(key for key in found if key.islower())  # make_env accepts no other names
     if model not in known:
-        raise UnknownEnvironment(f"{name}: expected model to be one of {', '.join(known)}, got {model!r}")
+        raise UnknownEnvironment(f"{name}: expected the parameter model to be one of {', '.join(known)}, got {model!r}")
 
 
 def parameters_of(which: str) -> dict[str, Any]:
-    """Parameters for ``pcgym.make_env``, of ``cstr`` or from a JSON file.
+    """Return the parameters for ``pcgym.make_env``: those of ``cstr``, or those in a JSON file.
 
     Raises:
-        UnknownEnvironment: neither of them, or the file has parameters that can't be used here.
+        UnknownEnvironment: ``which`` is neither of these, or the file has parameters that can't be used.
     """
     given = STIRRED_TANK if which == "cstr" else _read(which)
     for key, why in REFUSED.items():
@@ -113,13 +116,13 @@ def _read(which: str) -> dict[str, Any]:
     path = Path(which)
     if path.suffix != ".json" or not path.is_file():
         raise UnknownEnvironment(
-            f"expected pcgym:cstr, or pcgym:FILE.json with what pcgym.make_env takes, got 'pcgym:{which}'"
+            f"expected pcgym:cstr, or pcgym:FILE.json with a file of parameters for pcgym.make_env, got 'pcgym:{which}'"
         )
     return read_parameters(path)
 
 
 class Process(OfParts):
-    """One process. Its observation is its state, in the units of the process."""
+    """One process of pc-gym. Its observation is its state, in the units of the process."""
 
     def __init__(self, name: str, env: Any) -> None:
         self._name, self._env = name, env
@@ -132,21 +135,21 @@ class Process(OfParts):
         held = [v.name for v in self.variables if v.motion == "held"]
         self.scheduled = {name: (float(np.min(schedule[name])), float(np.max(schedule[name]))) for name in held}
         self.action = action_of(name, env.action_space)
-        self.time_limit = int(env.N) - 1  # its episodes end one step before their number of samples
+        self.time_limit = int(env.N) - 1  # pc-gym ends an episode one step before N samples
 
     def reset(self, seed: int | None) -> Array:
         del seed  # a reset draws no random numbers
         self._env.SP, disturbances = self._schedule
         if disturbances:
             self._env.disturbances = disturbances
-        with _silence():  # each reset makes the spaces anew
+        with _silence():  # each reset creates the spaces again, which may warn
             self._env.reset()
         self._show_setpoints()
         return self.observe()
 
     def _show_setpoints(self) -> None:
-        """Show the first setpoints of the schedule. pc-gym shows those of ``x0``, though it already pays by the
-        schedule."""
+        """Write the first setpoints of the schedule into the state. After a reset, pc-gym shows those of ``x0``
+        instead, although its reward follows the schedule."""
         at = self._env.Nx_oracle
         for i, values in enumerate(self._schedule[0].values()):
             self._env.state[at + i] = values[0]
@@ -164,7 +167,7 @@ class Process(OfParts):
 
 
 class _State(StatePart):
-    """The process's states, its setpoints, and its disturbances."""
+    """The state of a process: the model's states, its setpoints and its disturbances."""
 
     def __init__(self, env: Any) -> None:
         self._env = env

@@ -1,7 +1,4 @@
-"""Checks of the parameters of ``pcgym.make_env`` in a JSON file. pc-gym itself checks nothing.
-
-Each check names its key, what was expected, and what came.
-"""
+"""Checks of a JSON file with parameters for ``pcgym.make_env``, because pc-gym itself checks nothing."""
 
 from __future__ import annotations
 
@@ -13,22 +10,22 @@ from typing import Any
 
 from surrogym_sampler.original.errors import UnknownEnvironment
 
-FEWEST, MOST = 2, 100_000  # samples of an episode
+FEWEST, MOST = 2, 100_000  # smallest and largest number of samples in an episode
 NEEDED = ("model", "N", "tsim", "SP", "a_space", "o_space", "x0")
 RANGES = ("a_space", "o_space", "disturbance_bounds")
-SHOWN = 60  # characters of a value in a message
+SHOWN = 60  # largest number of characters of a value in a message
 
 
 def read_parameters(path: Path) -> dict[str, Any]:
-    """The parameters in a file, with all that can be checked without the model.
+    """Read the parameters in a JSON file, and make all checks that don't need the model.
 
     Raises:
-        UnknownEnvironment: the file is no JSON object, or a value of it can't be used.
+        UnknownEnvironment: the file is not a JSON object, or one of its values can't be used.
     """
     try:
         given = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise UnknownEnvironment(f"{path} is not JSON: {error}; correct it there") from error
+        raise UnknownEnvironment(f"{path} is not JSON: {error}; correct the file at this position") from error
     if not isinstance(given, dict) or (lacking := [key for key in NEEDED if key not in given]):
         lacks = f"; it lacks {', '.join(lacking)}" if isinstance(given, dict) else ""
         raise UnknownEnvironment(f"{path}: expected an object with {', '.join(NEEDED)}{lacks}")
@@ -42,22 +39,23 @@ def read_parameters(path: Path) -> dict[str, Any]:
     if given.get("disturbances") is not None:
         _check_schedule(path, "disturbances", given["disturbances"], given["N"])
         if "disturbance_bounds" not in given:
-            raise UnknownEnvironment(f"{path}: expected disturbance_bounds, because it has disturbances")
+            raise UnknownEnvironment(f"{path} has disturbances but no disturbance_bounds: add these with low and high")
         count = len(given["disturbances"])
         _check_length(path, "low and high of disturbance_bounds", given["disturbance_bounds"]["low"], count, "")
     return given
 
 
 def check_model(where: str, given: Mapping[str, Any], info: Mapping[str, Any]) -> None:
-    """Check the parameters against what the model knows of itself.
+    """Check parameters against the model's own description.
 
     Args:
         where: the file, for messages.
         given: the checked parameters.
-        info: of the model, with names of its states, inputs and disturbances.
+        info: description of the model by pc-gym, with names of its states, inputs and disturbances.
 
     Raises:
-        UnknownEnvironment: they name other states, or have another number of values.
+        UnknownEnvironment: the parameters name unknown states or disturbances, or a list has the wrong number of
+            values.
     """
     states, inputs = list(info["states"]), list(info["inputs"])
     for key, known in (("SP", states), ("disturbances", list(info["disturbances"] or ()))):
@@ -119,7 +117,7 @@ def _number(given: Any) -> bool:
         return False
     try:
         return math.isfinite(float(given))
-    except OverflowError:  # a whole number of more than 308 digits
+    except OverflowError:  # an integer that is too large for a float
         return False
 
 
