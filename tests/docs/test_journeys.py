@@ -51,6 +51,8 @@ ELSEWHERE = {
     "make": "tests/demo and the Makefile itself",
     "docker": "tests/docker",
     "export": "a setting of the shell",
+    "for": "a loop of the shell, whose commands are tested elsewhere",
+    "done": "a loop of the shell, whose commands are tested elsewhere",
     ".": "a setting of the shell",
     "pip": "tests/packaging",
     "tensorboard": "a page that stays open",
@@ -64,6 +66,9 @@ ELSEWHERE_WITH = {  # a word anywhere in the line
     "--watch": "tests/cli/test_status.py",
     "--install-completion": "tests/cli/test_completion.py",
     "--improve": "tests/training/test_closed_loop.py",
+    "Pusher-v5": "tests/cli/test_learning.py, as these rounds take an hour",
+    "pusher": "tests/cli/test_learning.py, as these rounds take an hour",
+    "--learn-all": "tests/cli/test_learning.py, as these rounds take an hour",
     "wandb": "tests/examples/test_trackers.py",
     "mlflow": "tests/examples/test_trackers.py",
 }
@@ -83,7 +88,6 @@ OTHERWISE = {
     "docs/how-to/controller-c.md": "tests/deployment compiles its program and runs the vectors",
     "docs/how-to/priors.md": "tests/docs/test_how_to.py runs its programs, tests/cli/test_prior.py the command",
     "docs/how-to/history.md": "tests/docs/test_how_to.py runs its programs",
-    "docs/how-to/rounds.md": "tests/cli/test_commands.py, as its rounds take an hour",
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
 }
 BLOCK = re.compile(r"^```(python|console)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
