@@ -44,7 +44,9 @@ def lines(server: ServerProcess, request: str) -> list[str]:
     return [line for line in server.log.splitlines() if line.endswith(f"[request {request}]")]
 
 
-def test_a_change_names_role_token_address_and_request(guarded: ServerProcess, send: Send) -> None:
+def test_the_audit_line_of_a_change_names_role_token_fingerprint_address_and_request(
+    guarded: ServerProcess, send: Send
+) -> None:
     body = {"name": "audited", "spec": pendulum.spec()}
     sent = [
         ("POST", "/v1/surrogates", "admin", {"json": body}, 201),
@@ -64,13 +66,13 @@ def test_a_change_names_role_token_address_and_request(guarded: ServerProcess, s
         )
 
 
-def test_a_fingerprint_is_found_in_the_list_of_the_start_and_is_no_part_of_the_token(guarded: ServerProcess) -> None:
+def test_the_server_logs_the_fingerprint_of_every_token_at_start(guarded: ServerProcess) -> None:
     listed = next(line for line in guarded.log.splitlines() if "tokens: " in line)
     assert listed.endswith(", ".join(f"{role} {fingerprint(token)}" for role, token in TOKENS.items()))
     assert len({fingerprint(token) for token in TOKENS.values()}) == len(TOKENS)
 
 
-def test_long_path_of_a_stranger_does_not_fill_the_log(guarded: ServerProcess, send: Send) -> None:
+def test_a_very_long_request_path_is_shortened_in_the_audit_line(guarded: ServerProcess, send: Send) -> None:
     assert send("DELETE", "/v1/surrogates/" + "x" * 30_000, "a-stranger", "long-path").status_code == 401
     assert until(lambda: lines(guarded, "long-path"))
     (line,) = lines(guarded, "long-path")
@@ -78,7 +80,7 @@ def test_long_path_of_a_stranger_does_not_fill_the_log(guarded: ServerProcess, s
     assert "(30015 characters)" in line
 
 
-def test_a_token_that_is_refused_is_not_fingerprinted(guarded: ServerProcess, send: Send) -> None:
+def test_the_fingerprint_of_an_unknown_token_is_not_logged(guarded: ServerProcess, send: Send) -> None:
     """Who mistypes a password into the header has not published its hash."""
     assert send("DELETE", "/v1/surrogates/x", "a-mistyped-secret", "stranger").status_code == 401
     assert until(lambda: lines(guarded, "stranger"))
@@ -86,7 +88,9 @@ def test_a_token_that_is_refused_is_not_fingerprinted(guarded: ServerProcess, se
     assert fingerprint("a-mistyped-secret") not in guarded.log
 
 
-def test_steps_and_looks_leave_no_line(client: httpx.Client, server_process: ServerProcess, taught: str) -> None:
+def test_steps_resets_and_reads_leave_no_audit_line(
+    client: httpx.Client, server_process: ServerProcess, taught: str
+) -> None:
     """By default; one that is refused leaves one, and so does the session's opening, on an open server by anybody."""
     headers = {"x-request-id": "quiet"}
     opened = client.post(f"/v1/surrogates/{taught}/sessions", json={}, headers={"x-request-id": "opening"}).json()
@@ -101,7 +105,7 @@ def test_steps_and_looks_leave_no_line(client: httpx.Client, server_process: Ser
         assert "ms, by anybody from 127.0.0.1" in lines(server_process, request)[0]
 
 
-def test_what_leaves_no_line_is_on_the_list_alone(client: httpx.Client) -> None:
+def test_every_route_without_an_audit_line_exists_and_deletes_nothing(client: httpx.Client) -> None:
     """A new route that changes something leaves a line unless it is named as frequent."""
     paths = client.get("/openapi.json").json()["paths"]
     changing = {path for path, methods in paths.items() if CHANGING & {method.upper() for method in methods}}
@@ -109,7 +113,7 @@ def test_what_leaves_no_line_is_on_the_list_alone(client: httpx.Client) -> None:
     assert {path for path in FREQUENT if "DELETE" in {method.upper() for method in paths[path]}} == set()
 
 
-def test_no_path_or_address_forges_a_line(tmp_path: Path) -> None:
+def test_a_path_or_forwarded_address_cannot_forge_an_audit_line(tmp_path: Path) -> None:
     forged = "INFO surrogym_server.requests: DELETE /v1/surrogates/p -> 204 in 1.0 ms, by admin 00 from 9.9.9.9"
     with running_server(tmp_path) as server:
         path = f"/x\n{forged}".replace("\n", "%0A").replace(" ", "%20")
@@ -121,7 +125,7 @@ def test_no_path_or_address_forges_a_line(tmp_path: Path) -> None:
     assert "from an unknown address [request proxied]" in lines(server, "proxied")[0]
 
 
-def test_json_lines_name_the_caller_too(tmp_path: Path) -> None:
+def test_audit_lines_in_json_format_name_the_caller(tmp_path: Path) -> None:
     with running_server(tmp_path, "--log-format", "json", SURROGYM_TOKEN=TOKENS["admin"]) as server:
         headers = {"authorization": f"Bearer {TOKENS['admin']}", "x-request-id": "as-json"}
         httpx.delete(f"{server.url}/v1/surrogates/none", headers=headers)

@@ -72,14 +72,14 @@ def called(client: httpx.Client, call: str, header: str | None) -> httpx.Respons
         return reply
 
 
-def test_no_route_is_forgotten(guarded: httpx.Client):
+def test_every_route_has_an_expected_set_of_roles_in_this_test(guarded: httpx.Client):
     schema = guarded.get("/openapi.json", headers={"authorization": f"Bearer {TOKENS['read']}"}).json()
     found = {f"{method.upper()} {path}" for path, methods in schema["paths"].items() for method in methods}
     assert {call for call in found if call.split()[1] not in PUBLIC} | UNDESCRIBED == ROLES_OF.keys()
 
 
 @pytest.mark.parametrize("call", ROLES_OF)
-def test_a_role_may_do_its_part_alone(guarded: httpx.Client, call: str):
+def test_each_token_role_may_call_exactly_its_routes(guarded: httpx.Client, call: str):
     """What is allowed goes on to fail by its content, for there is no such surrogate, or to succeed."""
     for role, token in TOKENS.items():
         reply = called(guarded, call, f"Bearer {token}")
@@ -89,7 +89,7 @@ def test_a_role_may_do_its_part_alone(guarded: httpx.Client, call: str):
             assert (reply.status_code, reply.json()["code"]) == (403, "forbidden"), role
 
 
-def test_a_train_token_asks_within_the_budget_and_an_admin_raises_it(guarded: httpx.Client):
+def test_a_train_token_cannot_raise_the_budget_and_an_admin_token_can(guarded: httpx.Client):
     """A real step costs money: who trains may not decide how many are taken."""
     train, admin = ({"authorization": f"Bearer {TOKENS[role]}"} for role in ("train", "admin"))
     guarded.post("/v1/surrogates", json={"name": "owned", "spec": pendulum.spec()}, headers=admin).raise_for_status()
@@ -112,17 +112,17 @@ def test_a_train_token_asks_within_the_budget_and_an_admin_raises_it(guarded: ht
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_a_token_can_ask_for_its_role(guarded: httpx.Client, role: str):
+def test_the_access_route_returns_the_role_of_the_token(guarded: httpx.Client, role: str):
     reply = guarded.get("/v1/access", headers={"authorization": f"Bearer {TOKENS[role]}"})
     assert reply.json() == {"role": role, "tokens": True}
 
 
-def test_where_there_are_no_tokens_everybody_is_admin(client: httpx.Client):
+def test_every_caller_is_admin_on_a_server_without_tokens(client: httpx.Client):
     assert client.get("/v1/access").json() == {"role": "admin", "tokens": False}
 
 
 @pytest.mark.parametrize("header", [None, "Bearer wrong", "Bearer", "Basic eDp5", TOKENS["admin"]])
-def test_without_a_known_token_nothing_but_health_and_the_page(guarded: httpx.Client, header: str | None):
+def test_requests_without_a_known_token_are_refused_on_all_protected_routes(guarded: httpx.Client, header: str | None):
     for call in ROLES_OF:
         reply = called(guarded, call, header)
         assert (reply.status_code, reply.headers.get("www-authenticate")) == (401, "Bearer"), call
@@ -138,7 +138,9 @@ def test_without_a_known_token_nothing_but_health_and_the_page(guarded: httpx.Cl
         (f"Bearer {TOKENS['admin']}", 404),
     ],
 )
-def test_a_stream_authenticates_in_its_handshake(guarded: httpx.Client, header: str | None, status: int):
+def test_a_stream_without_a_valid_token_is_refused_at_the_websocket_handshake(
+    guarded: httpx.Client, header: str | None, status: int
+):
     """404, for there is no such session; a stranger is not told."""
     url = f"{str(guarded.base_url).replace('http', 'ws', 1)}/v1/sessions/x/stream"
     headers = {"Authorization": header} if header else {}
@@ -148,7 +150,7 @@ def test_a_stream_authenticates_in_its_handshake(guarded: httpx.Client, header: 
 
 
 @pytest.mark.parametrize("path", sorted(PUBLIC))
-def test_health_and_the_page_are_public(guarded: httpx.Client, path: str):
+def test_health_check_and_dashboard_page_need_no_token(guarded: httpx.Client, path: str):
     whole = guarded.get(path)
     assert whole.status_code == 200
     head = guarded.head(path)  # as wget --spider and load balancers ask
@@ -156,7 +158,7 @@ def test_health_and_the_page_are_public(guarded: httpx.Client, path: str):
     assert head.headers["content-type"] == whole.headers["content-type"]
 
 
-def test_the_page_may_load_nothing_from_elsewhere(guarded: httpx.Client):
+def test_the_dashboards_content_security_policy_forbids_other_origins(guarded: httpx.Client):
     policy = guarded.get("/").headers["content-security-policy"]
     assert "default-src 'none'" in policy
     assert "unsafe" not in policy
@@ -172,5 +174,5 @@ def test_the_page_may_load_nothing_from_elsewhere(guarded: httpx.Client):
         ("127.0.0.1.evil.example:8000", 403),
     ],
 )
-def test_a_name_pointed_at_this_machine_is_refused(client: httpx.Client, host: str, status: int):
+def test_a_foreign_host_name_in_the_host_header_is_refused(client: httpx.Client, host: str, status: int):
     assert client.get("/v1/surrogates", headers={"host": host}).status_code == status

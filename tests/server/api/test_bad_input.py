@@ -52,7 +52,9 @@ def post(client: httpx.Client, path: str, body: Any) -> httpx.Response:
         ("PUT", "/v1/surrogates", Code.METHOD_NOT_ALLOWED),
     ],
 )
-def test_what_is_not_there(client: httpx.Client, method: str, path: str, code: Code):
+def test_requests_for_unknown_resources_get_the_matching_error_code(
+    client: httpx.Client, method: str, path: str, code: Code
+):
     refused(client.request(method, path), code)
 
 
@@ -69,12 +71,12 @@ def test_what_is_not_there(client: httpx.Client, method: str, path: str, code: C
         ("sessions", {}),
     ],
 )
-def test_an_unknown_surrogate_in_every_post(client: httpx.Client, path: str, body: Any):
+def test_every_post_to_an_unknown_surrogate_is_refused(client: httpx.Client, path: str, body: Any):
     refused(post(client, f"/v1/surrogates/nobody/{path}", body), Code.UNKNOWN_SURROGATE, "nobody")
 
 
 @pytest.mark.parametrize("what", ["reset", "step", "rollout", "occupancy"])
-def test_an_unknown_session(client: httpx.Client, what: str):
+def test_every_post_to_an_unknown_session_is_refused(client: httpx.Client, what: str):
     bodies = {"step": {"action": [[0]]}, "rollout": {"actions": [[[0]]]}, "occupancy": {"checkpoint": "c"}}
     reply = post(client, f"/v1/sessions/nobody/{what}", bodies.get(what, {}))
     refused(reply, Code.UNKNOWN_SESSION, "'nobody'")
@@ -126,7 +128,7 @@ def test_a_contradictory_specification_is_refused(client: httpx.Client, name: st
     refused(client.get(f"/v1/surrogates/{name}"), Code.UNKNOWN_SURROGATE)
 
 
-def test_a_stop_at_zero_that_the_bounds_exclude(client: httpx.Client, name: str):
+def test_a_bound_that_stops_another_coordinate_outside_its_range_is_refused(client: httpx.Client, name: str):
     """The model would set a coordinate where the environment never lets it be."""
     spec = pendulum.spec()
     spec["coordinates"].append({"name": "x", "sampling": UNIT, "bounds": {"low": 0, "high": 1, "stops": "gear"}})
@@ -136,7 +138,7 @@ def test_a_stop_at_zero_that_the_bounds_exclude(client: httpx.Client, name: str)
     refused(reply, Code.INVALID_SPEC, "'x' sets 'gear' to 0, outside its [1.0, 2.0]")
 
 
-def test_a_second_spec_under_the_same_name(client: httpx.Client, fresh: str):
+def test_another_specification_under_an_existing_surrogate_name_is_refused(client: httpx.Client, fresh: str):
     before = client.get(f"/v1/surrogates/{fresh}").json()
     other = pendulum.spec()
     other["time_limit"] = 100
@@ -174,13 +176,15 @@ def sample(**changes: Any) -> dict[str, Any]:
         ({"query_id": 1}, "query_id and lease_token together"),
     ],
 )
-def test_an_unusable_sample_is_refused(client: httpx.Client, fresh: str, changes: dict[str, Any], said: str):
+def test_an_invalid_sample_is_refused_and_nothing_is_stored(
+    client: httpx.Client, fresh: str, changes: dict[str, Any], said: str
+):
     body = {"sampler": "s", "idempotency_key": "k", "samples": [sample(), sample(**changes)][::-1]}
     refused(post(client, f"/v1/surrogates/{fresh}/add_sample", body), Code.INVALID_REQUEST, said)
     assert client.get(f"/v1/surrogates/{fresh}/samples").json()["samples"] == []
 
 
-def test_a_foreign_lease(client: httpx.Client, fresh: str):
+def test_a_wrong_lease_token_cannot_answer_renew_or_fail_a_query(client: httpx.Client, fresh: str):
     query = pendulum.claim(client, fresh, max_queries=1)["queries"][0]
     foreign = {"query_id": query["id"], "lease_token": "not-the-token"}
     body = {"sampler": "thief", "samples": [sample(**foreign)]}
@@ -192,17 +196,17 @@ def test_a_foreign_lease(client: httpx.Client, fresh: str):
     assert (view["queries"]["leased"], view["samples"]) == (1, 0)
 
 
-def test_an_unknown_query(client: httpx.Client, fresh: str):
+def test_a_sample_for_an_unknown_query_is_refused(client: httpx.Client, fresh: str):
     body = {"sampler": "s", "samples": [sample(query_id=10**9, lease_token="t")]}
     refused(post(client, f"/v1/surrogates/{fresh}/add_sample", body), Code.UNKNOWN_QUERY)
 
 
-def test_a_sample_without_a_query_needs_a_key(client: httpx.Client, fresh: str):
+def test_a_sample_without_query_and_idempotency_key_is_refused(client: httpx.Client, fresh: str):
     body = {"sampler": "s", "samples": [sample()]}
     refused(post(client, f"/v1/surrogates/{fresh}/add_sample", body), Code.INVALID_REQUEST, "idempotency_key")
 
 
-def test_the_same_key_with_another_body(client: httpx.Client, fresh: str):
+def test_reusing_an_idempotency_key_with_another_sample_is_refused(client: httpx.Client, fresh: str):
     path = f"/v1/surrogates/{fresh}/add_sample"
     body = {"sampler": "s", "idempotency_key": "k", "samples": [sample()]}
     first = post(client, path, body).json()
@@ -225,7 +229,9 @@ def test_the_same_key_with_another_body(client: httpx.Client, fresh: str):
         ({"coordinates": [], "action": []}, "expected 1 or more entries"),
     ],
 )
-def test_an_impossible_manual_query_is_refused(client: httpx.Client, fresh: str, body: Any, said: str):
+def test_a_manual_query_outside_the_specification_is_refused_and_not_stored(
+    client: httpx.Client, fresh: str, body: Any, said: str
+):
     refused(post(client, f"/v1/surrogates/{fresh}/queries", body), Code.INVALID_REQUEST, said)
     assert len(client.get(f"/v1/surrogates/{fresh}/queries").json()["queries"]) == pendulum.INITIAL
 
@@ -233,7 +239,7 @@ def test_an_impossible_manual_query_is_refused(client: httpx.Client, fresh: str,
 # Models
 
 
-def test_invalid_points_are_refused(client: httpx.Client, taught: str):
+def test_predicting_at_an_invalid_action_or_with_an_unknown_model_is_refused(client: httpx.Client, taught: str):
     for path in ("predict", "query_uncertainty"):
         body = {"coordinates": [[0, 0]], "action": [[5]]}
         refused(post(client, f"/v1/surrogates/{taught}/{path}", body), Code.INVALID_REQUEST, "[-2, 2], got 5")
@@ -241,21 +247,21 @@ def test_invalid_points_are_refused(client: httpx.Client, taught: str):
         refused(post(client, f"/v1/surrogates/{taught}/{path}", {**good, "model": 99}), Code.UNKNOWN_MODEL)
 
 
-def test_nothing_has_been_fitted_yet(client: httpx.Client, fresh: str):
+def test_sessions_and_predictions_before_the_first_fit_are_refused(client: httpx.Client, fresh: str):
     refused(post(client, f"/v1/surrogates/{fresh}/sessions", {}), Code.NO_MODEL)
     points = {"coordinates": [[0, 0]], "action": [[0]]}
     refused(post(client, f"/v1/surrogates/{fresh}/predict", points), Code.NO_MODEL)
 
 
 @pytest.mark.parametrize("content", [b"", b"no model", b"\x80\x04K\x01.", (2**40).to_bytes(8, "little") + b"{}"])
-def test_a_file_that_is_no_model(client: httpx.Client, taught: str, content: bytes):
+def test_importing_a_file_that_is_not_a_model_is_refused(client: httpx.Client, taught: str, content: bytes):
     before = client.get(f"/v1/surrogates/{taught}/models").json()
     reply = client.post(f"/v1/surrogates/{taught}/models", content=content, headers={"content-type": FILE})
     refused(reply, Code.INVALID_REQUEST, "expected")
     assert client.get(f"/v1/surrogates/{taught}/models").json() == before
 
 
-def test_an_unknown_occupancy_is_refused(client: httpx.Client, taught: str):
+def test_improving_by_visited_states_of_an_unknown_checkpoint_is_refused(client: httpx.Client, taught: str):
     body = {"queries": 1, "checkpoint": "never"}
     refused(post(client, f"/v1/surrogates/{taught}/improve", body), Code.INVALID_REQUEST, "'never'")
 
@@ -280,7 +286,7 @@ def test_an_unknown_occupancy_is_refused(client: httpx.Client, taught: str):
         ({"action": [[0.0], [0.0]], "seq": 0}, "greater than or equal to 1, got 0"),
     ],
 )
-def test_an_impossible_step_is_refused(client: httpx.Client, session: str, body: Any, said: str):
+def test_an_invalid_step_is_refused_and_the_session_continues(client: httpx.Client, session: str, body: Any, said: str):
     post(client, f"/v1/sessions/{session}/reset", {"seq": 1}).raise_for_status()
     reply = post(client, f"/v1/sessions/{session}/step", {"seq": 2, **body})
     refused(reply, Code.INVALID_REQUEST, said)
@@ -297,18 +303,20 @@ def test_an_impossible_step_is_refused(client: httpx.Client, session: str, body:
         ({"mask": [True]}, "mask: expected 2 entries, one for each lane, got 1"),
     ],
 )
-def test_an_impossible_reset_is_refused(client: httpx.Client, session: str, body: Any, said: str):
+def test_an_invalid_reset_is_refused_and_the_session_is_unchanged(
+    client: httpx.Client, session: str, body: Any, said: str
+):
     refused(post(client, f"/v1/sessions/{session}/reset", body), Code.INVALID_REQUEST, said)
     assert client.get(f"/v1/sessions/{session}").json()["seq"] == 0
 
 
-def test_a_step_before_the_reset(client: httpx.Client, session: str):
+def test_a_step_before_the_first_reset_is_refused(client: httpx.Client, session: str):
     reply = post(client, f"/v1/sessions/{session}/step", {"seq": 1, "action": [[0.0], [0.0]]})
     refused(reply, Code.NOT_RESET, "lanes [0, 1]")
     post(client, f"/v1/sessions/{session}/reset", {"seq": 1}).raise_for_status()
 
 
-def test_a_rollout_is_made_whole_or_not_at_all(client: httpx.Client, session: str):
+def test_a_rollout_with_one_invalid_action_takes_no_step(client: httpx.Client, session: str):
     post(client, f"/v1/sessions/{session}/reset", {"seq": 1}).raise_for_status()
     body = {"seq": 2, "actions": [[[0.0], [0.0]], [[0.0], [9.0]]]}
     refused(post(client, f"/v1/sessions/{session}/rollout", body), Code.INVALID_REQUEST, "got 9")
@@ -350,13 +358,13 @@ def with_layers(count: int, units: int) -> dict[str, Any]:
         (with_layers(1, 1_025), "1024"),
     ],
 )
-def test_a_policy_that_cannot_act(client: httpx.Client, session: str, body: Any, said: str):
+def test_a_rollout_with_an_invalid_policy_is_refused(client: httpx.Client, session: str, body: Any, said: str):
     post(client, f"/v1/sessions/{session}/reset", {"seq": 1}).raise_for_status()
     refused(post(client, f"/v1/sessions/{session}/rollout", {"seq": 2, **body}), Code.INVALID_REQUEST, said)
     assert client.get(f"/v1/sessions/{session}").json()["seq"] == 1
 
 
-def test_a_policy_too_large_for_json_is_told_the_way_of_frames(client: httpx.Client, session: str):
+def test_the_refusal_of_a_policy_too_large_for_json_recommends_msgpack(client: httpx.Client, session: str):
     reply = post(client, f"/v1/sessions/{session}/rollout", with_layers(8, 100))
     refused(reply, Code.TOO_LARGE, "131072 bytes", "send a larger body as application/vnd.msgpack")
 
@@ -380,7 +388,7 @@ def test_a_policy_too_large_for_json_is_told_the_way_of_frames(client: httpx.Cli
         ({"penalty": float("nan")}, Code.INVALID_REQUEST),
     ],
 )
-def test_a_session_that_cannot_be_opened(client: httpx.Client, taught: str, body: Any, code: Code):
+def test_opening_a_session_with_invalid_options_is_refused(client: httpx.Client, taught: str, body: Any, code: Code):
     refused(post(client, f"/v1/surrogates/{taught}/sessions", body), code)
 
 
@@ -389,14 +397,14 @@ def test_a_session_that_cannot_be_opened(client: httpx.Client, taught: str, body
 
 @pytest.mark.parametrize("path", ["/v1/surrogates", "/v1/sessions/nobody/step"])
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b'"x"', b"\xff\xfe", b"[" * 100_000, b'{"seq": ' + b"9" * 9_999])
-def test_bodies_that_are_no_json_object(client: httpx.Client, path: str, content: bytes):
+def test_a_request_body_that_is_not_a_json_object_is_refused(client: httpx.Client, path: str, content: bytes):
     reply = client.post(path, content=content, headers={"content-type": "application/json"})
     assert 400 <= reply.status_code < 500
     assert reply.headers["content-type"] == PROBLEM_MEDIA_TYPE
 
 
 @pytest.mark.parametrize("content_type", ["text/plain", "application/x-www-form-urlencoded", None])
-def test_a_form_of_another_site_is_not_json(client: httpx.Client, session: str, content_type: str | None):
+def test_json_sent_with_a_form_content_type_is_refused(client: httpx.Client, session: str, content_type: str | None):
     headers = {"content-type": content_type} if content_type else {}
     reply = client.post(f"/v1/sessions/{session}/reset", content=b"{}", headers=headers)
     refused(reply, Code.UNSUPPORTED_MEDIA_TYPE, "application/json")
@@ -404,14 +412,14 @@ def test_a_form_of_another_site_is_not_json(client: httpx.Client, session: str, 
     refused(reply, Code.UNSUPPORTED_MEDIA_TYPE, "application/json")
 
 
-def test_an_oversized_body(client: httpx.Client, session: str):
+def test_a_request_body_over_the_size_limit_is_refused(client: httpx.Client, session: str):
     bodies = {f"/v1/sessions/{session}/step": "application/vnd.msgpack", "/v1/surrogates/x/models": FILE}
     for path, content_type in bodies.items():
         reply = client.post(path, content=b" " * (MAX_BODY + 1), headers={"content-type": content_type})
         refused(reply, Code.TOO_LARGE, f"at most {MAX_BODY} bytes as {content_type}, got {MAX_BODY + 1} bytes")
 
 
-def test_an_oversized_body_in_chunks_that_do_not_say_how_many(client: httpx.Client, session: str):
+def test_a_chunked_body_over_the_size_limit_is_refused(client: httpx.Client, session: str):
     def chunks() -> Iterator[bytes]:
         for _ in range(MAX_BODY // 2**20 + 1):
             yield b" " * 2**20
@@ -422,13 +430,13 @@ def test_an_oversized_body_in_chunks_that_do_not_say_how_many(client: httpx.Clie
         refused(reply, Code.TOO_LARGE, "at most")
 
 
-def test_bytes_that_are_no_text(client: httpx.Client):
+def test_a_json_body_that_is_not_utf_8_is_refused(client: httpx.Client):
     reply = client.post("/v1/surrogates", content=b"\xff\xfe{", headers={"content-type": "application/json"})
     refused(reply, Code.INVALID_REQUEST, "expected JSON in UTF-8")
     assert reply.status_code == 422
 
 
-def test_every_pattern_of_a_text_is_described_in_words(client: httpx.Client):
+def test_every_regular_expression_of_the_api_has_a_description_in_words(client: httpx.Client):
     """A name with a space was refused by a regular expression."""
     patterns = set(entries(client.get("/openapi.json").json(), "pattern"))
     assert patterns

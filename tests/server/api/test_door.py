@@ -37,7 +37,7 @@ def url_of(name: str) -> tuple[str, str]:
     return method, path.format(name="none", id="none", query_id=1, version=1)
 
 
-def test_every_route_that_takes_a_body_says_which_and_how_much():
+def test_every_route_with_a_body_declares_its_content_type_and_size_limit():
     for name, door in ROUTES.items():
         method = name.split()[0]
         assert bool(door.bodies) == (method in ("POST", "PATCH", "PUT")), name
@@ -48,7 +48,9 @@ def test_every_route_that_takes_a_body_says_which_and_how_much():
 @pytest.mark.parametrize(
     "content_type", ["text/plain", "multipart/form-data", "application/x-www-form-urlencoded", None]
 )
-def test_a_body_of_another_type_is_refused(client: httpx.Client, name: str, content_type: str | None):
+def test_a_body_with_an_unsupported_content_type_is_refused_on_every_route(
+    client: httpx.Client, name: str, content_type: str | None
+):
     """A page of another site can send these without asking: no browser would ask first."""
     method, url = url_of(name)
     reply = client.request(method, url, content=b"{}", headers={"content-type": content_type} if content_type else {})
@@ -57,7 +59,7 @@ def test_a_body_of_another_type_is_refused(client: httpx.Client, name: str, cont
 
 
 @pytest.mark.parametrize("name", WITH_BODY)
-def test_an_encoded_body_is_refused_by_its_name(client: httpx.Client, name: str):
+def test_a_compressed_request_body_is_refused_with_its_encoding_named(client: httpx.Client, name: str):
     method, url = url_of(name)
     content_type = next(iter(WITH_BODY[name].bodies))
     reply = client.request(
@@ -67,7 +69,7 @@ def test_an_encoded_body_is_refused_by_its_name(client: httpx.Client, name: str)
 
 
 @pytest.mark.parametrize("name", WITH_BODY)
-def test_a_body_beyond_its_routes_limit_is_refused_unread(client: httpx.Client, name: str):
+def test_a_body_over_the_size_limit_of_its_route_is_refused(client: httpx.Client, name: str):
     method, url = url_of(name)
     for content_type, limit in WITH_BODY[name].bodies.items():
         if limit is not None:
@@ -86,21 +88,21 @@ def test_a_body_beyond_its_routes_limit_is_refused_unread(client: httpx.Client, 
     ],
     ids=["duplicate key", "nested", "zipped", "fields"],
 )
-def test_odd_json_is_refused_in_words(client: httpx.Client, content: bytes, said: str):
+def test_unusual_json_is_refused_with_an_explanation(client: httpx.Client, content: bytes, said: str):
     for path in ("/v1/surrogates/none/queries:claim", "/v1/sessions/none/step"):
         reply = client.post(path, content=content, headers={"content-type": JSON})
         assert (reply.status_code, problem(reply).code) == (422, Code.INVALID_REQUEST)
         assert said in problem(reply).detail
 
 
-def test_a_route_must_say_who_may_call_it():
+def test_a_route_without_declared_roles_is_rejected():
     async def forgotten() -> None: ...
 
     with pytest.raises(TypeError, match="expected one declaration of who may call it"):
         door_of(APIRoute("/forgotten", forgotten))
 
 
-def test_who_may_call_is_known_without_a_body():
+def test_roles_and_body_limits_are_read_from_the_declaration_of_a_route():
     assert ROUTES["GET /healthz"] == Door(None, {})
     assert ROUTES["POST /v1/surrogates"] == Door((), {JSON: 2 * DEFAULT_JSON_BYTES})
     assert all(door.roles is not None for name, door in ROUTES.items() if name.split()[1].startswith("/v1"))
@@ -121,13 +123,13 @@ def begun(server: ServerProcess, name: str, *lines: str) -> socket.socket:
 
 
 @pytest.mark.parametrize("name", WITH_BODY)
-def test_a_stranger_is_refused_before_the_body_comes(guarded: ServerProcess, name: str):
+def test_a_request_without_token_is_refused_before_its_body_is_read(guarded: ServerProcess, name: str):
     with begun(guarded, name, "content-length: 1000", f"content-type: {JSON}") as stranger:
         assert stranger.recv(65_536).startswith(b"HTTP/1.1 401")
 
 
 @pytest.mark.parametrize("name", WITH_BODY)
-def test_a_wrong_type_is_refused_before_the_body_comes(guarded: ServerProcess, name: str):
+def test_an_unsupported_content_type_is_refused_before_the_body_is_read(guarded: ServerProcess, name: str):
     with begun(guarded, name, "content-length: 1000", f"authorization: Bearer {TOKEN}", "content-type: a/b") as owner:
         assert owner.recv(65_536).startswith(b"HTTP/1.1 415")
 
@@ -149,7 +151,7 @@ BEGINNINGS = {
 
 
 @pytest.mark.parametrize("kind", BEGINNINGS)
-def test_a_head_without_end_is_refused_at_its_limit(guarded: ServerProcess, kind: str):
+def test_an_endless_request_head_is_refused_with_bounded_memory(guarded: ServerProcess, kind: str):
     """A trickle of 4 MiB, slow enough for the refusal to be read; the server keeps 64 KiB of it at most."""
     beginning, more = BEGINNINGS[kind]
     before, sent, refused = resident_mib(guarded.process.pid), 0, b""
@@ -176,7 +178,9 @@ def test_a_head_without_end_is_refused_at_its_limit(guarded: ServerProcess, kind
         (["a: b"] * 101, b"431"),
     ],
 )
-def test_the_limits_of_a_head_are_those_that_it_says(guarded: ServerProcess, lines: list[str], status: bytes):
+def test_a_request_head_is_refused_exactly_beyond_the_stated_limits(
+    guarded: ServerProcess, lines: list[str], status: bytes
+):
     with connected(guarded.url, seconds=20.0) as caller:
         head = ["GET /healthz HTTP/1.1", "host: 127.0.0.1", *lines, "", ""]
         caller.sendall("\r\n".join(head).encode())
@@ -191,7 +195,7 @@ def test_the_limits_of_a_head_are_those_that_it_says(guarded: ServerProcess, lin
     [("a" * 20_000, ""), ("none", "x-a: " + "a" * 20_000), ("none", "content-length: 5"), ("none", "a: \x80")],
     ids=["long id", "long header", "body", "not ASCII"],
 )
-def test_a_handshake_that_opens_no_stream_is_answered(guarded: ServerProcess, id: str, line: str):
+def test_a_malformed_websocket_handshake_gets_an_error_reply(guarded: ServerProcess, id: str, line: str):
     """The library that reads handshakes has limits of its own; such a connection would stay open without a reply."""
     upgrade = ["upgrade: websocket", "connection: upgrade", "sec-websocket-version: 13", f"sec-websocket-key: {KEY}"]
     lines = [f"GET /v1/sessions/{id}/stream HTTP/1.1", "host: 127.0.0.1", *upgrade, *([line] if line else []), "", ""]

@@ -18,7 +18,7 @@ def read(client: httpx.Client, name: str, count: int, **headers: str) -> list[Ev
         return [Event.model_validate_json(line.removeprefix("data: ")) for line in found]
 
 
-def test_events_tell_the_story_of_a_surrogate(client: httpx.Client, fresh: str):
+def test_creation_query_and_sample_of_a_surrogate_are_reported_as_events_in_order(client: httpx.Client, fresh: str):
     query = pendulum.claim(client, fresh, max_queries=1)["queries"][0]
     pendulum.add(client, fresh, [pendulum.answer(query)]).raise_for_status()
     events = read(client, fresh, 3, **{"last-event-id": "0"})
@@ -26,12 +26,12 @@ def test_events_tell_the_story_of_a_surrogate(client: httpx.Client, fresh: str):
     assert [event.id for event in events] == sorted({event.id for event in events})
 
 
-def test_a_reader_continues_after_its_last_event(client: httpx.Client, fresh: str):
+def test_an_event_stream_resumes_after_the_given_last_event_id(client: httpx.Client, fresh: str):
     first, second = read(client, fresh, 2, **{"last-event-id": "0"})
     assert read(client, fresh, 1, **{"last-event-id": str(first.id)}) == [second]
 
 
-def test_without_a_number_the_stream_begins_now(client: httpx.Client, fresh: str):
+def test_an_event_stream_without_last_event_id_reports_only_new_events(client: httpx.Client, fresh: str):
     with client.stream("GET", f"/v1/surrogates/{fresh}/events") as stream:
         lines = stream.iter_lines()
         assert next(lines).startswith(":")
@@ -42,7 +42,7 @@ def test_without_a_number_the_stream_begins_now(client: httpx.Client, fresh: str
 
 
 @pytest.mark.timeout(60)
-def test_the_stream_of_a_deleted_surrogate_ends(client: httpx.Client, fresh: str):
+def test_deleting_a_surrogate_ends_its_event_stream(client: httpx.Client, fresh: str):
     with client.stream("GET", f"/v1/surrogates/{fresh}/events") as stream:
         lines = stream.iter_lines()
         next(lines)
@@ -50,7 +50,7 @@ def test_the_stream_of_a_deleted_surrogate_ends(client: httpx.Client, fresh: str
         assert not [line for line in lines if line.startswith("data: ")]
 
 
-def test_one_stream_reports_changes_of_any_surrogate(client: httpx.Client, fresh: str):
+def test_the_common_event_stream_reports_changes_of_every_surrogate(client: httpx.Client, fresh: str):
     with client.stream("GET", "/v1/events") as stream:
         lines = stream.iter_lines()
         assert next(lines).startswith(":")

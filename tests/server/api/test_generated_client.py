@@ -46,7 +46,7 @@ def module(path: str) -> ModuleType:
     return importlib.import_module(f"{PACKAGE}.{path}")
 
 
-def test_nothing_is_left_out_but_the_frames(generated: str, client: httpx.Client):
+def test_a_client_generated_from_openapi_has_every_operation_except_binary_frames(generated: str, client: httpx.Client):
     reasons = generated.count("WARNING parsing")
     assert generated.count(FRAMES) == reasons == 3  # reset, step, rollout
     assert "Unable to process" not in generated
@@ -68,7 +68,7 @@ def call(generated: str, server_process: ServerProcess) -> Iterator[Call]:
         yield call_one
 
 
-def test_the_whole_loop_through_a_generated_client(call: Call, name: str):
+def test_a_client_generated_from_openapi_can_register_sample_and_step(call: Call, name: str):
     models = module("models")
     spec = models.EnvironmentSpec.from_dict(pendulum.spec() | {"design": {"initial": QUERIES, "budget": QUERIES}})
     created = call("surrogates_create", body=models.CreateSurrogate(name=name, spec=spec))

@@ -16,7 +16,7 @@ def imagine(client: httpx.Client, name: str, **body: Any) -> httpx.Response:
     return client.post(f"/v1/surrogates/{name}/imagine", json={"coordinates": [0.3, 0.1], "actions": ACTIONS, **body})
 
 
-def test_the_mean_repeats_the_stateless_transition(client: httpx.Client, taught: str):
+def test_the_mean_episode_equals_repeated_single_step_predictions(client: httpx.Client, taught: str):
     reply = wire.Imagined.model_validate_json(imagine(client, taught).raise_for_status().content)
     assert (len(reply.mean.coordinates), len(reply.mean.reward), reply.draws) == (4, 3, [])
     for step, action in enumerate(ACTIONS):
@@ -26,7 +26,7 @@ def test_the_mean_repeats_the_stateless_transition(client: httpx.Client, taught:
         assert reply.mean.reward[step] == pytest.approx(said["reward"][0], abs=1e-9)
 
 
-def test_the_same_seed_draws_the_same_functions(client: httpx.Client, taught: str):
+def test_imagined_episodes_of_one_seed_are_the_same(client: httpx.Client, taught: str):
     first, again, other = (imagine(client, taught, draws=3, seed=seed).json() for seed in (1, 1, 2))
     assert first["draws"] == again["draws"] != other["draws"]
     ends = {tuple(episode["coordinates"][-1]) for episode in first["draws"]}
@@ -43,7 +43,9 @@ def test_the_same_seed_draws_the_same_functions(client: httpx.Client, taught: st
         ({"actions": [[0.0, 0.0]]}, "expected shape (1, 1)"),
     ],
 )
-def test_invalid_episodes_are_refused(client: httpx.Client, taught: str, body: dict[str, Any], says: str):
+def test_a_request_to_imagine_an_invalid_episode_is_refused(
+    client: httpx.Client, taught: str, body: dict[str, Any], says: str
+):
     reply = imagine(client, taught, **body)
     assert reply.status_code == 422
     assert says in reply.text

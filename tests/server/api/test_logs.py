@@ -26,7 +26,7 @@ def log(rows: int, spoiled: str = "") -> str:
     return "\n".join([*lines, spoiled, ""] if spoiled else [*lines, ""])
 
 
-def test_a_check_lists_unusable_rows_and_stores_nothing(client: httpx.Client, fresh: str):
+def test_checking_a_log_lists_unusable_rows_and_stores_nothing(client: httpx.Client, fresh: str):
     body = {"text": log(20, "0.1,9.5,0.0,-1,1"), "check_only": True}
     report = client.post(f"/v1/surrogates/{fresh}/logs", json=body).raise_for_status().json()
     assert (report["rows"], report["steps"], report["rejected"], report["stored"]) == (21, 19, 1, 0)
@@ -35,7 +35,7 @@ def test_a_check_lists_unusable_rows_and_stores_nothing(client: httpx.Client, fr
     assert client.get(f"/v1/surrogates/{fresh}").json()["ledger"]["logged"] == 0
 
 
-def test_a_stored_log_costs_no_budget_and_a_repeat_changes_nothing(client: httpx.Client, fresh: str):
+def test_an_imported_log_costs_no_budget_and_is_stored_once(client: httpx.Client, fresh: str):
     url = f"/v1/surrogates/{fresh}/logs"
     text = log(20)
     first, again = (client.post(url, json={"text": text}).raise_for_status().json() for _ in range(2))
@@ -45,7 +45,7 @@ def test_a_stored_log_costs_no_budget_and_a_repeat_changes_nothing(client: httpx
     assert (ledger["logged"], ledger["total"]) == (19, 0)
 
 
-def test_a_mapping_names_columns_of_other_names(client: httpx.Client, fresh: str):
+def test_a_column_mapping_imports_a_log_with_other_column_names(client: httpx.Client, fresh: str):
     text = log(5).replace(HEADING, "angle,rate,motor,profit,batch")
     url = f"/v1/surrogates/{fresh}/logs"
     refused = client.post(url, json={"text": text, "check_only": True})
@@ -61,7 +61,7 @@ def test_a_mapping_names_columns_of_other_names(client: httpx.Client, fresh: str
     assert report["mapping"]["state"] == mapping["state"]
 
 
-def test_a_draft_equals_that_of_the_command(client: httpx.Client, tmp_path):
+def test_a_specification_drafted_over_http_equals_that_of_the_command(client: httpx.Client, tmp_path):
     file = reactor.log(runs=3, length=20).write(tmp_path / "reactor.csv")
     own = read_log(file)
     body = {"text": file.read_text(), "environment": "reactor"}
@@ -81,7 +81,7 @@ def test_a_draft_equals_that_of_the_command(client: httpx.Client, tmp_path):
         ({"text": "x" * 6 * 1024 * 1024}, 413, "at most 5242880 bytes"),
     ],
 )
-def test_an_invalid_log_is_refused_with_the_expected_form(
+def test_an_invalid_log_is_refused_with_the_expected_format(
     client: httpx.Client, fresh: str, body: dict[str, object], status: int, expected: str
 ):
     refused = client.post(f"/v1/surrogates/{fresh}/logs", json=body)
@@ -95,7 +95,7 @@ def test_an_invalid_log_is_refused_with_the_expected_form(
     ("first", "last", "says"),
     [("1e13", "3e13", "at most 1e+12 in size"), ("1e-300", "3e-300", "differ by 1e-12 or more")],
 )
-def test_numbers_that_no_specification_takes_are_no_fault_of_the_server(
+def test_drafting_from_a_log_with_extreme_numbers_is_refused_as_invalid_request(
     client: httpx.Client, first: str, last: str, says: str
 ):
     refused = client.post("/v1/logs:draft", json={"text": f"x,action_a\n{first},1.5\n{last},2\n{first},3\n"})
@@ -103,6 +103,6 @@ def test_numbers_that_no_specification_takes_are_no_fault_of_the_server(
     assert says in refused.json()["detail"]
 
 
-def test_a_column_may_be_called_cls(client: httpx.Client):
+def test_a_log_column_named_cls_becomes_a_coordinate(client: httpx.Client):
     drafted = client.post("/v1/logs:draft", json={"text": "cls,action_a\n1,1.5\n2,2\n4,3\n"})
     assert drafted.raise_for_status().json()["spec"]["coordinates"][0]["name"] == "cls"

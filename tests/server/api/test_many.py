@@ -55,6 +55,6 @@ async def answered(app: FastAPI, path: str, first_ended: Callable[[], None]) -> 
 
 
 @pytest.mark.parametrize("path", ["/metrics", "/v1/surrogates"])
-def test_many_surrogates_take_no_more_statements_than_a_few(tmp_path: Path, path: str):
+def test_listing_many_surrogates_takes_as_many_sql_statements_as_a_few(tmp_path: Path, path: str):
     few, many = (statements(tmp_path, count, path) for count in (4, 60))
     assert 0 < few == many < 10

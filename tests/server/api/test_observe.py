@@ -31,7 +31,7 @@ def read(client: httpx.Client) -> dict[tuple[str, tuple[str, ...]], float]:
     }
 
 
-def test_what_is_stored_is_shown(client: httpx.Client, taught: str):
+def test_metrics_show_real_steps_queries_phase_and_model_of_a_surrogate(client: httpx.Client, taught: str):
     shown = read(client)
     adaptive = pendulum.BUDGET - pendulum.INITIAL
     assert shown["surrogym_real_steps_total", ("initial", taught)] == pendulum.INITIAL
@@ -43,7 +43,9 @@ def test_what_is_stored_is_shown(client: httpx.Client, taught: str):
     assert shown["surrogym_confidence_index", (taught,)] == model["confidence_index"]
 
 
-def test_steps_and_lanes_are_counted(client: httpx.Client, open_session: Callable[..., dict[str, Any]]):
+def test_metrics_count_virtual_steps_and_parallel_environments(
+    client: httpx.Client, open_session: Callable[..., dict[str, Any]]
+):
     id = open_session(num_envs=3)["id"]
     client.post(f"/v1/sessions/{id}/reset", json={}).raise_for_status()
     before = read(client)
@@ -60,7 +62,9 @@ def test_steps_and_lanes_are_counted(client: httpx.Client, open_session: Callabl
     assert before["surrogym_lanes", ()] >= 3
 
 
-def test_the_queue_before_the_sessions_is_shown(client: httpx.Client, open_session: Callable[..., dict[str, Any]]):
+def test_metrics_show_the_number_of_waiting_session_requests(
+    client: httpx.Client, open_session: Callable[..., dict[str, Any]]
+):
     id = open_session(num_envs=1)["id"]
     client.post(f"/v1/sessions/{id}/reset", json={}).raise_for_status()
     body = {"actions": [[0.0]] * 5_000}
@@ -77,20 +81,20 @@ def test_the_queue_before_the_sessions_is_shown(client: httpx.Client, open_sessi
     assert read(client)["surrogym_session_requests", ()] == 0
 
 
-def test_the_reply_carries_the_caller_s_own_id_or_a_new_one(client: httpx.Client):
+def test_a_reply_carries_the_request_id_of_the_caller_or_a_new_one(client: httpx.Client):
     assert client.get("/healthz", headers={"x-request-id": "mine-1"}).headers["x-request-id"] == "mine-1"
     new = [client.get("/healthz", headers={"x-request-id": given}).headers["x-request-id"] for given in ("a b", "")]
     assert len({"a b", "", *new}) == 4
 
 
-def test_a_refusal_names_its_request_and_the_client_prints_it(client: httpx.Client):
+def test_an_error_reply_carries_its_request_id_and_the_client_prints_it(client: httpx.Client):
     reply = client.get("/v1/surrogates/nowhere")
     problem = Problem.model_validate_json(reply.content)
     assert problem.request == reply.headers["x-request-id"]
     assert str(error_from_problem(problem)).endswith(f"[request {problem.request}]")
 
 
-def test_a_refused_stream_is_a_request_and_no_error_of_the_server(tmp_path: Path):
+def test_a_refused_stream_is_logged_as_a_request_and_not_as_an_error(tmp_path: Path):
     """Of another site's page, without a session: each is told why, and what the log says of it is that."""
     with running_server(tmp_path) as server:
         address = f"{server.url.replace('http', 'ws', 1)}/v1/sessions/nowhere/stream"
@@ -107,7 +111,7 @@ def test_a_refused_stream_is_a_request_and_no_error_of_the_server(tmp_path: Path
     assert "ERROR" not in server.log
 
 
-def test_logs_are_json_on_request_and_name_the_request(tmp_path: Path):
+def test_server_logs_in_json_format_carry_the_request_id(tmp_path: Path):
     with running_server(tmp_path, "--log-format", "json") as server:
         httpx.get(f"{server.url}/v1/surrogates/nowhere", headers={"x-request-id": "find-me"})
         server.stop()

@@ -50,29 +50,29 @@ def operations(openapi: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
 
 
 @pytest.mark.parametrize(("name", "model"), EXAMPLES.items())
-def test_every_example_is_accepted_by_its_model(name: str, model: type[wire.Request]):
+def test_every_openapi_example_passes_validation(name: str, model: type[wire.Request]):
     model.model_validate(getattr(examples, name))
 
 
-def test_no_example_is_forgotten():
+def test_every_defined_openapi_example_is_used_in_this_test():
     bodies = {name for name in vars(examples) if name.isupper()} - {"PENDULUM"}
     assert bodies == set(EXAMPLES)
 
 
-def test_every_operation_says_what_it_does(openapi: dict[str, Any]):
+def test_every_openapi_operation_has_a_summary_and_a_description(openapi: dict[str, Any]):
     for operation, said in operations(openapi):
         assert said["summary"], operation
         assert said["description"], operation
 
 
-def test_every_body_has_an_example(openapi: dict[str, Any]):
+def test_every_openapi_request_body_has_an_example(openapi: dict[str, Any]):
     for operation, said in operations(openapi):
         for media_type, content in said.get("requestBody", {}).get("content", {}).items():
             if media_type == "application/json":
                 assert "example" in content or "examples" in content, operation
 
 
-def test_every_refusal_is_a_problem(openapi: dict[str, Any]):
+def test_every_openapi_error_reply_has_the_problem_media_type(openapi: dict[str, Any]):
     assert "Problem" in openapi["components"]["schemas"]
     for operation, said in operations(openapi):
         for status, reply in said["responses"].items():
@@ -86,13 +86,13 @@ def resolved(openapi: dict[str, Any], reply: dict[str, Any]) -> dict[str, Any]:
     return response
 
 
-def test_guards_and_limits_are_described_wherever_they_stand(openapi: dict[str, Any]):
+def test_every_openapi_operation_lists_its_possible_error_statuses(openapi: dict[str, Any]):
     for operation, said in operations(openapi):
         guards = {"404", "405", "408", "413", "422", "429", "503"} | ({"401", "403"} if "security" in said else set())
         assert guards <= said["responses"].keys(), operation
 
 
-def test_no_reference_dangles(openapi: dict[str, Any]):
+def test_every_openapi_reference_points_to_a_defined_component(openapi: dict[str, Any]):
     def references(node: Any) -> set[str]:
         if isinstance(node, dict):
             below = set().union(*(references(value) for value in node.values())) if node else set()
@@ -103,7 +103,7 @@ def test_no_reference_dangles(openapi: dict[str, Any]):
     assert references(openapi) <= known
 
 
-def test_the_four_names_stay(openapi: dict[str, Any]):
+def test_the_routes_reset_step_query_uncertainty_and_add_sample_keep_their_names(openapi: dict[str, Any]):
     for path in ("/v1/sessions/{id}/reset", "/v1/sessions/{id}/step"):
         assert path in openapi["paths"]
     for path in ("query_uncertainty", "add_sample"):

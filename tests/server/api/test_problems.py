@@ -15,21 +15,21 @@ def leaves(cls: type[errors.SurrogymError]) -> list[type[errors.SurrogymError]]:
 
 
 @pytest.mark.parametrize("leaf", leaves(errors.SurrogymError))
-def test_every_error_has_a_code_of_its_own(leaf: type[errors.SurrogymError]):
+def test_every_exception_class_has_an_error_code(leaf: type[errors.SurrogymError]):
     assert leaf in CODES
 
 
-def test_no_two_kinds_of_client_error_share_a_code():
+def test_no_two_client_exception_classes_share_an_error_code():
     codes = [code for code in CODES.values() if code is not Code.INTERNAL]
     assert len(set(codes)) == len(codes)
 
 
 @pytest.mark.parametrize("code", Code)
-def test_every_code_has_a_status(code: Code):
+def test_every_error_code_has_an_http_error_status(code: Code):
     assert 400 <= STATUS[code] < 600
 
 
-def test_a_class_below_the_table_has_the_code_above_it():
+def test_an_unlisted_exception_class_has_the_error_code_of_its_parent_class():
     class NewKind(errors.UnknownModel):
         """Not in the table."""
 

@@ -16,7 +16,7 @@ def docs(client: httpx.Client) -> httpx.Response:
     return client.get("/docs").raise_for_status()
 
 
-def test_it_names_every_operation_and_schema(client: httpx.Client, docs: httpx.Response):
+def test_the_reference_page_lists_every_operation_and_schema(client: httpx.Client, docs: httpx.Response):
     openapi, text = client.get("/openapi.json").json(), unescape(docs.text)
     for path, methods in openapi["paths"].items():
         for method, operation in methods.items():
@@ -33,7 +33,7 @@ def test_the_reference_page_loads_nothing_from_elsewhere_and_its_policy_forbids_
     assert docs.headers["x-content-type-options"] == "nosniff"
 
 
-def test_what_a_description_says_is_text():
+def test_the_reference_page_escapes_html_in_descriptions():
     hostile = "<script>alert(1)</script>"
     operation = {"tags": [hostile], "summary": hostile, "description": hostile, "responses": {}}
     info = {"title": hostile, "version": "0", "description": hostile}
@@ -42,6 +42,6 @@ def test_what_a_description_says_is_text():
     assert "<script" not in page(openapi)
 
 
-def test_the_refusal_of_a_method_lists_the_allowed_methods(client: httpx.Client):
+def test_the_refusal_of_an_http_method_lists_the_allowed_methods(client: httpx.Client):
     assert client.put("/v1/surrogates/any").headers["allow"] == "DELETE, GET, PATCH"
     assert client.post("/").headers["allow"] == "GET"

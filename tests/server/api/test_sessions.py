@@ -22,7 +22,7 @@ def send(client: httpx.Client, session: str, what: str, **body: Any) -> httpx.Re
     return client.post(f"/v1/sessions/{session}/{what}", json=body)
 
 
-def test_replies_are_what_the_api_says(client: httpx.Client, session: str):
+def test_reset_step_and_rollout_replies_match_their_schemas(client: httpx.Client, session: str):
     wire.ResetReply.model_validate_json(send(client, session, "reset").content)
     step = wire.StepReply.model_validate_json(send(client, session, "step", action=ACTIONS, deviations=True).content)
     assert (step.seq, len(step.observation), len(step.observation[0])) == (2, 2, 3)
@@ -35,7 +35,7 @@ def test_replies_are_what_the_api_says(client: httpx.Client, session: str):
 POLICY = {"mean": [0, 0, 0], "deviation": [1, 1, 8], "layers": [{"weights": [[1], [0.5], [2]], "bias": [0.1]}]}
 
 
-def test_a_policy_by_hand(client: httpx.Client, session: str):
+def test_a_rollout_with_a_handwritten_policy_returns_its_actions_and_probabilities(client: httpx.Client, session: str):
     send(client, session, "reset")
     noisy = {"policy": {**POLICY, "log_deviations": [-1]}, "noise": {"seed": 4}}
     for body, spoken in (({"policy": POLICY}, False), (noisy, True)):
@@ -45,7 +45,7 @@ def test_a_policy_by_hand(client: httpx.Client, session: str):
         assert (rollout.log_probability is not None) == spoken
 
 
-def test_a_rollout_ends_with_its_session(client: httpx.Client, open_session: Open):
+def test_closing_a_session_stops_its_running_rollout(client: httpx.Client, open_session: Open):
     """Long before its steps could have been taken."""
     steps, share = 50_000, 100
     session = open_session(num_envs=2)["id"]
@@ -63,7 +63,7 @@ def test_a_rollout_ends_with_its_session(client: httpx.Client, open_session: Ope
     assert time.perf_counter() - begun < whole / 2
 
 
-def test_steps_are_answered_while_a_policy_acts_elsewhere(client: httpx.Client, open_session: Open):
+def test_steps_are_answered_while_another_session_runs_a_long_rollout(client: httpx.Client, open_session: Open):
     planner, trainer = open_session(num_envs=2)["id"], open_session(num_envs=2)["id"]
     for session in (planner, trainer):
         send(client, session, "reset")
@@ -77,7 +77,7 @@ def test_steps_are_answered_while_a_policy_acts_elsewhere(client: httpx.Client, 
         client.delete(f"/v1/sessions/{planner}")
 
 
-def test_an_action_of_one_number_may_come_flat(client: httpx.Client, open_session: Open):
+def test_a_one_dimensional_action_may_be_sent_without_its_inner_list(client: httpx.Client, open_session: Open):
     sessions = [open_session(num_envs=2)["id"] for _ in range(2)]
     replies = []
     for session, action in zip(sessions, (ACTIONS, [row[0] for row in ACTIONS]), strict=True):
@@ -95,7 +95,7 @@ def test_a_repeated_request_gets_the_same_reply_bit_for_bit(client: httpx.Client
         assert (first.status_code, again.content) == (200, first.content)
 
 
-def test_a_repeat_while_the_first_is_computed_steps_once(client: httpx.Client, session: str):
+def test_a_request_repeated_during_its_computation_steps_once(client: httpx.Client, session: str):
     send(client, session, "reset", seq=1)
     body = {"seq": 2, "actions": [ACTIONS] * 200}
     with ThreadPoolExecutor(4) as threads:
@@ -106,7 +106,7 @@ def test_a_repeat_while_the_first_is_computed_steps_once(client: httpx.Client, s
 
 
 @pytest.mark.parametrize("seq", [1, 4, 99])
-def test_any_other_seq_is_refused_with_the_expected_one(client: httpx.Client, session: str, seq: int):
+def test_an_unexpected_sequence_number_is_refused_with_the_expected_one(client: httpx.Client, session: str, seq: int):
     send(client, session, "reset", seq=1)
     send(client, session, "step", seq=2, action=ACTIONS)
     refusal = send(client, session, "step", seq=seq, action=ACTIONS)
@@ -114,7 +114,7 @@ def test_any_other_seq_is_refused_with_the_expected_one(client: httpx.Client, se
     assert refusal.json()["expected_seq"] == 3
 
 
-def test_the_same_seq_with_another_body_is_refused(client: httpx.Client, session: str):
+def test_a_repeated_sequence_number_with_another_body_is_refused(client: httpx.Client, session: str):
     send(client, session, "reset", seq=1)
     send(client, session, "step", seq=2, action=ACTIONS)
     for other in ({"action": [[0.5], [1.5]]}, {"action": ACTIONS, "deviations": True}):
@@ -122,13 +122,15 @@ def test_the_same_seq_with_another_body_is_refused(client: httpx.Client, session
     assert send(client, session, "reset", seq=2).json()["expected_seq"] == 3
 
 
-def test_a_request_without_seq_is_the_next_one(client: httpx.Client, session: str):
+def test_a_request_without_sequence_number_takes_the_next_one(client: httpx.Client, session: str):
     assert send(client, session, "reset").json()["seq"] == 1
     assert send(client, session, "step", action=ACTIONS).json()["seq"] == 2
     assert send(client, session, "step", seq=3, action=ACTIONS).json()["seq"] == 3
 
 
-def test_opening_with_a_key_opens_once(client: httpx.Client, open_session: Open, taught: str, name: str):
+def test_opening_a_session_twice_with_one_idempotency_key_opens_it_once(
+    client: httpx.Client, open_session: Open, taught: str, name: str
+):
     first, again = (open_session(num_envs=2, idempotency_key=name) for _ in range(2))
     assert first["id"] == again["id"]
     body = {"seed": 0, "num_envs": 3, "idempotency_key": name}
@@ -136,7 +138,7 @@ def test_opening_with_a_key_opens_once(client: httpx.Client, open_session: Open,
     assert refusal.json()["code"] == "idempotency_conflict"
 
 
-def test_seed_zero_is_a_seed_and_none_is_drawn(client: httpx.Client, open_session: Open):
+def test_session_seed_zero_is_reproducible_and_seed_none_is_random(client: httpx.Client, open_session: Open):
     starts = {}
     for key, seed in (("a", 0), ("b", 0), ("c", 1), ("d", None)):
         session = open_session(num_envs=2, seed=seed)
@@ -147,7 +149,7 @@ def test_seed_zero_is_a_seed_and_none_is_drawn(client: httpx.Client, open_sessio
     assert starts["d"] != starts["a"]
 
 
-def test_a_mask_steps_its_lanes_alone(client: httpx.Client, session: str):
+def test_a_masked_step_moves_only_the_masked_environments(client: httpx.Client, session: str):
     start = send(client, session, "reset").json()["observation"]
     step = send(client, session, "step", action=ACTIONS, mask=[False, True]).json()
     assert step["observation"][0] == start[0]
@@ -155,7 +157,7 @@ def test_a_mask_steps_its_lanes_alone(client: httpx.Client, session: str):
     assert step["reward"][0] == 0.0
 
 
-def test_the_time_limit_truncates_and_the_next_step_begins_anew(client: httpx.Client, open_session: Open):
+def test_an_episode_is_truncated_at_the_time_limit_and_the_next_step_resets(client: httpx.Client, open_session: Open):
     session = open_session(num_envs=1, time_limit=2)["id"]
     send(client, session, "reset")
     steps = send(client, session, "rollout", actions=[[[0.0]]] * 4).json()["steps"]
@@ -163,7 +165,7 @@ def test_the_time_limit_truncates_and_the_next_step_begins_anew(client: httpx.Cl
     assert steps[2]["reward"] == [0.0], "this step only began the next episode"
 
 
-def test_same_step_brings_the_last_observation_along(client: httpx.Client, open_session: Open):
+def test_same_step_autoreset_returns_the_final_observation(client: httpx.Client, open_session: Open):
     session = open_session(num_envs=2, time_limit=1, autoreset_mode="same_step")["id"]
     send(client, session, "reset")
     step = send(client, session, "step", action=ACTIONS).json()
@@ -171,20 +173,24 @@ def test_same_step_brings_the_last_observation_along(client: httpx.Client, open_
     assert step["final_observation"] != step["observation"]
 
 
-def test_no_occupancy_without_asking_for_it(client: httpx.Client, session: str, open_session: Open):
+def test_visited_states_are_kept_only_if_the_session_asked_for_it(
+    client: httpx.Client, session: str, open_session: Open
+):
     assert send(client, session, "occupancy", checkpoint="c").json()["code"] == "invalid_request"
     asked = open_session(occupancy=True)["id"]
     assert send(client, asked, "occupancy", checkpoint="c").json()["code"] == "not_reset"
 
 
-def test_coordinates_of_lanes_match_observations(client: httpx.Client, session: str):
+def test_the_coordinates_of_a_session_match_its_observations(client: httpx.Client, session: str):
     observation = send(client, session, "reset", seed=3).json()["observation"]
     coordinates = client.get(f"/v1/sessions/{session}/coordinates").json()["coordinates"]
     angles, speeds = np.array(coordinates).T
     np.testing.assert_allclose(np.stack([np.cos(angles), np.sin(angles), speeds], 1), observation, rtol=1e-6)
 
 
-def test_rewards_keep_near_those_of_the_samples(client: httpx.Client, name: str, open_session: Open):
+def test_virtual_rewards_stay_near_the_range_of_the_sampled_rewards(
+    client: httpx.Client, name: str, open_session: Open
+):
     pendulum.teach(client, name, budget=5)
     samples = client.get(f"/v1/surrogates/{name}/samples").json()["samples"]
     rewards = [sample["reward"] for sample in samples]
@@ -197,7 +203,7 @@ def test_rewards_keep_near_those_of_the_samples(client: httpx.Client, name: str,
     assert imagined.max() <= max(rewards) + room
 
 
-def test_episodes_start_at_states_of_real_steps(client: httpx.Client, name: str):
+def test_with_start_visited_1_virtual_episodes_start_at_sampled_states(client: httpx.Client, name: str):
     pendulum.teach(client, name, budget=5)
     samples = client.get(f"/v1/surrogates/{name}/samples").json()["samples"]
     asked = {"num_envs": 64, "seed": 0, "start_visited": 1.0}
@@ -207,7 +213,7 @@ def test_episodes_start_at_states_of_real_steps(client: httpx.Client, name: str)
     assert {tuple(start) for start in starts} == {tuple(sample["coordinates"]) for sample in samples}
 
 
-def test_shares_of_starts_above_one_are_refused(client: httpx.Client, name: str):
+def test_start_shares_that_sum_above_one_are_refused(client: httpx.Client, name: str):
     pendulum.teach(client, name, budget=5)
     asked = {"start_box": 0.5, "start_visited": 0.6}
     refused = client.post(f"/v1/surrogates/{name}/sessions", json=asked)
@@ -215,19 +221,21 @@ def test_shares_of_starts_above_one_are_refused(client: httpx.Client, name: str)
 
 
 @pytest.mark.parametrize("functions", [0, 2])
-def test_functions_are_of_variant_pathwise_alone(client: httpx.Client, taught: str, functions: int):
+def test_the_option_functions_is_refused_for_variants_other_than_pathwise(
+    client: httpx.Client, taught: str, functions: int
+):
     options = {"num_envs": 2, "functions": functions, "variant": "deterministic" if functions else "pathwise"}
     refused = client.post(f"/v1/surrogates/{taught}/sessions", json=options)
     assert refused.status_code == 422
     assert "functions" in refused.json()["detail"]
 
 
-def test_closing_twice_is_harmless(client: httpx.Client, session: str):
+def test_closing_a_session_twice_is_harmless(client: httpx.Client, session: str):
     assert [client.delete(f"/v1/sessions/{session}").status_code for _ in range(2)] == [204, 204]
     assert send(client, session, "reset").json()["code"] == "unknown_session"
 
 
-def test_a_lane_keeps_its_model_to_the_end_of_its_episode(client: httpx.Client, name: str):
+def test_an_environment_keeps_its_model_version_until_its_episode_ends(client: httpx.Client, name: str):
     pendulum.teach(client, name, budget=5)
     options = {"num_envs": 2, "seed": 0, "time_limit": 3, "autoreset_mode": "same_step"}
     opened = {
@@ -247,7 +255,7 @@ def test_a_lane_keeps_its_model_to_the_end_of_its_episode(client: httpx.Client, 
     client.delete(f"/v1/surrogates/{name}")
 
 
-def test_the_list_of_sessions_counts_steps_once_and_ended_episodes(client: httpx.Client, open_session: Open):
+def test_the_session_list_counts_each_step_once_and_each_ended_episode(client: httpx.Client, open_session: Open):
     session = open_session(num_envs=2, time_limit=3, autoreset_mode="same_step", penalty=1.0)["id"]
     send(client, session, "reset", seq=1)
     body = {"seq": 2, "actions": [ACTIONS] * 4}

@@ -19,14 +19,14 @@ def view(client: httpx.Client, name: str) -> wire.SurrogateView:
     return wire.SurrogateView.model_validate_json(client.get(f"/v1/surrogates/{name}").raise_for_status().content)
 
 
-def test_creating_twice_is_harmless(client: httpx.Client, fresh: str):
+def test_registering_the_same_surrogate_twice_changes_nothing(client: httpx.Client, fresh: str):
     first = client.get(f"/v1/surrogates/{fresh}").json()
     again = client.post("/v1/surrogates", json={"name": fresh, "spec": pendulum.spec()})
     assert (again.status_code, again.json()) == (201, {**first, "created": False})
     assert (first["phase"], first["queries"]["pending"]) == ("collecting", pendulum.INITIAL)
 
 
-def test_a_checked_registration_stores_nothing(client: httpx.Client, name: str):
+def test_checking_a_registration_stores_nothing(client: httpx.Client, name: str):
     checked = client.post("/v1/surrogates:check", json={"name": name, "spec": pendulum.spec()})
     assert checked.status_code == 200
     assert (checked.json()["initial"], checked.json()["exists"]) == (pendulum.INITIAL, False)
@@ -41,14 +41,14 @@ def test_a_checked_registration_stores_nothing(client: httpx.Client, name: str):
     client.delete(f"/v1/surrogates/{name}")
 
 
-def test_a_new_surrogate_asks_a_latin_hypercube(client: httpx.Client, fresh: str):
+def test_the_first_queries_of_a_new_surrogate_form_a_latin_hypercube(client: httpx.Client, fresh: str):
     queries = client.get(f"/v1/surrogates/{fresh}/queries").json()["queries"]
     speeds = sorted((query["coordinates"][1] + 8) / 16 * pendulum.INITIAL for query in queries)
     assert [int(speed) for speed in speeds] == list(range(pendulum.INITIAL))
     assert {query["purpose"] for query in queries} == {"initial"}
 
 
-def test_the_design_spends_its_budget_and_counts_it(client: httpx.Client, taught: str):
+def test_the_design_uses_its_whole_budget_and_the_ledger_counts_it(client: httpx.Client, taught: str):
     finished = view(client, taught)
     assert finished.phase == "over_budget"
     assert finished.ledger.initial == pendulum.INITIAL
@@ -59,14 +59,14 @@ def test_the_design_spends_its_budget_and_counts_it(client: httpx.Client, taught
     assert finished.outputs == ["theta", "theta_dot", "reward"]
 
 
-def test_the_list_has_what_the_page_shows(client: httpx.Client, taught: str):
+def test_the_surrogate_list_contains_confidence_index_and_model_version(client: httpx.Client, taught: str):
     listed = {summary["name"]: summary for summary in client.get("/v1/surrogates").json()["surrogates"]}
     finished = view(client, taught)
     assert listed[taught]["confidence_index"] == finished.confidence_index
     assert listed[taught]["model_version"] == finished.model_version
 
 
-def test_surrogates_come_in_pages(client: httpx.Client, taught: str, fresh: str):
+def test_the_surrogate_list_can_be_read_in_pages(client: httpx.Client, taught: str, fresh: str):
     whole = client.get("/v1/surrogates").json()
     assert whole.keys() == {"surrogates"}, "as clients know it that follow no pages"
     listed: list[str] = []
@@ -82,7 +82,7 @@ def test_surrogates_come_in_pages(client: httpx.Client, taught: str, fresh: str)
         assert (refused.status_code, refused.json()["code"]) == (422, "invalid_request")
 
 
-def test_improve_asks_more_and_raises_the_budget(client: httpx.Client, name: str):
+def test_improve_adds_queries_and_raises_the_budget_once_per_key(client: httpx.Client, name: str):
     before = pendulum.teach(client, name, budget=5)
     body = {"queries": 2, "idempotency_key": "once"}
     for _ in range(2):
@@ -92,7 +92,7 @@ def test_improve_asks_more_and_raises_the_budget(client: httpx.Client, name: str
     assert (before["samples"], after["samples"], after["budget"]) == (5, 7, 7)
 
 
-def test_improve_by_the_states_a_policy_visited(client: httpx.Client, name: str):
+def test_improve_accepts_the_states_that_a_policy_visited(client: httpx.Client, name: str):
     pendulum.teach(client, name, budget=5)
     opened = client.post(f"/v1/surrogates/{name}/sessions", json={"num_envs": 4, "occupancy": True}).json()
     for what, body in (("reset", {}), ("step", {"action": [[0.0]] * 4})):
@@ -105,13 +105,13 @@ def test_improve_by_the_states_a_policy_visited(client: httpx.Client, name: str)
     assert pendulum.finish(client, name)["samples"] == 6
 
 
-def test_a_raised_budget_sets_a_finished_design_going(client: httpx.Client, name: str):
+def test_raising_the_budget_restarts_a_finished_design(client: httpx.Client, name: str):
     pendulum.teach(client, name, budget=5)
     client.patch(f"/v1/surrogates/{name}", json={"budget": 7}).raise_for_status()
     assert pendulum.finish(client, name)["samples"] == 7
 
 
-def test_a_tolerance_has_a_finished_design_judged_anew(client: httpx.Client, name: str):
+def test_a_changed_tolerance_has_a_finished_design_judged_again(client: httpx.Client, name: str):
     pendulum.teach(client, name, budget=5)
     changed = client.patch(f"/v1/surrogates/{name}", json={"tolerances": {"theta_dot": 0.25}, "budget": 6})
     assert changed.raise_for_status().json()["tolerances"] == {"theta_dot": 0.25}
@@ -132,7 +132,7 @@ def test_a_tolerance_has_a_finished_design_judged_anew(client: httpx.Client, nam
     assert next(output for output in judged if output["name"] == "theta_dot")["tolerance"] != 0.25
 
 
-def test_a_tolerance_typed_wrong_costs_no_real_step(client: httpx.Client, name: str):
+def test_correcting_a_wrong_tolerance_withdraws_the_queries_it_caused(client: httpx.Client, name: str):
     """What it made the design ask is withdrawn with it, though nobody answers it."""
     taken = pendulum.teach(client, name, budget=9)["ledger"]["total"]
     for value, waiting in ((1e-12, True), (10.0, False)):
@@ -150,7 +150,7 @@ def tolerance_of_theta(client: httpx.Client, name: str) -> float:
     return next(output.tolerance for output in fidelity.outputs if output.name == "theta")
 
 
-def test_a_paused_design_hands_out_nothing(client: httpx.Client, fresh: str):
+def test_a_paused_design_hands_out_no_queries(client: httpx.Client, fresh: str):
     assert client.patch(f"/v1/surrogates/{fresh}", json={"paused": True}).json()["paused"]
     claimed = pendulum.claim(client, fresh, wait_seconds=0)
     assert (claimed["queries"], claimed["paused"]) == ([], True)
@@ -158,7 +158,7 @@ def test_a_paused_design_hands_out_nothing(client: httpx.Client, fresh: str):
     assert pendulum.claim(client, fresh, wait_seconds=0)["queries"]
 
 
-def test_queries_set_aside_never_stick_the_design(client: httpx.Client, fresh: str):
+def test_the_design_finishes_without_answers_to_failed_queries(client: httpx.Client, fresh: str):
     lost = client.get(f"/v1/surrogates/{fresh}/queries").json()["queries"][0]["id"]
     while (found := view(client, fresh)).phase != "unsure":
         assert found.phase != "failed", found.error
@@ -173,7 +173,7 @@ def test_queries_set_aside_never_stick_the_design(client: httpx.Client, fresh: s
     assert [query["error"] for query in aside] == ["the motor did not answer"]
 
 
-def test_a_design_without_answers_fails_and_continues_after_manual_samples(client: httpx.Client, fresh: str):
+def test_a_design_whose_initial_queries_all_failed_continues_after_manual_samples(client: httpx.Client, fresh: str):
     while view(client, fresh).phase == "collecting":
         for query in pendulum.claim(client, fresh)["queries"]:
             body = {"lease_token": query["lease_token"], "error": "no power"}
@@ -191,13 +191,13 @@ def test_a_design_without_answers_fails_and_continues_after_manual_samples(clien
     assert (found.ledger.manual, found.error, found.model_version) == (pendulum.BUDGET, None, 1)
 
 
-def test_a_heartbeat_keeps_a_lease(client: httpx.Client, fresh: str):
+def test_the_lease_of_a_query_can_be_renewed(client: httpx.Client, fresh: str):
     query = pendulum.claim(client, fresh, max_queries=1, lease_seconds=60)["queries"][0]
     body = {"lease_token": query["lease_token"], "lease_seconds": 30}
     assert client.post(f"/v1/surrogates/{fresh}/queries/{query['id']}:renew", json=body).status_code == 204
 
 
-def test_a_lease_that_ends_goes_to_the_next_sampler(client: httpx.Client, fresh: str):
+def test_a_query_whose_lease_expired_goes_to_the_next_sampler(client: httpx.Client, fresh: str):
     first = pendulum.claim(client, fresh, lease_seconds=0.05)["queries"]
     second = pendulum.claim(client, fresh, sampler="next")["queries"]
     assert {query["id"] for query in second} <= {query["id"] for query in first}
@@ -207,7 +207,7 @@ def test_a_lease_that_ends_goes_to_the_next_sampler(client: httpx.Client, fresh:
     assert [(sample["id"], sample["late"]) for sample in kept] == [(late["sample_ids"][0], True)]
 
 
-def test_queries_by_hand_are_answered_too(client: httpx.Client, name: str):
+def test_manual_queries_of_a_finished_design_are_handed_out_and_answered(client: httpx.Client, name: str):
     pendulum.teach(client, name, budget=5)
     body = {"coordinates": [[1.0, 0.5]], "action": [[0.25]], "idempotency_key": "once"}
     asked = [client.post(f"/v1/surrogates/{name}/queries", json=body).json()["queries"] for _ in range(2)]
@@ -216,14 +216,14 @@ def test_queries_by_hand_are_answered_too(client: httpx.Client, name: str):
     assert (after["ledger"]["manual"], after["samples"]) == (1, 6)
 
 
-def test_the_ledger_counts_an_evaluation_once(client: httpx.Client, fresh: str):
+def test_the_ledger_counts_a_repeated_evaluation_report_once(client: httpx.Client, fresh: str):
     body = {"steps": 200, "episodes": 1, "idempotency_key": "e"}
     counts = [client.post(f"/v1/surrogates/{fresh}/ledger", json=body).json() for _ in range(2)]
     assert counts[0] == counts[1]
     assert (counts[0]["evaluation"], counts[0]["total"]) == (200, 0)
 
 
-def test_samples_come_in_pages_and_as_tables(client: httpx.Client, taught: str):
+def test_samples_can_be_read_in_pages_as_csv_and_as_npz(client: httpx.Client, taught: str):
     path = f"/v1/surrogates/{taught}/samples"
     after: int | None = 0
     samples: list[dict[str, Any]] = []
@@ -239,7 +239,7 @@ def test_samples_come_in_pages_and_as_tables(client: httpx.Client, taught: str):
         assert file["coordinate_names"].tolist() == ["theta", "theta_dot"]
 
 
-def test_models_are_kept_exported_and_imported(client: httpx.Client, taught: str, fresh: str):
+def test_an_exported_model_predicts_the_same_after_import(client: httpx.Client, taught: str, fresh: str):
     models = client.get(f"/v1/surrogates/{taught}/models").json()["models"]
     latest = len(models)
     assert latest >= 2
@@ -261,7 +261,7 @@ def test_models_are_kept_exported_and_imported(client: httpx.Client, taught: str
     assert again == export
 
 
-def test_what_a_model_says_about_points(client: httpx.Client, taught: str):
+def test_predictions_fit_the_samples_and_are_uncertain_far_from_them(client: httpx.Client, taught: str):
     known = client.get(f"/v1/surrogates/{taught}/samples").json()["samples"][0]
     points = {"coordinates": [known["coordinates"], [1.0, 7.0]], "action": [known["action"], [2.0]]}
     said = wire.Prediction(**client.post(f"/v1/surrogates/{taught}/predict", json=points).json())
@@ -271,7 +271,7 @@ def test_what_a_model_says_about_points(client: httpx.Client, taught: str):
     np.testing.assert_allclose(unsure.uncertainty_index, np.exp(unsure.log_uncertainty_index))
 
 
-def test_deleting_takes_everything_along(client: httpx.Client, name: str):
+def test_deleting_a_surrogate_also_deletes_its_sessions_and_models(client: httpx.Client, name: str):
     pendulum.teach(client, name, budget=5)
     session = client.post(f"/v1/surrogates/{name}/sessions", json={}).json()["id"]
     assert client.delete(f"/v1/surrogates/{name}").status_code == 204
@@ -281,7 +281,7 @@ def test_deleting_takes_everything_along(client: httpx.Client, name: str):
     assert view(client, name).model_version is None
 
 
-def test_a_surrogate_names_its_samplers_and_counts_its_sessions(client: httpx.Client, fresh: str):
+def test_a_surrogate_lists_its_samplers_and_has_no_sessions_at_first(client: httpx.Client, fresh: str):
     before = view(client, fresh)
     query = pendulum.claim(client, fresh, max_queries=1)["queries"][0]
     pendulum.add(client, fresh, [pendulum.answer(query)]).raise_for_status()
@@ -289,5 +289,5 @@ def test_a_surrogate_names_its_samplers_and_counts_its_sessions(client: httpx.Cl
     assert before.sessions == 0
 
 
-def test_an_open_session_is_counted(client: httpx.Client, taught: str, session: str):
+def test_a_surrogate_counts_its_open_sessions(client: httpx.Client, taught: str, session: str):
     assert view(client, taught).sessions >= 1

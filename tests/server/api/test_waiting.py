@@ -15,7 +15,7 @@ def of(token: str) -> Request:
     return Request({"type": "http", "headers": [(b"authorization", f"Bearer {token}".encode())]})
 
 
-def test_a_token_has_a_limit_of_its_own_which_frees_with_the_requests():
+def test_each_token_has_its_own_limit_of_concurrent_waiting_requests():
     waiting = Waiting("streams", most=2)
     with ExitStack() as places:
         for _ in range(2):

@@ -32,12 +32,12 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("started")
-def test_what_was_imported_is_kept_out_of_collections():
+def test_imported_objects_are_frozen_out_of_garbage_collection():
     assert len(gc.get_objects()) < gc.get_freeze_count() / 10, "a full collection stops the loop for some 200 ms"
 
 
 @pytest.mark.usefixtures("started")
-def test_a_page_of_samples_is_read_without_a_search_for_garbage():
+def test_reading_a_page_of_samples_triggers_no_garbage_collection():
     """Its records live until the reply is written, so no collection would find any of them."""
     collections = [generation["collections"] for generation in gc.get_stats()]
     records = [{"coordinates": [0.0, 0.0], "action": [0.0], "next_coordinates": [0.0, 0.0]} for _ in range(1_000)]

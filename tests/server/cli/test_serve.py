@@ -26,12 +26,12 @@ PATIENCE = 60.0
 WITHOUT_CUDA = pytest.mark.skipif(torch.cuda.is_available(), reason="torch has CUDA here")
 
 
-def test_a_taken_database_is_one_sentence(server_process: Any, tmp_path: Path):
+def test_serve_refuses_a_database_in_use_in_one_sentence(server_process: Any, tmp_path: Path):
     database = str(server_process.folder / "surrogym.db")
     assert "surrogym.db" in refusal(tmp_path, "--port", "0", "--database", database)
 
 
-def test_a_taken_port_is_one_sentence(server_process: Any, tmp_path: Path):
+def test_serve_refuses_a_port_in_use_in_one_sentence(server_process: Any, tmp_path: Path):
     port = server_process.url.rpartition(":")[2]
     assert f"port {port}" in refusal(tmp_path, "--port", port, "--database", str(tmp_path / "other.db"))
 
@@ -50,19 +50,19 @@ def test_a_taken_port_is_one_sentence(server_process: Any, tmp_path: Path):
         pytest.param([], {"SURROGYM_DEVICE": "cuda"}, "setting device: expected cpu, got cuda", marks=WITHOUT_CUDA),
     ],
 )
-def test_invalid_settings_are_refused_at_start(
+def test_serve_refuses_invalid_settings_at_start(
     tmp_path: Path, options: list[str], environment: dict[str, str], said: str
 ):
     assert said in refusal(tmp_path, *options, **environment)
 
 
-def test_help_has_an_example():
+def test_the_help_of_serve_contains_an_example():
     result = subprocess.run([*SERVE, "--help"], capture_output=True, text=True, timeout=PATIENCE)
     assert result.returncode == 0
     assert "surrogym serve --port" in result.stdout
 
 
-def test_a_clean_end_brings_the_sessions_back(tmp_path: Path):
+def test_sessions_continue_after_a_clean_stop_and_restart_of_the_server(tmp_path: Path):
     server = start_server(tmp_path)
     with httpx.Client(base_url=server.url, timeout=60) as client:
         pendulum.teach(client, "p", budget=5)
@@ -82,7 +82,7 @@ def test_a_clean_end_brings_the_sessions_back(tmp_path: Path):
     assert replies == [first, first], "a repeat of the last step, and the same step made only now"
 
 
-def test_under_nohup_a_terminal_that_closes_ends_nothing(tmp_path: Path):
+def test_a_server_that_ignores_sighup_survives_a_closed_terminal(tmp_path: Path):
     """Who starts a server with SIGHUP ignored wants it to stay."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
@@ -97,7 +97,7 @@ def test_under_nohup_a_terminal_that_closes_ends_nothing(tmp_path: Path):
     assert "SIGHUP" not in server.log
 
 
-def test_a_window_that_is_closed_over_a_server_costs_no_session(tmp_path: Path):
+def test_closing_the_servers_terminal_saves_its_sessions(tmp_path: Path):
     """The kernel hangs up on all its processes, that of the fits too, and nothing can be written any more."""
     ready, database = tmp_path / "ready", tmp_path / "surrogym.db"
     window, terminal = os.openpty()
@@ -125,7 +125,7 @@ def test_a_window_that_is_closed_over_a_server_costs_no_session(tmp_path: Path):
         assert httpx.get(f"{again.url}/v1/sessions/{session}").status_code == 200
 
 
-def test_a_clean_end_does_not_wait_for_long_polls_and_streams(tmp_path: Path):
+def test_a_stopping_server_does_not_wait_for_open_event_streams(tmp_path: Path):
     server = start_server(tmp_path)
     with httpx.Client(base_url=server.url, timeout=60) as client:
         client.post("/v1/surrogates", json={"name": "p", "spec": pendulum.spec()}).raise_for_status()
@@ -138,7 +138,7 @@ def test_a_clean_end_does_not_wait_for_long_polls_and_streams(tmp_path: Path):
     assert "timeout graceful shutdown exceeded" not in server.log
 
 
-def test_killed_in_a_fit_leaves_no_process_behind(tmp_path: Path):
+def test_a_killed_server_leaves_no_fitting_process_behind(tmp_path: Path):
     server = start_server(tmp_path, program=COLD)
     children = _wait_for_children(server.process.pid)
     server.stop(signal.SIGKILL)
@@ -148,7 +148,7 @@ def test_killed_in_a_fit_leaves_no_process_behind(tmp_path: Path):
         time.sleep(0.05)
 
 
-def test_it_says_where_it_listens_as_json_and_ends_with_its_parent(tmp_path: Path):
+def test_serve_prints_its_address_as_json_and_ends_with_its_parent_process(tmp_path: Path):
     ready = tmp_path / "ready"
     options = ["--port", "0", "--database", str(tmp_path / "p.db"), "--ready-file", str(ready), "--json"]
     options.append("--exit-with-parent")

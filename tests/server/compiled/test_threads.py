@@ -10,7 +10,7 @@ from surrogym_server.compiled.threads import side_by_side
 
 
 @pytest.mark.parametrize(("rows", "threads"), [(1_024, 2), (1_000, 3), (33, 4), (10, 2), (64, 1), (1, 8)])
-def test_each_row_is_computed_once_in_whole_blocks(rows, threads):
+def test_threads_compute_each_row_once_in_whole_blocks(rows, threads):
     done: list[slice] = []
     side_by_side(done.append, rows, 32, threads)
     done.sort(key=lambda at: at.start)
@@ -19,7 +19,7 @@ def test_each_row_is_computed_once_in_whole_blocks(rows, threads):
     assert len(done) <= min(threads, -(-rows // 32))
 
 
-def test_the_callers_thread_takes_part():
+def test_the_calling_thread_computes_rows_too():
     names: list[str] = []
     side_by_side(lambda _: names.append(threading.current_thread().name), 128, 32, 4)
     assert len(names) == 4
@@ -27,7 +27,7 @@ def test_the_callers_thread_takes_part():
 
 
 @pytest.mark.parametrize("at_fault", [0, 32])
-def test_errors_reach_the_caller(at_fault):
+def test_an_error_in_a_row_thread_reaches_the_caller(at_fault):
     def fails(at: slice) -> None:
         if at.start == at_fault:
             raise ArithmeticError("rows")

@@ -8,11 +8,11 @@ from surrogym_server.errors import Damaged
 from surrogym_shared.spec import EnvironmentSpec
 
 
-def test_a_document_is_read_as_its_model():
+def test_a_stored_json_document_is_read_as_its_pydantic_model():
     assert read_stored(EnvironmentSpec, "a stored specification", pendulum.spec()).environment == "Pendulum-v1"
 
 
-def test_damage_names_the_document_and_the_field():
+def test_the_error_for_a_damaged_document_names_document_and_field():
     broken = pendulum.spec() | {"time_limit": "long"}
     with pytest.raises(Damaged, match=r"^a stored specification can't be read: time_limit: expected a whole number"):
         read_stored(EnvironmentSpec, "a stored specification", broken)

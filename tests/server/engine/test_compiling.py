@@ -21,7 +21,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_first_server_compiles_in_a_process_of_its_own(folder: Path, monkeypatch: pytest.MonkeyPatch):
+def test_without_a_compile_cache_the_server_compiles_in_a_separate_process(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
     done = folder / "done"
     monkeypatch.setattr(compiling, "PROGRAM", f"open({str(done)!r}, 'w').close()")
     ahead = Compiling()
@@ -31,14 +33,16 @@ def test_first_server_compiles_in_a_process_of_its_own(folder: Path, monkeypatch
     ahead.close()
 
 
-def test_later_server_starts_no_process(folder: Path, monkeypatch: pytest.MonkeyPatch):
+def test_with_a_filled_compile_cache_the_server_starts_no_compile_process(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(compiling.subprocess, "Popen", lambda *_, **__: pytest.fail("nothing is left to compile"))
     (folder / "step").mkdir()
     (folder / "step" / "step.nbi").touch()
     Compiling().start()
 
 
-def test_server_that_closes_ends_the_process(folder: Path, monkeypatch: pytest.MonkeyPatch):
+def test_closing_the_server_ends_its_compile_process(folder: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(compiling, "PROGRAM", "import time; time.sleep(600)")
     ahead = Compiling()
     ahead.start()

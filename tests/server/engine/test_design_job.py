@@ -29,7 +29,7 @@ def job() -> DesignJob:
     return DesignJob(definition, columns(steps), state={}, budget=20, target=0.999)
 
 
-def test_the_same_job_in_another_process_form_gives_the_same_result(job):
+def test_a_pickled_design_job_gives_the_same_result(job):
     one, two = run_design_job(job), run_design_job(pickle.loads(pickle.dumps(job)))
     assert one.model == two.model
     assert one.fidelity == two.fidelity
@@ -37,13 +37,13 @@ def test_the_same_job_in_another_process_form_gives_the_same_result(job):
     assert one.data_hash == two.data_hash
 
 
-def test_a_result_is_pickled_and_its_state_json(job):
+def test_a_design_result_can_be_pickled_and_its_state_is_json(job):
     result = pickle.loads(pickle.dumps(run_design_job(job)))
     again = replace(job, state=json.loads(json.dumps(result.state)))
     assert run_design_job(again).state["round"] == 2
 
 
-def test_the_model_is_complete_and_the_fidelity_is_the_wires(job):
+def test_the_model_bytes_and_fidelity_of_a_design_result_can_be_read_back(job):
     result = run_design_job(job)
     model = from_bytes(job.definition, result.model)
     assert model.samples == len(job.samples) == result.fidelity["samples"]
@@ -54,7 +54,7 @@ def test_the_model_is_complete_and_the_fidelity_is_the_wires(job):
     assert fidelity.outputs[0].structure.startswith("squared exponential")
 
 
-def test_queries_are_inside_the_sampling_range(job):
+def test_the_queries_of_a_design_job_are_inside_the_sampling_range(job):
     result = run_design_job(replace(job, extra_queries=4))
     q, u = arrays(result.queries)
     assert (q.shape[1:], u.shape[1:]) == ((2,), (1,))
@@ -62,7 +62,7 @@ def test_queries_are_inside_the_sampling_range(job):
     assert (u.abs() <= 2).all()
 
 
-def test_pending_queries_and_occupancy_are_passed_on(job):
+def test_a_design_job_uses_pending_queries_and_visited_states(job):
     hungry = replace(job, budget=len(job.samples) + 2, state={"round": 1, "usual": [1e-12] * 3})
     assert len(run_design_job(hungry).queries) == 2
     pending = replace(hungry, pending=(Query.step((1.0, 1.0), (0.0,)),))
@@ -84,7 +84,7 @@ def scored(result: DesignResult) -> list[int]:
     return [0 if output.prequential is None else output.prequential.predictions for output in outputs]
 
 
-def test_new_samples_are_predicted_by_the_model_before(job):
+def test_new_samples_are_scored_by_the_model_of_the_previous_round(job):
     """Over two rounds, as the scores are cumulative. No answer of this design ends at a limit."""
     first = run_design_job(replace(job, extra_queries=3))
     assert scored(first) == [0, 0, 0]
@@ -102,7 +102,7 @@ def test_new_samples_are_predicted_by_the_model_before(job):
     assert deviation > 0
 
 
-def test_scores_change_neither_the_model_nor_the_queries(job):
+def test_prediction_scores_change_neither_model_nor_queries(job):
     following = answered(job, run_design_job(replace(job, extra_queries=3)))
     scores, none = (run_design_job(replace(following, extra_queries=2, previous=p)) for p in (following.previous, None))
     assert scored(none) == [0, 0, 0]
@@ -111,7 +111,7 @@ def test_scores_change_neither_the_model_nor_the_queries(job):
     assert scores.queries == none.queries
 
 
-def test_only_chosen_samples_are_predicted_and_only_by_a_model_of_the_samples_before(job):
+def test_logged_samples_and_unusable_previous_models_give_no_prediction_scores(job):
     following = answered(job, run_design_job(replace(job, extra_queries=3)))
     purpose = (*following.samples.purpose[:-1], "logged")
     new = len(following.samples) - len(job.samples)

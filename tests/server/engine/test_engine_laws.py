@@ -20,7 +20,7 @@ SURROGATE = 5
 
 
 @pytest.mark.parametrize("law", LAWS_OF_ENGINES, ids=lambda law: law.__name__)
-def test_the_engine_of_this_process_keeps_the_laws(
+def test_the_local_engine_passes_the_laws_of_the_engine_interface(
     law, definition: EnvironmentDefinition, fitted: Callable[[int], DynamicsModel]
 ):
     def load(surrogate: int, version: int) -> DynamicsModel:
@@ -41,7 +41,7 @@ def test_the_engine_of_this_process_keeps_the_laws(
     asyncio.run(kept())
 
 
-def test_an_opening_waits_for_no_model_of_another_surrogate(
+def test_opening_a_session_does_not_wait_for_another_surrogates_model_to_load(
     definition: EnvironmentDefinition, fitted: Callable[[int], DynamicsModel]
 ):
     """The model of a long log takes long to load."""

@@ -47,14 +47,14 @@ def run(fits: Fits, **state: Any) -> DesignResult:
 
 
 @pytest.mark.usefixtures("cold")
-def test_a_job_is_done_in_another_process(started: Started):
+def test_fit_jobs_run_in_one_other_process(started: Started):
     fits = started(jobs.answer)
     assert run(fits).data_hash not in ("", str(os.getpid()))
     assert run(fits).data_hash == run(fits).data_hash, "one process does them all"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems don't allow a fork")
-def test_the_first_process_may_be_a_fork_which_ends_with_its_parent_too():
+def test_a_forked_fitting_process_ends_with_its_parent():
     """In a program of its own, because this one has threads."""
     program = """
 import asyncio, os, signal, sys
@@ -82,7 +82,7 @@ os.kill(os.getpid(), signal.SIGKILL)
         time.sleep(0.01)
 
 
-def test_it_yields_to_whoever_steps(started: Started):
+def test_the_fitting_process_has_a_lower_cpu_priority_than_the_server(started: Started):
     process = int(run(started(jobs.answer)).data_hash)
     mine = os.getpriority(os.PRIO_PROCESS, 0)
     assert os.getpriority(os.PRIO_PROCESS, process) == min(mine + NICENESS, 19)
@@ -100,7 +100,7 @@ RAISED = {
 }
 
 
-def test_a_jobs_error_arrives_as_text_and_ends_nothing(started: Started):
+def test_the_error_of_a_fit_job_arrives_as_text_and_the_process_continues(started: Started):
     """Not as the exception: one could end who receives it, and another can't be sent. One process does all."""
     fits = started(jobs.refuse)
     process = run(fits, answer=True).data_hash
@@ -113,7 +113,7 @@ def test_a_jobs_error_arrives_as_text_and_ends_nothing(started: Started):
         assert run(fits, answer=True).data_hash == process
 
 
-def test_a_job_that_is_cancelled_is_ended_and_others_do_not_wait_for_it(started: Started, tmp_path: Path):
+def test_a_cancelled_fit_job_is_killed_and_blocks_no_other_job(started: Started, tmp_path: Path):
     fits, mark = started(jobs.hang), tmp_path / "mark"
 
     async def cancel_while_it_hangs() -> int:
@@ -130,19 +130,19 @@ def test_a_job_that_is_cancelled_is_ended_and_others_do_not_wait_for_it(started:
     assert not _alive(process)
 
 
-def test_a_process_that_dies_is_replaced_and_the_job_done_again(started: Started, tmp_path: Path):
+def test_a_fitting_process_that_dies_is_replaced_and_its_job_repeated(started: Started, tmp_path: Path):
     mark = tmp_path / "died"
     assert run(started(jobs.die_once), mark=str(mark)).verdict == "ready"
     assert mark.exists()
 
 
-def test_a_job_that_kills_every_process_is_given_up(started: Started):
+def test_a_fit_job_whose_process_dies_twice_fails(started: Started):
     fits = started(jobs.die)
     with pytest.raises(Unavailable, match="died twice"):
         run(fits)
 
 
-def test_closing_ends_the_process_in_the_middle_of_a_fit(started: Started, tmp_path: Path):
+def test_closing_kills_the_fitting_process_during_a_fit(started: Started, tmp_path: Path):
     fits, mark = started(jobs.hang), tmp_path / "mark"
 
     async def close_while_it_hangs() -> int:
@@ -161,7 +161,7 @@ def test_closing_ends_the_process_in_the_middle_of_a_fit(started: Started, tmp_p
 
 
 @pytest.mark.usefixtures("cold")
-def test_closing_does_not_wait_for_a_process_that_is_still_starting(started: Started):
+def test_closing_does_not_wait_for_a_starting_fitting_process(started: Started):
     """It imports for seconds where others keep the machine busy, and a stop of the server would wait for it."""
     beginning = time.monotonic()
     run(started(jobs.answer))

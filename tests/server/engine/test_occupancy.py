@@ -17,13 +17,13 @@ def visit(batch: int, visits: int, seed: int = 5) -> Reservoir:
     return reservoir
 
 
-def test_all_are_kept_while_there_is_room():
+def test_all_visited_states_are_kept_below_the_reservoir_capacity():
     reservoir = visit(batch=7, visits=100)
     np.testing.assert_array_equal(reservoir.states[:, 0], np.arange(100))
     assert reservoir.visits == 100
 
 
-def test_the_sample_does_not_depend_on_the_batches(monkeypatch: pytest.MonkeyPatch):
+def test_the_reservoir_of_visited_states_does_not_depend_on_batch_sizes(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(occupancy, "CAPACITY", 100)  # batches of one take seconds to fill it
     visits = 211
     kept = [visit(batch, visits).states for batch in (1, 3, 64, visits)]
@@ -32,7 +32,7 @@ def test_the_sample_does_not_depend_on_the_batches(monkeypatch: pytest.MonkeyPat
         np.testing.assert_array_equal(other, kept[0])
 
 
-def test_beyond_its_capacity_it_is_a_uniform_sample():
+def test_a_full_reservoir_is_a_uniform_sample_of_all_visited_states():
     visits = 8 * CAPACITY
     reservoir = visit(batch=1000, visits=visits)
     assert reservoir.states.shape == (CAPACITY, 2)
@@ -42,12 +42,12 @@ def test_beyond_its_capacity_it_is_a_uniform_sample():
     assert np.abs(quarters - expected).max() < 5 * deviation
 
 
-def test_another_seed_keeps_others():
+def test_another_seed_keeps_other_visited_states_in_the_reservoir():
     kept = [set(visit(1000, 4 * CAPACITY, seed).states[:, 0]) for seed in (1, 2)]
     assert kept[0] != kept[1]
 
 
-def test_a_visit_changes_nothing_of_the_old_one():
+def test_adding_visited_states_returns_a_new_reservoir_and_keeps_the_old():
     before = visit(batch=10, visits=10)
     before.visit(np.zeros((5, 2)))
     assert (before.visits, len(before.states)) == (10, 10)

@@ -39,7 +39,7 @@ def stepped(fitted: Fitted, session: Session, action: float = 0.5, latest: int =
     return step_session(session, u, None, True, lambda version: fitted(VERSIONS[version]), latest)
 
 
-def test_lanes_of_two_versions_step_as_two_sessions_would(opened: Open, fitted: Fitted):
+def test_environments_of_two_model_versions_in_one_session_step_as_if_separate(opened: Open, fitted: Fitted):
     session, _ = reset_session(opened(), None, None, 1)
     one = [stepped(fitted, replace(session, versions=np.full(4, version)))[1] for version in (1, 2)]
     mixed, result = stepped(fitted, replace(session, versions=np.array([2, 1, 1, 2])))
@@ -51,7 +51,7 @@ def test_lanes_of_two_versions_step_as_two_sessions_would(opened: Open, fitted: 
     np.testing.assert_array_equal(mixed.versions, [2, 1, 1, 2])
 
 
-def test_lanes_of_two_versions_end_together(opened: Open, fitted: Fitted):
+def test_environments_of_two_model_versions_can_end_in_the_same_step(opened: Open, fitted: Fitted):
     session, _ = reset_session(opened(time_limit=1), None, None, 1)
     after, result = stepped(fitted, replace(session, versions=np.array([2, 1, 1, 2])))
     np.testing.assert_array_equal(result.final_lanes, [0, 1, 2, 3])
@@ -61,20 +61,20 @@ def test_lanes_of_two_versions_end_together(opened: Open, fitted: Fitted):
     np.testing.assert_array_equal(after.versions, [2, 2, 2, 2])
 
 
-def test_a_reset_moves_its_lanes_alone(opened: Open):
+def test_a_masked_reset_moves_only_those_environments_to_the_latest_model(opened: Open):
     session, _ = reset_session(opened(), None, None, 1)
     session, result = reset_session(session, None, np.array([True, False, False, True]), 2)
     np.testing.assert_array_equal(result.model_version, [2, 1, 1, 2])
 
 
-def test_a_mask_of_another_length_is_refused(opened: Open, fitted: Fitted):
+def test_a_step_mask_of_wrong_length_is_refused(opened: Open, fitted: Fitted):
     session, _ = reset_session(opened(), None, None, 1)
     session = replace(session, versions=np.array([1, 2, 1, 2]))
     with pytest.raises(InvalidInput, match="expected 4 entries, one for each lane, got 3"):
         step_session(session, np.zeros((4, 1)), np.ones(3, dtype=bool), False, fitted, 2)
 
 
-def test_only_stepped_lanes_count_as_visits(opened: Open, fitted: Fitted):
+def test_only_stepped_environments_add_visited_states(opened: Open, fitted: Fitted):
     session, _ = reset_session(opened(occupancy=True), None, None, 1)
     mask = np.array([True, False, False, False])
     session, _ = step_session(session, np.zeros((4, 1)), mask, False, lambda _: fitted(6), 1)
@@ -127,7 +127,7 @@ def test_a_saved_session_with_a_flipped_bit_is_refused_or_comes_back_the_same(
     assert refused > 150
 
 
-def test_pathwise_lanes_of_two_versions_step_side_by_side(opened: Open, fitted: Fitted):
+def test_pathwise_environments_of_two_model_versions_step_as_if_separate(opened: Open, fitted: Fitted):
     session, _ = reset_session(opened(variant="pathwise"), 11, None, 1)
     mixed = replace(session, versions=np.array([2, 1, 1, 2]))
     for _ in range(2):
@@ -140,7 +140,7 @@ def test_pathwise_lanes_of_two_versions_step_side_by_side(opened: Open, fitted: 
         np.testing.assert_allclose(result.observation[lane], expected.observation[lane], rtol=1e-6)
 
 
-def test_the_answer_of_a_reset_is_saved_too(opened: Open, definition: EnvironmentDefinition):
+def test_a_saved_session_replays_its_last_reset_reply(opened: Open, definition: EnvironmentDefinition):
     session, result = reset_session(opened(), 5, None, 1)
     session, _ = answered(session, Fingerprint("digest"), result)
     back = session_from_bytes(definition, session_to_bytes(session))
@@ -150,7 +150,9 @@ def test_the_answer_of_a_reset_is_saved_too(opened: Open, definition: Environmen
 
 
 @pytest.mark.parametrize("noise", [None, NoiseKey(3)])
-def test_the_answer_to_a_policy_is_saved_too(opened: Open, fitted: Fitted, definition: EnvironmentDefinition, noise):
+def test_a_saved_session_replays_its_last_policy_rollout_reply(
+    opened: Open, fitted: Fitted, definition: EnvironmentDefinition, noise
+):
     session, _ = reset_session(opened(trust=100.0, autoreset_mode="same_step", time_limit=2), 5, None, 1)
 
     def step(session: Session, u: np.ndarray) -> tuple[Session, StepResult]:
@@ -162,7 +164,7 @@ def test_the_answer_to_a_policy_is_saved_too(opened: Open, fitted: Fitted, defin
     assert_same_rollout(replay(back, 1, Fingerprint("digest")).outcome, rollout)
 
 
-def test_only_the_next_seq_and_a_repeat_of_the_last_are_taken(opened: Open):
+def test_only_the_next_sequence_number_or_an_exact_repeat_is_accepted(opened: Open):
     session, result = reset_session(opened(), None, None, 1)
     a, b = Fingerprint("step", "a"), Fingerprint("step", "b")
     assert replay(session, 1, a) is None

@@ -61,7 +61,7 @@ class Slow:
         return work(session)
 
 
-def test_a_repeat_while_the_first_runs_waits_for_its_answer(live: LiveSessions, opened: Open):
+def test_a_repeated_request_waits_for_the_reply_of_the_running_one(live: LiveSessions, opened: Open):
     slow = Slow()
     live.add(opened())
 
@@ -77,7 +77,7 @@ def test_a_repeat_while_the_first_runs_waits_for_its_answer(live: LiveSessions, 
     assert (slow.begun, live.get("s").seq) == (1, 1)
 
 
-def test_another_session_and_the_event_loop_continue_meanwhile(live: LiveSessions, opened: Open):
+def test_a_slow_request_does_not_block_another_session(live: LiveSessions, opened: Open):
     slow = Slow()
     live.add(opened("slow"))
     live.add(opened("quick"))
@@ -92,7 +92,7 @@ def test_another_session_and_the_event_loop_continue_meanwhile(live: LiveSession
     asyncio.run(both())
 
 
-def test_a_step_does_not_queue_behind_rollouts(opened: Open):
+def test_a_step_does_not_wait_for_the_rollouts_of_other_sessions(opened: Open):
     slow = Slow()
     with ThreadPoolExecutor(1) as steps, ThreadPoolExecutor(1) as rollouts:
         live = LiveSessions(Threads(steps, 1), Threads(rollouts, 1), limits=LIMITS, idle_seconds=10)
@@ -113,7 +113,7 @@ def test_a_step_does_not_queue_behind_rollouts(opened: Open):
 
 
 @pytest.mark.parametrize(("end", "error"), [("close", UnknownSession), ("stop", Unavailable)])
-def test_long_work_ends_when_its_session_or_the_server_does(opened: Open, end: str, error: type[Exception]):
+def test_a_running_rollout_ends_when_its_session_or_the_server_closes(opened: Open, end: str, error: type[Exception]):
     begun = threading.Event()
     with ThreadPoolExecutor(1) as steps, ThreadPoolExecutor(1) as rollouts:
         live = LiveSessions(Threads(steps, 1), Threads(rollouts, 1), limits=LIMITS, idle_seconds=10)
@@ -135,7 +135,7 @@ def test_long_work_ends_when_its_session_or_the_server_does(opened: Open, end: s
         asyncio.run(run())
 
 
-def test_work_that_fails_changes_nothing(live: LiveSessions, opened: Open):
+def test_a_failed_step_leaves_the_session_unchanged(live: LiveSessions, opened: Open):
     live.add(opened())
 
     def fail(session: Session) -> tuple[Session, Outcome]:
@@ -153,7 +153,7 @@ def test_work_that_fails_changes_nothing(live: LiveSessions, opened: Open):
     asyncio.run(run())
 
 
-def test_quick_work_is_done_without_a_thread_once_it_is_known(live: LiveSessions, opened: Open):
+def test_steps_measured_as_quick_run_in_the_event_loop_thread(live: LiveSessions, opened: Open):
     live.add(opened())
     threads: list[str] = []
 
@@ -170,7 +170,9 @@ def test_quick_work_is_done_without_a_thread_once_it_is_known(live: LiveSessions
     assert threads[-1] == threading.current_thread().name
 
 
-def test_an_idle_session_expires_with_an_error_of_its_own(live: LiveSessions, opened: Open, clock: Clock):
+def test_an_idle_session_expires_and_later_requests_get_a_specific_error(
+    live: LiveSessions, opened: Open, clock: Clock
+):
     live.add(opened("idle"))
     live.add(opened("used"))
     clock.now = 9
@@ -184,7 +186,7 @@ def test_an_idle_session_expires_with_an_error_of_its_own(live: LiveSessions, op
     assert live.get("used").seq == 1
 
 
-def test_a_session_at_work_is_not_idle(live: LiveSessions, opened: Open, clock: Clock):
+def test_a_session_with_a_running_request_does_not_expire(live: LiveSessions, opened: Open, clock: Clock):
     slow = Slow()
     live.add(opened())
 
@@ -201,7 +203,7 @@ def test_a_session_at_work_is_not_idle(live: LiveSessions, opened: Open, clock: 
     asyncio.run(run())
 
 
-def test_no_more_than_the_limit_are_open(live: LiveSessions, opened: Open):
+def test_opening_more_sessions_than_the_limit_is_refused(live: LiveSessions, opened: Open):
     for id in ("a", "b"):
         live.add(opened(id))
     with pytest.raises(Overloaded, match="fewer than 2"):
@@ -212,7 +214,7 @@ def test_no_more_than_the_limit_are_open(live: LiveSessions, opened: Open):
     assert {session.id for session in live} == {"b", "c"}
 
 
-def test_all_sessions_together_have_a_limit_of_memory(live: LiveSessions, opened: Open):
+def test_sessions_and_rollouts_beyond_the_total_memory_limit_are_refused(live: LiveSessions, opened: Open):
     particles = {"variant": "probabilistic", "particles": 10_000}  # 4 lanes of 2 coordinates: 0.6 MiB
     live.add(opened("a", **particles))
     with pytest.raises(Overloaded, match=r"at most 1\.0 MiB, got 0\.6 MiB and 0\.6 MiB more"):
@@ -228,7 +230,7 @@ def test_all_sessions_together_have_a_limit_of_memory(live: LiveSessions, opened
     assert {session.id for session in live} == {"a", "small"}
 
 
-def test_requests_beyond_the_queue_are_refused(live: LiveSessions, opened: Open):
+def test_requests_beyond_the_queue_limit_are_refused(live: LiveSessions, opened: Open):
     slow = Slow()
     live.add(opened())
 
@@ -244,7 +246,9 @@ def test_requests_beyond_the_queue_are_refused(live: LiveSessions, opened: Open)
     asyncio.run(run())
 
 
-def test_a_request_that_would_be_late_is_never_begun(live: LiveSessions, opened: Open, clock: Clock):
+def test_a_request_that_cannot_meet_its_deadline_is_refused_before_it_starts(
+    live: LiveSessions, opened: Open, clock: Clock
+):
     slow = Slow()
     live.add(opened("known"))
     live.add(opened("waiting"))

@@ -39,7 +39,7 @@ def answer(seq: int, *results: StepResult) -> Reply:
 
 
 @pytest.mark.parametrize("gathered", [1, 10**6])
-def test_returns_are_sums_between_ends(gathered: int, monkeypatch: pytest.MonkeyPatch):
+def test_the_episode_return_is_the_sum_of_rewards_between_episode_ends(gathered: int, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(tallies, "FOLD_LANE_STEPS", gathered)
     tally = Tally(Clock())
     tally.stepped(answer(2, result([1, 10], [False, False])))
@@ -52,7 +52,7 @@ def test_returns_are_sums_between_ends(gathered: int, monkeypatch: pytest.Monkey
     assert [episode.penalty for episode in read.recent] == [1.0, 1.5, 1.0]
 
 
-def test_the_steps_of_a_policy_count_as_single_steps():
+def test_rollout_steps_are_counted_like_single_steps_in_statistics():
     several, one = Tally(Clock()), Tally(Clock())
     steps = [result([1, 10], [False, False]), result([2, 20], [True, False]), result([4, 40], [False, True])]
     one.stepped(answer(2, *steps))
@@ -62,7 +62,7 @@ def test_the_steps_of_a_policy_count_as_single_steps():
     assert several.read(None) == one.read(None)  # type: ignore[arg-type]
 
 
-def test_a_reset_drops_unfinished_episodes():
+def test_a_reset_drops_unfinished_episodes_from_the_statistics():
     tally = Tally(Clock())
     tally.stepped(answer(2, result([1, 10], [False, False])))
     tally.reset(np.array([True, False]))
@@ -70,7 +70,7 @@ def test_a_reset_drops_unfinished_episodes():
     assert [episode.reward for episode in tally.read(None).recent] == [2, 30]  # type: ignore[arg-type]
 
 
-def test_the_rate_is_right_from_the_start_and_falls_in_silence():
+def test_the_steps_per_second_figure_falls_when_no_steps_arrive():
     clock = Clock()
     tally = Tally(clock)
     for seq in range(2, 102):

@@ -14,26 +14,26 @@ DISCRETE = ActionDefinition("discrete", nvec=(3,))
 SEVERAL = ActionDefinition("multi_discrete", nvec=(3, 2))
 
 
-def test_bins_are_equally_spaced_values_between_the_bounds():
+def test_discretised_actions_are_equally_spaced_between_the_action_bounds():
     numbers = np.array([[0, 0], [1, 1], [2, 2], [4, 0]])
     np.testing.assert_array_equal(policy_actions(BINS, numbers, 4), [[-2, 0], [-1, 0.5], [0, 1], [2, 0]])
 
 
-def test_queries_and_samples_carry_continuous_values_whatever_the_bins():
+def test_real_queries_and_samples_may_use_actions_between_the_bins():
     np.testing.assert_array_equal(model_actions(BINS, np.array([[0.3, 0.7]])), [[0.3, 0.7]])
 
 
-def test_one_entry_may_come_without_its_axis():
+def test_one_dimensional_actions_may_be_given_as_a_flat_array():
     np.testing.assert_array_equal(policy_actions(TORQUE, np.array([1.0, -1.0]), 2), [[1.0], [-1.0]])
     np.testing.assert_array_equal(policy_actions(DISCRETE, np.array([2, 0]), 2), [[2.0], [0.0]])
 
 
-def test_discrete_numbers_pass_as_they_are():
+def test_discrete_actions_pass_unchanged():
     np.testing.assert_array_equal(policy_actions(SEVERAL, np.array([[2, 1], [0, 0]]), 2), [[2, 1], [0, 0]])
     np.testing.assert_array_equal(model_actions(SEVERAL, np.array([[2.0, 1.0]])), [[2, 1]])
 
 
-def test_a_float32_bound_may_round_to_just_outside_and_is_clipped():
+def test_an_action_outside_its_bound_by_float32_rounding_is_clipped():
     tenth = ActionDefinition("box", low=(-0.1,), high=(0.1,))
     rounded = np.array([[np.float32(0.1)]], dtype=np.float64)
     assert rounded[0, 0] > 0.1
@@ -43,7 +43,7 @@ def test_a_float32_bound_may_round_to_just_outside_and_is_clipped():
 
 
 @pytest.mark.parametrize("count", [-1, 3])
-def test_a_choice_out_of_range_is_refused_with_its_entry_and_row(count):
+def test_a_discrete_action_out_of_range_is_refused_with_its_entry_and_row(count):
     with pytest.raises(InvalidInput, match=rf"entry 0 in 0\.\.2, got {count} in row 1"):
         policy_actions(DISCRETE, np.array([[0], [count]]), 2)
 
@@ -62,12 +62,12 @@ def test_a_choice_out_of_range_is_refused_with_its_entry_and_row(count):
         (SEVERAL, np.array([[0, 0], [0, 2]]), r"entry 1 in 0\.\.1, got 2 in row 1"),
     ],
 )
-def test_what_is_refused(action, raw, complaint):
+def test_invalid_policy_actions_are_refused(action, raw, complaint):
     with pytest.raises(InvalidInput, match=complaint):
         policy_actions(action, raw, 2)
 
 
-def test_samples_are_checked_as_policies_are():
+def test_invalid_actions_in_samples_are_refused():
     for action, raw in ((BINS, [[2.5, 0]]), (DISCRETE, [[1.5]]), (DISCRETE, [[3]]), (BOX, [[np.nan, 0]])):
         with pytest.raises(InvalidInput):
             model_actions(action, np.array(raw))

@@ -26,7 +26,7 @@ def spun(fastest: float, count: int = 60, seed: int = 0) -> tuple[Tensor, Tensor
 
 
 @pytest.mark.parametrize("fastest", [30.0, 60.0])
-def test_more_than_half_a_turn_within_a_step_is_unwrapped(
+def test_an_angle_that_turns_more_than_half_a_circle_per_step_is_unwrapped(
     pendulum_definition: EnvironmentDefinition, fastest: float
 ) -> None:
     q, q_next, change = spun(fastest)
@@ -39,12 +39,12 @@ def test_a_slow_angle_keeps_its_increment_bit_for_bit(pendulum_definition: Envir
     assert torch.equal(angle_increments(pendulum_definition, q, q_next), wrap(q_next - q)[:, :1])
 
 
-def test_no_turns_are_seen_where_speeds_explain_nothing(pendulum_definition: EnvironmentDefinition) -> None:
+def test_angles_unrelated_to_the_speeds_are_not_unwrapped(pendulum_definition: EnvironmentDefinition) -> None:
     rng = torch.Generator().manual_seed(1)
     q, q_next = (6 * torch.rand(60, 2, generator=rng, dtype=torch.float64) - 3 for _ in range(2))
     assert torch.equal(angle_increments(pendulum_definition, q, q_next), wrap(q_next - q)[:, :1])
 
 
-def test_too_few_steps_are_left_as_they_are(pendulum_definition: EnvironmentDefinition) -> None:
+def test_angles_of_too_few_steps_are_not_unwrapped(pendulum_definition: EnvironmentDefinition) -> None:
     q, q_next, _ = spun(60.0, count=5)
     assert torch.equal(angle_increments(pendulum_definition, q, q_next), wrap(q_next - q)[:, :1])

@@ -24,7 +24,7 @@ def assert_features(made: torch.Tensor, *expected: float) -> None:
     torch.testing.assert_close(made, row(*expected), rtol=1e-12, atol=1e-12)
 
 
-def test_angles_speeds_and_torque_of_the_pendulum(pendulum_definition):
+def test_pendulum_features_are_scaled_angle_speed_and_torque(pendulum_definition):
     q, u = row(2.0, 4.0), row(1.0)
     speed, torque, angle = 4 / (16 / math.sqrt(12)), 1 * math.sqrt(12) / 4, 2 * math.sqrt(3) / math.pi
     for state, expected in (
@@ -35,13 +35,13 @@ def test_angles_speeds_and_torque_of_the_pendulum(pendulum_definition):
         assert_features(encode(pendulum_definition, FeatureMap(state), q, u), *expected)
 
 
-def test_the_papers_observation_is_shown_as_it_is():
+def test_with_preset_paper_the_features_are_the_observation():
     paper = definition_from_spec(pendulum().model_copy(update={"design": Design(preset="paper")}))
     made = encode(paper, FeatureMap("observation"), row(2.0, 4.0), row(1.0))
     assert_features(made, math.cos(2), math.sin(2), 4.0, math.sqrt(12) / 4)
 
 
-def test_the_lead_is_one_more_input(pendulum_definition):
+def test_the_predicted_next_speed_can_be_an_additional_input(pendulum_definition):
     made = encode(pendulum_definition, FeatureMap("wrapped", lead=True), row(0, 0), row(0), row(8.0))
     assert_features(made, 0, 0, 0, math.sqrt(3))
 
@@ -61,20 +61,20 @@ def test_discrete_actions_as_values_have_mean_zero_and_deviation_one(pendulum_de
     assert float(column.std(correction=0)) == pytest.approx(1)
 
 
-def test_one_hot_actions(pendulum_definition):
+def test_discrete_actions_can_be_encoded_one_hot(pendulum_definition):
     definition = replace(pendulum_definition, action=ActionDefinition("multi_discrete", nvec=(3, 2)))
     made = encode(definition, FeatureMap("wrapped", "one_hot"), row(0, 0), row(2, 1))
     assert_features(made, 0, 0, 0, 0, 1, 1)
 
 
-def test_limited_speeds_lead_and_walls_do_not():
+def test_next_speeds_are_offered_as_inputs_only_for_speeds_with_limits():
     assert leading(definition_from_spec(pendulum())) == (1,)
     assert leading(definition_from_spec(mountain_car_continuous())) == (1,)
     assert leading(definition_from_spec(acrobot())) == (2, 3)
 
 
 @pytest.mark.parametrize("task", [pendulum, acrobot, mountain_car_continuous])
-def test_features_of_several_maps_at_once_are_those_of_each(task):
+def test_encoding_several_feature_maps_at_once_equals_encoding_each_alone(task):
     definition = definition_from_spec(task())
     maps = candidates(definition, follows=True)
     rng = torch.Generator().manual_seed(0)

@@ -41,7 +41,7 @@ def defined(**lags: dict[str, Any]) -> EnvironmentDefinition:
     return definition_from_spec(EnvironmentSpec.model_validate(described(**lags)))
 
 
-def test_each_kind_of_lag_repeats_its_source():
+def test_each_kind_of_lagged_coordinate_repeats_its_source_value():
     definition = defined(**LAGS)
     q = torch.tensor([[3.0, 1.0, 9.0, 0.5, 9.0, 9.0, 9.0]], dtype=torch.float64)
     u = torch.tensor([[0.25, -0.75]], dtype=torch.float64)
@@ -52,7 +52,7 @@ def test_each_kind_of_lag_repeats_its_source():
     assert not arrived[0, 2:].any()
 
 
-def test_steps_are_counted_to_the_bound():
+def test_a_step_counter_coordinate_stops_at_its_upper_bound():
     definition = definition_from_spec(EnvironmentSpec.model_validate(counting(2.0)))
     q, still = torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
     known = []
@@ -73,12 +73,12 @@ def counting(high: float | None) -> dict[str, Any]:
     return fields
 
 
-def test_a_count_without_an_end_is_refused():
+def test_a_step_counter_coordinate_without_upper_bound_is_refused():
     with pytest.raises(ValidationError, match="needs an upper bound above 0"):
         EnvironmentSpec.model_validate(counting(None))
 
 
-def test_two_counts_are_refused():
+def test_two_step_counter_coordinates_are_refused():
     fields = counting(2.0)
     second = fields["coordinates"][2] | {"name": "again"}
     fields |= {"coordinates": [*fields["coordinates"], second], "start": fields["start"] | {"again": WIDE}}
@@ -86,7 +86,7 @@ def test_two_counts_are_refused():
         EnvironmentSpec.model_validate(fields)
 
 
-def test_a_lag_is_no_output_of_the_model():
+def test_the_model_does_not_predict_lagged_coordinates():
     assert defined(**LAGS).outputs == ("angle", "level", "reward")
 
 
@@ -101,18 +101,18 @@ def test_a_lag_is_no_output_of_the_model():
         ({"kind": "steps", "of": "level"}, "expected no entry and no 'of'"),
     ],
 )
-def test_a_lag_without_a_source_is_refused(lag, message):
+def test_a_lagged_coordinate_without_a_source_is_refused(lag, message):
     with pytest.raises(ValidationError, match=message):
         EnvironmentSpec.model_validate(described(lagged=lag))
 
 
-def test_lags_where_any_state_can_be_set_are_refused():
+def test_lagged_coordinates_are_refused_where_queries_set_any_state():
     with pytest.raises(ValidationError, match=r"has no past, .* expected query 'rollout', got 'step'"):
         EnvironmentSpec.model_validate(described(**LAGS) | {"query": "step"})
 
 
 @pytest.mark.parametrize("limit", ["time_limit", "max_rollout"])
-def test_a_lag_as_old_as_an_episode_is_refused(limit):
+def test_a_lag_longer_than_an_episode_is_refused(limit):
     lags = {"u1": {"kind": "action", "entry": 0}, "u2": {"kind": "value", "of": "u1"}}
     assert EnvironmentSpec.model_validate(described(**lags) | {limit: 3})
     with pytest.raises(ValidationError, match="looks 2 steps back: expected fewer than an episode's 2"):

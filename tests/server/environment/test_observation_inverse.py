@@ -24,14 +24,14 @@ PAPER = Design(preset="paper")
 
 
 @pytest.mark.parametrize("task", [pendulum, cartpole_of_the_paper, acrobot])
-def test_what_is_observed_is_read_back(task):
+def test_coordinates_are_recovered_from_their_observation(task):
     definition = definition_from_spec(task().model_copy(update={"design": PAPER}))
     q = torch.rand(20, len(definition.coordinates), generator=torch.manual_seed(0), dtype=torch.float64) * 3 - 1.5
     recovered = ObservationInverse.of(definition)(definition.observe(q), torch.zeros_like(q))
     torch.testing.assert_close(recovered, q, rtol=0, atol=1e-12)
 
 
-def test_an_observation_off_the_circle_still_has_an_angle():
+def test_an_angle_is_recovered_from_a_cosine_and_sine_off_the_unit_circle():
     inverse = ObservationInverse.of(definition_from_spec(pendulum()))
     o = torch.tensor([[0.3, 0.3, 1.0], [-2.0, 0.0, 1.0]], dtype=torch.float64)
     angles = inverse(o, torch.zeros(2, 2, dtype=torch.float64))[:, 0]
@@ -52,13 +52,13 @@ def reacher(*observed: ObservationEntry) -> EnvironmentSpec:
     )
 
 
-def test_a_clip_without_effect_is_accepted():
+def test_an_observation_clipped_beyond_its_range_can_be_inverted():
     clipped = ObservationEntry(name="o", term=Term.linear(joint=1).clipped(-4, 4))
     inverse = ObservationInverse.of(definition_from_spec(reacher(clipped)))
     assert inverse.sources == ((0, (0,)),)
 
 
-def test_constants_are_kept_and_need_not_be_observed():
+def test_constant_coordinates_keep_their_value_and_need_not_be_observed():
     observed = (
         ObservationEntry(name="sin", term=Term.sin(joint=1)),
         ObservationEntry(name="cos", term=Term.cos(joint=1)),

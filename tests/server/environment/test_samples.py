@@ -13,13 +13,13 @@ def samples(q: list[list[float]], q_next: list[list[float]]) -> Samples:
     return Samples(at, torch.zeros(n, 1), to, torch.zeros(n), torch.zeros(n, dtype=torch.bool))
 
 
-def test_angles_increase_the_short_way_round(pendulum_definition):
+def test_angle_increments_take_the_shorter_direction_round_the_circle(pendulum_definition):
     made = increments(pendulum_definition, samples([[3.1, 1.0], [-3.1, -1.0]], [[-3.1, 1.5], [3.1, -2.0]]))
     expected = torch.tensor([[2 * torch.pi - 6.2, 0.5], [6.2 - 2 * torch.pi, -1.0]], dtype=torch.float64)
     torch.testing.assert_close(made, expected)
 
 
-def test_constants_are_no_target(pendulum_definition):
+def test_constant_coordinates_are_not_learned(pendulum_definition):
     angle, speed = pendulum_definition.coordinates
     definition = replace(pendulum_definition, coordinates=(replace(angle, kind="constant"), speed))
     torch.testing.assert_close(
@@ -27,7 +27,7 @@ def test_constants_are_no_target(pendulum_definition):
     )
 
 
-def test_samples_that_end_at_a_bound_are_saturated(pendulum_definition, mountain_car_definition):
+def test_samples_that_end_at_a_coordinate_bound_are_marked_saturated(pendulum_definition, mountain_car_definition):
     ends = torch.tensor([[0.0, 8.0], [0.0, -8.0], [0.0, 7.999], [0.0, 8.0 - 1e-12]], dtype=torch.float64)
     assert saturated(pendulum_definition, ends).tolist() == [True, True, False, True]
     ends = torch.tensor([[-1.2, 0.0], [0.0, 0.07], [0.5, 0.0]], dtype=torch.float64)

@@ -34,20 +34,20 @@ def by_hand(term: TermDefinition, q: tuple[float, ...]) -> float:
 
 
 @given(terms=st.lists(term, min_size=1, max_size=4), points=st.lists(st.tuples(*[numbers] * 3), min_size=1))
-def test_compiled_terms_are_their_sums(terms, points):
+def test_compiled_terms_equal_the_sum_computed_by_hand(terms, points):
     values = compile_terms(terms, COORDINATES)(torch.tensor(points, dtype=torch.float64))
     assert values.shape == (len(points), len(terms))
     expected = [[by_hand(t, q) for t in terms] for q in points]
     torch.testing.assert_close(values, torch.tensor(expected, dtype=torch.float64), rtol=1e-9, atol=1e-9)
 
 
-def test_terms_keep_leading_dimensions():
+def test_compiled_terms_keep_leading_batch_dimensions():
     compiled = compile_terms([TermDefinition((PartDefinition("sin", 2.0, (1.0, 0.0, 0.0)),))], COORDINATES)
     assert compiled(torch.zeros(4, 5, 3, dtype=torch.float64)).shape == (4, 5, 1)
 
 
 @given(angle=st.floats(-1e3, 1e3))
-def test_wrapped_angles_are_on_the_circle_and_the_same_direction(angle):
+def test_wrapping_an_angle_changes_it_by_whole_turns_into_plus_minus_pi(angle):
     wrapped = float(wrap(torch.tensor(angle, dtype=torch.float64)))
     assert -math.pi <= wrapped <= math.pi
     turns = (angle - wrapped) / (2 * math.pi)
@@ -70,13 +70,15 @@ def speed_is(relation, value):
     ("relation", "ends"),
     [("<", [1, 0, 0]), ("<=", [1, 1, 0]), (">", [0, 0, 1]), (">=", [0, 1, 1])],
 )
-def test_each_relation_at_its_bound(pendulum_definition: EnvironmentDefinition, relation, ends):
+def test_each_inequality_relation_is_evaluated_exactly_at_its_bound(
+    pendulum_definition: EnvironmentDefinition, relation, ends
+):
     definition = replace(pendulum_definition, termination_groups=((x_is(relation, 1.0),),))
     q = torch.tensor([[0.5, 0.0], [1.0, 0.0], [1.5, 0.0]], dtype=torch.float64)
     assert definition.terminated(q).tolist() == [bool(e) for e in ends]
 
 
-def test_an_episode_ends_when_any_group_holds_as_a_whole(pendulum_definition: EnvironmentDefinition):
+def test_an_episode_terminates_when_all_conditions_of_any_group_hold(pendulum_definition: EnvironmentDefinition):
     groups = ((x_is(">", 1.0), speed_is(">", 0.0)), (speed_is("<", -5.0),))
     definition = replace(pendulum_definition, termination_groups=groups)
     q = torch.tensor([[2.0, 1.0], [2.0, -1.0], [0.0, 1.0], [0.0, -6.0]], dtype=torch.float64)

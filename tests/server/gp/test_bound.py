@@ -70,7 +70,7 @@ def drawn(
 
 @settings(max_examples=40)
 @kernels
-def test_the_gradient_is_that_of_finite_differences(linear, quadratic, seed, noise, parity):
+def test_the_gradient_of_the_sparse_bound_equals_finite_differences(linear, quadratic, seed, noise, parity):
     x, y, options, reflection, theta = drawn(linear, quadratic, seed, noise, parity)
     bound = Bound(x, y, torch.arange(0, 20, 3), options, reflection)
     _, gradient = bound(theta)
@@ -82,7 +82,7 @@ def test_the_gradient_is_that_of_finite_differences(linear, quadratic, seed, noi
 
 @settings(max_examples=40)
 @kernels
-def test_it_never_exceeds_the_evidence(linear, quadratic, seed, noise, parity):
+def test_the_sparse_bound_never_exceeds_the_log_marginal_likelihood(linear, quadratic, seed, noise, parity):
     x, y, options, reflection, theta = drawn(linear, quadratic, seed, noise, parity)
     negative, _ = Evidence(x, y, options, reflection)(theta)
     costs = [Bound(x, y, torch.arange(m), options, reflection)(theta)[0] for m in (1, 3, 8, 20)]
@@ -92,7 +92,9 @@ def test_it_never_exceeds_the_evidence(linear, quadratic, seed, noise, parity):
 
 @settings(max_examples=40)
 @kernels
-def test_with_all_points_it_is_the_evidence(linear, quadratic, seed, noise, parity):
+def test_with_all_points_as_inducing_points_the_bound_equals_the_marginal_likelihood(
+    linear, quadratic, seed, noise, parity
+):
     """But for the jitter, which is as small as 1e-9 of the prior's variance."""
     x, y, options, reflection, theta = drawn(linear, quadratic, seed, noise, parity)
     whole = Bound(x, y, torch.arange(len(y)), options, reflection)
@@ -121,7 +123,7 @@ class Reference(gpytorch.models.ExactGP):
         return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
 
 
-def test_it_is_gpytorchs_bound():
+def test_the_sparse_bound_equals_that_of_gpytorch():
     x, y = points(60, 3, seed=0)
     hyper = Hyperparameters(torch.tensor([0.8, 1.7, 3.1], dtype=torch.float64), 1.6, 0.7, 0.0, 0.02)
     chosen = pivots(hyper, x, 12)
@@ -143,7 +145,7 @@ def fitted(x: Tensor, y: Tensor, inducing: int) -> Posterior:
     return fit_bound(x, y, FitOptions(), start, inducing)
 
 
-def test_a_fit_learns_the_function_and_the_noise():
+def test_a_sparse_fit_by_the_bound_recovers_function_and_noise():
     x, y = points(3_000, 2, seed=1)
     scale = y.std(correction=0)
     found, (at, _) = fitted(x, (y - y.mean()) / scale, 60), points(1_000, 2, seed=2)
@@ -154,7 +156,7 @@ def test_a_fit_learns_the_function_and_the_noise():
     assert math.sqrt(found.hyper.noise_variance) * float(scale) == pytest.approx(NOISE, rel=0.05)
 
 
-def test_what_inducing_points_leave_counts_as_noise():
+def test_variation_unexplained_by_inducing_points_is_learned_as_noise():
     """A fit to a subset would take six points for enough, and be sure of what they leave."""
     x, y = points(600, 2, seed=3)
     y = (y - y.mean()) / y.std(correction=0)
@@ -165,7 +167,7 @@ def test_what_inducing_points_leave_counts_as_noise():
     assert float(within.double().mean()) > 0.9
 
 
-def test_a_process_of_so_few_points_is_exact():
+def test_a_fit_with_as_many_inducing_points_as_samples_is_exact():
     x, y = points(40, 2, seed=4)
     found = fitted(x, y, 40)
     exact = condition(found.hyper, x, y)
@@ -173,7 +175,7 @@ def test_a_process_of_so_few_points_is_exact():
     torch.testing.assert_close(found.weights, exact.weights, rtol=0, atol=0)
 
 
-def test_inputs_that_are_not_read_are_left_out():
+def test_a_sparse_fit_leaves_out_irrelevant_inputs_unless_protected():
     x, y = points(1_500, 6, seed=5)
     y = (y - y.mean()) / y.std(correction=0)
     whole, may = fitted(x, y, 60), torch.ones(6, dtype=torch.bool)
@@ -187,13 +189,13 @@ def test_inputs_that_are_not_read_are_left_out():
     assert again.mask.tolist() == [True, True, False, False, True, False]
 
 
-def test_inputs_that_are_read_are_kept():
+def test_a_sparse_fit_keeps_relevant_inputs():
     x, y = points(1_500, 2, seed=6)
     y = (y - y.mean()) / y.std(correction=0)
     assert fewer_inputs(x, y, fitted(x, y, 60), FitOptions(), 60, torch.ones(2, dtype=torch.bool), -1.0) is None
 
 
-def test_an_odd_process_keeps_an_input_that_turns():
+def test_a_sparse_odd_process_keeps_an_input_whose_sign_it_mirrors():
     """Of a function that is zero everywhere else nothing would be left."""
     x, _ = points(600, 2, seed=7)
     y = 0.01 * torch.from_numpy(np.random.default_rng(0).normal(size=600))
@@ -205,7 +207,7 @@ def test_an_odd_process_keeps_an_input_that_turns():
 
 
 @pytest.mark.parametrize("parity", [0, -1])
-def test_noisy_points_go_through_few_of_them_and_predict_as_through_all(parity: int):
+def test_a_sparse_fit_of_noisy_points_predicts_as_well_as_the_exact_fit(parity: int):
     (x, y), (at, truth) = points(900, 3, 0), points(300, 3, 1)
     mirror = Reflection(-torch.ones(3, dtype=torch.float64), parity) if parity else None
     some = fit_some(x, y, FitOptions(), fit(x[:100], y[:100], FitOptions(), reflection=mirror).theta, mirror)
@@ -223,7 +225,7 @@ def test_noisy_points_go_through_few_of_them_and_predict_as_through_all(parity: 
 
 
 @pytest.mark.parametrize("what", ["a kink", "few points", "rough"])
-def test_no_sparse_fit_is_made_where_few_points_would_lose_accuracy(what: str):
+def test_no_sparse_fit_is_made_if_it_would_lose_accuracy(what: str):
     count = 300 if what == "few points" else 600
     x, y = points(count, 3, 0)
     if what == "a kink":
@@ -237,7 +239,7 @@ def test_no_sparse_fit_is_made_where_few_points_would_lose_accuracy(what: str):
     assert fit_through_few(x, y, FitOptions(), some) is None
 
 
-def test_a_smooth_function_without_noise_goes_through_few_points_precisely():
+def test_a_noise_free_smooth_function_is_fitted_precisely_by_few_inducing_points():
     (x, _), (at, _) = points(900, 3, 0), points(300, 3, 1)
 
     def function(x: Tensor) -> Tensor:

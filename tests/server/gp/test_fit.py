@@ -36,7 +36,7 @@ def draw(rng: np.random.Generator, n: int, lengths: list[float], noise: float) -
     noise=st.floats(-6.0, 0.0),
     parity=st.sampled_from([0, 1, -1]),
 )
-def test_the_gradient_is_that_of_finite_differences(linear, quadratic, seed, noise, parity):
+def test_the_gradient_of_the_fit_objective_equals_finite_differences(linear, quadratic, seed, noise, parity):
     rng = np.random.default_rng(seed)
     x, y = draw(rng, 12, [1.0, 2.0], 0.1)
     reflection = Reflection(torch.tensor([-1.0, 1.0], dtype=torch.float64), parity) if parity else None
@@ -51,7 +51,7 @@ def test_the_gradient_is_that_of_finite_differences(linear, quadratic, seed, noi
 
 
 @pytest.mark.parametrize("linear", [False, True])
-def test_without_priors_the_objective_is_scikit_learns_evidence(rng, linear):
+def test_without_hyperparameter_priors_the_objective_equals_scikit_learns_marginal_likelihood(rng, linear):
     x, y = draw(rng, 20, [0.7, 3.0], 1e-3)
     kernel = ConstantKernel(1.4) * RBF([0.9, 2.0])
     theta = [0.9, 2.0, 1.4]
@@ -65,7 +65,7 @@ def test_without_priors_the_objective_is_scikit_learns_evidence(rng, linear):
     assert -(value - constant) == pytest.approx(reference.log_marginal_likelihood_value_, rel=1e-6)
 
 
-def test_a_covariance_that_cannot_be_factored_has_a_huge_cost(rng):
+def test_the_objective_of_a_singular_covariance_is_huge(rng):
     x, y = draw(rng, 10, [1.0], 1e-2)
     objective = Evidence(x, y, FitOptions(linear=False), None)
     theta = np.array([40.0, 40.0, -80.0])  # all points alike, far outside the bounds
@@ -74,7 +74,7 @@ def test_a_covariance_that_cannot_be_factored_has_a_huge_cost(rng):
     assert not gradient.any()
 
 
-def test_priors_lower_the_score_by_their_log_density(rng):
+def test_hyperparameter_priors_change_the_score_by_their_log_density(rng):
     x, y = draw(rng, 10, [1.0], 1e-2)
     vague = Evidence(x, y, FitOptions(linear=False, **WITHOUT_PRIORS), None)
     informed = Evidence(x, y, FitOptions(linear=False, **(WITHOUT_PRIORS | {"signal_prior": (0.5, 0.25)})), None)
@@ -84,7 +84,7 @@ def test_priors_lower_the_score_by_their_log_density(rng):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_optimum_is_no_worse_than_scikit_learns(seed):
+def test_the_fitted_marginal_likelihood_is_at_least_that_of_scikit_learn(seed):
     x, y = draw(np.random.default_rng(seed), 40, [0.7, 3.0], 1e-2)
     kernel = ConstantKernel(1.0, (1e-8, 1e4)) * RBF([1.0, 1.0], (0.02, 1e3)) + WhiteKernel(1e-2, (1e-8, 2.0))
     with warnings.catch_warnings():
@@ -108,7 +108,7 @@ def test_an_irrelevant_input_gets_a_long_length_scale(rng):
     assert long > 5 * short
 
 
-def test_a_linear_part_makes_a_linear_function_exact(rng):
+def test_with_a_linear_kernel_a_linear_function_is_predicted_exactly(rng):
     x, at = (torch.from_numpy(rng.normal(size=(n, 3))) for n in (8, 50))
     slope = torch.tensor([0.5, -0.3, 0.2], dtype=torch.float64)
     fitted = fit(x, x @ slope, FitOptions())
@@ -116,14 +116,14 @@ def test_a_linear_part_makes_a_linear_function_exact(rng):
     assert float((fitted.posterior.mean(at) - at @ slope).abs().max()) < 5e-3
 
 
-def test_a_warm_start_can_only_help(rng):
+def test_a_warm_start_never_lowers_the_fitted_score(rng):
     x, y = draw(rng, 15, [1.0, 1.0], 1e-3)
     cold = fit(x, y, FitOptions())
     assert fit(x, y, FitOptions(), cold.theta).score >= cold.score
     assert fit(x, y, FitOptions(), np.full_like(cold.theta, 50.0)).score >= cold.score - 1e-9
 
 
-def test_a_constant_output_and_a_repeated_point_fit_to_finite_numbers(rng):
+def test_fits_of_constant_outputs_and_repeated_points_stay_finite(rng):
     x = torch.from_numpy(rng.normal(size=(6, 2)))
     for inputs, targets in ((x, torch.zeros(6, dtype=torch.float64)), (torch.cat([x, x]), torch.cat([x, x])[:, 0])):
         fitted = fit(inputs, targets, FitOptions())
@@ -135,7 +135,7 @@ def test_a_constant_output_and_a_repeated_point_fit_to_finite_numbers(rng):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_noise_of_a_fifth_of_the_variance_is_seen(seed):
+def test_noise_with_a_fifth_of_the_output_variance_is_detected(seed):
     rng = np.random.default_rng(seed)
     x = torch.tensor(rng.uniform(-1.7, 1.7, (60, 3)))
     y = x[:, 1] + torch.tensor(0.5 * rng.standard_normal(60))
@@ -156,13 +156,13 @@ print(libraries(ThreadpoolController()) - libraries(blas()))
 """
 
 
-def test_the_first_fit_of_a_process_limits_every_blas():
+def test_the_first_fit_in_a_process_limits_the_threads_of_every_blas():
     """SciPy's own library is loaded on first use, and a controller knows only what was loaded before it."""
     ran = subprocess.run([sys.executable, "-c", LIMITED], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == "set()"
 
 
-def test_results_of_equal_points_lead_a_warm_fit_to_the_noise(rng):
+def test_repeated_points_let_a_warm_started_fit_detect_the_noise(rng):
     """A fit to points of one result each has explained the noise by short length scales."""
     x = torch.from_numpy(rng.uniform(-1, 1, (28, 2)))
     y = x[:, 0] + 0.3 * torch.from_numpy(rng.normal(size=28))
@@ -174,7 +174,7 @@ def test_results_of_equal_points_lead_a_warm_fit_to_the_noise(rng):
     assert fit(x[:27], y[:27], FitOptions(), warm=stuck).posterior.hyper.noise_variance < 1e-2, "without, it is stuck"
 
 
-def test_a_stuck_fit_hides_no_noisy_explanation(rng):
+def test_a_noisy_explanation_is_found_even_if_the_fit_is_in_a_local_optimum(rng):
     x = torch.from_numpy(rng.uniform(-1, 1, (27, 2)))
     y = x[:, 0] + 0.3 * torch.from_numpy(rng.normal(size=27))
     stuck = np.log(np.array([0.02, 0.02, 1.0, 1e-8, 1e-7]))

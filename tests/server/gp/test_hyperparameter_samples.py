@@ -14,7 +14,7 @@ def wave(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     return x, (y - y.mean()) / y.std(correction=0)
 
 
-def test_free_parameters_become_hyperparameters_and_back(hyper):
+def test_hyperparameters_survive_conversion_to_free_parameters_and_back(hyper):
     x = torch.from_numpy(np.random.default_rng(0).normal(size=(6, 3)))
     options = FitOptions(linear=hyper.linear_variance > 0, quadratic=hyper.quadratic_variance > 0)
     objective = Evidence(x, x[:, 0], options, hyper.reflection)
@@ -24,7 +24,7 @@ def test_free_parameters_become_hyperparameters_and_back(hyper):
         assert getattr(back, name) == pytest.approx(getattr(hyper, name))
 
 
-def test_samples_have_the_mean_of_the_posterior_on_a_grid():
+def test_hyperparameter_samples_have_the_posterior_mean_computed_on_a_grid():
     """One point says nothing of two parameters but its own density, which a grid integrates."""
     x, y = torch.zeros(1, 1, dtype=torch.float64), torch.tensor([2.5], dtype=torch.float64)
     options = FitOptions(linear=False)
@@ -39,7 +39,7 @@ def test_samples_have_the_mean_of_the_posterior_on_a_grid():
     assert logs.mean() == pytest.approx(expected, abs=4 * logs.std() / np.sqrt(50))
 
 
-def test_few_points_leave_the_length_scale_uncertain():
+def test_length_scale_samples_vary_more_with_fewer_points():
     spreads = []
     for count in (4, 30):
         found = hyperparameter_samples(fit(*wave(count, 1), FitOptions(linear=False)).posterior, 40, seed=0)
@@ -47,14 +47,14 @@ def test_few_points_leave_the_length_scale_uncertain():
     assert spreads[0] > 3 * spreads[1]
 
 
-def test_samples_are_a_pure_function_of_points_and_seed():
+def test_hyperparameter_samples_are_reproducible_from_points_and_seed():
     posterior = fit(*wave(6, 0), FitOptions()).posterior
     first, again, other = (hyperparameter_samples(posterior, 2, seed) for seed in (1, 1, 2))
     assert [h.noise_variance for h in first] == [h.noise_variance for h in again]
     assert [h.noise_variance for h in first] != [h.noise_variance for h in other]
 
 
-def test_a_thin_layer_is_in_the_functions_if_noise_may_not_explain_it():
+def test_hyperparameter_samples_with_limited_noise_fit_a_narrow_step():
     """A kink between points looks like noise: functions with it pass far from the points, in narrow intervals."""
     x = torch.linspace(-1.7, 1.7, 25, dtype=torch.float64)[:, None]
     y = torch.where(x[:, 0].abs() < 0.15, 1.5, 0.0) + x[:, 0]

@@ -20,7 +20,7 @@ def x() -> torch.Tensor:
     return 1.5 * torch.randn(30, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
 
-def test_its_variance_is_the_posteriors_and_its_covariance_goes_with_it(posterior, x):
+def test_the_joint_posterior_has_the_variances_of_the_posterior(posterior, x):
     joint = Joint.of(posterior, x)
     torch.testing.assert_close(joint.variance, posterior.mean_and_variance(x)[1])
     everywhere = joint.between(slice(None), slice(None))
@@ -28,7 +28,7 @@ def test_its_variance_is_the_posteriors_and_its_covariance_goes_with_it(posterio
     torch.testing.assert_close(joint.between(slice(5), slice(7, 9)), everywhere[:5, 7:9])
 
 
-def test_observing_points_is_conditioning_on_them(posterior, x):
+def test_observing_a_point_in_the_joint_posterior_equals_conditioning_on_it(posterior, x):
     joint, conditioned = Joint.of(posterior, x), posterior
     for index in (3, 17, 4):
         joint = joint.observe(index)
@@ -39,7 +39,7 @@ def test_observing_points_is_conditioning_on_them(posterior, x):
     torch.testing.assert_close(joint.between(both, both), expected.between(both, both), rtol=0, atol=1e-11)
 
 
-def test_the_same_point_observed_again_and_again_stays_finite(posterior, x):
+def test_the_joint_variance_stays_finite_when_one_point_is_observed_repeatedly(posterior, x):
     joint = Joint.of(posterior, x)
     for _ in range(50):
         joint = joint.observe(0)

@@ -38,7 +38,7 @@ def assert_agree(posterior: Posterior, at: torch.Tensor, mean: np.ndarray, std: 
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-2, 0.5])
 @pytest.mark.parametrize("linear", [0.0, 0.7])
-def test_scikit_learn(rng, linear, noise):
+def test_the_posterior_equals_that_of_scikit_learn(rng, linear, noise):
     x, y, at = points(rng)
     hyper = Hyperparameters(torch.tensor([0.8, 1.7, 3.1], dtype=torch.float64), 1.6, linear, 0.0, noise)
     kernel = ConstantKernel(1.6) * RBF(hyper.lengthscale.numpy())
@@ -80,7 +80,7 @@ class Reference(gpytorch.models.ExactGP):
         return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
 
 
-def test_gpytorch(rng, plain):
+def test_the_posterior_equals_that_of_gpytorch(rng, plain):
     x, y, at = points(rng)
     torch.set_default_dtype(torch.float64)
     try:
@@ -92,12 +92,12 @@ def test_gpytorch(rng, plain):
     assert_agree(condition(plain, x, y), at, mean, std)
 
 
-def test_the_prior_variance_is_the_covariances_diagonal(rng, hyper):
+def test_the_prior_variance_equals_the_diagonal_of_the_covariance(rng, hyper):
     x, _, _ = points(rng)
     torch.testing.assert_close(variance(hyper, x), covariance(hyper, x, x).diagonal(), rtol=1e-12, atol=0)
 
 
-def test_distances_keep_their_digits_far_from_the_origin(rng):
+def test_the_covariance_is_accurate_far_from_the_origin(rng):
     x = torch.from_numpy(np.round(rng.normal(size=(10, 2)) * 2**20) / 2**20)  # so that shifting by 1024 is exact
     hyper = Hyperparameters(torch.tensor([0.02, 0.5], dtype=torch.float64), 1.0, 0.0, 0.0, 1e-8)
     far, here = covariance(hyper, x + 1024, x + 1024), covariance(hyper, x, x)

@@ -34,7 +34,7 @@ def exact_covariance(posterior: Posterior, at: torch.Tensor) -> torch.Tensor:
     return covariance(posterior.hyper, at, at) - k.T @ torch.cholesky_solve(k, posterior.factor)
 
 
-def test_the_covariance_of_draws_is_the_posteriors(posterior, at):
+def test_pathwise_draws_have_the_posterior_covariance_analytically(posterior, at):
     """Exactly, but for the mean over frequencies: it is off by 5 of its standard errors at most."""
     response = responses(posterior, at)
     cosines, sines = response[:, :FREQUENCIES], response[:, FREQUENCIES : 2 * FREQUENCIES]
@@ -44,7 +44,7 @@ def test_the_covariance_of_draws_is_the_posteriors(posterior, at):
     assert (off <= 5 * error + 1e-9).all()
 
 
-def test_many_draws_have_its_mean_and_covariance(posterior, at, rng):
+def test_many_pathwise_draws_have_the_posterior_mean_and_covariance(posterior, at, rng):
     """To 5 standard errors of 4,000 draws."""
     paths, count = Pathwise(posterior), 4_000
     weights = paths.draw(torch.from_numpy(rng.standard_normal((count, paths.size))))
@@ -57,7 +57,7 @@ def test_many_draws_have_its_mean_and_covariance(posterior, at, rng):
     assert ((residuals.cov() - expected).abs() <= 5 * error).all()
 
 
-def test_draws_pass_through_the_data_up_to_noise(posterior, rng):
+def test_pathwise_draws_pass_through_the_data_up_to_noise(posterior, rng):
     paths = Pathwise(posterior)
     weights = paths.draw(torch.from_numpy(rng.standard_normal((200, paths.size))))
     noise = math.sqrt(posterior.hyper.noise_variance)
@@ -65,13 +65,13 @@ def test_draws_pass_through_the_data_up_to_noise(posterior, rng):
         assert float(paths.residual(x.expand(200, -1), weights).std()) < 1.5 * noise
 
 
-def test_without_noise_a_draw_is_the_mean(posterior, at):
+def test_a_pathwise_draw_with_zero_random_weights_equals_the_mean(posterior, at):
     paths = Pathwise(posterior)
     weights = paths.draw(torch.zeros(len(at), paths.size, dtype=torch.float64))
     assert paths.residual(at, weights).abs().max() == 0
 
 
-def test_a_draw_is_one_function_in_any_batch(posterior, at, rng):
+def test_a_pathwise_draw_has_the_same_values_in_any_batch(posterior, at, rng):
     paths = Pathwise(posterior)
     weights = paths.draw(torch.from_numpy(rng.standard_normal((len(at), paths.size))))
     together = paths.residual(at, weights)

@@ -38,7 +38,7 @@ def pool() -> Pool:
     return found
 
 
-def test_inputs_that_play_the_same_parts_are_found(pool):
+def test_pooling_matches_corresponding_inputs_of_similar_processes(pool):
     first, second = (dict(zip(("own", "other"), inputs, strict=True)) for inputs in pool.inputs)
     known = {0: "a", 3: "b"} if pool.numbers[0] == 0 else {4: "a", 1: "b"}
     rival = {4: "a", 1: "b"} if pool.numbers[0] == 0 else {0: "a", 3: "b"}
@@ -46,7 +46,7 @@ def test_inputs_that_play_the_same_parts_are_found(pool):
     assert pool.gain > 2 * 25
 
 
-def test_what_a_process_reads_need_not_be_known(pool):
+def test_pooling_finds_the_relevant_inputs_of_a_process_itself(pool):
     """The second one thinks that it reads all inputs."""
     lost = part((4, 1), 1, reads=tuple(range(5)))
     lost = replace(lost, fewer=lost.hyper)
@@ -54,7 +54,7 @@ def test_what_a_process_reads_need_not_be_known(pool):
     assert sorted(found.inputs[1]) == [1, 4]
 
 
-def test_each_member_foretells_better_with_the_samples_of_both(pool):
+def test_pooled_processes_predict_better_with_the_samples_of_both(pool):
     x = 2 * torch.rand(300, 5, generator=torch.Generator().manual_seed(9), dtype=torch.float64) - 1
     for member, own in enumerate(pool.parts):
         a, b = (0, 3) if pool.numbers[member] == 0 else (4, 1)
@@ -66,7 +66,7 @@ def test_each_member_foretells_better_with_the_samples_of_both(pool):
         assert errors[0] < 0.7 * errors[1]
 
 
-def test_own_samples_come_first_and_others_become_fewer(pool):
+def test_a_pooled_process_keeps_its_own_samples_and_a_limited_number_of_others(pool):
     for member, own in enumerate(pool.parts):
         x, y, _ = pool.samples_of(member, 40)
         assert x.shape == (40, 2)
@@ -74,7 +74,7 @@ def test_own_samples_come_first_and_others_become_fewer(pool):
         torch.testing.assert_close(own.scale * y[:25] + pool.parts[0].centre, own.scale * own.y + own.centre)
 
 
-def test_gain_is_the_evidence_together_less_that_apart(pool):
+def test_the_pooling_gain_is_joint_minus_separate_log_marginal_likelihood(pool):
     """In units of the targets: evidence apart does not depend on how each process is standardised."""
     x, y, _ = pool.samples_of(0, 1000)
     first = pool.parts[0]
@@ -84,18 +84,18 @@ def test_gain_is_the_evidence_together_less_that_apart(pool):
     assert pool.gain == pytest.approx(together - apart, abs=1e-6)
 
 
-def test_other_functions_share_nothing():
+def test_processes_of_different_functions_are_not_pooled():
     other = part((4, 1), 1)
     other = replace(other, y=-other.y.flip(0))
     assert pools([part((0, 3), 0), other], most=4) == []
 
 
-def test_a_function_of_another_size_is_another_function():
+def test_processes_of_functions_with_different_scale_are_not_pooled():
     """The same shape, but three times as large."""
     assert pools([part((0, 3), 0), part((4, 1), 1, scale=3.0)], most=4) == []
 
 
-def test_functions_of_more_inputs_are_not_joined():
+def test_processes_with_more_inputs_than_the_limit_are_not_pooled():
     assert pools([part((0, 3), 0), part((4, 1), 1)], most=1) == []
 
 
@@ -109,7 +109,7 @@ def odd(of: tuple[int, int], seed: int, signs: Tensor) -> Part:
     return replace(plain, y=y, centre=0.0, scale=1.0, hyper=whole, fewer=fewer, signs=signs)
 
 
-def test_inputs_keep_their_signs_in_a_mirror_image():
+def test_odd_processes_are_pooled_only_if_matched_inputs_mirror_alike():
     """An odd function reads no input that stays in the mirror image, and none if there is no mirror image."""
     turned = -torch.ones(5, dtype=torch.float64)
     known, other = odd((0, 3), 0, turned), odd((4, 1), 1, turned)
@@ -120,7 +120,7 @@ def test_inputs_keep_their_signs_in_a_mirror_image():
     assert pools([known, replace(other, signs=None, **unread)], most=4) == []
 
 
-def test_an_odd_function_has_no_centre():
+def test_pooled_odd_processes_are_centred_at_zero():
     """A part that was standardised around its average sees the pool around 0, where an odd function is 0."""
     turned = -torch.ones(5, dtype=torch.float64)
     known, plain = odd((0, 3), 0, turned), odd((4, 1), 1, turned)

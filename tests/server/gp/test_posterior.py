@@ -17,7 +17,7 @@ def points(rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
     return x, torch.sin(x[:, 0]) + 0.3 * x[:, 2]
 
 
-def test_leave_one_out_is_leaving_one_out(hyper, points):
+def test_leave_one_out_predictions_equal_conditioning_without_the_point(hyper, points):
     x, y = points
     mean, variance = condition(hyper, x, y).leave_one_out()
     for i in range(len(y)):
@@ -27,7 +27,7 @@ def test_leave_one_out_is_leaving_one_out(hyper, points):
         assert variance[i] == pytest.approx(float(latent) + hyper.noise_variance, rel=1e-6)
 
 
-def test_extending_is_conditioning_anew(hyper, points, rng):
+def test_extending_a_posterior_by_a_point_equals_conditioning_anew(hyper, points, rng):
     x, y = points
     at = torch.from_numpy(rng.normal(size=(20, 3)))
     extended = condition(hyper, x[:-2], y[:-2]).extend(x[-2], y[-2]).extend(x[-1], y[-1])
@@ -37,7 +37,7 @@ def test_extending_is_conditioning_anew(hyper, points, rng):
         torch.testing.assert_close(ours, theirs, rtol=1e-7, atol=1e-9)
 
 
-def test_extending_leaves_the_old_posterior_alone(hyper, points):
+def test_extending_a_posterior_leaves_the_old_one_unchanged(hyper, points):
     x, y = points
     before = condition(hyper, x, y)
     mean = before.mean(x)
@@ -46,14 +46,14 @@ def test_extending_leaves_the_old_posterior_alone(hyper, points):
     torch.testing.assert_close(before.mean(x), mean, rtol=0, atol=0)
 
 
-def test_extending_by_the_same_point_keeps_a_positive_pivot(hyper, points):
+def test_extending_a_posterior_repeatedly_by_one_point_stays_factorable(hyper, points):
     x, y = points
     repeated = condition(replace(hyper, noise_variance=1e-16), x, y).extend(x[0], y[0])
     assert float(repeated.factor[-1, -1]) > 0
     assert torch.isfinite(repeated.mean(x)).all()
 
 
-def test_predictions_in_blocks_are_those_in_one(hyper, points, rng, monkeypatch):
+def test_posterior_predictions_do_not_depend_on_the_block_size(hyper, points, rng, monkeypatch):
     x, y = points
     at = torch.from_numpy(rng.normal(size=(23, 3)))
     whole = condition(hyper, x, y).mean_and_variance(at)
@@ -62,7 +62,7 @@ def test_predictions_in_blocks_are_those_in_one(hyper, points, rng, monkeypatch)
         torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
 
 
-def test_the_variance_is_never_negative_and_zero_noise_interpolates(hyper, points):
+def test_posterior_variance_is_never_negative_and_zero_noise_interpolates(hyper, points):
     x, y = points
     mean, variance = condition(replace(hyper, noise_variance=0.0), x, y).mean_and_variance(x)
     assert (variance >= 0).all()
@@ -70,14 +70,14 @@ def test_the_variance_is_never_negative_and_zero_noise_interpolates(hyper, point
     torch.testing.assert_close(mean, y, rtol=0, atol=1e-6)
 
 
-def test_duplicates_without_noise_are_repaired_by_jitter_that_is_reported(hyper, points):
+def test_noise_free_duplicate_points_are_repaired_by_reported_jitter(hyper, points):
     x, y = points
     repaired = condition(replace(hyper, noise_variance=0.0), torch.cat([x, x]), torch.cat([y, y]))
     assert 0 < repaired.jitter < 1e-6
     torch.testing.assert_close(repaired.mean(x), y, rtol=0, atol=1e-3)
 
 
-def test_jitter_escalates_by_tens_only_as_far_as_needed():
+def test_jitter_is_raised_tenfold_only_until_the_covariance_can_be_factored():
     indefinite = torch.diag(torch.tensor([1.0, 1.0, -3e-8], dtype=torch.float64))
     factor, jitter = factorise(indefinite)
     assert jitter == pytest.approx(1e-7 * 2 / 3)
@@ -85,7 +85,7 @@ def test_jitter_escalates_by_tens_only_as_far_as_needed():
     assert factorise(torch.eye(3, dtype=torch.float64))[1] == 0
 
 
-def test_a_matrix_that_no_jitter_repairs_is_a_numerical_failure():
+def test_a_covariance_that_no_jitter_repairs_raises_a_numerical_error():
     hopeless = torch.diag(torch.tensor([1.0, -2 * MAX_JITTER], dtype=torch.float64))
     with pytest.raises(NumericalFailure, match="covariance of 2 points"):
         factorise(hopeless)
@@ -93,7 +93,7 @@ def test_a_matrix_that_no_jitter_repairs_is_a_numerical_failure():
         factorise(torch.full((2, 2), torch.nan, dtype=torch.float64))
 
 
-def test_the_joint_covariance_of_points_has_their_variances_and_their_correlations(hyper, points, rng):
+def test_the_joint_posterior_covariance_has_the_variances_on_its_diagonal(hyper, points, rng):
     """What is left of one point's variance after another is observed: by the joint covariance, and by extending."""
     x, y = points
     known = condition(hyper, x, y)

@@ -54,7 +54,7 @@ def served(posterior: Posterior, at: torch.Tensor) -> tuple[torch.Tensor, torch.
 
 @pytest.mark.parametrize("length", [0.5, 2.0, 20.0])
 @pytest.mark.parametrize(("linear", "quadratic"), [(0.0, 0.0), (0.7, 0.3)])
-def test_ill_conditioned(rng, monkeypatch, device, length, linear, quadratic):
+def test_the_posterior_of_ill_conditioned_data_agrees_with_mpmath(rng, monkeypatch, device, length, linear, quadratic):
     x = rng.normal(size=(12, 2))
     x = np.concatenate([x, x[:4] + 1e-4 * rng.normal(size=(4, 2)), x[:4] + 1e-6 * rng.normal(size=(4, 2))])
     y = np.sin(x[:, 0]) + 0.4 * x.sum(1) - 0.2 * x[:, 1] ** 2

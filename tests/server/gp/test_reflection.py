@@ -30,7 +30,7 @@ def odd(x: torch.Tensor) -> torch.Tensor:
     return torch.sin(2 * x[:, 0]) * (1 + x[:, 1]) + 0.3 * x[:, 0]
 
 
-def test_the_covariance_is_that_of_the_part_with_the_parity(reflected, rng):
+def test_the_kernel_of_an_odd_or_even_process_equals_its_symmetrised_plain_kernel(reflected, rng):
     """Of f(x) + p f(s x) over the root of 2, f a plain process, with the polynomial parts at half of their variance."""
     a, b, parity = points(rng, 6), points(rng, 5), reflected.reflection.parity
     plain = replace(reflected, reflection=None, linear_variance=0.35, quadratic_variance=0.15)
@@ -39,7 +39,7 @@ def test_the_covariance_is_that_of_the_part_with_the_parity(reflected, rng):
     torch.testing.assert_close(variance(reflected, a), covariance(reflected, a, a).diagonal())
 
 
-def test_a_prediction_is_the_plain_one_from_the_points_and_their_mirror_images(reflected, rng):
+def test_an_odd_or_even_process_predicts_like_a_plain_one_with_mirrored_points(reflected, rng):
     """Each observed with twice the noise, by a process of half of the variances: the two errors average."""
     x, at, parity = points(rng, 9), points(rng, 20), reflected.reflection.parity
     y = even(x) if parity > 0 else odd(x)
@@ -48,7 +48,7 @@ def test_a_prediction_is_the_plain_one_from_the_points_and_their_mirror_images(r
     torch.testing.assert_close(condition(reflected, x, y).mean(at), doubled.mean(at), rtol=1e-9, atol=1e-9)
 
 
-def test_what_is_predicted_has_the_parity(reflected, rng):
+def test_predictions_of_an_odd_or_even_process_are_odd_or_even(reflected, rng):
     x, at, parity = points(rng, 9), points(rng, 20), reflected.reflection.parity
     mean, latent = condition(reflected, x, even(x)).mean_and_variance(at)
     mirrored, same = condition(reflected, x, even(x)).mean_and_variance(at * SIGNS)
@@ -56,7 +56,7 @@ def test_what_is_predicted_has_the_parity(reflected, rng):
     torch.testing.assert_close(same, latent, rtol=1e-8, atol=1e-10)
 
 
-def test_an_odd_process_is_certainly_zero_at_the_mirror(rng):
+def test_an_odd_process_is_zero_with_certainty_on_the_mirror_plane(rng):
     hyper = Hyperparameters(torch.ones(2, dtype=torch.float64), 1.0, 0.5, 0.5, 1e-4, Reflection(SIGNS, -1))
     at = points(rng, 7) * torch.tensor([0.0, 1.0], dtype=torch.float64)
     mean, latent = condition(hyper, points(rng, 3), torch.ones(3, dtype=torch.float64)).mean_and_variance(at)
@@ -65,7 +65,7 @@ def test_an_odd_process_is_certainly_zero_at_the_mirror(rng):
 
 
 @pytest.mark.parametrize(("function", "parity"), [(even, 1), (odd, -1)], ids=["even", "odd"])
-def test_the_evidence_tells_which_parity_a_function_has(rng, function, parity):
+def test_the_marginal_likelihood_selects_the_parity_of_a_function(rng, function, parity):
     x = points(rng, 20)
     y = function(x)
     scores = {p: fit(x, y, FitOptions(), reflection=Reflection(SIGNS, p)).score for p in (1, -1)}
@@ -73,7 +73,7 @@ def test_the_evidence_tells_which_parity_a_function_has(rng, function, parity):
     assert max(scores, key=lambda p: scores[p]) == parity
 
 
-def test_half_of_the_points_do(rng):
+def test_an_odd_process_predicts_an_odd_function_better_than_a_plain_process(rng):
     """Learned by its parity from n points a function is known better than without from n."""
     x, at = points(rng, 16), points(rng, 200)
     error = {}

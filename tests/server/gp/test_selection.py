@@ -26,25 +26,25 @@ def selected(x: Tensor, y: Tensor, may: Tensor, mirror: Reflection | None = None
     return found.mask.nonzero()[:, 0].tolist(), found.score, fitted.score
 
 
-def test_inputs_that_are_not_read_are_left_out():
+def test_input_selection_drops_irrelevant_inputs():
     kept, score, before = selected(*points(25), torch.ones(5, dtype=torch.bool))
     assert kept == [0, 3]
     assert score > before + 3
 
 
-def test_score_is_that_of_a_process_of_these_inputs_alone():
+def test_the_score_of_an_input_selection_equals_that_of_a_process_with_only_those_inputs():
     x, y = points(25)
     found = select_inputs(fit(x, y, OPTIONS).posterior, OPTIONS, torch.ones(5, dtype=torch.bool), ODDS)
     cost, _ = Evidence(x[:, found.mask], y, OPTIONS, None)(found.theta)
     assert abs(found.score + cost) < 1e-6
 
 
-def test_inputs_that_may_not_be_left_out_stay():
+def test_input_selection_keeps_protected_inputs():
     may = torch.tensor([True, False, True, True, True])
     assert selected(*points(25), may)[0] == [0, 1, 3]
 
 
-def test_inputs_that_are_all_read_stay():
+def test_input_selection_keeps_all_inputs_if_all_are_relevant():
     x, y = points(25)
     y = y + x[:, 1] * x[:, 2] + torch.cos(x[:, 4])
     fitted = fit(x, y, OPTIONS)
@@ -54,13 +54,13 @@ def test_inputs_that_are_all_read_stay():
     torch.testing.assert_close(found.hyper.lengthscale, fitted.posterior.hyper.lengthscale, rtol=0.05, atol=0)
 
 
-def test_an_odd_function_keeps_an_input_whose_sign_turns():
+def test_input_selection_of_an_odd_function_keeps_an_input_that_changes_sign():
     x, y = points(12)
     mirror = Reflection(torch.tensor([1.0, -1.0, 1.0, 1.0, 1.0], dtype=torch.float64), -1)
     assert 1 in selected(x, y, torch.ones(5, dtype=torch.bool), mirror)[0]
 
 
-def test_one_input_is_kept_at_least():
+def test_input_selection_keeps_at_least_one_input():
     x, _ = points(12)
     mirror = Reflection(torch.ones(5, dtype=torch.float64), 1)
     for reflection in (None, mirror):

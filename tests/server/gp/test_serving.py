@@ -31,7 +31,7 @@ def at(rng) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1.0], ids=["differences", "products"])
-def test_every_output_is_its_posterior(outputs, at, monkeypatch, device, tolerance):
+def test_each_served_output_equals_its_own_posterior(outputs, at, monkeypatch, device, tolerance):
     monkeypatch.setattr(serving, "MEAN_TOLERANCE", tolerance)
     monkeypatch.setattr(serving, "VARIANCE_TOLERANCE", tolerance)
     compiled = Serving.of(to_device(tuple(outputs), device), COLUMNS, WIDTH, device)
@@ -48,7 +48,7 @@ def test_every_output_is_its_posterior(outputs, at, monkeypatch, device, toleran
         torch.testing.assert_close(std[:, output.column], output.scale * variance.sqrt(), rtol=1e-7, atol=1e-9)
 
 
-def test_stds_that_were_not_requested_are_zero(outputs, at):
+def test_served_standard_deviations_that_were_not_requested_are_zero(outputs, at):
     compiled = Serving.of(outputs, COLUMNS, WIDTH)
     _, some = compiled.mean_and_std(at, [1])
     _, every = compiled.mean_and_std(at, range(COLUMNS))
@@ -56,7 +56,7 @@ def test_stds_that_were_not_requested_are_zero(outputs, at):
     assert (some[:, [0, 2, 3, 4]] == 0).all()
 
 
-def test_blocks_change_no_more_than_last_bits(outputs, at, monkeypatch):
+def test_served_predictions_do_not_depend_on_the_block_size(outputs, at, monkeypatch):
     compiled = Serving.of(outputs, COLUMNS, WIDTH)
     whole = compiled.mean_and_std(at, range(COLUMNS))
     monkeypatch.setattr(serving, "BLOCK", 1)
@@ -66,13 +66,13 @@ def test_blocks_change_no_more_than_last_bits(outputs, at, monkeypatch):
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
 
 
-def test_rows_of_a_block_shrink_as_points_grow(outputs):
+def test_a_served_block_has_fewer_rows_if_the_processes_have_more_points(outputs):
     few, many = Serving.of(outputs[:2], COLUMNS, WIDTH), Serving.of(outputs, COLUMNS, WIDTH)
     assert few.rows * 12 <= serving.BLOCK
     assert many.rows < few.rows
 
 
-def test_in_blocks_joins_rows_and_leaves_none_alone():
+def test_in_blocks_applies_a_function_to_blocks_and_joins_the_results():
     sizes = []
 
     def function(a: torch.Tensor, b: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
@@ -88,7 +88,7 @@ def test_in_blocks_joins_rows_and_leaves_none_alone():
 
 
 @pytest.mark.parametrize("length", [0.05, 0.5, 5.0])
-def test_the_bounds_hold(rng, length):
+def test_the_error_bound_of_matrix_product_distances_holds(rng, length):
     """Exponents by products err by less than the bound in every point's covariance, out to twice the reach."""
     hyper = Hyperparameters(length * torch.tensor([1.0, 2.0, 0.7], dtype=torch.float64), 1.0, 0.0, 0.0, 1e-4)
     x = torch.from_numpy(rng.normal(size=(60, 3)))
@@ -103,7 +103,7 @@ def test_the_bounds_hold(rng, length):
     assert 0 < error <= bound
 
 
-def test_where_products_are_not_good_enough_differences_are_taken(rng):
+def test_distances_are_computed_by_differences_if_matrix_products_are_too_inaccurate(rng):
     x = torch.from_numpy(rng.normal(size=(40, 2)))
     x = torch.cat([x, x + 1e-7])
     hyper = Hyperparameters(torch.tensor([0.01, 0.01], dtype=torch.float64), 1.0, 0.0, 0.0, 1e-12)

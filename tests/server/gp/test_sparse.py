@@ -38,7 +38,7 @@ def drawn() -> tuple[Hyperparameters, Tensor, Tensor]:
     return Hyperparameters(torch.full((2,), 1.5, dtype=torch.float64), 1.0, 0.5, 0.0, NOISE), x, y
 
 
-def test_few_inducing_points_predict_as_all_points_do(drawn: tuple[Hyperparameters, Tensor, Tensor]):
+def test_a_sparse_process_predicts_as_the_exact_process_does(drawn: tuple[Hyperparameters, Tensor, Tensor]):
     hyper, x, y = drawn
     exact, through = condition(hyper, x, y), condition_sparse(hyper, x, y)
     assert through.sparse is not None
@@ -48,7 +48,7 @@ def test_few_inducing_points_predict_as_all_points_do(drawn: tuple[Hyperparamete
         torch.testing.assert_close(ours.abs().sqrt(), theirs.abs().sqrt(), rtol=0, atol=1e-3)
 
 
-def test_too_few_say_what_is_lost_and_are_not_sure_of_it(
+def test_a_process_with_too_few_inducing_points_reports_larger_uncertainty(
     drawn: tuple[Hyperparameters, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ):
     hyper, x, y = drawn
@@ -62,7 +62,7 @@ def test_too_few_say_what_is_lost_and_are_not_sure_of_it(
     assert float(error) < 3 * float(variance.mean().sqrt())
 
 
-def test_it_is_served_extended_and_drawn_from_as_any_other(drawn: tuple[Hyperparameters, Tensor, Tensor]):
+def test_a_sparse_process_can_be_served_extended_and_drawn_from(drawn: tuple[Hyperparameters, Tensor, Tensor]):
     through = condition_sparse(*drawn)
     at = torch.tensor([[0.3, -0.4], [2.5, 1.0]], dtype=torch.float64)
     mean, variance = through.mean_and_variance(at)
@@ -82,7 +82,7 @@ def spread_of_draws(posterior: Posterior, at: Tensor) -> float:
 
 
 @pytest.mark.parametrize(("points", "exact"), [(60, True), (61, False)])
-def test_a_process_is_exact_up_to_a_number_of_points(
+def test_a_process_becomes_sparse_beyond_a_number_of_points(
     drawn: tuple[Hyperparameters, Tensor, Tensor], points: int, exact: bool, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(sparse, "MAX_EXACT", 60)
@@ -90,7 +90,7 @@ def test_a_process_is_exact_up_to_a_number_of_points(
     assert (condition_many([hyper], x[:points], y[:points]).sparse is None) == exact
 
 
-def test_noise_that_is_too_small_is_seen_by_all_points(
+def test_a_sparse_process_corrects_an_underestimated_noise_variance(
     drawn: tuple[Hyperparameters, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(sparse, "MAX_EXACT", 60)
@@ -100,7 +100,7 @@ def test_noise_that_is_too_small_is_seen_by_all_points(
         assert found.hyper.noise_variance == pytest.approx(NOISE)
 
 
-def test_of_sparse_processes_the_one_is_kept_that_foretells_all_points(
+def test_the_sparse_process_that_predicts_all_points_best_is_kept(
     drawn: tuple[Hyperparameters, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(sparse, "MAX_EXACT", 60)
@@ -110,7 +110,7 @@ def test_of_sparse_processes_the_one_is_kept_that_foretells_all_points(
         assert condition_many(order, x, y).hyper.lengthscale is hyper.lengthscale
 
 
-def test_points_of_which_a_side_is_known_judge_sparse_processes(
+def test_points_known_only_as_inequalities_count_in_choosing_a_sparse_process(
     drawn: tuple[Hyperparameters, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ):
     """Both foretell the points alike, with a linear part slightly better. Beyond them it leads away."""
@@ -124,7 +124,7 @@ def test_points_of_which_a_side_is_known_judge_sparse_processes(
         assert condition_many(order, x, y, at_most).hyper.linear_variance == flat.linear_variance
 
 
-def test_an_earlier_process_stays_where_none_foretells_better(
+def test_the_earlier_sparse_process_is_kept_unless_a_new_one_predicts_better(
     drawn: tuple[Hyperparameters, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(sparse, "MAX_EXACT", 60)
@@ -135,7 +135,7 @@ def test_an_earlier_process_stays_where_none_foretells_better(
     assert condition_many([hyper], x, y, earlier=bad).hyper.lengthscale is hyper.lengthscale
 
 
-def test_hardest_points_lie_apart_or_have_the_largest_residuals(drawn: tuple[Hyperparameters, Tensor, Tensor]):
+def test_the_hardest_points_are_isolated_or_have_large_residuals(drawn: tuple[Hyperparameters, Tensor, Tensor]):
     hyper, x, y = drawn
     lone = torch.cat([x, torch.tensor([[6.0, 6.0]], dtype=torch.float64)])
     off = torch.cat([y, y.new_zeros(1)]).index_add(0, torch.tensor([7, 250]), y.new_tensor([5.0, -5.0]))
@@ -145,14 +145,14 @@ def test_hardest_points_lie_apart_or_have_the_largest_residuals(drawn: tuple[Hyp
     assert {7, 250} <= set(found)
 
 
-def test_leave_one_out_is_of_the_points_not_of_the_inducing_ones(drawn: tuple[Hyperparameters, Tensor, Tensor]):
+def test_leave_one_out_errors_of_a_sparse_process_are_over_all_points(drawn: tuple[Hyperparameters, Tensor, Tensor]):
     exact, through = condition(*drawn).left_out, condition_sparse(*drawn).left_out
     assert through.error == pytest.approx(exact.error, rel=1e-3)
     assert through.within_one == pytest.approx(exact.within_one, abs=0.01)
     assert through.within_two == pytest.approx(exact.within_two, abs=0.01)
 
 
-def test_leave_one_out_of_too_few_inducing_points_counts_what_they_leave(
+def test_leave_one_out_errors_include_what_inducing_points_cannot_explain(
     drawn: tuple[Hyperparameters, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(sparse, "INDUCING", 12)

@@ -24,7 +24,7 @@ from surrogym_server.gp.search import Evidence, minimum
 
 
 @pytest.mark.parametrize("points", [1, 30, 31, 1_000])
-def test_a_subset_is_all_points_or_one_from_each_stretch(points: int):
+def test_a_subset_takes_one_point_of_each_equal_stretch_of_the_sequence(points: int):
     rows = spread(points, 30)
     assert len(rows) == len(rows.unique()) == min(points, 30)
     stretch = points / len(rows)
@@ -44,7 +44,7 @@ def smooth(points: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     return x, y + torch.from_numpy(0.02 * rng.normal(size=points))
 
 
-def test_hyperparameters_refined_from_a_few_points_predict_as_those_of_all():
+def test_hyperparameters_refined_from_few_points_predict_as_those_fitted_to_all():
     (x, y), (at, truth) = smooth(500, 0), smooth(300, 1)
     few = spread(len(y), subsets.FEW)
     some = fit_some(x, y, FitOptions(), fit(x[few], y[few], FitOptions()).theta)
@@ -57,7 +57,7 @@ def test_hyperparameters_refined_from_a_few_points_predict_as_those_of_all():
     assert float((refined.mean(at) - truth).std()) < 0.03
 
 
-def test_more_points_resolve_what_few_explain_as_noise():
+def test_refining_with_more_points_explains_a_wave_mistaken_for_noise():
     """From where few points end, the search ends in noise; the second start finds the wave."""
     x = torch.linspace(-1.7, 1.7, 200, dtype=torch.float64)[:, None]
     y, found = torch.sin(6 * x[:, 0]), np.array([0.7, 0.0, -10.0, 0.0])  # as theta: the last is log sigma_n^2
@@ -66,7 +66,7 @@ def test_more_points_resolve_what_few_explain_as_noise():
     assert refine(x, y, FitOptions(), fit_some(x, y, FitOptions(), found))[-1].noise_variance < 1e-4
 
 
-def test_hard_points_teach_what_a_steep_region_needs(monkeypatch: pytest.MonkeyPatch):
+def test_refining_with_the_hardest_points_improves_a_steep_region(monkeypatch: pytest.MonkeyPatch):
     """One in 25 points lies where the function is steep, and as many points drawn evenly hardly meet it."""
     monkeypatch.setattr(sys.modules[refine_where_hard.__module__], "HARD", 60)
     x = 3.4 * torch.rand(1_500, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 1.7

@@ -19,11 +19,11 @@ def model(pendulum_samples) -> DynamicsModel:
     return learn(exact_pendulum().definition, pendulum_samples).model
 
 
-def test_a_file_names_its_family(model):
+def test_a_model_file_names_its_model_family(model):
     assert header_of(to_bytes(model))["family"] == "gaussian_process"
 
 
-def test_a_file_without_a_family_is_refused(model):
+def test_a_model_file_without_model_family_is_refused(model):
     header = header_of(to_bytes(model))
     del header["family"]
     with pytest.raises(InvalidInput, match="'family'"):
@@ -31,7 +31,7 @@ def test_a_file_without_a_family_is_refused(model):
 
 
 @pytest.mark.parametrize("checksum", [None, "", 7])
-def test_a_file_without_its_checksum_is_refused(model, checksum):
+def test_a_model_file_without_checksum_is_refused(model, checksum):
     """It was not checked, so that another number in it was served."""
     data = to_bytes(model)
     header = header_of(data) | ({} if checksum is None else {"checksum": checksum})
@@ -61,7 +61,7 @@ def forgeries(data: bytes) -> dict[str, bytes]:
     }
 
 
-def test_forged_files_are_refused_in_words_of_this_program(model):
+def test_forged_model_files_are_refused_without_library_error_texts(model):
     """The messages were those of safetensors and of Python: HeaderTooLarge, 'int' object is not iterable."""
     for what, forged in forgeries(to_bytes(model)).items():
         with pytest.raises(InvalidInput, match=r"^expected") as refused:
@@ -74,7 +74,7 @@ def test_forged_files_are_refused_in_words_of_this_program(model):
 
 
 @pytest.mark.parametrize("family", ["os", "ensemble", "", 7, None, "x" * 10_000])
-def test_a_file_of_another_family_than_the_specifications_is_refused(model, family):
+def test_a_model_file_of_another_family_than_specified_is_refused(model, family):
     with pytest.raises(
         InvalidInput, match="family 'gaussian_process', as the specification says, got one of"
     ) as refused:
@@ -82,12 +82,12 @@ def test_a_file_of_another_family_than_the_specifications_is_refused(model, fami
     assert len(str(refused.value)) < 300
 
 
-def test_a_family_is_not_looked_up_because_a_file_names_it(model):
+def test_the_model_family_is_taken_from_the_specification_and_not_the_file(model):
     """The specification names it, and the registry knows what is installed."""
     learning = replace(model.definition.learning, model=Choice("gaussian_process"))
     assert from_bytes(replace(model.definition, learning=learning), to_bytes(model)).samples == model.samples
 
 
-def test_a_model_of_another_family_is_not_stored_under_this_one():
+def test_storing_a_model_of_another_family_as_gaussian_process_is_refused():
     with pytest.raises(TypeError, match="expected a model of Gaussian processes, got ExactModel"):
         to_bytes(exact_pendulum())

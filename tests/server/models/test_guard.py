@@ -43,19 +43,19 @@ def job(**changes: object) -> DesignJob:
         ("infinite", ": expected a description that can be written as JSON, got ValueError: "),
     ],
 )
-def test_an_invalid_model_fails_its_fit_in_one_sentence(monkeypatch: pytest.MonkeyPatch, mode: str, said: str):
+def test_an_invalid_plugin_model_fails_the_fit_with_one_sentence(monkeypatch: pytest.MonkeyPatch, mode: str, said: str):
     monkeypatch.setattr(guard, "learner_of", lambda _: unruly.Unruly(mode))
     with pytest.raises(PluginFailed, match=f"^the model family 'gaussian_process'{said}"):
         run_design_job(job())
 
 
-def test_ctrl_c_in_a_fit_of_ones_own_process_stays_ctrl_c(monkeypatch: pytest.MonkeyPatch):
+def test_ctrl_c_during_a_fit_raises_keyboard_interrupt(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(guard, "learner_of", lambda _: unruly.Unruly("interrupt"))
     with pytest.raises(KeyboardInterrupt):
         run_design_job(job())
 
 
-def test_a_prediction_of_a_wrong_shape_raises_on_use(monkeypatch: pytest.MonkeyPatch):
+def test_a_plugin_prediction_of_wrong_shape_raises(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(guard, "learner_of", lambda _: unruly.Unruly())
     made = job()
     inner = guard.learn(made.definition, Samples.of(made.samples), None).model.inner
@@ -72,7 +72,7 @@ def test_a_prediction_of_a_wrong_shape_raises_on_use(monkeypatch: pytest.MonkeyP
         (InvalidInput(""), "InvalidInput"),
     ],
 )
-def test_an_error_is_one_line_that_says_what_it_is(error: Exception, said: str):
+def test_a_plugin_exception_is_reported_in_one_short_line(error: Exception, said: str):
     assert in_one_line(error).startswith(said)
     assert "\n" not in in_one_line(error)
     assert len(in_one_line(ValueError("x" * 10_000))) < 600

@@ -16,7 +16,7 @@ def learner(**design: object) -> object:
     return learner_of(definition_from_spec(spec).learning.model)
 
 
-def test_gaussian_processes_are_the_default_and_the_preset_says_how():
+def test_the_default_model_is_a_gaussian_process_with_the_settings_of_the_preset():
     assert learner() == GaussianProcesses("composite", True, "auto")
     assert learner(symmetry="none") == GaussianProcesses("composite", True, "none")
     assert learner(preset="paper", symmetry="none") == GaussianProcesses(
@@ -24,7 +24,7 @@ def test_gaussian_processes_are_the_default_and_the_preset_says_how():
     )
 
 
-def test_settings_of_the_specification_override_those_of_the_preset():
+def test_model_settings_of_the_specification_override_those_of_the_preset():
     chosen = ModelChoice(name="gaussian_process", settings={"reward_jumps": False})
     assert learner(model=chosen) == GaussianProcesses("composite", False, "auto")
     assert learner(model="gaussian_process") == learner()
@@ -42,14 +42,14 @@ def test_settings_of_the_specification_override_those_of_the_preset():
         (Choice("ensemble", (("members", True),)), "ensemble: expected members to be a whole number, got True"),
     ],
 )
-def test_what_is_unknown_or_set_wrong_is_refused(choice, said):
+def test_unknown_model_families_and_invalid_settings_are_refused(choice, said):
     with pytest.raises(InvalidSpec, match=said):
         learner_of(choice)
 
 
-def test_names_are_listed():
+def test_the_gaussian_process_is_first_in_the_list_of_model_families():
     assert MODELS.names[0] == "gaussian_process"
 
 
-def test_a_stored_surrogate_of_a_removed_family_says_what_takes_its_place():
+def test_the_error_for_a_removed_model_family_names_its_replacement():
     assert str(MODELS.lack(Choice("selected"))).startswith("the model family 'selected', which was removed: name")

@@ -47,7 +47,7 @@ def value(model: GaussianProcessModel, candidates: Candidates, criterion: str, c
 
 
 @pytest.mark.parametrize("name", ACQUISITIONS.names)
-def test_every_acquisition_keeps_the_laws(model, candidates, name):
+def test_every_acquisition_function_passes_the_acquisition_laws(model, candidates, name):
     """Pure, one finite value for each candidate and beginning of a path, no decrease along a path."""
     kept = candidates.points.q.clone()
     first, again = (value(model, candidates, name, 1) for _ in range(2))
@@ -63,13 +63,13 @@ def test_every_acquisition_keeps_the_laws(model, candidates, name):
     assert bool((along.diff(dim=1) >= -1e-9).all())
 
 
-def test_the_index_is_uncertainty_times_probability(model, candidates):
+def test_the_uncertainty_index_is_uncertainty_times_probability(model, candidates):
     sigma = stds(model, candidates.points.q, candidates.points.u)[:, 1].numpy()
     expected = norm.sf(0.02 / sigma) * np.exp(candidates.log_p.numpy())
     np.testing.assert_allclose(value(model, candidates, "uncertainty_index", 1).exp().numpy(), expected, rtol=1e-4)
 
 
-def test_variance_looks_at_the_std_alone(model, candidates):
+def test_the_variance_acquisition_equals_the_predictive_deviation(model, candidates):
     said = value(model, candidates, "variance", 2)
     torch.testing.assert_close(said, stds(model, candidates.points.q, candidates.points.u)[:, 2], rtol=1e-6, atol=0)
 
@@ -85,7 +85,7 @@ def test_integrated_variance_prefers_queries_that_inform_many_points(model, cand
 
 
 @pytest.mark.parametrize("criterion", CRITERIA)
-def test_a_batch_equals_its_points_one_by_one(model, candidates, criterion):
+def test_choosing_a_batch_of_queries_equals_choosing_them_one_by_one(model, candidates, criterion):
     """Choosing three at once is choosing one three times, with those before assumed."""
     points, nothing = candidates.points, candidates.points[:0]
     model = by(model, criterion)
@@ -97,13 +97,13 @@ def test_a_batch_equals_its_points_one_by_one(model, candidates, criterion):
     assert len(set(batch)) == 3
 
 
-def test_earlier_queries_are_not_chosen_again(model, candidates):
+def test_queries_already_asked_are_not_chosen_again(model, candidates):
     points = candidates.points
     all_but_two = points[: len(points) - 2]
     assert set(choose(model, candidates, all_but_two, points[:0], [0, 1, 2, 0, 1], TOLERANCES)) == {58, 59}
 
 
-def test_the_first_of_a_batch_is_taken_from_the_reserved(model, candidates):
+def test_the_first_query_of_a_batch_is_a_reserved_candidate(model, candidates):
     reserved = torch.zeros(60, dtype=torch.bool)
     reserved[[7, 31]] = True
     nothing = candidates.points[:0]
@@ -120,7 +120,7 @@ def test_a_constant_output_is_queried_far_from_earlier_queries(model, candidates
     assert pick == int(nearest(model.definition, candidates.points, taken).argmax())
 
 
-def test_near_is_measured_standardised_of_the_sampling_range(definition):
+def test_the_distance_between_queries_is_standardised_by_the_sampling_range(definition):
     taken = Points(torch.tensor([[3.14, 1.0]]).double(), torch.tensor([[0.5]]).double())
     std = 16 / 12**0.5
     q = torch.tensor([[3.14, 1.0]] * 2).double()
@@ -133,7 +133,7 @@ def test_near_is_measured_standardised_of_the_sampling_range(definition):
     assert torch.isinf(nearest(definition, taken, taken[:0])).all()
 
 
-def test_another_discrete_action_is_another_query(definition):
+def test_queries_with_different_discrete_actions_are_not_near_duplicates(definition):
     discrete = replace(definition, action=definition_from_spec(cartpole()).action)
     q, left, right = torch.zeros(1, 2).double(), torch.zeros(1, 1).double(), torch.ones(1, 1).double()
     assert nearest(discrete, Points(q, left), Points(q, right))[0] > NEAR
@@ -155,7 +155,9 @@ def leave(_: torch.Tensor) -> object:
         (leave, "SystemExit: no licence"),
     ],
 )
-def test_an_answer_that_breaks_the_laws_names_the_acquisition(model, candidates, monkeypatch, answer, said):
+def test_invalid_acquisition_values_raise_an_error_that_names_the_acquisition(
+    model, candidates, monkeypatch, answer, said
+):
     """By its values the design spends real steps; argmax of NaN or of a scalar would choose without a word."""
     monkeypatch.setattr(Variance, "value", lambda _, view: answer(view.std))
     nothing = candidates.points[:0]
@@ -164,7 +166,7 @@ def test_an_answer_that_breaks_the_laws_names_the_acquisition(model, candidates,
         choose(by(model, "variance"), candidates, nothing, nothing, [0], TOLERANCES)
 
 
-def test_an_answer_along_paths_is_held_to_the_laws_too(monkeypatch):
+def test_invalid_acquisition_values_along_a_path_raise_an_error(monkeypatch):
     weight = torch.ones(2, 3)
     paths = PathView(0.1, weight, lambda: weight, lambda: weight)
     monkeypatch.setattr(Variance, "path_value", lambda _, view: view.weight / 0)

@@ -25,17 +25,17 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-def test_without_visited_states_every_state_is_as_likely(model, points):
+def test_without_visited_states_all_candidates_have_equal_probability(model, points):
     assert (input_probability(model, Points(*points), None) == 0).all()
     assert (input_probability(model, Points(*points), torch.zeros(0, 2).double()) == 0).all()
 
 
-def test_visited_states_are_what_is_weighed_by(model, points, unseen):
+def test_candidates_are_weighted_by_the_density_of_visited_states(model, points, unseen):
     said = input_probability(model, Points(*points), unseen.q)
     torch.testing.assert_close(said, log_occupancy(model.definition, unseen.q, points[0]))
 
 
-def test_the_paper_takes_the_density_of_predicted_next_states(points):
+def test_preset_paper_weights_candidates_by_the_density_of_predicted_next_states(points):
     spec = pendulum().model_copy(update={"design": Design(preset="paper")})
     model = learn(definition_from_spec(spec), random_steps(spec, 12, seed=0)).model
     arrived = model.transition(*points).q_next
@@ -45,7 +45,7 @@ def test_the_paper_takes_the_density_of_predicted_next_states(points):
 
 
 @pytest.mark.parametrize("acquisition", ["uncertainty_index", "integrated_variance", "variance"])
-def test_probabilities_are_computed_for_the_criterion_that_reads_them(model, points, unseen, rng, acquisition):
+def test_candidate_probabilities_are_computed_only_for_the_uncertainty_index(model, points, unseen, rng, acquisition):
     design = dataclasses.replace(model.definition.design, acquisition=Choice(acquisition))
     asked = dataclasses.replace(model, definition=dataclasses.replace(model.definition, design=design))
     made = candidates_of(asked, Points(*points), unseen.q, rng)
@@ -54,7 +54,7 @@ def test_probabilities_are_computed_for_the_criterion_that_reads_them(model, poi
     torch.testing.assert_close(made.log_p, expected)
 
 
-def test_without_visited_states_a_query_should_be_good_anywhere(model, points, rng):
+def test_without_visited_states_reference_points_cover_the_sampling_range_equally(model, points, rng):
     made = candidates_of(model, Points(*points), None, rng)
     assert torch.equal(made.points.q, points[0])
     assert torch.equal(made.reference.q, points[0])
@@ -71,7 +71,7 @@ def test_visited_states_outside_the_sampling_range_are_never_queried(model, poin
     assert torch.equal(none.weights, torch.full_like(none.weights, 1 / len(none.weights)))
 
 
-def test_visited_states_are_candidates_and_have_their_share_of_the_reference(model, points, unseen, rng):
+def test_visited_states_become_candidates_and_reference_points(model, points, unseen, rng):
     visited = unseen.q[:7]
     made = candidates_of(model, Points(*points), visited, rng)
     assert torch.equal(made.points.q[:60], points[0])
@@ -81,14 +81,14 @@ def test_visited_states_are_candidates_and_have_their_share_of_the_reference(mod
     assert float(made.weights[of_policies].sum()) == pytest.approx(OCCUPIED)
 
 
-def test_a_large_monte_carlo_set_is_not_compared_pair_by_pair(model, points, rng, monkeypatch):
+def test_candidates_and_reference_points_are_limited_in_number(model, points, rng, monkeypatch):
     monkeypatch.setattr(candidates_room, "MAX_CANDIDATES", 20)
     monkeypatch.setattr(candidates_room, "REFERENCE", 10)
     made = candidates_of(model, Points(*points), None, rng)
     assert (len(made.points), len(made.log_p), len(made.reference), len(made.weights)) == (20, 20, 10, 10)
 
 
-def test_the_end_of_an_episode_is_reserved_until_one_was_seen():
+def test_candidates_that_end_the_episode_are_reserved_until_a_termination_was_sampled():
     spec = cartpole()
     steps = random_steps(spec, 60, seed=0)
     going = Samples(*(getattr(steps, n)[~steps.terminated] for n in steps.__dataclass_fields__))

@@ -74,7 +74,9 @@ def writers(monkeypatch: pytest.MonkeyPatch) -> set[threading.Thread]:
 
 
 @pytest.mark.parametrize("steps", [1, forms.SHORT_ROLLOUT, forms.SHORT_ROLLOUT + 1, 200])
-def test_a_long_reply_is_written_beside_the_event_loop(steps: int, writers: set[threading.Thread]):
+def test_long_rollout_replies_are_serialised_in_a_thread_and_short_ones_are_not(
+    steps: int, writers: set[threading.Thread]
+):
     actions = np.zeros((steps, 2, 1))
     as_json = in_json(msgspec.json.encode({"actions": actions.tolist()}))
     as_frame = in_frame(frames.rollout_request(None, actions))
@@ -90,7 +92,7 @@ def test_a_long_reply_is_written_beside_the_event_loop(steps: int, writers: set[
 
 
 @pytest.mark.parametrize("steps", [1, forms.SHORT_ROLLOUT + 1])
-def test_a_reply_to_a_policy_says_the_same_in_both_forms(steps: int, writers: set[threading.Thread]):
+def test_a_policy_rollout_reply_is_equal_as_json_and_as_binary_frame(steps: int, writers: set[threading.Thread]):
     run = PolicyRun(random_policy((3, 4, 1)), steps)
     as_json = in_json(JsonForm().policy(1, run, SHAPE))
     as_frame = in_frame(frames.policy_request(None, run.policy, steps, None, None))

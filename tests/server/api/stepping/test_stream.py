@@ -74,7 +74,9 @@ AS_JSON: list[tuple[str, dict[str, Any]]] = [
 ]
 
 
-def test_a_repeat_may_come_over_any_other_transport(client: httpx.Client, session: str, stream: ClientConnection):
+def test_a_repeated_request_gets_the_same_reply_over_another_transport(
+    client: httpx.Client, session: str, stream: ClientConnection
+):
     """One session goes through three requests, each repeated over all transports: one reply each, bit for bit."""
     first: list[Callable[[int], bytes]] = [
         lambda i: frames.encode(over_stream(stream)(REQUESTS[i])),
@@ -138,7 +140,7 @@ BAD: list[tuple[bytes, str]] = [
 
 
 @pytest.mark.parametrize(("content", "said"), BAD)
-def test_bad_bytes_change_nothing(
+def test_an_invalid_frame_is_refused_and_the_session_is_unchanged(
     client: httpx.Client, session: str, stream: ClientConnection, content: bytes, said: str
 ):
     over_stream(stream)(frames.reset_request(1, None, None))
@@ -153,32 +155,32 @@ def test_bad_bytes_change_nothing(
     assert client.get(f"/v1/sessions/{session}").json()["seq"] == 1
 
 
-def test_text_is_no_frame(stream: ClientConnection):
+def test_a_text_message_on_the_stream_is_refused(stream: ClientConnection):
     stream.send('{"op": "reset"}')
     problem = frames.read_reply(stream.recv(timeout=60))
     assert isinstance(problem, frames.ProblemReply)
     assert problem.detail == "expected a binary message, got text"
 
 
-def test_a_frame_belongs_to_its_route(client: httpx.Client, session: str):
+def test_a_reset_frame_sent_to_the_step_route_is_refused(client: httpx.Client, session: str):
     reply = post(client, session, frames.reset_request(1, None, None), what="step")
     assert (reply.status_code, reply.json()["detail"]) == (422, "expected a StepRequest, got a ResetRequest")
 
 
-def test_an_unknown_form_is_refused(client: httpx.Client, session: str):
+def test_a_step_with_an_unknown_content_type_is_refused(client: httpx.Client, session: str):
     reply = client.post(f"/v1/sessions/{session}/step", content=b"1", headers={"content-type": "text/csv"})
     assert reply.json()["code"] == "unsupported_media_type"
     assert "application/json or application/vnd.msgpack, got text/csv" in reply.json()["detail"]
 
 
-def test_no_stream_without_a_session(server_process: ServerProcess):
+def test_opening_a_stream_of_an_unknown_session_is_refused(server_process: ServerProcess):
     with pytest.raises(InvalidStatus) as refused, connect(address(server_process.url, "none")):
         pass
     problem = Problem.model_validate_json(refused.value.response.body)
     assert (problem.code, refused.value.response.status_code) == (Code.UNKNOWN_SESSION, 404)
 
 
-def test_a_session_that_ends_ends_its_stream_with_a_problem(
+def test_a_request_on_the_stream_of_a_closed_session_gets_an_error_reply(
     client: httpx.Client, session: str, stream: ClientConnection
 ):
     client.delete(f"/v1/sessions/{session}")
@@ -187,7 +189,7 @@ def test_a_session_that_ends_ends_its_stream_with_a_problem(
     assert problem.code is Code.UNKNOWN_SESSION
 
 
-def test_a_client_that_sends_ahead_leaves_others_their_turns():
+def test_many_messages_sent_at_once_do_not_block_other_clients():
     """Messages that are all there at once are answered with other work in between."""
     waiting, answered, turns = 200, 0, 0
     action = SimpleNamespace(size=1)
@@ -222,7 +224,7 @@ def test_a_client_that_sends_ahead_leaves_others_their_turns():
     assert turns >= waiting - 1
 
 
-def test_two_streams_of_one_session_step_once(server_process: ServerProcess, session: str):
+def test_the_same_request_over_several_streams_of_a_session_steps_once(server_process: ServerProcess, session: str):
     def run(_: int) -> bytes:
         with connect(address(server_process.url, session), compression=None) as stream:
             return frames.encode(over_stream(stream)(frames.rollout_request(2, np.stack([ACTION] * 200))))
@@ -233,7 +235,7 @@ def test_two_streams_of_one_session_step_once(server_process: ServerProcess, ses
         assert len(set(pool.map(run, range(3)))) == 1
 
 
-def test_a_page_of_another_host_gets_no_stream(server_process: ServerProcess, session: str):
+def test_a_stream_opened_by_a_page_of_another_origin_is_refused(server_process: ServerProcess, session: str):
     url = address(server_process.url, session)
     with connect(url, origin=server_process.url) as own:  # type: ignore[arg-type]
         assert isinstance(over_stream(own)(frames.reset_request(1, None, None)), frames.ResetReply)
@@ -243,7 +245,7 @@ def test_a_page_of_another_host_gets_no_stream(server_process: ServerProcess, se
     assert b"elsewhere.example" in refused.value.response.body
 
 
-def test_too_large_a_message_and_a_shutdown_end_the_stream(tmp_path: Path):
+def test_an_oversized_message_or_a_server_shutdown_closes_the_stream(tmp_path: Path):
     server = start_server(tmp_path, SURROGYM_MAX_BODY_BYTES="2048")
     try:
         with httpx.Client(base_url=server.url, timeout=60) as client:
@@ -266,7 +268,7 @@ def test_too_large_a_message_and_a_shutdown_end_the_stream(tmp_path: Path):
         server.stop(signal.SIGKILL)
 
 
-def test_a_deadline_of_the_handshake_holds_for_each_message(
+def test_the_deadline_header_of_a_stream_applies_to_each_message(
     server_process: ServerProcess, client: httpx.Client, session: str
 ):
     client.post(f"/v1/sessions/{session}/reset", json={}).raise_for_status()
@@ -307,7 +309,7 @@ def replies(connected: socket.socket, count: int) -> list[Any]:
     return [frames.read_reply(frame[extent.payload :]) for frame, extent in found if frame[0] == WHOLE_BINARY]
 
 
-def test_messages_in_any_pieces_are_answered_in_order(bare: socket.socket):
+def test_fragmented_and_joined_websocket_messages_are_answered_in_order(bare: socket.socket):
     """Alone, byte by byte, several in one piece with a ping between, and as fragments."""
     bare.sendall(written(frames.reset_request(1, 0, None)))
     (first,) = replies(bare, 1)
@@ -326,7 +328,7 @@ def test_messages_in_any_pieces_are_answered_in_order(bare: socket.socket):
     assert [r.seq for r in (first, second, *ahead, fifth, sixth)] == [1, 2, 3, 4, 5, 6]
 
 
-def test_an_announced_message_beyond_the_limit_ends_the_stream(bare: socket.socket):
+def test_a_message_whose_announced_length_exceeds_the_limit_closes_the_stream(bare: socket.socket):
     bare.sendall(written(frames.reset_request(1, 0, None)))
     replies(bare, 1)
     bare.sendall(header(2**40, MASKED) + b"key!" + b"some")

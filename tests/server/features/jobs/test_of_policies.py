@@ -31,7 +31,7 @@ def known(api: Api, taught: str) -> Iterator[str]:
         yield taught
 
 
-def test_an_evaluation_names_a_version_and_goes_to_a_worker_that_takes_it(api: Api, known: str):
+def test_an_evaluation_job_goes_only_to_a_worker_that_allows_its_episodes(api: Api, known: str):
     with pytest.raises(UnknownPolicy):
         api.jobs.add(known, EVALUATE.model_copy(update={"policy": "production"}))
     version = api.policies.push(known, wire.PushedCard(), [], "zip", network_file(seed=1)).version
@@ -43,7 +43,7 @@ def test_an_evaluation_names_a_version_and_goes_to_a_worker_that_takes_it(api: A
     api.jobs.finish(known, job.id, job.lease_token, "failed", error="the motor did not answer")
 
 
-def test_a_training_ends_with_a_version_and_an_evaluation_that_are_there(api: Api, known: str):
+def test_a_training_job_cannot_finish_with_an_unknown_evaluation(api: Api, known: str):
     version = api.policies.push(known, wire.PushedCard(), [], "zip", network_file(seed=2)).version
     api.jobs.add(known, TRAIN)
     job = api.jobs.claim(known, "trainer-1")

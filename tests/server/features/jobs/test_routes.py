@@ -43,11 +43,11 @@ def known(api: Api, taught: str) -> Iterator[str]:
         (routes.FINISH, wire.FinishJob),
     ],
 )
-def test_every_example_is_accepted_by_its_model(example: dict[str, Any], model: type[wire.Request]):
+def test_every_openapi_example_of_a_job_passes_validation(example: dict[str, Any], model: type[wire.Request]):
     model.model_validate(example)
 
 
-def test_a_job_is_seen_from_its_queue_to_its_end(api: Api, known: str):
+def test_a_job_is_listed_from_queued_to_finished(api: Api, known: str):
     added = api.jobs.add(known, TRAIN)
     assert (added.status, added.task) == ("queued", TRAIN)
     job = api.jobs.claim(known, "trainer-1", most_episodes=7)
@@ -72,7 +72,7 @@ def test_a_job_is_seen_from_its_queue_to_its_end(api: Api, known: str):
         api.jobs.get(known, 2**40)
 
 
-def test_a_waiting_worker_gets_a_job_as_it_comes(api: Api, known: str):
+def test_a_waiting_worker_gets_a_new_job_at_once(api: Api, known: str):
     found: list[Any] = []
     waiting = threading.Thread(target=lambda: found.append(api.jobs.claim(known, "waiting", wait_seconds=30)))
     waiting.start()
@@ -83,14 +83,14 @@ def test_a_waiting_worker_gets_a_job_as_it_comes(api: Api, known: str):
     api.jobs.finish(known, id, found[0].lease_token, "done")
 
 
-def test_a_training_needs_a_model(api: Api, name: str):
+def test_a_training_job_for_a_surrogate_without_model_is_refused(api: Api, name: str):
     api.create_surrogate(name, pendulum())
     with pytest.raises(NoModel):
         api.jobs.add(name, TRAIN)
     api.delete_surrogate(name)
 
 
-def test_jobs_that_nobody_runs_are_bounded(api: Api, known: str):
+def test_more_unfinished_jobs_than_the_limit_are_refused(api: Api, known: str):
     while sum(job.status in ("queued", "running") for job in api.jobs.list(known).jobs) < 20:
         api.jobs.add(known, TRAIN)
     with Api(api.url, retries=Retries(seconds=0)) as impatient, pytest.raises(Overloaded, match="wait or run"):
@@ -111,7 +111,7 @@ def test_jobs_that_nobody_runs_are_bounded(api: Api, known: str):
         ({"kind": "shell"}, "kind"),
     ],
 )
-def test_a_task_outside_its_bounds_is_refused_and_changes_nothing(
+def test_a_job_with_out_of_range_settings_is_refused_and_not_stored(
     client: httpx.Client, known: str, task: dict[str, Any], said: str
 ):
     before = client.get(f"/v1/surrogates/{known}/jobs").json()["jobs"]
@@ -121,7 +121,7 @@ def test_a_task_outside_its_bounds_is_refused_and_changes_nothing(
     assert client.get(f"/v1/surrogates/{known}/jobs").json()["jobs"] == before
 
 
-def test_a_report_outside_its_bounds_is_refused(api: Api, client: httpx.Client, known: str):
+def test_a_job_progress_report_with_out_of_range_values_is_refused(api: Api, client: httpx.Client, known: str):
     id = api.jobs.add(known, TRAIN).id
     job = api.jobs.claim(known, "trainer-1")
     assert job is not None

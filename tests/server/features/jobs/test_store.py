@@ -37,7 +37,7 @@ def fall_silent(jobs: Jobs, name: str, until: Until) -> LeasedJob:
     return job
 
 
-def test_jobs_go_out_oldest_first_and_to_one_worker(storage: Storage, jobs: Jobs, make: Make) -> None:
+def test_each_job_is_handed_to_one_worker_and_the_oldest_first(storage: Storage, jobs: Jobs, make: Make) -> None:
     name = make()
     ids = [jobs.add(name, TRAIN) for _ in range(2)]
     assert [claimed(jobs, name).id, claimed(jobs, name).id] == ids
@@ -48,7 +48,7 @@ def test_jobs_go_out_oldest_first_and_to_one_worker(storage: Storage, jobs: Jobs
     assert [event.body for event in storage.events.list(name) if event.kind == "job"][-1]["worker"] == "worker"
 
 
-def test_a_worker_gets_no_more_real_episodes_than_it_takes(jobs: Jobs, make: Make) -> None:
+def test_a_worker_gets_no_evaluation_with_more_episodes_than_it_allows(jobs: Jobs, make: Make) -> None:
     name = make()
     evaluation, training = jobs.add(name, EVALUATE), jobs.add(name, TRAIN)
     first, none = jobs.claim(name, "a", 9, LONG), jobs.claim(name, "a", 9, LONG)
@@ -58,7 +58,7 @@ def test_a_worker_gets_no_more_real_episodes_than_it_takes(jobs: Jobs, make: Mak
     assert (second.id, second.task) == (evaluation, EVALUATE.task)
 
 
-def test_a_job_with_a_reference_controller_waits_for_its_worker(jobs: Jobs, make: Make) -> None:
+def test_a_job_with_reference_controller_waits_for_a_worker_that_has_one(jobs: Jobs, make: Make) -> None:
     name = make()
     asked = NewJob("evaluate", {**EVALUATE.task, "reference": True}, EVALUATE.episodes)
     first, training = jobs.add(name, asked), jobs.add(name, TRAIN)
@@ -71,7 +71,7 @@ def test_a_job_with_a_reference_controller_waits_for_its_worker(jobs: Jobs, make
     assert found.id == first
 
 
-def test_a_report_keeps_the_lease_and_replaces_the_progress(jobs: Jobs, make: Make) -> None:
+def test_a_progress_report_renews_the_lease_of_a_job(jobs: Jobs, make: Make) -> None:
     name = make()
     jobs.add(name, TRAIN)
     job = claimed(jobs, name)
@@ -84,7 +84,7 @@ def test_a_report_keeps_the_lease_and_replaces_the_progress(jobs: Jobs, make: Ma
     assert jobs.list(name)[0].curve == []
 
 
-def test_a_result_ends_a_job_once(jobs: Jobs, make: Make) -> None:
+def test_a_job_accepts_one_result(jobs: Jobs, make: Make) -> None:
     name = make()
     jobs.add(name, TRAIN)
     job = claimed(jobs, name)
@@ -98,7 +98,7 @@ def test_a_result_ends_a_job_once(jobs: Jobs, make: Make) -> None:
         jobs.finish(name, job.id, "invented", DONE)
 
 
-def test_the_training_of_a_dead_worker_goes_to_the_next(jobs: Jobs, make: Make, until: Until) -> None:
+def test_the_training_job_of_a_dead_worker_goes_to_the_next_worker(jobs: Jobs, make: Make, until: Until) -> None:
     name = make()
     jobs.add(name, TRAIN)
     dead = fall_silent(jobs, name, until)
@@ -116,7 +116,7 @@ def test_the_training_of_a_dead_worker_goes_to_the_next(jobs: Jobs, make: Make, 
             late()
 
 
-def test_a_training_whose_workers_all_fall_silent_fails(jobs: Jobs, make: Make, until: Until) -> None:
+def test_a_training_job_fails_after_all_its_workers_went_silent(jobs: Jobs, make: Make, until: Until) -> None:
     name = make()
     id = jobs.add(name, TRAIN)
     for attempt in range(1, MAX_RUNS + 1):
@@ -126,7 +126,7 @@ def test_a_training_whose_workers_all_fall_silent_fails(jobs: Jobs, make: Make, 
     assert jobs.claim(name, "a", 0, LONG) is None
 
 
-def test_an_evaluation_is_never_run_again_by_itself(jobs: Jobs, make: Make, until: Until) -> None:
+def test_an_evaluation_job_of_a_silent_worker_is_not_repeated(jobs: Jobs, make: Make, until: Until) -> None:
     """Nobody knows which of its real steps were taken."""
     name = make()
     jobs.add(name, EVALUATE)
@@ -136,7 +136,7 @@ def test_an_evaluation_is_never_run_again_by_itself(jobs: Jobs, make: Make, unti
 
 
 @pytest.mark.parametrize("new", [TRAIN, EVALUATE])
-def test_a_worker_continues_after_a_long_absence_of_its_server(
+def test_a_worker_can_finish_its_job_after_a_long_server_outage(
     jobs: Jobs, make: Make, until: Until, new: NewJob
 ) -> None:
     name = make()
@@ -149,7 +149,7 @@ def test_a_worker_continues_after_a_long_absence_of_its_server(
     assert (ended.status, ended.error, ended.version) == ("done", None, 3)
 
 
-def test_cancelling_asks_a_worker_to_stop_and_ends_what_waits(jobs: Jobs, make: Make) -> None:
+def test_cancelling_ends_a_queued_job_and_asks_a_running_one_to_stop(jobs: Jobs, make: Make) -> None:
     name = make()
     running, waiting = (jobs.add(name, TRAIN) for _ in range(2))
     job = claimed(jobs, name)
@@ -162,7 +162,7 @@ def test_cancelling_asks_a_worker_to_stop_and_ends_what_waits(jobs: Jobs, make: 
     assert jobs.cancel(name, running) == ended
 
 
-def test_a_silent_worker_that_was_to_stop_leaves_its_job_cancelled(jobs: Jobs, make: Make, until: Until) -> None:
+def test_a_cancelled_job_whose_worker_goes_silent_ends_as_cancelled(jobs: Jobs, make: Make, until: Until) -> None:
     name = make()
     id = jobs.add(name, TRAIN)
     job = claimed(jobs, name, 0.2)
@@ -172,7 +172,7 @@ def test_a_silent_worker_that_was_to_stop_leaves_its_job_cancelled(jobs: Jobs, m
     assert jobs.finish(name, id, job.token, JobResult("cancelled", version=2)).version == 2
 
 
-def test_a_job_that_was_cancelled_while_it_waited_again_takes_no_result(jobs: Jobs, make: Make, until: Until) -> None:
+def test_a_job_cancelled_after_its_worker_went_silent_accepts_no_result(jobs: Jobs, make: Make, until: Until) -> None:
     name = make()
     jobs.add(name, TRAIN)
     job = fall_silent(jobs, name, until)
@@ -181,7 +181,7 @@ def test_a_job_that_was_cancelled_while_it_waited_again_takes_no_result(jobs: Jo
         jobs.finish(name, job.id, job.token, DONE)
 
 
-def test_the_lease_of_a_dead_worker_ends_though_the_clock_was_set_back(
+def test_the_lease_of_a_dead_worker_expires_although_the_clock_was_set_back(
     jobs: Jobs, make: Make, until: Until, set_clock_back: Callable[[float], None]
 ) -> None:
     name = make()
@@ -192,7 +192,7 @@ def test_the_lease_of_a_dead_worker_ends_though_the_clock_was_set_back(
     assert claimed(jobs, name).attempt == 2
 
 
-def test_the_same_key_queues_once(jobs: Jobs, make: Make) -> None:
+def test_a_job_added_twice_with_one_idempotency_key_is_queued_once(jobs: Jobs, make: Make) -> None:
     name = make()
     id = jobs.add(name, TRAIN, key="a")
     assert jobs.add(name, TRAIN, key="a") == id
@@ -201,7 +201,9 @@ def test_the_same_key_queues_once(jobs: Jobs, make: Make) -> None:
     assert len(jobs.list(name)) == 1
 
 
-def test_the_number_of_jobs_is_bounded(jobs: Jobs, make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jobs_beyond_the_limit_of_a_surrogate_are_refused(
+    jobs: Jobs, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("surrogym_server.features.jobs.store.MAX_JOBS", 2)
     name = make()
     ids = [jobs.add(name, TRAIN) for _ in range(MAX_OPEN)]
@@ -215,7 +217,7 @@ def test_the_number_of_jobs_is_bounded(jobs: Jobs, make: Make, monkeypatch: pyte
         jobs.get(name, ids[0])
 
 
-def test_a_job_belongs_to_its_surrogate(storage: Storage, jobs: Jobs, make: Make) -> None:
+def test_a_job_cannot_be_reached_through_another_surrogate(storage: Storage, jobs: Jobs, make: Make) -> None:
     id = jobs.add(make(name="one"), TRAIN)
     with pytest.raises(UnknownJob, match="which is not there"):
         jobs.cancel(make(name="two"), id)

@@ -23,7 +23,7 @@ def zipped(entries: int) -> bytes:
     return file.getvalue()
 
 
-def test_zip_of_too_many_entries_is_refused_before_it_is_listed():
+def test_a_policy_zip_with_too_many_entries_is_refused_before_listing_it():
     content = zipped(2 * MOST_ENTRIES)
     digest = hashlib.sha256(content).hexdigest()
     tracemalloc.start()
@@ -36,6 +36,6 @@ def test_zip_of_too_many_entries_is_refused_before_it_is_listed():
     assert peak < len(content) / 10
 
 
-def test_zip_of_many_entries_is_accepted():
+def test_a_policy_zip_with_many_entries_is_accepted():
     content = zipped(MOST_ENTRIES)
     check_file("zip", content, len(content), hashlib.sha256(content).hexdigest())

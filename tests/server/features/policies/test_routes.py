@@ -48,7 +48,7 @@ class Bomb:
         (routes.DRIFT_EXAMPLE, AddDrift),
     ],
 )
-def test_every_example_is_accepted_by_its_model(example: dict[str, Any], model: type[wire.Request]):
+def test_every_openapi_example_of_a_policy_passes_validation(example: dict[str, Any], model: type[wire.Request]):
     model.model_validate(example)
 
 
@@ -82,7 +82,7 @@ def episodes(key: str = "a", **fields: Any) -> wire.AddEvaluation:
     return wire.AddEvaluation(**{**given, "idempotency_key": key, **fields})
 
 
-def test_a_policy_is_given_out_as_it_came(api: Api, surrogate: str, tmp_path: Path):
+def test_an_uploaded_policy_is_returned_unchanged(api: Api, surrogate: str, tmp_path: Path):
     file = network_file(tmp_path)
     curve = [wire.CurvePoint(steps=10, imagined_return=-900.0, seconds=0.5)]
     pushed = api.policies.push(surrogate, card(settings={"units": 4}), curve, "zip", file)
@@ -110,7 +110,9 @@ def test_a_policy_is_given_out_as_it_came(api: Api, surrogate: str, tmp_path: Pa
         ('"settings": ' + 20 * '{"a":' + "1" + 20 * "}", "levels"),
     ],
 )
-def test_a_card_with_impossible_values_is_refused(client: httpx.Client, surrogate: str, fields: str, named: str):
+def test_a_policy_description_with_invalid_values_is_refused(
+    client: httpx.Client, surrogate: str, fields: str, named: str
+):
     body = f'{{"card": {{{fields}}}, "file": {{"form": "zip", "bytes": 1, "digest": "{"0" * 64}"}}}}'
     reply = client.post(
         f"/v1/surrogates/{surrogate}/policies", content=body, headers={"content-type": "application/json"}
@@ -120,7 +122,7 @@ def test_a_card_with_impossible_values_is_refused(client: httpx.Client, surrogat
     assert client.get(f"/v1/surrogates/{surrogate}/policies").json()["policies"] == []
 
 
-def test_an_audit_is_given_out_as_it_came(api: Api, surrogate: str, tmp_path: Path):
+def test_the_audit_of_an_uploaded_policy_is_returned_unchanged(api: Api, surrogate: str, tmp_path: Path):
     """The server dropped how many steps were off the policy's way, and where this way leaves the sampling range."""
     left = wire.PolicyRangeLeft(coordinate="speed", side="upper", end=8.0, share=0.1, farthest=9.0)
     audit = wire.PolicyAudit(steps=8, elsewhere=2, passed=True, range_left=left)
@@ -128,14 +130,18 @@ def test_an_audit_is_given_out_as_it_came(api: Api, surrogate: str, tmp_path: Pa
     assert api.policies.get(surrogate, 1).audit == audit
 
 
-def test_a_card_with_the_largest_specification_and_a_curve_is_stored(api: Api, surrogate: str, tmp_path: Path):
+def test_a_policy_with_the_largest_specification_and_a_learning_curve_is_stored(
+    api: Api, surrogate: str, tmp_path: Path
+):
     """A specification may have 128 KiB by itself."""
     curve = [wire.CurvePoint(steps=10**9 + n, imagined_return=-1 / 3, seconds=1 / 7) for n in range(200)]
     large = card(settings={"as large as a specification": "x" * 128 * 1024})
     assert api.policies.push(surrogate, large, curve, "zip", network_file(tmp_path)).created
 
 
-def test_an_evaluation_has_intervals_and_says_whether_the_promise_was_kept(api: Api, surrogate: str, tmp_path: Path):
+def test_a_stored_evaluation_has_confidence_intervals_and_tells_if_the_promise_held(
+    api: Api, surrogate: str, tmp_path: Path
+):
     api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
     trace = wire.EpisodeTrace(
         rank="worst", seed=10_001, coordinates=[[3.0, 0.0], [3.1, 0.2]], action=[[1.0]], reward=[-9.0]
@@ -162,7 +168,7 @@ def test_an_evaluation_has_intervals_and_says_whether_the_promise_was_kept(api: 
     assert [one.id for one in policy.evaluations] == [said.id, worse.id, kept.id, wide.id]
 
 
-def test_a_policy_whose_latest_evaluation_broke_its_promise_is_not_trusted(api: Api, surrogate: str, tmp_path: Path):
+def test_a_policy_whose_latest_evaluation_missed_the_promise_is_not_trusted(api: Api, surrogate: str, tmp_path: Path):
     """Episodes elsewhere judge nothing, and a later evaluation that keeps the promise gives the trust back."""
     api.policies.push(surrogate, card(reason="an audit passed"), [], "zip", network_file(tmp_path))
     said = []
@@ -177,7 +183,7 @@ def test_a_policy_whose_latest_evaluation_broke_its_promise_is_not_trusted(api: 
     assert said[2].reason == "an audit passed"
 
 
-def test_drift_withdraws_the_trust_until_an_evaluation_keeps_the_promise(
+def test_reported_drift_makes_a_policy_untrusted_until_an_evaluation_meets_the_promise(
     api: Api, client: httpx.Client, surrogate: str, tmp_path: Path
 ):
     api.policies.push(surrogate, card(reason="an audit passed"), [], "zip", network_file(tmp_path))
@@ -203,7 +209,7 @@ def test_drift_withdraws_the_trust_until_an_evaluation_keeps_the_promise(
 
 
 @pytest.mark.parametrize(("field", "value"), [("error", float("inf")), ("words", "a\0b"), ("steps", -1), ("more", 1)])
-def test_an_impossible_drift_is_refused_and_changes_nothing(
+def test_a_drift_report_with_invalid_values_is_refused_and_changes_nothing(
     api: Api, client: httpx.Client, surrogate: str, tmp_path: Path, field: str, value: object
 ):
     api.policies.push(surrogate, card(reason="an audit passed"), [], "zip", network_file(tmp_path))
@@ -216,7 +222,7 @@ def test_an_impossible_drift_is_refused_and_changes_nothing(
     assert api.policies.get(surrogate, 1).trusted is True
 
 
-def test_only_episodes_in_the_own_environment_judge_a_promise(api: Api, surrogate: str, tmp_path: Path):
+def test_evaluations_in_another_environment_do_not_decide_on_the_promise(api: Api, surrogate: str, tmp_path: Path):
     api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
     many: dict[str, Any] = {"returns": [-180.0] * 30, "lengths": [200] * 30}
     names = ("", "Pendulum-v1", "plants:Heavy")
@@ -228,7 +234,7 @@ def test_only_episodes_in_the_own_environment_judge_a_promise(api: Api, surrogat
     ]
 
 
-def test_the_own_environment_of_a_free_text_is_that_of_the_first_evaluation(api: Api, name: str, tmp_path: Path):
+def test_if_the_specification_names_no_environment_the_first_evaluation_defines_it(api: Api, name: str, tmp_path: Path):
     spec = pendulum().model_copy(update={"environment": "a pendulum"})
     api.create_surrogate(name, spec)
     try:
@@ -240,20 +246,20 @@ def test_the_own_environment_of_a_free_text_is_that_of_the_first_evaluation(api:
         api.delete_surrogate(name)
 
 
-def test_fewer_than_30_episodes_do_not_judge_a_promise(api: Api, surrogate: str, tmp_path: Path):
+def test_evaluations_of_fewer_than_30_episodes_do_not_decide_on_the_promise(api: Api, surrogate: str, tmp_path: Path):
     """Their mean is too uncertain. `surrogym evaluate` says so, and the server has to agree."""
     api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
     few = api.policies.evaluate(surrogate, 1, episodes(returns=[-180.0] * 29, lengths=[200] * 29))
     assert few.promise_kept is None
 
 
-def test_the_median_is_the_return_of_an_episode(api: Api, surrogate: str, tmp_path: Path):
+def test_the_median_return_of_an_even_number_of_episodes_is_one_of_them(api: Api, surrogate: str, tmp_path: Path):
     api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
     even = api.policies.evaluate(surrogate, 1, episodes(returns=[-1.0, -2.0, -4.0, -9.0], lengths=[200] * 4))
     assert even.median == -4.0
 
 
-def test_an_alias_moves_and_a_deleted_policy_is_unknown(api: Api, surrogate: str, tmp_path: Path):
+def test_a_policy_alias_can_be_moved_and_a_deleted_policy_is_unknown(api: Api, surrogate: str, tmp_path: Path):
     for seed in range(2):
         api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path, seed))
     api.policies.put_alias(surrogate, "production", 1)
@@ -269,7 +275,7 @@ def test_an_alias_moves_and_a_deleted_policy_is_unknown(api: Api, surrogate: str
         api.policies.put_alias(surrogate, "latest", 1)
 
 
-def test_a_policy_for_another_specification_is_refused_and_says_where(api: Api, surrogate: str, tmp_path: Path):
+def test_a_policy_for_another_specification_is_refused_with_the_difference(api: Api, surrogate: str, tmp_path: Path):
     with pytest.raises(SpecConflict, match="got one for another specification: observation is "):
         api.policies.push(surrogate, card(cartpole()), [], "zip", network_file(tmp_path))
     assert api.policies.list(surrogate) == []
@@ -277,7 +283,7 @@ def test_a_policy_for_another_specification_is_refused_and_says_where(api: Api, 
     assert api.policies.push(surrogate, card(shorter), [], "zip", network_file(tmp_path)).differs == "time_limit"
 
 
-def test_a_file_that_is_not_of_its_form_is_refused(api: Api, surrogate: str, tmp_path: Path):
+def test_a_policy_file_of_the_wrong_format_is_refused(api: Api, surrogate: str, tmp_path: Path):
     zipped = io.BytesIO()
     with zipfile.ZipFile(zipped, "w") as archive:
         archive.writestr("holiday.jpg", b"not a policy")
@@ -297,7 +303,7 @@ def test_a_file_that_is_not_of_its_form_is_refused(api: Api, surrogate: str, tmp
         api.policies.file(surrogate, version, "onnx")
 
 
-def test_a_body_that_was_cut_is_refused(api: Api, surrogate: str, tmp_path: Path):
+def test_a_truncated_policy_file_upload_is_refused(api: Api, surrogate: str, tmp_path: Path):
     file = network_file(tmp_path)
     version = api.policies.push(surrogate, card(), [], "zip", file).version
     digest = {"digest": hashlib.sha256(file).hexdigest()}
@@ -307,7 +313,7 @@ def test_a_body_that_was_cut_is_refused(api: Api, surrogate: str, tmp_path: Path
     assert api.policies.file(surrogate, version, "zip") == file
 
 
-def test_nothing_in_a_file_is_unpickled(api: Api, surrogate: str, tmp_path: Path):
+def test_the_server_never_unpickles_an_uploaded_policy_file(api: Api, surrogate: str, tmp_path: Path):
     exploded = tmp_path / "exploded"
     zipped = io.BytesIO()
     with zipfile.ZipFile(zipped, "w") as archive:
@@ -320,7 +326,7 @@ def test_nothing_in_a_file_is_unpickled(api: Api, surrogate: str, tmp_path: Path
     assert not exploded.exists()
 
 
-def test_lists_that_do_not_belong_together_change_nothing(api: Api, surrogate: str, tmp_path: Path):
+def test_an_evaluation_with_lists_of_unequal_length_is_refused(api: Api, surrogate: str, tmp_path: Path):
     api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
     with pytest.raises(InvalidInput, match="lengths: expected 3 entries"):
         api.policies.evaluate(surrogate, 1, episodes(lengths=[200, 200]))
@@ -336,7 +342,9 @@ def test_lists_that_do_not_belong_together_change_nothing(api: Api, surrogate: s
     assert api.policies.get(surrogate, 1).evaluations == []
 
 
-def test_damage_is_named_and_the_rest_is_shown(api: Api, surrogate: str, tmp_path: Path, server_process: ServerProcess):
+def test_damaged_policy_files_are_reported_and_the_rest_stays_readable(
+    api: Api, surrogate: str, tmp_path: Path, server_process: ServerProcess
+):
     version = api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path)).version
     said = api.policies.evaluate(surrogate, version, episodes())
     folder = Path(f"{server_process.folder}/surrogym.db.files")

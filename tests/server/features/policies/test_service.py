@@ -61,7 +61,9 @@ def lost_at_commit(monkeypatch: pytest.MonkeyPatch, operation: str) -> None:
     monkeypatch.setattr(Policies, operation, broken)
 
 
-def test_a_file_with_a_lost_acknowledgement_is_stored(storage: Storage, monkeypatch: pytest.MonkeyPatch):
+def test_a_policy_file_is_stored_although_its_commit_acknowledgement_was_lost(
+    storage: Storage, monkeypatch: pytest.MonkeyPatch
+):
     policies, file = service(storage)
     with monkeypatch.context() as patched:
         lost_at_commit(patched, "attach")
@@ -70,7 +72,9 @@ def test_a_file_with_a_lost_acknowledgement_is_stored(storage: Storage, monkeypa
     assert policies.file(NAME, "1", "gif") == (1, GIF)
 
 
-def test_episodes_with_a_lost_acknowledgement_are_stored_once(storage: Storage, monkeypatch: pytest.MonkeyPatch):
+def test_an_evaluation_whose_commit_acknowledgement_was_lost_is_stored_once(
+    storage: Storage, monkeypatch: pytest.MonkeyPatch
+):
     policies, _ = service(storage)
     with monkeypatch.context() as patched:
         lost_at_commit(patched, "evaluate")
@@ -83,14 +87,14 @@ def test_episodes_with_a_lost_acknowledgement_are_stored_once(storage: Storage, 
     )
 
 
-def test_file_that_is_refused_leaves_nothing(storage: Storage):
+def test_a_refused_policy_file_leaves_no_stored_blob(storage: Storage):
     policies, file = service(storage, most=len(GIF) - 1)
     with pytest.raises(TooLarge):
         policies.put_file(NAME, 1, file, GIF)
     assert storage.part(RowBlobs).older(-1.0) == set()
 
 
-def test_only_who_stored_a_version_adds_files_to_it(storage: Storage):
+def test_only_the_sender_of_a_policy_version_can_add_files_to_it(storage: Storage):
     policies, file = service(storage)
     with pytest.raises(Forbidden, match="train one"):
         policies.put_file(NAME, 1, file, GIF, by="train two")

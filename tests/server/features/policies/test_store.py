@@ -59,7 +59,7 @@ def evaluated(
     return stored.policies.evaluate(name, version, new, most)[1]
 
 
-def test_a_policy_comes_back_with_card_curve_and_file(stored: Stored, make: Make) -> None:
+def test_a_stored_policy_is_read_back_with_description_learning_curve_and_file(stored: Stored, make: Make) -> None:
     name = make()
     version, created, _ = stored.policies.add(name, CARD, [{"steps": 1}], file_of(b"one"))
     assert (version, created) == (1, True)
@@ -74,7 +74,7 @@ def test_a_policy_comes_back_with_card_curve_and_file(stored: Stored, make: Make
     assert stored.policies.blobs() == {file.blob}
 
 
-def test_a_stored_version_never_changes(stored: Stored, make: Make) -> None:
+def test_a_stored_policy_version_never_changes(stored: Stored, make: Make) -> None:
     name = make()
     pushed(stored, name, b"one")
     stored.policies.put_alias(name, "production", 1)
@@ -90,7 +90,7 @@ def test_a_stored_version_never_changes(stored: Stored, make: Make) -> None:
     assert stored.policies.get(name, "production") == before
 
 
-def test_a_version_is_never_used_again(stored: Stored, make: Make) -> None:
+def test_the_number_of_a_deleted_policy_version_is_not_reused(stored: Stored, make: Make) -> None:
     name = make()
     for content in (b"one", b"two"):
         pushed(stored, name, content)
@@ -102,7 +102,7 @@ def test_a_version_is_never_used_again(stored: Stored, make: Make) -> None:
     assert [policy.version for policy in stored.policies.list(name)] == [3, 1]
 
 
-def test_an_alias_leads_to_one_version_and_goes_with_it(stored: Stored, make: Make) -> None:
+def test_a_policy_alias_points_to_one_version_and_is_deleted_with_it(stored: Stored, make: Make) -> None:
     name = make()
     for content in (b"one", b"two"):
         pushed(stored, name, content)
@@ -118,7 +118,7 @@ def test_an_alias_leads_to_one_version_and_goes_with_it(stored: Stored, make: Ma
         stored.policies.put_alias(name, "production", 2)
 
 
-def test_an_evaluation_is_stored_once_a_key_and_the_oldest_goes(
+def test_an_evaluation_is_stored_once_per_key_and_the_oldest_is_dropped(
     stored: Stored, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name = make()
@@ -134,7 +134,7 @@ def test_an_evaluation_is_stored_once_a_key_and_the_oldest_goes(
 
 
 @pytest.mark.parametrize("flood", [EPISODES, EPISODES | {"declared": True, "own": False}])
-def test_a_flood_of_other_evaluations_removes_none_that_decides_trust(
+def test_many_other_evaluations_never_displace_one_that_decides_trust(
     stored: Stored, make: Make, monkeypatch: pytest.MonkeyPatch, flood: dict[str, Any]
 ) -> None:
     """A hundred of another plant removed a broken promise and a drift, and the policy was trusted again."""
@@ -151,7 +151,7 @@ def test_a_flood_of_other_evaluations_removes_none_that_decides_trust(
     assert [one.summary for one in policy.drifts] == [drift]
 
 
-def test_beyond_the_bound_the_oldest_files_without_an_alias_go(stored: Stored, make: Make) -> None:
+def test_beyond_the_size_limit_the_oldest_policy_files_without_alias_are_deleted(stored: Stored, make: Make) -> None:
     name = make()
     versions = [pushed(stored, name, bytes([number]) * 100, most=350)[0] for number in range(3)]
     stored.policies.put_alias(name, "production", versions[0])
@@ -163,7 +163,7 @@ def test_beyond_the_bound_the_oldest_files_without_an_alias_go(stored: Stored, m
     assert stored.policies.get(name, "2").evaluations[0].summary == EPISODES  # what describes it stays
 
 
-def test_a_file_that_aliased_ones_leave_no_room_for_changes_nothing(stored: Stored, make: Make) -> None:
+def test_a_policy_file_is_refused_if_aliased_policies_fill_the_size_limit(stored: Stored, make: Make) -> None:
     name = make()
     version, _ = pushed(stored, name, b"x" * 100)
     stored.policies.put_alias(name, "production", version)
@@ -172,7 +172,7 @@ def test_a_file_that_aliased_ones_leave_no_room_for_changes_nothing(stored: Stor
     assert stored.policies.get(name, "production").files[0].blob is not None
 
 
-def test_beyond_the_count_the_oldest_without_an_alias_goes(
+def test_beyond_the_policy_count_limit_the_oldest_without_alias_is_deleted(
     stored: Stored, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("surrogym_server.features.policies.store.MAX_POLICIES", 2)
@@ -187,7 +187,7 @@ def test_beyond_the_count_the_oldest_without_an_alias_goes(
         pushed(stored, name, b"four")
 
 
-def test_flood_of_one_sender_leaves_the_policies_of_others(
+def test_many_policies_of_one_sender_do_not_displace_those_of_others(
     stored: Stored, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("surrogym_server.features.policies.store.MAX_POLICIES", 4)
@@ -199,7 +199,7 @@ def test_flood_of_one_sender_leaves_the_policies_of_others(
     assert [policy.version for policy in stored.policies.list(name)] == [22, 21, 2, 1]
 
 
-def test_files_of_one_sender_do_not_displace_those_of_others(stored: Stored, make: Make) -> None:
+def test_policy_files_of_one_sender_do_not_displace_those_of_others(stored: Stored, make: Make) -> None:
     name = make()
     for number, sender in enumerate(["honest", *["flood"] * 5]):
         content = bytes([number]) * 100
@@ -209,7 +209,9 @@ def test_files_of_one_sender_do_not_displace_those_of_others(stored: Stored, mak
     assert [policy.version for policy in policies if policy.files[0].blob is not None] == [6, 5, 1]
 
 
-def test_files_of_a_deleted_surrogate_are_orphans(storage: Storage, stored: Stored, make: Make) -> None:
+def test_policy_files_of_a_deleted_surrogate_become_orphaned_blobs(
+    storage: Storage, stored: Stored, make: Make
+) -> None:
     name = make()
     version, _ = pushed(stored, name, b"one")
     evaluated(stored, name, version, "a")
@@ -226,7 +228,7 @@ def test_files_of_a_deleted_surrogate_are_orphans(storage: Storage, stored: Stor
         stored.policies.list(name)
 
 
-def test_blobs_of_a_sqlite_file_lie_beside_it_for_its_owner_alone(tmp_path: Path) -> None:
+def test_blobs_of_a_sqlite_database_are_files_readable_by_its_owner_only(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/own.db"
     storage = open_storage(url)
     blobs = open_blobs(storage, url, None)
@@ -239,7 +241,7 @@ def test_blobs_of_a_sqlite_file_lie_beside_it_for_its_owner_alone(tmp_path: Path
     assert {file.stat().st_mode & 0o777 for file in files} == {0o600}
 
 
-def test_a_name_that_leads_out_of_the_folder_is_damage(tmp_path: Path) -> None:
+def test_a_blob_name_that_leaves_the_blob_folder_is_refused(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/own.db"
     storage = open_storage(url)
     blobs = open_blobs(storage, url, None)

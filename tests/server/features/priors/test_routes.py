@@ -61,7 +61,7 @@ def sent(api: Api, name: str, count: int) -> None:
     api.add_samples(name, "test", samples)
 
 
-def test_the_next_model_learns_beside_the_prior(api: Api, surrogate: str, textbook: SurrogateFile):
+def test_the_next_model_after_storing_a_prior_uses_the_prior(api: Api, surrogate: str, textbook: SurrogateFile):
     calls = PriorCalls(api.connection)
     assert calls.get(surrogate) == calls.get(surrogate).model_copy(update={"awaited": False, "about": None})
     stored = calls.put(surrogate, textbook.to_bytes())
@@ -78,7 +78,7 @@ def test_the_next_model_learns_beside_the_prior(api: Api, surrogate: str, textbo
     assert not any(output.structure.startswith("prior + ") for output in view.fidelity.outputs)
 
 
-def test_a_design_waits_for_its_prior_and_goes_on_with_it(api: Api, surrogate: str, textbook: SurrogateFile):
+def test_a_design_waits_for_an_announced_prior_before_the_first_fit(api: Api, surrogate: str, textbook: SurrogateFile):
     calls = PriorCalls(api.connection)
     assert calls.wait(surrogate).awaited
     sent(api, surrogate, 6)
@@ -105,18 +105,18 @@ def test_a_prior_in_other_units_is_refused(api: Api, surrogate: str, textbook: S
 
 
 @pytest.mark.parametrize("body", [b"", b"no file", bytes(100)], ids=["empty", "text", "zeros"])
-def test_other_bytes_are_refused(api: Api, surrogate: str, body: bytes):
+def test_a_body_that_is_not_a_prior_file_is_refused(api: Api, surrogate: str, body: bytes):
     with pytest.raises(InvalidInput, match="expected a"):
         PriorCalls(api.connection).put(surrogate, body)
 
 
-def test_a_description_that_makes_no_sense_is_refused(api: Api, surrogate: str, textbook: SurrogateFile):
+def test_a_prior_with_an_invalid_description_is_refused(api: Api, surrogate: str, textbook: SurrogateFile):
     other = SurrogateFile("x", textbook.spec, textbook.model, textbook.samples, about={"source": "a\x07b"})
     with pytest.raises(InvalidInput, match="description of a prior"):
         PriorCalls(api.connection).put(surrogate, other.to_bytes())
 
 
-def test_a_family_that_takes_no_prior_says_so(api: Api, name: str, textbook: SurrogateFile):
+def test_a_prior_for_a_model_family_without_prior_support_is_refused(api: Api, name: str, textbook: SurrogateFile):
     api.create_surrogate(name, hinge_spec(design={"budget": 0, "model": "ensemble"}))
     try:
         with pytest.raises(InvalidInput, match="ensemble"):
@@ -127,7 +127,7 @@ def test_a_family_that_takes_no_prior_says_so(api: Api, name: str, textbook: Sur
         api.delete_surrogate(name)
 
 
-def test_an_unknown_surrogate_is_named(api: Api, textbook: SurrogateFile):
+def test_a_prior_for_an_unknown_surrogate_is_refused_with_its_name(api: Api, textbook: SurrogateFile):
     calls = PriorCalls(api.connection)
     for call in (calls.get, calls.wait, calls.drop):
         with pytest.raises(UnknownSurrogate, match="nobody"):

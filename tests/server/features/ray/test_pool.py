@@ -13,7 +13,7 @@ ray = pytest.importorskip("ray")
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning:ray")
 
 
-def test_a_cluster_of_another_ray_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch):
+def test_a_cluster_with_another_ray_version_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch):
     """Ray compares its version and Python's itself, in several lines."""
 
     def init(*_: object, **__: object) -> None:
@@ -26,7 +26,7 @@ def test_a_cluster_of_another_ray_is_refused_in_one_sentence(monkeypatch: pytest
     assert "\n" not in str(refused.value)
 
 
-def test_without_ray_one_sentence_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch):
+def test_without_ray_installed_the_error_tells_how_to_install_it(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(pool, "find_spec", lambda _: None)
     with pytest.raises(InvalidInput, match=r"pip install 'surrogym\[ray\]'"):
         pool.check(Settings(database="postgresql+psycopg://here/there", engine="ray"))

@@ -45,11 +45,11 @@ pytestmark = [pytest.mark.postgresql, pytest.mark.timeout(600), pytest.mark.filt
 
 
 @pytest.mark.parametrize("law", LAWS_OF_ENGINES, ids=lambda law: law.__name__)
-def test_the_engine_of_a_cluster_keeps_the_laws(law, case: EngineCase):
+def test_the_ray_engine_passes_the_laws_of_the_engine_interface(law, case: EngineCase):
     asyncio.run(law(case))
 
 
-def test_session_hosts_have_the_niceness_that_docs_and_manifests_start_ray_with(case: EngineCase, database: str):
+def test_ray_session_hosts_have_the_cpu_priority_that_docs_and_manifests_set(case: EngineCase, database: str):
     """The cluster of this module has the same variable. Without it Ray takes 15."""
     hosts = asyncio.run(about(database))
     own = os.getpriority(os.PRIO_PROCESS, 0)  # Ray's niceness comes on top
@@ -57,7 +57,7 @@ def test_session_hosts_have_the_niceness_that_docs_and_manifests_start_ray_with(
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_session_goes_on_at_another_host_when_its_own_died_or_stopped(
+def test_a_session_continues_on_another_host_after_its_host_died_or_stopped(
     how: signal.Signals, case: EngineCase, storage: Storage, database: str, caplog: pytest.LogCaptureFixture
 ):
     """What was done since the last checkpoint is asked for again. A host that wakes has lost the session."""
@@ -90,7 +90,9 @@ def test_a_session_goes_on_at_another_host_when_its_own_died_or_stopped(
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_a_request_that_takes_long_is_waited_for(case: EngineCase, monkeypatch: pytest.MonkeyPatch, late: bool):
+def test_a_long_request_is_awaited_while_its_session_host_lives(
+    case: EngineCase, monkeypatch: pytest.MonkeyPatch, late: bool
+):
     """As long as its host renews the lease, or is late with that and lives."""
     looks, look = [], LiveSessions.holder
 
@@ -112,7 +114,7 @@ def test_a_request_that_takes_long_is_waited_for(case: EngineCase, monkeypatch: 
     asyncio.run(waited())
 
 
-def test_an_opening_is_refused_when_its_host_stops_answering(
+def test_opening_a_session_on_an_unresponsive_host_is_refused(
     case: EngineCase, postgresql: Postgresql, database: str, monkeypatch: pytest.MonkeyPatch
 ):
     """The host stops while it waits for the database, which a lock holds up. The repeat opens one session."""
@@ -146,7 +148,7 @@ def test_an_opening_is_refused_when_its_host_stops_answering(
     asyncio.run(stopped())
 
 
-def test_a_host_that_has_stopped_is_left_out_of_what_is_shown(
+def test_an_unresponsive_session_host_is_left_out_of_counts_and_lists(
     case: EngineCase, database: str, monkeypatch: pytest.MonkeyPatch
 ):
     """The view of each surrogate has them, also in the answer to a request that has created it."""
@@ -171,7 +173,7 @@ def test_a_host_that_has_stopped_is_left_out_of_what_is_shown(
         os.kill(stopped.pid, signal.SIGCONT)
 
 
-def test_a_session_of_another_pool_is_refused_with_the_reason(
+def test_a_session_of_another_host_pool_is_refused_with_the_reason(
     settings: Settings, case: EngineCase, storage: Storage, postgresql: Postgresql
 ):
     """A front server that writes the database's address in another way has session hosts of its own."""
@@ -250,13 +252,13 @@ def fronts(
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_conformance_holds_at_each_front_server(fronts: list[str], number: int):
+def test_the_conformance_suite_passes_at_each_front_server(fronts: list[str], number: int):
     outcomes = {outcome.name: outcome.failure for outcome in conformance(fronts[number], None, f"front-{number}")}
     assert len(outcomes) == len(leases.CHECKS) + len(sessions.CHECKS)
     assert set(outcomes.values()) == {None}, outcomes
 
 
-def test_conformance_holds_while_each_session_alternates_between_two_front_servers(
+def test_the_conformance_suite_passes_while_sessions_alternate_between_two_front_servers(
     fronts: list[str], capsys: pytest.CaptureFixture[str]
 ):
     with alternating(fronts) as alternation:
@@ -272,7 +274,7 @@ def test_conformance_holds_while_each_session_alternates_between_two_front_serve
         print(f"\n{len(outcomes)} checks hold; {len(shared)} sessions, {counts} requests at the front servers")
 
 
-def test_any_front_server_goes_on_with_a_session(fronts: list[str]):
+def test_a_session_can_continue_through_any_front_server(fronts: list[str]):
     action = np.full((2, 1), 0.5)
     with HttpSurrogate(fronts[0], NAME, transport="stream") as port:
         alone = port.open(OpenSession(num_envs=2, seed=0)).id
@@ -303,7 +305,7 @@ def server(database: str, address: str, engine: SessionEngine, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("transport", ["stream", "binary"])
-def test_a_client_goes_on_bit_for_bit_while_hosts_are_killed(
+def test_a_client_gets_bit_equal_replies_while_session_hosts_are_killed(
     server: ServerProcess, database: str, storage: Storage, transport: Transport
 ):
     """The client sends its last requests again by itself."""
@@ -320,13 +322,13 @@ def test_a_client_goes_on_bit_for_bit_while_hosts_are_killed(
         np.testing.assert_array_equal(walked(port, {120: kill_its_host, 250: kill_its_host}), undisturbed)
 
 
-def test_a_front_server_designs_with_fits_in_the_cluster(server: ServerProcess):
+def test_the_design_of_a_front_server_runs_its_fits_in_the_ray_cluster(server: ServerProcess):
     with httpx.Client(base_url=server.url, timeout=60) as client:
         assert pendulum.teach(client, "taught")["model_version"] >= 1
     assert "fits run as tasks of the cluster" in server.log
 
 
-def test_a_client_goes_on_bit_for_bit_while_postgresql_crashes(server: ServerProcess, postgresql: Postgresql):
+def test_a_client_gets_bit_equal_replies_while_postgresql_crashes(server: ServerProcess, postgresql: Postgresql):
     """Steps go on until the lease ends, and again when the database is back."""
 
     def away_for_longer_than_a_lease(_: str) -> None:
@@ -364,7 +366,7 @@ def walked(port: HttpSurrogate, disturbances: dict[int, Callable[[str], None]]) 
         ({"max_lanes": 5}, "which have max_lanes"),
     ],
 )
-def test_an_unsuitable_cluster_is_refused_in_one_sentence(
+def test_an_unsuitable_ray_cluster_is_refused_in_one_sentence(
     settings: Settings, engine: SessionEngine, storage: Storage, options: dict[str, object], said: str
 ):
     with pytest.raises(InvalidInput, match=said) as refused:
@@ -372,7 +374,7 @@ def test_an_unsuitable_cluster_is_refused_in_one_sentence(
     assert "\n" not in str(refused.value)
 
 
-def test_hosts_that_wait_for_room_are_logged_with_the_reason(
+def test_session_hosts_that_wait_for_cluster_resources_are_logged_with_the_reason(
     settings: Settings,
     storage: Storage,
     monkeypatch: pytest.MonkeyPatch,
@@ -391,7 +393,7 @@ def test_hosts_that_wait_for_room_are_logged_with_the_reason(
     assert f"of {HOSTS + 1} CPUs and 0 of 0 GPUs" in caplog.text
 
 
-def test_other_versions_than_the_hosts_run_are_refused(
+def test_a_front_server_with_other_versions_than_the_session_hosts_is_refused(
     settings: Settings, engine: SessionEngine, storage: Storage, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(pool, "versions", lambda: {"Python": "2.7"})

@@ -47,7 +47,7 @@ def job(pendulum_samples: Samples) -> DesignJob:
 
 
 @pytest.mark.parametrize("law", LAWS_OF_COMPUTE, ids=lambda law: law.__name__)
-def test_tasks_of_a_cluster_keep_the_laws(law, job: DesignJob, tmp_path: Path):
+def test_ray_fitting_tasks_pass_the_laws_of_the_compute_interface(law, job: DesignJob, tmp_path: Path):
     asyncio.run(law(ComputeCase(fits.RayFits, job, tmp_path)))
 
 
@@ -59,7 +59,7 @@ def die(job: DesignJob) -> DesignResult:
     raise AssertionError
 
 
-def test_a_job_whose_process_dies_is_tried_again_and_then_unavailable(job: DesignJob, tmp_path: Path):
+def test_a_ray_fit_job_whose_process_dies_is_retried_and_then_fails(job: DesignJob, tmp_path: Path):
     notes = tmp_path / "notes"
     with pytest.raises(Unavailable, match="the process or machine of a fit died"):
         asyncio.run(fits.RayFits(die).run(replace(job, state={"notes": str(notes)})))
@@ -67,12 +67,14 @@ def test_a_job_whose_process_dies_is_tried_again_and_then_unavailable(job: Desig
 
 
 @pytest.mark.parametrize(("hosts", "expected"), [(1, fits.RayFits), (2, type(None))])
-def test_fits_are_tasks_where_session_hosts_leave_a_cpu(hosts: int, expected: type):
+def test_fits_run_as_ray_tasks_only_if_session_hosts_leave_a_free_cpu(hosts: int, expected: type):
     """A task that waits for a CPU that never comes free would wait for ever."""
     assert type(pool.fits_of(Settings(engine="ray", ray_hosts=hosts), die)) is expected
 
 
-def test_a_machine_of_other_versions_is_named(job: DesignJob, monkeypatch: pytest.MonkeyPatch):
+def test_a_fit_on_a_cluster_machine_with_other_package_versions_fails_with_them(
+    job: DesignJob, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(
         fits, "versions", lambda: {"Python": "2.7", "surrogym": "0", "torch": "0", "numpy": "0", "ray": "0"}
     )
@@ -87,7 +89,7 @@ def note_gpus(job: DesignJob) -> DesignResult:
 
 
 @pytest.mark.parametrize(("asked", "given"), [(0.0, "[]"), (0.5, "[0]")])
-def test_a_fit_has_the_gpus_that_the_setting_names(asked: float, given: str, job: DesignJob, tmp_path: Path):
+def test_a_ray_fit_gets_the_number_of_gpus_of_its_setting(asked: float, given: str, job: DesignJob, tmp_path: Path):
     notes = tmp_path / "notes"
     compute = pool.fits_of(Settings(engine="ray", ray_hosts=1, ray_fit_gpus=asked), note_gpus)
     assert compute is not None
@@ -97,7 +99,7 @@ def test_a_fit_has_the_gpus_that_the_setting_names(asked: float, given: str, job
 
 
 @pytest.mark.parametrize(("device", "asked"), [("cpu", 1.5), ("cuda", 0.5)])
-def test_fits_that_would_wait_for_a_gpu_for_ever_run_in_the_front_server(
+def test_fits_run_in_the_front_server_if_the_cluster_lacks_their_gpus(
     device: str, asked: float, caplog: pytest.LogCaptureFixture
 ):
     settings = Settings.model_validate({"engine": "ray", "ray_hosts": 1, "device": device, "ray_fit_gpus": asked})
@@ -115,7 +117,7 @@ class Standin:
         return self._number, ray.get_gpu_ids()
 
 
-def test_each_session_host_takes_a_gpu_of_the_cluster(monkeypatch: pytest.MonkeyPatch):
+def test_each_session_host_on_device_cuda_reserves_a_gpu_of_the_cluster(monkeypatch: pytest.MonkeyPatch):
     """One host has the GPU, and the second waits for another one. On the processor none takes any."""
     monkeypatch.setattr(pool, "SessionHost", Standin)
     wanted = HostSettings.of(Settings.model_validate({"engine": "ray", "device": "cuda"}))

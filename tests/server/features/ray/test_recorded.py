@@ -89,7 +89,7 @@ def end_lease(storage: Storage) -> Callable[[Host, str], None]:
 
 
 @pytest.mark.parametrize("law", LAWS_OF_ENGINES, ids=lambda law: law.__name__)
-def test_a_host_keeps_the_laws_of_engines(law, host):
+def test_a_session_host_passes_the_laws_of_the_engine_interface(law, host):
     async def kept() -> None:
         one = host()
         await one.engine.start()
@@ -101,7 +101,7 @@ def test_a_host_keeps_the_laws_of_engines(law, host):
     asyncio.run(kept())
 
 
-def test_a_session_goes_on_from_its_checkpoint_bit_for_bit(host, end_lease):
+def test_a_session_resumed_from_its_checkpoint_gives_bit_equal_replies(host, end_lease):
     """The requests since the checkpoint are refused with the seq to begin from, and sent again they get the same."""
 
     async def moved() -> None:
@@ -131,7 +131,7 @@ def test_a_session_goes_on_from_its_checkpoint_bit_for_bit(host, end_lease):
     asyncio.run(moved())
 
 
-def test_the_last_reply_is_given_again_by_the_next_host(host, end_lease):
+def test_the_next_session_host_can_repeat_the_last_reply(host, end_lease):
     async def moved() -> None:
         first, second = host(), host()
         session = await first.case.opened()
@@ -146,7 +146,7 @@ def test_the_last_reply_is_given_again_by_the_next_host(host, end_lease):
     asyncio.run(moved())
 
 
-def test_a_host_whose_lease_has_ended_refuses_every_step(host, end_lease):
+def test_a_session_host_with_an_expired_lease_refuses_every_step(host, end_lease):
     """As one that was stopped and wakes: it asks no database, and what it did is replaced by what the next host did."""
 
     async def woken() -> None:
@@ -171,7 +171,7 @@ def test_a_host_whose_lease_has_ended_refuses_every_step(host, end_lease):
     asyncio.run(woken())
 
 
-def test_a_host_goes_on_after_its_lease_if_nobody_took_the_session(host):
+def test_a_session_host_can_renew_an_expired_lease_nobody_else_took(host):
     """As while the database was away for longer than a lease."""
 
     async def renewed() -> None:
@@ -186,7 +186,7 @@ def test_a_host_goes_on_after_its_lease_if_nobody_took_the_session(host):
 
 
 @pytest.mark.parametrize("taken", [True, False])
-def test_a_step_during_which_the_lease_ended_is_not_answered(host, end_lease, monkeypatch, taken: bool):
+def test_a_step_during_which_the_session_lease_expired_is_not_answered(host, end_lease, monkeypatch, taken: bool):
     async def stopped() -> None:
         first, second = host(), host()
         session = await first.case.opened()
@@ -213,7 +213,9 @@ def test_a_step_during_which_the_lease_ended_is_not_answered(host, end_lease, mo
 
 
 @pytest.mark.parametrize("what", ["without a seq", "coordinates", "submit"])
-def test_a_session_that_is_behind_answers_to_nothing_but_its_requests(host, end_lease, storage: Storage, what: str):
+def test_a_session_resumed_from_an_old_checkpoint_answers_only_repeated_requests(
+    host, end_lease, storage: Storage, what: str
+):
     async def asked() -> None:
         first, second = host(), host()
         session = await first.case.opened(occupancy=True)
@@ -231,7 +233,7 @@ def test_a_session_that_is_behind_answers_to_nothing_but_its_requests(host, end_
     asyncio.run(asked())
 
 
-def test_a_session_on_another_kind_of_machine_is_lost_with_the_reason(host, end_lease, storage: Storage):
+def test_a_session_cannot_move_to_another_kind_of_machine_and_says_why(host, end_lease, storage: Storage):
     async def moved() -> None:
         first, second = host(), host(machine="another kind")
         session = await first.case.opened()
@@ -242,7 +244,7 @@ def test_a_session_on_another_kind_of_machine_is_lost_with_the_reason(host, end_
     asyncio.run(moved())
 
 
-def test_a_session_that_is_too_large_to_record_is_lost_with_the_reason(host, end_lease, monkeypatch):
+def test_a_session_too_large_for_a_checkpoint_cannot_move_and_says_why(host, end_lease, monkeypatch):
     async def moved() -> None:
         first, second = host(), host()
         session = await first.case.opened()
@@ -254,7 +256,7 @@ def test_a_session_that_is_too_large_to_record_is_lost_with_the_reason(host, end
     asyncio.run(moved())
 
 
-def test_a_host_without_room_leaves_the_session_to_another(host, end_lease):
+def test_a_full_session_host_leaves_a_free_session_to_another_host(host, end_lease):
     async def moved() -> None:
         first, full, third = host(), host(sessions=1), host()
         session = await first.case.opened()
@@ -267,7 +269,7 @@ def test_a_host_without_room_leaves_the_session_to_another(host, end_lease):
     asyncio.run(moved())
 
 
-def test_a_session_under_a_living_lease_is_not_taken(host):
+def test_a_session_with_a_valid_lease_cannot_be_taken_by_another_host(host):
     async def moved() -> None:
         first, second = host(), host()
         session = await first.case.opened()
@@ -277,7 +279,7 @@ def test_a_session_under_a_living_lease_is_not_taken(host):
     asyncio.run(moved())
 
 
-def test_records_end_with_their_sessions(host, storage: Storage):
+def test_the_stored_record_of_a_session_is_deleted_when_it_ends(host, storage: Storage):
     async def ended() -> None:
         one = host()
         sessions = [await one.case.opened() for _ in range(3)]
@@ -293,7 +295,7 @@ def test_records_end_with_their_sessions(host, storage: Storage):
     asyncio.run(ended())
 
 
-def test_an_opening_under_one_key_at_two_hosts_opens_one_session(host, storage: Storage):
+def test_opening_with_one_idempotency_key_at_two_hosts_opens_one_session(host, storage: Storage):
     async def opened() -> None:
         first, second = host(), host()
         info = await first.engine.open(first.case.asked(key="once"))
@@ -306,7 +308,7 @@ def test_an_opening_under_one_key_at_two_hosts_opens_one_session(host, storage: 
     asyncio.run(opened())
 
 
-def test_a_session_whose_recording_was_not_confirmed_is_free_after_its_lease(host, storage: Storage, monkeypatch):
+def test_a_session_whose_storing_was_not_confirmed_is_free_after_its_lease(host, storage: Storage, monkeypatch):
     """The database has it under the host's name, and the host lost the answer, with the connection."""
 
     async def opened() -> None:
@@ -327,7 +329,7 @@ def test_a_session_whose_recording_was_not_confirmed_is_free_after_its_lease(hos
     asyncio.run(opened())
 
 
-def test_a_record_that_could_not_be_deleted_is_deleted_later(host, storage: Storage, monkeypatch):
+def test_a_session_record_whose_deletion_failed_is_deleted_later(host, storage: Storage, monkeypatch):
     """The session ended while the database was away. Its record would keep the key of its opening."""
 
     async def ended() -> None:

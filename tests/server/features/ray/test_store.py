@@ -41,7 +41,7 @@ def add(storage: Storage, surrogate: int) -> Callable[..., SessionLease]:
     return record
 
 
-def test_a_session_is_taken_as_at_its_last_checkpoint(storage: Storage, surrogate: int, add, until: Until) -> None:
+def test_taking_over_a_session_returns_its_last_checkpoint(storage: Storage, surrogate: int, add, until: Until) -> None:
     lease = add(seconds=SHORT)
     assert storage.part(LiveSessions).record(lease, Checkpoint(7, b"\0seven"))
     until(lambda: seconds_left(storage, "s") < 0)
@@ -51,7 +51,7 @@ def test_a_session_is_taken_as_at_its_last_checkpoint(storage: Storage, surrogat
     assert storage.part(LiveSessions).take("s", "b", LONG).checkpoint == Checkpoint(9, None)
 
 
-def test_nobody_takes_a_session_under_a_living_lease(storage: Storage, add) -> None:
+def test_taking_a_session_with_a_valid_lease_is_refused(storage: Storage, add) -> None:
     add()
     with pytest.raises(Unavailable, match=r"belongs to another session host for (59|60)\.\d s more"):
         storage.part(LiveSessions).take("s", "b", LONG)
@@ -60,7 +60,7 @@ def test_nobody_takes_a_session_under_a_living_lease(storage: Storage, add) -> N
     assert (holder.owner, holder.machine) == ("a", "this machine")
 
 
-def test_an_owner_whose_lease_was_replaced_changes_nothing(storage: Storage, add, until: Until) -> None:
+def test_an_owner_whose_session_lease_was_replaced_cannot_write(storage: Storage, add, until: Until) -> None:
     old = add(seconds=SHORT)
     until(lambda: seconds_left(storage, "s") < 0)
     new = storage.part(LiveSessions).take("s", "b", LONG).lease
@@ -72,7 +72,7 @@ def test_an_owner_whose_lease_was_replaced_changes_nothing(storage: Storage, add
     assert not storage.part(LiveSessions).record(new, Checkpoint(1, b"of the lease before"))
 
 
-def test_a_lease_that_nobody_replaced_is_renewed_after_its_end(storage: Storage, add, until: Until) -> None:
+def test_an_expired_session_lease_that_nobody_took_can_be_renewed(storage: Storage, add, until: Until) -> None:
     add("s", seconds=SHORT)
     add("t", seconds=SHORT)
     add("u", owner="b")
@@ -82,7 +82,7 @@ def test_a_lease_that_nobody_replaced_is_renewed_after_its_end(storage: Storage,
         storage.part(LiveSessions).take("s", "b", LONG)
 
 
-def test_a_lease_that_its_owner_does_not_name_ends(storage: Storage, add) -> None:
+def test_a_session_lease_missing_from_its_owners_renewal_expires(storage: Storage, add) -> None:
     """The answer to ``add`` was lost with the connection: the owner never heard of its session."""
     add("s", seconds=SHORT)
     ids = [f"id'{number}" for number in range(70_000)]  # more than a statement may have parameters
@@ -91,7 +91,7 @@ def test_a_lease_that_its_owner_does_not_name_ends(storage: Storage, add) -> Non
 
 
 @pytest.mark.parametrize("url", [pytest.param("postgresql", marks=pytest.mark.postgresql)], indirect=True)
-def test_an_owner_that_stops_within_a_transaction_locks_its_session_for_some_seconds_only(
+def test_an_owner_stopped_within_a_transaction_locks_its_session_only_briefly(
     url: str, storage: Storage, add, until: Until, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A stopped process, or a paused machine, does not end its transaction. Nobody else could ever take the session."""
@@ -116,12 +116,12 @@ def test_an_owner_that_stops_within_a_transaction_locks_its_session_for_some_sec
     assert storage.part(LiveSessions).take("s", "b", LONG).checkpoint == Checkpoint(0, b"opened")
 
 
-def test_a_released_session_is_free_at_once(storage: Storage, add) -> None:
+def test_a_released_session_can_be_taken_at_once(storage: Storage, add) -> None:
     storage.part(LiveSessions).release(add())
     assert storage.part(LiveSessions).take("s", "b", LONG).lease.fence == 2
 
 
-def test_of_several_at_once_one_takes_a_session(storage: Storage, add) -> None:
+def test_if_several_hosts_take_a_session_at_once_one_succeeds(storage: Storage, add) -> None:
     storage.part(LiveSessions).release(add())
 
     def take(owner: str) -> str | None:
@@ -137,7 +137,7 @@ def test_of_several_at_once_one_takes_a_session(storage: Storage, add) -> None:
     assert won == [holder.owner]
 
 
-def test_a_session_is_found_by_the_key_of_its_opening(storage: Storage, surrogate: int, add) -> None:
+def test_a_session_is_found_by_the_idempotency_key_of_its_opening(storage: Storage, surrogate: int, add) -> None:
     add("s", key="once")
     add("t")
     add("u")
@@ -149,7 +149,7 @@ def test_a_session_is_found_by_the_key_of_its_opening(storage: Storage, surrogat
     assert storage.part(LiveSessions).holder("other") is None
 
 
-def test_a_removed_session_is_unknown(storage: Storage, surrogate: int, add) -> None:
+def test_a_removed_session_record_is_unknown(storage: Storage, surrogate: int, add) -> None:
     lease = add("s", key="once")
     add("t")
     storage.part(LiveSessions).remove("s")
@@ -164,7 +164,7 @@ def test_a_removed_session_is_unknown(storage: Storage, surrogate: int, add) -> 
     assert storage.part(LiveSessions).renew("a", ["s", "t"], LONG) == frozenset()
 
 
-def test_sessions_go_with_their_surrogate(storage: Storage, make, add) -> None:
+def test_deleting_a_surrogate_deletes_its_session_records(storage: Storage, make, add) -> None:
     add()
     storage.surrogates.delete(make())
     assert storage.part(LiveSessions).holder("s") is None
@@ -172,7 +172,7 @@ def test_sessions_go_with_their_surrogate(storage: Storage, make, add) -> None:
         add("t")
 
 
-def test_a_session_that_nobody_took_is_swept(storage: Storage, add, until: Until) -> None:
+def test_a_session_record_with_a_long_expired_lease_is_deleted(storage: Storage, add, until: Until) -> None:
     add("s", seconds=SHORT)
     add("t")
     assert storage.part(LiveSessions).sweep(LONG) == 0
@@ -181,7 +181,7 @@ def test_a_session_that_nobody_took_is_swept(storage: Storage, add, until: Until
     assert storage.part(LiveSessions).holder("t") is not None
 
 
-def test_a_lease_lasts_no_longer_though_the_clock_is_set_back(
+def test_a_session_lease_expires_although_the_database_clock_is_set_back(
     storage: Storage, add, set_clock_back: Callable[[float], None]
 ) -> None:
     add()

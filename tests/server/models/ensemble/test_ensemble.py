@@ -46,21 +46,21 @@ def definition(model) -> EnvironmentDefinition:
     return model.definition
 
 
-def test_members_disagree_more_where_nothing_was_seen(model):
+def test_ensemble_members_disagree_more_far_from_the_samples(model):
     steps = random_steps(pendulum(), 24, seed=0)
     near = model.transition(steps.q, steps.u, stds=True).std
     far = model.transition(torch.tensor([[0.0, 60.0]]).double(), torch.zeros(1, 1).double(), stds=True).std
     assert float(far[0, 1]) > 10 * float(near[:, 1].median())
 
 
-def test_a_draw_is_one_of_the_members_each_as_likely(model):
+def test_a_drawn_function_is_one_ensemble_member_with_equal_probability(model):
     noise = torch.randn(2_000, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     drawn = model.draw(noise)[:, 0]
     assert drawn.unique().tolist() == [0.0, 1.0, 2.0, 3.0]
     assert int(drawn.long().bincount().min()) > 400
 
 
-def test_the_mean_is_that_of_the_members(model):
+def test_ensemble_mean_and_deviation_are_those_over_the_members(model):
     steps = random_steps(pendulum(), 10, seed=3)
     members = torch.arange(4.0, dtype=torch.float64)[:, None]
     one = [model.transition_along(member.expand(10, 1), steps.q, steps.u) for member in members]
@@ -70,20 +70,20 @@ def test_the_mean_is_that_of_the_members(model):
     torch.testing.assert_close(speeds.std(0), made.std[:, 1])
 
 
-def test_another_seed_gives_other_members(model):
+def test_another_seed_gives_other_ensemble_members(model):
     other = ensemble(pendulum(), seed=7)
     assert not torch.equal(other.transitions.networks.first, model.transitions.networks.first)
 
 
 @pytest.mark.parametrize("timing", ["before", "after", "auto"])
-def test_a_reward_is_learned_by_every_timing(timing):
+def test_an_ensemble_learns_rewards_of_every_timing(timing):
     made = ensemble(pendulum().model_copy(update={"reward": Reward(timing=timing)}), samples=40)
     steps = random_steps(pendulum(), 50, seed=9)
     off = made.transition(steps.q, steps.u).reward - steps.reward
     assert float(off.square().mean().sqrt()) < 0.25 * float(steps.reward.std())
 
 
-def test_the_papers_representation_moves_the_observation():
+def test_an_ensemble_with_preset_paper_predicts_the_observation():
     spec = pendulum()
     made = ensemble(spec.model_copy(update={"design": spec.design.model_copy(update={"preset": "paper"})}))
     assert made.definition.outputs == ("cos", "sin", "speed", "reward")
@@ -92,7 +92,7 @@ def test_the_papers_representation_moves_the_observation():
     assert float(off[:, 1].square().mean().sqrt()) < 0.5 * float(steps.q_next[:, 1].std())
 
 
-def test_an_output_that_never_varied_is_constant_and_certain():
+def test_an_ensemble_output_that_never_varied_is_constant_without_uncertainty():
     made = ensemble(cartpole())
     steps = random_steps(cartpole(), 5, seed=9)
     moved = made.transition(steps.q, steps.u, reward_std=True)
@@ -100,7 +100,7 @@ def test_an_output_that_never_varied_is_constant_and_certain():
     assert (moved.reward.tolist(), moved.reward_std.tolist()) == ([1.0] * 5, [0.0] * 5)
 
 
-def test_very_many_samples_are_learned_from_in_batches():
+def test_an_ensemble_learns_from_many_samples_in_batches():
     made = ensemble(pendulum(), samples=600, steps=20)
     assert made.samples == 600
 
@@ -116,7 +116,7 @@ def test_very_many_samples_are_learned_from_in_batches():
         ({"depth": 3}, "expected a setting out of members, units, steps, seed, beta, got 'depth'"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(settings, said):
+def test_invalid_ensemble_settings_are_refused(settings, said):
     with pytest.raises(InvalidSpec, match=said):
         learner_of(Choice("ensemble", tuple(settings.items())))
 
@@ -131,13 +131,13 @@ def test_settings_that_make_no_sense_are_refused(settings, said):
         ({"family": "gaussian_process"}, "family 'ensemble', as the specification says, got one of 'gaussian_process'"),
     ],
 )
-def test_a_header_that_contradicts_the_environment_is_refused(model, definition, header, said):
+def test_an_ensemble_file_header_that_contradicts_the_environment_is_refused(model, definition, header, said):
     with pytest.raises(InvalidInput, match=said):
         from_bytes(definition, with_header(model, **header))
 
 
 @pytest.mark.parametrize("beta", [0.0, 1.0])
-def test_noise_is_learned_where_it_is(beta):
+def test_an_ensemble_learns_noise_that_depends_on_the_input(beta):
     """Half of the inputs have noise of 0.5, the other half none. A single noise would be right for neither."""
     x = torch.linspace(-1.5, 1.5, 300, dtype=torch.float64)[:, None]
     noise = torch.randn(300, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -152,7 +152,7 @@ def test_noise_is_learned_where_it_is(beta):
     )
 
 
-def test_with_beta_1_the_mean_learns_what_noise_could_explain():
+def test_with_beta_1_the_ensemble_mean_fits_a_rare_jump():
     """A rare jump: the likelihood calls it noise, and its mean passes by. With beta 1 the mean goes there."""
     x = torch.linspace(-1.5, 1.5, 400, dtype=torch.float64)[:, None]
     y = torch.where((x - 0.6).abs() < 0.06, 6.0, 0.0) + 0.1 * torch.sin(x)
@@ -166,7 +166,7 @@ def test_with_beta_1_the_mean_learns_what_noise_could_explain():
     assert errors[1.0] < 0.5 * errors[0.0]
 
 
-def test_process_noise_moves_steps_by_the_learned_noise(model):
+def test_process_noise_shifts_ensemble_steps_by_the_learned_noise(model):
     steps, able = random_steps(pendulum(), 10, seed=3), offers(model, LearnedNoise)
     assert able is not None
     assert 0 < able.noise_stds[1] < 0.5 * float(model.scales[1])
@@ -180,14 +180,14 @@ def test_process_noise_moves_steps_by_the_learned_noise(model):
     torch.testing.assert_close(along[1] - along[0], shift)
 
 
-def test_a_negative_size_of_noise_is_refused(model, definition):
+def test_an_ensemble_file_with_negative_noise_is_refused(model, definition):
     noise = replace(model.transitions.noise, size=-model.transitions.noise.size)
     data = to_bytes(replace(model, transitions=replace(model.transitions, noise=noise)))
     with pytest.raises(InvalidInput, match=r"transitions\.noise: expected each entry of size"):
         from_bytes(definition, data)
 
 
-def test_the_only_label_of_an_ending_is_0_or_1():
+def test_an_ensemble_file_with_a_termination_label_other_than_0_or_1_is_refused():
     spec = pendulum().model_copy(update={"termination": "learned"})
     model = ensemble(spec, steps=20)
     assert model.ending == 0.0
@@ -196,7 +196,7 @@ def test_the_only_label_of_an_ending_is_0_or_1():
         from_bytes(model.definition, with_header(model, ending=0.5))
 
 
-def test_more_members_than_any_learner_makes_are_refused(model, definition):
+def test_an_ensemble_file_with_too_many_members_is_refused(model, definition):
     few = model.transitions.networks
     networks = type(few)(*(weights.repeat(5, 1, 1) for weights in vars(few).values()))
     data = to_bytes(replace(model, transitions=replace(model.transitions, networks=networks)))

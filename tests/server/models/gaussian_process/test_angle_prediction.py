@@ -29,13 +29,13 @@ def model(definition):
     return learn(definition, random_steps(swing_up(), 40, seed=0)).model
 
 
-def test_a_speed_turns_its_angle_by_the_time_of_a_step(definition):
+def test_the_learned_angle_drift_is_speed_times_step_duration(definition):
     ((x, velocity, angle, omega),) = learn_drift(definition, random_steps(swing_up(), 200, seed=0))
     assert omega == pytest.approx(0.1, rel=0.05)
     assert (abs(x) + abs(velocity) + abs(angle)) < 0.02
 
 
-def test_turns_of_more_than_half_a_circle_are_not_mistaken_for_short_ones(definition):
+def test_the_angle_drift_is_learned_from_turns_of_more_than_half_a_circle(definition):
     samples = random_steps(swing_up(), 100, seed=0)
     fast = samples.q.clone()
     fast[:, 3] *= 1.5
@@ -47,12 +47,12 @@ def test_turns_of_more_than_half_a_circle_are_not_mistaken_for_short_ones(defini
     assert omega == pytest.approx(0.25, rel=1e-6)
 
 
-def test_there_is_none_without_angles_or_from_too_few_samples(definition):
+def test_no_angle_drift_is_learned_without_angles_or_with_too_few_samples(definition):
     assert learn_drift(definition_from_spec(cartpole()), random_steps(cartpole(), 40, seed=0)) == ()
     assert learn_drift(definition, random_steps(swing_up(), 11, seed=0)) == ()
 
 
-def test_inputs_are_cosine_and_sine_of_where_each_angle_turns_to():
+def test_angle_prediction_adds_cosine_and_sine_of_the_predicted_angle():
     definition = definition_from_spec(acrobot())
     drift = ((0.0, 0.0, 0.2, 0.0), (0.0, 0.0, 0.0, 0.3))
     q, u = torch.tensor([[0.5, -1.0, 2.0, -3.0]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
@@ -62,7 +62,7 @@ def test_inputs_are_cosine_and_sine_of_where_each_angle_turns_to():
     assert FeatureMap(drift=drift) in candidates(definition, follows=False, drift=drift)
 
 
-def test_evidence_prefers_it_where_a_pole_turns_fast_and_errors_agree(definition, model):
+def test_angle_prediction_is_selected_for_a_fast_pole_and_lowers_the_error(definition, model):
     omega = model.transitions[3]
     assert omega.feature_map.drift
     test = random_steps(swing_up(), 300, seed=1)
@@ -70,13 +70,13 @@ def test_evidence_prefers_it_where_a_pole_turns_fast_and_errors_agree(definition
     assert error[3] / omega.scale < 0.3  # 0.36 without
 
 
-def test_it_is_stored_with_the_model(definition, model):
+def test_the_angle_prediction_setting_is_stored_with_the_model(definition, model):
     loaded = from_bytes(definition, to_bytes(model))
     assert loaded.transitions[3].feature_map == model.transitions[3].feature_map
 
 
 @pytest.mark.parametrize("drift", [((0.1, 0.1),), ((0.0, 0.0, 0.0, math.inf),), ((0.0,) * 4,) * 2])
-def test_another_shape_is_refused(definition, model, drift):
+def test_a_stored_angle_drift_of_wrong_shape_is_refused(definition, model, drift):
     changed = [
         replace(o, feature_map=replace(o.feature_map, drift=drift)) if o.feature_map.drift else o
         for o in model.transitions

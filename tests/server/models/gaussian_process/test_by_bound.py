@@ -69,7 +69,7 @@ def model(inducing: int = 120) -> GaussianProcessModel:
     return found
 
 
-def test_with_few_samples_it_is_exact():
+def test_a_sparse_model_of_few_samples_equals_the_exact_model():
     spec = pendulum()
     samples = random_steps(spec, 40, seed=0)
     exact, sparse = (
@@ -83,7 +83,7 @@ def test_with_few_samples_it_is_exact():
     assert sparse.description == exact.description
 
 
-def test_it_learns_the_step_and_its_noise_through_a_few_of_the_samples():
+def test_a_sparse_model_learns_dynamics_and_noise_with_few_inducing_points():
     found, unseen = model(), steps(500, seed=1)
     sizes = [len(o.posterior.y) for o in found.transitions if o.posterior is not None]
     assert max(sizes) <= 120
@@ -93,7 +93,7 @@ def test_it_learns_the_step_and_its_noise_through_a_few_of_the_samples():
     assert found.noise_stds[3:6] == pytest.approx([NOISE] * 3, rel=0.1)
 
 
-def test_its_intervals_hold_what_they_promise():
+def test_prediction_intervals_of_a_sparse_model_have_their_coverage():
     found, unseen = model(), steps(2_000, seed=2)
     made = found.transition(unseen.q, unseen.u, stds=True)
     off = (made.q_next - unseen.q_next)[:, 3:]
@@ -101,18 +101,18 @@ def test_its_intervals_hold_what_they_promise():
     assert 0.8 < float(within) <= 1
 
 
-def test_inputs_that_an_output_does_not_read_are_left_out():
+def test_a_sparse_model_leaves_out_inputs_irrelevant_to_an_output():
     """The last mass' speed reads its neighbour, its own place and its own speed, of seven inputs."""
     assert model().transitions[5].feature_map.dropped == (0, 3, 4, 6)
 
 
-def test_a_stored_model_predicts_the_same():
+def test_a_stored_sparse_model_predicts_the_same():
     found, unseen = model(), steps(20, seed=3)
     loaded = from_bytes(found.definition, to_bytes(found))
     assert torch.equal(loaded.means(unseen.q, unseen.u), found.means(unseen.q, unseen.u))
 
 
-def test_drawn_functions_scatter_as_stds_say():
+def test_drawn_functions_of_a_sparse_model_have_its_standard_deviations():
     found = model(20)
     unseen = steps(4, seed=4)
     noise = torch.randn(400, found.path_size, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
@@ -122,7 +122,7 @@ def test_drawn_functions_scatter_as_stds_say():
         torch.testing.assert_close(drawn.q_next[:, 3:].std(0), made.std[i, 3:], rtol=0.25, atol=1e-4)
 
 
-def test_fewer_inducing_points_are_less_sure():
+def test_a_model_with_fewer_inducing_points_is_more_uncertain():
     unseen = steps(200, seed=5)
     few, many = (model(m).transition(unseen.q, unseen.u, stds=True).std for m in (20, 120))
     noises = [np.array(model(m).noise_stds[3:6]) for m in (20, 120)]
@@ -132,7 +132,7 @@ def test_fewer_inducing_points_are_less_sure():
     )
 
 
-def test_a_warm_start_leads_to_the_same_accuracy():
+def test_a_warm_started_sparse_model_is_as_accurate_as_a_fresh_one():
     definition, samples, unseen = model().definition, steps(1_200, seed=0, noise=NOISE), steps(500, seed=1)
     first = learn(definition, steps(600, seed=0, noise=NOISE))
     again = learn(definition, samples, first.warm).model
@@ -143,7 +143,7 @@ def test_a_warm_start_leads_to_the_same_accuracy():
     assert errors[1] < 1.5 * errors[0]
 
 
-def test_a_process_that_learns_again_from_more_samples_has_no_more_inducing_points():
+def test_reconditioning_a_sparse_process_keeps_the_number_of_inducing_points():
     """As one does that met limits of its output."""
     posterior, rng = model().transitions[3].posterior, np.random.default_rng(0)
     assert posterior is not None
@@ -153,14 +153,14 @@ def test_a_process_that_learns_again_from_more_samples_has_no_more_inducing_poin
     assert (again.sparse.points, len(again.y)) == (300, 30)
 
 
-def test_its_name_in_a_specification_stands_for_the_setting():
+def test_the_model_name_sparse_gaussian_process_is_short_for_its_settings():
     chosen = [definition_from_spec(designed(pendulum(), name)).learning.model for name in SHORT_NAMES]
     learners = [learner_of(choice) for choice in chosen]
     assert learners[0] == learners[1] == GaussianProcesses(inducing=300)
     assert {choice.name for choice in chosen} == {"gaussian_process"}
 
 
-def test_what_the_design_says_of_processes_holds_for_sparse_ones():
+def test_design_settings_of_gaussian_processes_apply_to_sparse_ones():
     spec = designed(Springs().spec(), "sparse_gaussian_process", inducing=50)
     chosen = spec.design.model_copy(update={"symmetry": "none", "preset": "paper"})
     learner = learner_of(definition_from_spec(spec.model_copy(update={"design": chosen})).learning.model)
@@ -169,7 +169,7 @@ def test_what_the_design_says_of_processes_holds_for_sparse_ones():
 
 
 @pytest.mark.skipif(not compiled.available(), reason="numba is not installed, or switched off")
-def test_large_steps_are_divided_between_threads_to_the_same_bits(monkeypatch):
+def test_a_batch_divided_between_threads_gives_bit_equal_steps(monkeypatch):
     from surrogym_server.models.gaussian_process.prediction.compiled import step
 
     move, unseen = model().compiled(), steps(100, seed=6)
@@ -184,7 +184,7 @@ def test_large_steps_are_divided_between_threads_to_the_same_bits(monkeypatch):
         np.testing.assert_array_equal(getattr(divided, field.name), getattr(whole, field.name))
 
 
-def test_the_step_in_c_reads_the_inducing_points():
+def test_the_exported_c_step_of_a_sparse_model_equals_the_model():
     unseen = steps(50, seed=6)
     check_in_c(model(), (unseen.q, unseen.u))
 
@@ -200,6 +200,6 @@ def test_the_step_in_c_reads_the_inducing_points():
         ({"points": 3}, "inducing, got 'points'"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(settings, said):
+def test_invalid_sparse_gaussian_process_settings_are_refused(settings, said):
     with pytest.raises(InvalidSpec, match=said):
         learner_of(Choice("gaussian_process", tuple(settings.items())))

@@ -33,7 +33,7 @@ def data(pendulum_model: GaussianProcessModel) -> bytes:
     return to_bytes(pendulum_model)
 
 
-def test_predictions_survive_bit_for_bit(model):
+def test_a_stored_model_predicts_bit_equal_after_loading(model):
     loaded = from_bytes(model.definition, to_bytes(model))
     generator = torch.manual_seed(1)
     q = torch.rand(50, len(model.definition.coordinates), generator=generator, dtype=torch.float64)
@@ -47,7 +47,7 @@ def test_predictions_survive_bit_for_bit(model):
         assert ours.reward_std is None or torch.equal(ours.reward_std, theirs.reward_std)
 
 
-def test_a_flipped_bit_is_refused_or_says_nothing(model):
+def test_a_model_file_with_a_flipped_bit_is_refused_or_loads_unchanged(model):
     data, refused = to_bytes(model), 0
     for place in np.random.default_rng(0).integers(len(data), size=300):
         flipped = bytearray(data)
@@ -61,7 +61,7 @@ def test_a_flipped_bit_is_refused_or_says_nothing(model):
     assert refused > 250
 
 
-def test_all_that_describes_a_model_survives(model):
+def test_description_samples_and_digest_of_a_stored_model_survive_loading(model):
     loaded = from_bytes(model.definition, to_bytes(model))
     assert loaded.description == model.description
     assert (loaded.samples, loaded.digest, loaded.terminal_reward) == (
@@ -73,42 +73,42 @@ def test_all_that_describes_a_model_survives(model):
 
 
 @pytest.mark.parametrize("keep", [0, 7, 8, 100, -1])
-def test_truncated_bytes_are_refused(pendulum_definition, data, keep):
+def test_a_truncated_model_file_is_refused(pendulum_definition, data, keep):
     with pytest.raises(InvalidInput, match="safetensors"):
         from_bytes(pendulum_definition, data[:keep])
 
 
 @pytest.mark.parametrize("place", [0, 7, 9, 200])
-def test_a_changed_byte_of_the_header_is_refused(pendulum_definition, data, place):
+def test_a_model_file_with_a_changed_header_byte_is_refused(pendulum_definition, data, place):
     with pytest.raises(InvalidInput):
         from_bytes(pendulum_definition, data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :])
 
 
-def test_a_missing_tensor_is_refused(pendulum_definition, data):
+def test_a_model_file_with_a_missing_tensor_is_refused(pendulum_definition, data):
     with pytest.raises(InvalidInput, match=r"'0\.weights'"):
         from_bytes(pendulum_definition, rewritten(data, **{"0_weights": None}))
 
 
-def test_a_tensor_of_another_precision_is_refused(pendulum_definition, data):
+def test_a_model_file_with_a_tensor_of_another_precision_is_refused(pendulum_definition, data):
     single = load(data)["0.x"].float()
     with pytest.raises(InvalidInput, match=r"expected x as torch\.float64"):
         from_bytes(pendulum_definition, rewritten(data, **{"0_x": single}))
 
 
 @pytest.mark.parametrize("name", ["0_x", "0_y", "0_factor", "1_weights", "2_lengthscale"])
-def test_a_tensor_of_another_shape_is_refused(pendulum_definition, data, name):
+def test_a_model_file_with_a_tensor_of_another_shape_is_refused(pendulum_definition, data, name):
     with pytest.raises(InvalidInput, match="expected"):
         from_bytes(pendulum_definition, rewritten(data, **{name: torch.zeros(3, 2, dtype=torch.float64)}))
 
 
-def test_a_file_without_its_header_field_is_refused(pendulum_definition, data):
+def test_a_model_file_without_a_required_header_field_is_refused(pendulum_definition, data):
     for field in ("outputs", "terminal_reward", "samples", "digest", "format"):
         header = {k: v for k, v in header_of(data).items() if k != field}
         with pytest.raises(InvalidInput):
             from_bytes(pendulum_definition, rewritten(data, header))
 
 
-def test_another_format_or_environment_is_refused(pendulum_definition, cartpole_definition, data):
+def test_a_model_file_of_another_format_or_environment_is_refused(pendulum_definition, cartpole_definition, data):
     for other in (FORMAT - 1, FORMAT + 1):
         with pytest.raises(InvalidInput, match=f"got format {other}, .* export its samples with that version"):
             from_bytes(pendulum_definition, rewritten(data, header_of(data) | {"format": other}))
@@ -120,7 +120,7 @@ def test_another_format_or_environment_is_refused(pendulum_definition, cartpole_
         from_bytes(other, data)
 
 
-def test_a_transition_that_reads_the_state_it_predicts_is_refused(pendulum_definition, data):
+def test_a_model_file_whose_transition_reads_the_next_state_is_refused(pendulum_definition, data):
     header = header_of(data)
     header["outputs"][1]["feature_map"] |= {"after": True}
     with pytest.raises(InvalidInput, match="before the step"):
@@ -133,7 +133,7 @@ def test_a_foreign_safetensors_file_is_refused(pendulum_definition):
             from_bytes(pendulum_definition, save({"a": torch.zeros(1)}, metadata))
 
 
-def test_numbers_that_no_model_has_are_refused(pendulum_definition, pendulum_model):
+def test_a_model_file_with_invalid_numbers_is_refused(pendulum_definition, pendulum_model):
     reward = pendulum_model.reward
     nowhere = replace(reward.posterior, weights=torch.full_like(reward.posterior.weights, math.nan))
     for bad in (
@@ -153,7 +153,7 @@ def test_numbers_that_no_model_has_are_refused(pendulum_definition, pendulum_mod
             from_bytes(pendulum_definition, to_bytes(bad))
 
 
-def test_a_header_without_end_is_refused(pendulum_definition):
+def test_a_model_file_with_an_unterminated_header_is_refused(pendulum_definition):
     with pytest.raises(InvalidInput):
         from_bytes(pendulum_definition, (200_000).to_bytes(8, "little") + b"[" * 200_000)
 
@@ -178,12 +178,12 @@ def beyond_the_end(head: dict) -> None:
 
 
 @pytest.mark.parametrize("change", [overlapping, beyond_the_end])
-def test_arrays_that_overlap_or_reach_beyond_the_file_are_refused(pendulum_definition, data, change):
+def test_a_model_file_with_overlapping_or_overlong_arrays_is_refused(pendulum_definition, data, change):
     with pytest.raises(InvalidInput, match="expected a Surrogym model"):
         from_bytes(pendulum_definition, with_head(data, change))
 
 
 @pytest.mark.parametrize("length", [2**32, 2**63 - 1, 2**64 - 1])
-def test_a_header_that_claims_to_be_huge_is_refused(pendulum_definition, data, length):
+def test_a_model_file_that_announces_a_huge_header_is_refused(pendulum_definition, data, length):
     with pytest.raises(InvalidInput, match="expected a Surrogym model"):
         from_bytes(pendulum_definition, length.to_bytes(8, "little") + data[8:])

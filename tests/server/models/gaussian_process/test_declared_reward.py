@@ -47,7 +47,7 @@ def model() -> GaussianProcessModel:
     return learn(definition_from_spec(PENDULUM), random_steps(PENDULUM, 12, seed=0)).model
 
 
-def test_pendulums_reward_is_what_it_declares(model):
+def test_a_declared_pendulum_reward_is_predicted_exactly_without_uncertainty(model):
     steps = random_steps(PENDULUM, 100, seed=1)
     predicted = model.transition(steps.q, steps.u, reward_std=True)
     torch.testing.assert_close(predicted.reward, steps.reward, rtol=0, atol=1e-6)
@@ -59,13 +59,13 @@ def test_pendulums_reward_is_what_it_declares(model):
     assert described["scores"]["declared, largest error over the samples"] < 1e-6
 
 
-def test_samples_that_contradict_the_declaration_show(model):
+def test_rewards_that_contradict_the_declared_formula_are_reported_in_the_description(model):
     steps = random_steps(PENDULUM, 12, seed=0)
     off = learn(model.definition, replace(steps, reward=steps.reward + 2)).model
     assert off.description["outputs"][-1]["scores"]["declared, largest error over the samples"] == pytest.approx(2)
 
 
-def test_shapes():
+def test_each_shape_of_a_declared_reward_term_has_its_value():
     x, push = Quantity(term=Term.linear(speed=2)), Quantity(term=Term.constant(1), action=(3.0,))
     q, u = [0.0, -0.5], [1.0]  # x = -1, push = 4
     assert value(paying(RewardTerm(shape="one", weight=2)), q, u) == 2
@@ -81,7 +81,7 @@ def test_shapes():
 
 
 @pytest.mark.parametrize("actions", [1, 2])
-def test_a_level_of_the_state_pays_whatever_the_number_of_actions(actions: int):
+def test_a_state_threshold_reward_works_with_any_number_of_actions(actions: int):
     """A reward of two values that was found has conditions, and no quantity whose weights name the actions."""
     fast = Inequality(term=Term.linear(speed=1), relation=">=", value=1.0)
     spec = paying(RewardTerm(shape="one", when=(fast,)))
@@ -89,14 +89,14 @@ def test_a_level_of_the_state_pays_whatever_the_number_of_actions(actions: int):
         assert value(spec, [0.0, speed], [0.3] * actions) == paid
 
 
-def test_a_term_counts_only_when_its_conditions_hold():
+def test_a_declared_reward_term_counts_only_when_its_conditions_hold():
     near = Inequality(term=Term.linear(theta=1), relation=">=", value=0.5)
     slow = Inequality(term=Term.linear(speed=1), relation="<", value=1)
     spec = paying(RewardTerm(shape="one", weight=5, when=(near, slow)), RewardTerm(shape="one", weight=-1))
     assert [value(spec, q, [0.0]) for q in ([0.5, 0.0], [0.4, 0.0], [0.5, 1.0])] == [4, -1, -1]
 
 
-def test_after_reads_the_next_state_and_an_ending_pays_beyond():
+def test_a_declared_reward_can_read_the_next_state_and_add_a_terminal_reward():
     end = Inequality(term=Term.linear(x=1), relation=">", value=2.4)
     reward = DeclaredReward(
         kind="declared",
@@ -113,7 +113,7 @@ def test_after_reads_the_next_state_and_an_ending_pays_beyond():
     assert model.means(q, u)[:, -1].tolist() == pytest.approx((predicted.q_next[:, 0] - torch.tensor([0, 10])).tolist())
 
 
-def test_pilcos_narrow_reward_can_be_declared():
+def test_the_narrow_cart_pole_reward_of_pilco_can_be_declared():
     """exp(-d^2 / (2 width^2)), d from the pole's tip to where it stands above the origin."""
     width, length = WIDTH["narrow"], LENGTH
     across = Quantity(term=(1 / width) * (Term.linear(x=1) + length * Term.sin(angle=1)))
@@ -128,14 +128,14 @@ def test_pilcos_narrow_reward_can_be_declared():
     assert float(steps.reward.max()) > 0.1
 
 
-def test_a_declared_reward_survives_storage_and_refuses_a_learned_one(model, pendulum_model):
+def test_a_model_with_declared_reward_survives_storage_and_one_with_learned_is_refused(model, pendulum_model):
     loaded = from_bytes(model.definition, to_bytes(model))
     assert loaded.description == model.description
     with pytest.raises(InvalidInput, match="without a learned reward"):
         from_bytes(model.definition, to_bytes(pendulum_model))
 
 
-def test_a_specification_with_one_survives_json():
+def test_a_specification_with_declared_reward_survives_json():
     assert EnvironmentSpec.model_validate_json(PENDULUM.model_dump_json()) == PENDULUM
     old = pendulum().model_dump(mode="json")
     del old["reward"]["kind"]
@@ -166,24 +166,24 @@ SQUARE = {"shape": "square", "of": [{"action": [1.0]}]}
         ),
     ],
 )
-def test_rewards_that_cannot_be_are_refused(reward, said):
+def test_invalid_declared_rewards_are_refused(reward, said):
     with pytest.raises(ValidationError, match=said):
         EnvironmentSpec.model_validate(pendulum().model_dump() | {"reward": reward})
 
 
-def test_the_papers_preset_learns_its_reward():
+def test_preset_paper_with_a_declared_reward_is_refused():
     design = {"preset": "paper"}
     with pytest.raises(ValidationError, match="learns its reward"):
         EnvironmentSpec.model_validate(PENDULUM.model_dump() | {"design": design})
 
 
 @pytest.mark.parametrize("termination", ["guessed", "import os", [["learned"]], [[]], None])
-def test_termination_is_learned_or_groups(termination):
+def test_a_termination_other_than_learned_or_condition_groups_is_refused(termination):
     with pytest.raises(ValidationError, match="termination"):
         EnvironmentSpec.model_validate(pendulum().model_dump() | {"termination": termination})
 
 
-def test_a_learned_termination_declares_no_groups():
+def test_a_specification_with_learned_termination_has_no_condition_groups():
     learned = EnvironmentSpec.model_validate(pendulum().model_dump() | {"termination": "learned"})
     assert learned.termination == "learned"
     assert learned.termination_groups == ()

@@ -76,42 +76,42 @@ def points() -> tuple[Tensor, Tensor]:
     return test.q, test.u
 
 
-def test_an_output_reads_what_its_next_value_depends_on(model):
+def test_each_output_keeps_only_the_inputs_its_next_value_depends_on(model):
     for column in range(1, 10):
         assert read(model, column) == {column - 1, column}
     assert "without" in model.structures[1]
     assert any("without" in name for name, _ in model.transitions[1].scores)
 
 
-def test_predictions_are_better_without_them(model):
+def test_predictions_are_better_without_irrelevant_inputs(model):
     whole = gaussian_processes(definition_from_spec(spec(high=1.5, drop_inputs=False)), steps(40, 0))
     assert not any(output.feature_map.dropped for output in whole.outputs)
     assert error(model, steps(400, 9)) < 0.1 * error(whole, steps(400, 9))
 
 
-def test_errors_are_within_the_stds(model):
+def test_errors_of_a_model_with_dropped_inputs_are_within_its_deviations(model):
     test = steps(400, 9)
     moved = model.transition(test.q, test.u, stds=True)
     within = (moved.q_next - test.q_next).abs() <= 1.645 * moved.std + 1e-3
     assert float(within.double().mean()) > 0.85
 
 
-def test_preset_paper_leaves_nothing_out():
+def test_preset_paper_drops_no_inputs():
     paper = spec().model_copy(update={"design": spec().design.model_validate({"preset": "paper"})})
     learned = gaussian_processes(definition_from_spec(paper), steps(20, 0))
     assert not any(output.feature_map.dropped for output in learned.outputs)
 
 
-def test_predictions_are_those_of_the_processes(model, points):
+def test_predictions_with_dropped_inputs_equal_those_of_the_processes(model, points):
     check_processes(model, points)
 
 
 @pytest.mark.parametrize("how", WAYS)
-def test_compiled_steps_are_the_same(model, points, how):
+def test_compiled_steps_with_dropped_inputs_equal_the_model(model, points, how):
     check_compiled(model, points, how)
 
 
-def test_functions_with_uncertain_hyperparameters_read_the_same(model, points):
+def test_drawn_functions_with_uncertain_hyperparameters_ignore_dropped_inputs(model, points):
     functions = model.uncertain_functions
     noise = torch.randn(50, functions.path_size, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     q, u = points[0].clone(), points[1].clone()
@@ -121,7 +121,7 @@ def test_functions_with_uncertain_hyperparameters_read_the_same(model, points):
     torch.testing.assert_close(functions.transition_along(paths, q, u).q_next[:, 3], before)
 
 
-def test_what_is_left_out_survives_storage(model, points):
+def test_dropped_inputs_survive_storage(model, points):
     loaded = from_bytes(ROW, to_bytes(model))
     assert isinstance(loaded, GaussianProcessModel)
     assert [o.feature_map for o in loaded.outputs] == [o.feature_map for o in model.outputs]
@@ -129,20 +129,20 @@ def test_what_is_left_out_survives_storage(model, points):
 
 
 @pytest.mark.parametrize("dropped", [(11,), (-1, 2), (2, 1), (1, 1), tuple(range(11))])
-def test_malformed_lists_are_refused(model, dropped):
+def test_a_malformed_list_of_dropped_inputs_is_refused(model, dropped):
     output = model.transitions[1]
     wrong = replace(output, feature_map=replace(output.feature_map, dropped=dropped))
     with pytest.raises(InvalidInput, match="left out"):
         require_output(ROW, wrong)
 
 
-def test_processes_that_are_mirror_images_leave_inputs_out_too():
+def test_odd_processes_drop_irrelevant_inputs_too():
     model = gaussian_processes(definition_from_spec(spec()), steps(24, 0, high=1.0))
     assert model.transitions[1].feature_map.parity == "odd"
     assert read(model, 1) == {0, 1}
 
 
-def test_all_samples_must_confirm_what_a_subset_leaves_out(monkeypatch):
+def test_inputs_dropped_by_a_subset_must_be_irrelevant_for_all_samples(monkeypatch):
     monkeypatch.setattr("surrogym_server.gp.subsets.FEW", 36)
     samples = steps(44, 0)
     model = gaussian_processes(ALONE, samples)
@@ -155,23 +155,23 @@ def test_all_samples_must_confirm_what_a_subset_leaves_out(monkeypatch):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_few_samples_leave_out_nothing_that_is_read(seed):
+def test_with_few_samples_no_relevant_input_is_dropped(seed):
     """With two samples for each input, the evidence is always for fewer inputs, and often for the wrong ones."""
     model = gaussian_processes(ROW, steps(22, seed))
     for column in range(1, 10):
         assert read(model, column) in ({column - 1, column}, set(range(11)))
 
 
-def test_nothing_is_left_out_of_fewer_samples():
+def test_below_the_minimum_number_of_samples_no_input_is_dropped():
     assert not any(o.feature_map.dropped for o in gaussian_processes(ROW, steps(dropping.FEWEST - 1, 0)).outputs)
 
 
-def test_a_well_known_output_leaves_nothing_out():
+def test_an_output_predicted_precisely_drops_no_inputs():
     model = gaussian_processes(definition_from_spec(pendulum()), random_steps(pendulum(), 20, seed=0))
     assert not any(output.feature_map.dropped for output in model.outputs)
 
 
-def test_the_next_value_of_a_limited_speed_and_an_input_with_a_rate_stay():
+def test_the_next_limited_speed_and_inputs_with_growth_rates_are_never_dropped():
     """As long as no sample ends at the limit, the next value seems to say nothing new."""
     known = definition_from_spec(pendulum())
     output = gaussian_processes(known, random_steps(pendulum(), 4, seed=0)).transitions[0]
@@ -186,7 +186,7 @@ def test_the_next_value_of_a_limited_speed_and_an_input_with_a_rate_stay():
         assert torch.equal(dropping._may_be_dropped(learner, unknown), kept)
 
 
-def test_a_map_without_a_feature_has_those_before_and_after_it():
+def test_a_feature_map_with_dropped_inputs_keeps_the_order_of_the_others():
     every = features(ROW, FeatureMap())
     left = features(ROW, FeatureMap(dropped=(1, 3), rates=(0.0, 0.5, *[0.0] * 7)))
     assert [f.entry for f in left] == [every[place].entry for place in (0, 2, 4, 5, 6, 7, 8, 9, 10)]

@@ -13,7 +13,7 @@ from surrogym_server.models.gaussian_process.learning.angle_prediction import le
 from surrogym_shared.spec import Design
 
 
-def test_which_maps_are_compared(pendulum_definition, cartpole_definition):
+def test_each_environment_has_its_expected_candidate_feature_maps(pendulum_definition, cartpole_definition):
     assert len(candidates(pendulum_definition, follows=True)) == 14
     assert len(candidates(pendulum_definition, follows=False)) == 6
     assert candidates(cartpole_definition, follows=True) == (FeatureMap(), FeatureMap(parity="odd"))
@@ -24,7 +24,7 @@ def test_which_maps_are_compared(pendulum_definition, cartpole_definition):
 
 
 @pytest.mark.parametrize("task", [pendulum, cartpole, acrobot])
-def test_a_reflection_is_what_features_do_when_all_signs_change(task):
+def test_the_reflection_of_a_feature_map_equals_encoding_the_negated_state(task):
     definition = definition_from_spec(task())
     rng = torch.Generator().manual_seed(0)
     q = torch.randn(6, len(definition.coordinates), generator=rng, dtype=torch.float64)
@@ -42,7 +42,9 @@ def test_a_reflection_is_what_features_do_when_all_signs_change(task):
         torch.testing.assert_close(encode(definition, feature_map, -q, limits - u, -lead), x * found.signs)
 
 
-def test_what_has_no_mirror_image(pendulum_definition, mountain_car_definition):
+def test_uncentred_ranges_observations_and_one_hot_actions_have_no_reflection(
+    pendulum_definition, mountain_car_definition
+):
     """A range that is not centred at 0 has none, nor a one-hot action, nor an observation."""
     assert not any(m.parity for m in candidates(mountain_car_definition, follows=False))
     assert reflection(pendulum_definition, FeatureMap()) is None
@@ -50,7 +52,7 @@ def test_what_has_no_mirror_image(pendulum_definition, mountain_car_definition):
     assert reflection(definition_from_spec(acrobot()), FeatureMap(action="one_hot", parity="odd")) is None
 
 
-def test_a_reward_may_read_an_observation_that_combines_coordinates():
+def test_observations_that_combine_coordinates_are_candidate_inputs_of_the_reward_only():
     """The way from a fingertip to its target says in two inputs what joints and target say in six."""
     combines, plain = definition_from_spec(reacher()), definition_from_spec(pendulum())
     assert FeatureMap("observation", after=True) in reward_candidates(combines)

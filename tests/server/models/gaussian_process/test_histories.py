@@ -69,12 +69,12 @@ def model(definition: EnvironmentDefinition) -> GaussianProcessModel:
 
 
 @pytest.mark.parametrize("dead_steps", range(LONGEST))
-def test_a_process_looks_back_as_far_as_the_dead_time(definition, dead_steps):
+def test_the_selected_history_length_equals_the_dead_time_of_the_environment(definition, dead_steps):
     (moved,) = learn(definition, walked(dead_steps)).model.transitions
     assert moved.feature_map.history == dead_steps
 
 
-def test_a_reward_of_the_present_looks_at_the_present_alone(model):
+def test_a_reward_of_the_current_state_selects_history_length_zero(model):
     assert model.reward.feature_map.history == 0
     assert "history 0" in model.description["outputs"][-1]["inputs"]
 
@@ -86,18 +86,18 @@ def test_every_history_length_is_scored_and_the_best_feature_map_is_kept(model):
     assert max(moved.scores, key=lambda score: score[1])[0] == str(moved.feature_map)
 
 
-def test_without_lags_no_history_is_compared(pendulum_definition):
+def test_without_lagged_coordinates_no_history_lengths_are_compared(pendulum_definition):
     assert {m.history for m in candidates(pendulum_definition, follows=True)} == {None}
 
 
-def test_a_stored_model_keeps_its_history(definition, model):
+def test_a_stored_model_keeps_its_history_length(definition, model):
     loaded = from_bytes(definition, to_bytes(model))
     assert loaded.transitions[0].feature_map == model.transitions[0].feature_map
     samples = walked(2)
     assert torch.equal(loaded.means(samples.q, samples.u), model.means(samples.q, samples.u))
 
 
-def test_a_stored_history_that_the_environment_does_not_have_is_refused(definition, model):
+def test_a_stored_model_with_an_invalid_history_length_is_refused(definition, model):
     data = to_bytes(replace(model))
     text = json.dumps(header_of(data))
     assert '"history": 2' in text

@@ -47,19 +47,19 @@ def three_levels(q, _):
     ("pay", "sizes", "wrong"),
     [(sparse, [1], 0.06), (until_goal, [1], 0.03), (cost_and_jump, [10], 0.03), (three_levels, [4, -1], 0.06)],
 )
-def test_a_jump_is_found_with_its_size_and_its_edge(pay, sizes, wrong):
+def test_a_reward_jump_is_found_with_its_size_and_boundary(pay, sizes, wrong):
     model = learn(definition_from_spec(plane()), drifting(pay, 60)).model
     assert sorted(abs(jump.size) for jump in model.jumps) == pytest.approx(sorted(map(abs, sizes)), abs=0.05)
     assert error(model, pay) < wrong
     assert len(model.description["jumps"]) == len(sizes)
 
 
-def test_the_step_in_c_jumps_where_the_model_does():
+def test_the_exported_c_step_reproduces_reward_jumps():
     unseen = drifting(three_levels, 200, seed=1)
     check_in_c(learn(definition_from_spec(plane()), drifting(three_levels, 60)).model, (unseen.q, unseen.u))
 
 
-def test_a_plain_process_is_worse():
+def test_a_model_with_reward_jumps_predicts_a_sparse_reward_better():
     model = learn(definition_from_spec(plane()), drifting(sparse, 60)).model
     paper = plane().model_copy(update={"design": plane().design.model_copy(update={"preset": "paper"})})
     without = learn(definition_from_spec(paper), drifting(sparse, 60)).model
@@ -77,11 +77,11 @@ def test_a_plain_process_is_worse():
         lambda q, _: torch.full((len(q),), -1.0, dtype=torch.float64),
     ],
 )
-def test_a_smooth_reward_does_not_jump(pay, seed):
+def test_no_jump_is_found_in_a_smooth_reward(pay, seed):
     assert learn(definition_from_spec(plane()), drifting(pay, 14, seed)).model.jumps == ()
 
 
-def test_an_edge_in_doubt_deviates():
+def test_the_reward_deviation_is_large_where_the_jump_boundary_is_uncertain():
     model = learn(definition_from_spec(plane()), drifting(until_goal, 40)).model
     inside = model.jumps[0].region.probability
     q, u = drifting(until_goal, 400, seed=2).q, torch.zeros(400, 1, dtype=torch.float64)
@@ -92,7 +92,7 @@ def test_an_edge_in_doubt_deviates():
     assert float(expected.max()) > 0.3
 
 
-def test_jumps_survive_storage_and_bad_ones_are_refused():
+def test_reward_jumps_survive_storage_and_invalid_ones_are_refused():
     model = learn(definition_from_spec(plane()), drifting(cost_and_jump, 60)).model
     loaded = from_bytes(model.definition, to_bytes(model))
     q, u = drifting(cost_and_jump, 50, seed=2).q, torch.zeros(50, 1, dtype=torch.float64)
@@ -105,7 +105,7 @@ def test_jumps_survive_storage_and_bad_ones_are_refused():
             from_bytes(model.definition, to_bytes(replace(model, jumps=(bad,))))
 
 
-def test_forms_whose_weights_exceed_1_by_rounding_leave_no_negative_variance():
+def test_jump_weights_that_sum_above_1_by_rounding_give_no_negative_variance():
     """The reward's deviation was NaN there, and the design failed."""
     model = learn(definition_from_spec(plane()), drifting(sparse, 60)).model
     form = model.jumps[0].region.forms[0][1]

@@ -21,7 +21,7 @@ PAPER = pendulum().model_copy(update={"design": Design(preset="paper")})
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_reward_of_the_squared_angle_is_given_the_wrapped_angle(pendulum_definition, seed):
+def test_a_reward_of_the_squared_angle_selects_the_wrapped_angle_as_input(pendulum_definition, seed):
     steps = random_steps(pendulum(), 24, seed=seed)
     squared = replace(steps, reward=-steps.q[:, 0].square())
     reward = learn(pendulum_definition, squared).model.reward
@@ -30,7 +30,7 @@ def test_a_reward_of_the_squared_angle_is_given_the_wrapped_angle(pendulum_defin
     assert max(scores, key=scores.get) == str(reward.feature_map)
 
 
-def test_a_reward_of_the_cosine_is_given_cos_and_sin(pendulum_definition):
+def test_a_reward_of_the_cosine_selects_cosine_and_sine_as_inputs(pendulum_definition):
     steps = random_steps(pendulum(), 24, seed=0)
     reward = learn(pendulum_definition, replace(steps, reward=3 * steps.q[:, 0].cos() - 1)).model.reward
     assert reward.feature_map.state == "cos_sin"
@@ -38,7 +38,7 @@ def test_a_reward_of_the_cosine_is_given_cos_and_sin(pendulum_definition):
 
 @pytest.mark.parametrize("task", [pendulum, cartpole])
 @pytest.mark.parametrize("seed", range(2))
-def test_the_symmetry_of_a_body_is_found(task, seed):
+def test_the_odd_symmetry_of_the_dynamics_is_found(task, seed):
     model = learn(definition_from_spec(task()), random_steps(task(), 12, seed=seed)).model
     assert {output.feature_map.parity for output in model.transitions} == {"odd"}
     assert all(output.centre == 0 for output in model.transitions)
@@ -46,7 +46,7 @@ def test_the_symmetry_of_a_body_is_found(task, seed):
 
 @pytest.mark.parametrize("task", [pendulum, mountain_car_continuous])
 @pytest.mark.parametrize("seed", range(2))
-def test_what_its_next_speed_alone_moves_is_found_from_six_steps(task, seed):
+def test_an_angle_that_depends_only_on_the_next_speed_is_recognised_after_six_steps(task, seed):
     """Both environments move by the speed after the step: no bound has to be met to know how far that goes."""
     model = learn(definition_from_spec(task()), random_steps(task(), 6, seed=seed)).model
     angle, speed = model.transitions
@@ -55,12 +55,12 @@ def test_what_its_next_speed_alone_moves_is_found_from_six_steps(task, seed):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_reward_that_is_even_is_found_to_be_so(pendulum_definition, seed):
+def test_an_even_reward_is_recognised_as_even(pendulum_definition, seed):
     assert learn(pendulum_definition, random_steps(pendulum(), 12, seed=seed)).model.reward.feature_map.parity == "even"
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_torque_that_pulls_to_one_side_is_no_mirror_image(pendulum_definition, seed):
+def test_a_constant_extra_torque_prevents_the_odd_symmetry(pendulum_definition, seed):
     """The same steps, said to have been taken with a tenth of the largest torque less."""
     steps = random_steps(pendulum(), 16, seed=seed)
     _, speed = learn(pendulum_definition, replace(steps, u=steps.u - 0.2)).model.transitions
@@ -69,7 +69,7 @@ def test_a_torque_that_pulls_to_one_side_is_no_mirror_image(pendulum_definition,
 
 @pytest.mark.parametrize("after", [False, True])
 @pytest.mark.parametrize("seed", range(2))
-def test_the_rewards_timing_is_found_by_evidence(pendulum_definition, after, seed):
+def test_reward_timing_before_or_after_the_step_is_selected_by_evidence(pendulum_definition, after, seed):
     steps = random_steps(pendulum(), 24, seed=seed)
     state = steps.q_next if after else steps.q
     paying = replace(steps, reward=-state[:, 0].square() - 0.1 * state[:, 1].square())
@@ -80,7 +80,7 @@ def test_the_rewards_timing_is_found_by_evidence(pendulum_definition, after, see
     assert max(scores, key=scores.get) == str(reward.feature_map)
 
 
-def test_cut_increments_are_left_out_of_the_dynamics_and_kept_for_the_reward(pendulum_definition, half_saturated):
+def test_samples_clipped_at_a_bound_train_the_reward_but_not_the_dynamics(pendulum_definition, half_saturated):
     cut = int((half_saturated.q_next[:, 1].abs() >= 8).sum())
     assert cut >= 5
     model = learn(pendulum_definition, half_saturated).model
@@ -92,21 +92,21 @@ def test_cut_increments_are_left_out_of_the_dynamics_and_kept_for_the_reward(pen
     assert model.reward.left_out == 0
 
 
-def test_where_every_sample_was_cut_they_are_all_that_is_known(pendulum_definition, half_saturated):
+def test_if_every_sample_was_clipped_at_a_bound_the_dynamics_use_them_all(pendulum_definition, half_saturated):
     cut = half_saturated.q_next[:, 1].abs() >= 8
     only = Samples(*(getattr(half_saturated, name)[cut] for name in half_saturated.__dataclass_fields__))
     model = learn(pendulum_definition, only).model
     assert [o.left_out for o in model.transitions] == [0, 0]
 
 
-def test_a_constant_output_has_no_process_and_no_std(cartpole_model):
+def test_a_constant_output_has_no_process_and_zero_deviation(cartpole_model):
     assert cartpole_model.reward.posterior is None
     mean, std = cartpole_model.reward.mean_and_std(torch.zeros(3, 5, dtype=torch.float64))
     assert mean.tolist() == [1.0] * 3
     assert std.tolist() == [0.0] * 3
 
 
-def test_an_ending_adds_its_terminal_reward(cartpole_definition):
+def test_the_terminal_reward_is_learned_from_terminated_samples(cartpole_definition):
     steps = random_steps(cartpole(), 60, seed=0)
     assert bool(steps.terminated.any())
     assert bool((~steps.terminated).any())
@@ -118,11 +118,11 @@ def test_an_ending_adds_its_terminal_reward(cartpole_definition):
     assert paid(model.terminal_reward, reward, torch.tensor([True, False])).tolist() == pytest.approx([-9.0, 1.0])
 
 
-def test_without_an_ending_there_is_no_terminal_reward(pendulum_model):
+def test_without_terminated_samples_the_terminal_reward_is_zero(pendulum_model):
     assert pendulum_model.terminal_reward == 0.0
 
 
-def test_the_papers_preset_models_the_observation_by_squared_exponentials():
+def test_preset_paper_models_the_observation_with_squared_exponential_kernels():
     steps = random_steps(PAPER, 30, seed=0)
     model = learn(definition_from_spec(PAPER), steps).model
     assert [o.name for o in (*model.transitions, model.reward)] == ["cos", "sin", "speed", "reward"]
@@ -131,7 +131,7 @@ def test_the_papers_preset_models_the_observation_by_squared_exponentials():
     assert float((q_next - steps.q_next)[:, 1].abs().max()) < 0.5
 
 
-def test_a_model_needs_two_samples(pendulum_definition):
+def test_learning_from_fewer_than_two_samples_is_refused(pendulum_definition):
     steps = random_steps(pendulum(), 1, seed=0)
     with pytest.raises(InvalidInput, match="at least 2 samples, got 1"):
         learn(pendulum_definition, steps)
@@ -145,7 +145,7 @@ def test_learning_the_same_samples_gives_the_same_model(pendulum_definition, pen
 
 
 @pytest.mark.parametrize(("points", "through"), [(40, False), (41, True)])
-def test_beyond_a_number_of_samples_a_model_is_sparse_and_says_so(
+def test_a_model_of_many_samples_is_sparse_and_its_description_tells_so(
     pendulum_definition, points: int, through: bool, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(sparse, "MAX_EXACT", 40)
@@ -165,7 +165,7 @@ def test_beyond_a_number_of_samples_a_model_is_sparse_and_says_so(
     assert float(error.abs().max()) < 0.05
 
 
-def test_a_model_of_many_noisy_samples_is_small_and_reads_what_matters():
+def test_a_model_of_many_noisy_samples_is_sparse_and_drops_irrelevant_inputs():
     """A mass on a spring, and a base on which nothing depends."""
     size, noise, seeded = 600, 0.02, torch.Generator().manual_seed(0)
     definition = definition_from_spec(spring())
@@ -200,7 +200,7 @@ def spring() -> EnvironmentSpec:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_structure_of_some_samples_and_a_process_of_all_predict_as_before(
+def test_a_structure_chosen_on_a_subset_predicts_as_one_chosen_on_all_samples(
     pendulum_definition, seed, monkeypatch: pytest.MonkeyPatch
 ):
     """The same samples by the whole path, and by structure and first hyperparameters of a third of them."""
@@ -217,7 +217,9 @@ def test_structure_of_some_samples_and_a_process_of_all_predict_as_before(
     assert to_bytes(again) == to_bytes(part)
 
 
-def test_no_search_evaluates_more_points_for_more_samples(pendulum_definition, monkeypatch: pytest.MonkeyPatch):
+def test_structure_search_uses_a_fixed_number_of_points_for_any_sample_count(
+    pendulum_definition, monkeypatch: pytest.MonkeyPatch
+):
     """What is compared costs the same for any number of samples: all maps see no more than a few of them."""
     sizes: list[int] = []
 

@@ -35,7 +35,7 @@ def model() -> GaussianProcessModel:
     return learned_from(CARTPOLE, 60, seed=0)
 
 
-def test_cartpole_ends_where_its_pole_has_fallen(model):
+def test_the_learned_termination_of_cart_pole_depends_on_the_pole_angle(model):
     _, form = max(model.ending.forms, key=lambda pair: pair[0])
     assert isinstance(form, Thresholds)
     assert any("pole" in cut["rule"] for rule in form.description["rules"] for cut in rule)
@@ -45,7 +45,7 @@ def test_cartpole_ends_where_its_pole_has_fallen(model):
     assert float((model.termination_probability(unseen.q_next) > 0.5).double().mean()) > 0
 
 
-def test_a_classifier_separates_states_that_no_threshold_can():
+def test_a_classifier_is_learned_if_no_threshold_separates_terminal_states():
     spec, steps = ACROBOT, random_steps(ACROBOT, 150, seed=1)
     region = learn_termination(OutputLearner(definition_from_spec(spec), Settings(), {}, {}), steps)
     assert isinstance(region.forms[0][1], Classifier)
@@ -54,7 +54,7 @@ def test_a_classifier_separates_states_that_no_threshold_can():
     assert float(wrong) < 0.4 * float(unseen.terminated.double().mean())
 
 
-def test_nothing_ends_before_anything_was_seen_to(model):
+def test_without_terminated_samples_no_state_is_predicted_terminal(model):
     definition = model.definition
     steps = random_steps(CARTPOLE, 12, seed=0)
     going = learn(definition, replace(steps, terminated=torch.zeros_like(steps.terminated))).model
@@ -63,20 +63,20 @@ def test_nothing_ends_before_anything_was_seen_to(model):
     assert bool(always.terminated(steps.q).all())
 
 
-def test_points_beyond_the_seen_states_are_unexplored(model):
+def test_states_outside_the_range_of_the_samples_count_as_unexplored(model):
     seen = torch.tensor([[0.0, 0, 0, 0], [1, 1, 1, 1]], dtype=torch.float64)
     at = torch.tensor([[0.5, 0.5, 0.5, 0.5], [1.25, 0.5, 0.5, 0.5], [-0.5, 1.5, 0.5, 9]], dtype=torch.float64)
     assert unexplored(model.definition, seen, at).tolist() == [0, 0.25, 2]
     assert unexplored(model.definition, seen[:0], at).tolist() == [1, 1, 1]
 
 
-def test_predicted_points_end_as_the_model_learned(model):
+def test_predicted_points_use_the_learned_termination(model):
     q = torch.tensor([[0, 0, 0.2, 3.0], [0, 0, 0, 0]], dtype=torch.float64)
     assert predict_points(model, q.numpy(), torch.ones(2, 1).double().numpy()).terminated.tolist() == [True, False]
 
 
 @pytest.mark.parametrize(("spec", "count"), [(CARTPOLE, 60), (ACROBOT, 25)])
-def test_a_learned_ending_survives_storage_bit_for_bit(spec, count):
+def test_a_learned_termination_survives_storage_bit_equal(spec, count):
     model = learned_from(spec, count)
     loaded = from_bytes(model.definition, to_bytes(model))
     q = random_steps(spec, 50, seed=3).q_next
@@ -85,7 +85,7 @@ def test_a_learned_ending_survives_storage_bit_for_bit(spec, count):
     json.dumps(loaded.description, allow_nan=False)
 
 
-def test_a_model_of_the_other_kind_of_termination_is_refused(model, cartpole_model):
+def test_loading_a_model_whose_termination_kind_differs_from_the_specification_is_refused(model, cartpole_model):
     with pytest.raises(InvalidInput, match="termination is declared, got learned"):
         from_bytes(cartpole_model.definition, to_bytes(model))
     with pytest.raises(InvalidInput, match="termination is learned, got declared"):
@@ -107,7 +107,7 @@ def test_a_model_of_the_other_kind_of_termination_is_refused(model, cartpole_mod
         [[["__import__('os')", 0.1, 0.2, 1.0]]],
     ],
 )
-def test_thresholds_that_cannot_be_are_refused(model, rules):
+def test_a_stored_model_with_invalid_termination_thresholds_is_refused(model, rules):
     data = to_bytes(model)
     header = header_of(data)
     header["termination"]["forms"] = [[1.0, {"rules": rules, "complement": False}]]
@@ -116,7 +116,7 @@ def test_thresholds_that_cannot_be_are_refused(model, rules):
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.5, -1.0, float("nan")])
-def test_weights_that_do_not_add_up_are_refused(model, weight):
+def test_stored_termination_weights_that_do_not_sum_to_one_are_refused(model, weight):
     bad = replace(model, ending=replace(model.ending, forms=((weight, model.ending.forms[0][1]),)))
     with pytest.raises(InvalidInput, match="weights"):
         from_bytes(model.definition, to_bytes(bad))

@@ -14,7 +14,7 @@ from surrogym_server.models.abilities import LeaveOneOutErrors
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
 
-def test_leave_one_out_error_is_of_models_that_never_saw_the_point(pendulum_definition, pendulum_samples):
+def test_leave_one_out_errors_equal_those_of_processes_without_the_point(pendulum_definition, pendulum_samples):
     reward = learn(pendulum_definition, pendulum_samples).model.reward
     posterior, errors, stds = reward.posterior, [], []
     for i in range(len(posterior.y)):
@@ -32,7 +32,7 @@ def test_leave_one_out_error_is_of_models_that_never_saw_the_point(pendulum_defi
     assert replace(reward, posterior=None).leave_one_out() == LeaveOneOutErrors(0.0, 1.0, 1.0)
 
 
-def test_stds_that_tell_the_truth_hold_two_thirds_and_nineteen_in_twenty():
+def test_calibrated_deviations_cover_68_and_95_percent_of_leave_one_out_errors():
     """A process whose data are its own draws is right about its errors."""
     generator = torch.Generator().manual_seed(0)
     x = 4 * torch.rand(300, 1, generator=generator, dtype=torch.float64)

@@ -58,7 +58,7 @@ def error(definition: EnvironmentDefinition, samples: Samples, test: Samples) ->
 
 
 @pytest.mark.parametrize(("bent", "share"), [(False, 0.1), (True, 0.5)])
-def test_level_is_better_known_with_samples_at_the_valve_of_the_pressure(monkeypatch, bent, share):
+def test_samples_at_the_limit_of_one_coordinate_improve_another_coordinates_model(monkeypatch, bent, share):
     samples, test = steps(40, bent, 5), steps(300, bent, 1)
     model = gaussian_processes(RELIEVED, samples)
     assert [output.past_limits for output in model.transitions] == [True, False]
@@ -67,14 +67,14 @@ def test_level_is_better_known_with_samples_at_the_valve_of_the_pressure(monkeyp
     assert chosen < share * error(RELIEVED, samples, test)
 
 
-def test_a_lower_limit_that_no_sample_reaches_changes_nothing_of_it():
+def test_a_second_limit_that_no_sample_reaches_does_not_change_the_accuracy():
     """With two limits the pressure is a coordinate whose next value others may read."""
     samples, test = steps(40, False, 5), steps(300, False, 1)
     assert gaussian_processes(TWO_SIDED, samples).transitions[0].past_limits
     assert error(TWO_SIDED, samples, test) == pytest.approx(error(RELIEVED, samples, test), rel=0.1)
 
 
-def test_an_output_that_follows_a_limited_speed_reads_its_next_value():
+def test_an_output_driven_by_a_limited_speed_reads_the_next_speed():
     found = steps(60, False, 5)
     follows = replace(found, q_next=torch.stack([found.q[:, 0] + 0.3 * found.q_next[:, 1], found.q_next[:, 1]], 1))
     output = gaussian_processes(TWO_SIDED, follows).transitions[0]
@@ -82,7 +82,7 @@ def test_an_output_that_follows_a_limited_speed_reads_its_next_value():
     assert not output.past_limits
 
 
-def test_a_process_of_inducing_points_is_judged_by_the_residuals_of_its_samples(monkeypatch):
+def test_with_sparse_processes_the_use_of_limit_samples_is_decided_by_residuals(monkeypatch):
     monkeypatch.setattr(sparse, "MAX_EXACT", 60)
     samples = steps(400, False, 5)
     compared: list[tuple[float, float]] = []
@@ -101,14 +101,14 @@ def test_a_process_of_inducing_points_is_judged_by_the_residuals_of_its_samples(
     assert all(ours == pytest.approx(theirs) for ours, theirs in compared)
 
 
-def test_samples_that_met_no_limit_are_all_there_is():
+def test_without_samples_at_a_limit_the_model_uses_all_samples_normally():
     samples = steps(40, False, 5)
     free = ~stopped(RELIEVED, 1, samples.q_next)
     below = Samples(*(getattr(samples, name)[free] for name in Samples.__dataclass_fields__))
     assert not any(output.past_limits for output in gaussian_processes(RELIEVED, below).transitions)
 
 
-def test_own_limit_and_a_wall_leave_samples_out():
+def test_samples_at_an_outputs_own_limit_or_a_wall_are_left_out():
     at_valve = torch.tensor([[0.0, VALVE], [0.0, 0.0]], dtype=torch.float64)
     assert stopped(RELIEVED, 1, at_valve).tolist() == [True, False]
     assert stopped(RELIEVED, 0, at_valve).tolist() == [False, False]
@@ -118,7 +118,7 @@ def test_own_limit_and_a_wall_leave_samples_out():
 
 
 @pytest.mark.parametrize("bent", [False, True])
-def test_what_was_learned_from_survives_storage(bent):
+def test_the_use_of_samples_at_limits_survives_storage(bent):
     model = gaussian_processes(RELIEVED, steps(20, bent, 0))
     loaded = from_bytes(RELIEVED, to_bytes(model))
     assert [o.past_limits for o in loaded.transitions] == [o.past_limits for o in model.transitions]
@@ -135,7 +135,7 @@ def kettle(count: int, seed: int) -> Samples:
     return Samples(q, u, torch.stack([q[:, 0], pressure], 1), reward, reward.bool())
 
 
-def test_predictions_reach_a_limit_wherever_a_sample_ended_at_it():
+def test_a_step_that_ended_at_a_limit_is_predicted_to_reach_it():
     samples = kettle(30, 0)
     at_valve = samples.q_next[:, 1] >= VALVE
     predicted = gaussian_processes(RELIEVED, samples).transition(samples.q, samples.u).q_next[:, 1]
@@ -143,7 +143,7 @@ def test_predictions_reach_a_limit_wherever_a_sample_ended_at_it():
     assert float((VALVE - predicted[at_valve]).max()) < 0.01
 
 
-def test_a_process_with_inequalities_foretells_where_the_limit_is_reached(monkeypatch):
+def test_samples_at_a_limit_used_as_inequalities_improve_predictions_at_the_limit(monkeypatch):
     samples, test = kettle(30, 0), kettle(500, 1)
 
     def short_and_error() -> tuple[float, float]:
@@ -159,7 +159,7 @@ def test_a_process_with_inequalities_foretells_where_the_limit_is_reached(monkey
     assert error < error_without
 
 
-def test_a_value_beyond_the_limit_is_no_leave_one_out_error():
+def test_a_prediction_beyond_the_limit_counts_as_zero_leave_one_out_error():
     """A point that observes a limit says that the value is at least as large."""
     pressure = gaussian_processes(RELIEVED, kettle(40, 5)).transitions[1]
     sides, posterior = torch.tensor(pressure.at_limit), pressure.posterior
@@ -172,7 +172,7 @@ def test_a_value_beyond_the_limit_is_no_leave_one_out_error():
     assert pressure.leave_one_out().error < 0.1 * replace(pressure, at_limit=()).leave_one_out().error
 
 
-def test_points_at_limits_survive_storage_and_are_checked():
+def test_points_at_limits_survive_storage_and_malformed_ones_are_refused():
     model = gaussian_processes(RELIEVED, kettle(30, 0))
     loaded = from_bytes(RELIEVED, to_bytes(model))
     assert [o.at_limit for o in loaded.transitions] == [o.at_limit for o in model.transitions]
@@ -184,7 +184,7 @@ def test_points_at_limits_survive_storage_and_are_checked():
             from_bytes(RELIEVED, stored)
 
 
-def test_samples_at_a_limit_that_the_process_foretells_change_nothing(monkeypatch):
+def test_samples_at_a_correctly_predicted_limit_do_not_change_the_model(monkeypatch):
     samples = steps(30, False, 5)  # the pressure is linear below the valve
     assert bool((samples.q_next[:, 1] >= VALVE).any())
     model = gaussian_processes(RELIEVED, samples)
@@ -192,7 +192,7 @@ def test_samples_at_a_limit_that_the_process_foretells_change_nothing(monkeypatc
     assert to_bytes(gaussian_processes(RELIEVED, samples)) == to_bytes(model)
 
 
-def test_a_lower_limit_counts_like_an_upper_one():
+def test_a_lower_limit_is_learned_like_an_upper_limit():
     samples = kettle(30, 0)
     mirrored = Samples(-samples.q, -samples.u, -samples.q_next, samples.reward, samples.terminated)
     lower = tank(pressure=Bounds(low=-VALVE))
@@ -201,7 +201,7 @@ def test_a_lower_limit_counts_like_an_upper_one():
     torch.testing.assert_close(below, -above, rtol=1e-4, atol=1e-4)
 
 
-def test_a_wall_says_nothing_of_the_speed_that_it_stops():
+def test_samples_stopped_by_a_wall_are_not_used_for_the_speed():
     """At the wall the speed becomes 0, which is its lower limit as well."""
     ranges = {"place": Uniform(low=0, high=1), "speed": Uniform(low=0, high=1)}
     spec = EnvironmentSpec(
@@ -227,7 +227,7 @@ def test_a_wall_says_nothing_of_the_speed_that_it_stops():
     assert float(off) < 1e-3
 
 
-def test_a_process_of_inducing_points_has_inequalities_with_its_own_hyperparameters(monkeypatch):
+def test_a_sparse_process_uses_limit_samples_as_inequalities_too(monkeypatch):
     """Nothing was seen between the cold, where the pressure hardly rises, and the valve."""
     monkeypatch.setattr(sparse, "MAX_EXACT", 100)
     every = kettle(500, 0)

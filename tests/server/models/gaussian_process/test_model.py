@@ -17,13 +17,13 @@ from surrogym_server.models.gaussian_process.prediction.description import descr
 from surrogym_server.virtual.single_step import predict_points
 
 
-def test_settling_wraps_angles_and_clips_speeds(pendulum_definition):
+def test_predicted_states_have_wrapped_angles_and_clipped_speeds(pendulum_definition):
     q = torch.tensor([[4.0, 9.0], [-4.0, -9.0], [1.0, 1.0]], dtype=torch.float64)
     expected = torch.tensor([[4 - 2 * torch.pi, 8], [2 * torch.pi - 4, -8], [1, 1]], dtype=torch.float64)
     torch.testing.assert_close(settle(pendulum_definition, q), expected)
 
 
-def test_a_wall_stops_what_runs_into_it_and_nothing_else(mountain_car_definition):
+def test_a_wall_sets_the_speed_to_zero_only_for_states_moving_into_it(mountain_car_definition):
     q = torch.tensor([[-1.3, -0.03], [-1.2, -0.01], [-1.3, 0.02], [-1.0, -0.03], [0.7, 0.09]], dtype=torch.float64)
     expected = [[-1.2, 0], [-1.2, 0], [-1.2, 0.02], [-1.0, -0.03], [0.7, 0.07]]
     before = q.clone()
@@ -31,7 +31,7 @@ def test_a_wall_stops_what_runs_into_it_and_nothing_else(mountain_car_definition
     torch.testing.assert_close(q, before, rtol=0, atol=0)
 
 
-def test_a_learned_mountain_car_stops_at_its_wall():
+def test_a_learned_mountain_car_model_stops_at_its_wall():
     spec = mountain_car_continuous()
     model = learn(definition_from_spec(spec), random_steps(spec, 12, seed=1)).model
     at = torch.tensor([[-1.19, -0.06], [-0.5, 0.01]], dtype=torch.float64)
@@ -40,7 +40,7 @@ def test_a_learned_mountain_car_stops_at_its_wall():
     assert q_next[1, 0] == pytest.approx(-0.49, abs=2e-3)
 
 
-def test_the_pendulum_is_predicted_where_it_was_not_sampled(pendulum_model):
+def test_pendulum_steps_outside_the_samples_are_predicted_accurately(pendulum_model):
     unseen = random_steps(pendulum(), 100, seed=5)
     q_next = pendulum_model.transition(unseen.q, unseen.u).q_next
     error = torch.stack([wrap(q_next[:, 0] - unseen.q_next[:, 0]), q_next[:, 1] - unseen.q_next[:, 1]], -1)
@@ -49,7 +49,7 @@ def test_the_pendulum_is_predicted_where_it_was_not_sampled(pendulum_model):
     assert q_next[:, 1].abs().max() <= 8
 
 
-def test_a_draw_is_the_mean_plus_stds(pendulum_model):
+def test_a_drawn_step_is_the_mean_plus_noise_times_deviation(pendulum_model):
     q = torch.tensor([[0.5, 1.0], [2.0, -3.0]], dtype=torch.float64)
     u, noise = torch.zeros(2, 1, dtype=torch.float64), torch.tensor([[1.0, -2.0], [0.0, 0.5]], dtype=torch.float64)
     mean = pendulum_model.transition(q, u, stds=True)
@@ -63,7 +63,7 @@ def test_a_draw_is_the_mean_plus_stds(pendulum_model):
 
 
 @pytest.mark.parametrize("timing", ["before", "after"])
-def test_a_step_in_blocks_of_rows_is_a_step_of_each(pendulum_model, monkeypatch, timing):
+def test_a_batch_stepped_in_blocks_equals_single_steps(pendulum_model, monkeypatch, timing):
     feature_map = replace(pendulum_model.reward.feature_map, after=timing == "after")
     model = replace(pendulum_model, reward=replace(pendulum_model.reward, feature_map=feature_map))
     points = random_steps(pendulum(), 20, seed=3)
@@ -82,7 +82,7 @@ def test_a_step_in_blocks_of_rows_is_a_step_of_each(pendulum_model, monkeypatch,
         torch.testing.assert_close(alone, getattr(whole, name), rtol=0, atol=1e-7)
 
 
-def test_a_model_predicts_what_its_processes_do(pendulum_model):
+def test_a_model_predicts_the_posteriors_of_its_processes(pendulum_model):
     """Compiled, each output is the posterior that was fitted."""
     points = random_steps(pendulum(), 50, seed=3)
     predicted = pendulum_model.transition(points.q, points.u, stds=True, reward_std=True)
@@ -100,7 +100,7 @@ def test_a_model_predicts_what_its_processes_do(pendulum_model):
         torch.testing.assert_close(std, expected, rtol=1e-3, atol=1e-4 * output.scale)
 
 
-def test_an_angle_that_reads_the_lead_follows_the_drawn_speed(pendulum_definition, half_saturated):
+def test_an_angle_that_reads_the_next_speed_follows_the_drawn_speed(pendulum_definition, half_saturated):
     """Where speeds were cut the lead alone tells how far the angle goes."""
     model = learn(pendulum_definition, half_saturated).model
     angle, speed = model.transitions
@@ -117,7 +117,7 @@ def test_an_angle_that_reads_the_lead_follows_the_drawn_speed(pendulum_definitio
 
 
 @pytest.mark.parametrize("timing", ["before", "after"])
-def test_the_reward_reads_the_state_that_its_timing_names(pendulum_model, timing):
+def test_the_reward_reads_the_state_before_or_after_the_step_by_its_timing(pendulum_model, timing):
     feature_map = replace(pendulum_model.reward.feature_map, after=timing == "after")
     model = replace(pendulum_model, reward=replace(pendulum_model.reward, feature_map=feature_map))
     q, u = torch.tensor([[0.0, 6.0]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
@@ -129,7 +129,7 @@ def test_the_reward_reads_the_state_that_its_timing_names(pendulum_model, timing
     assert model.transition(q, u).reward_std is None
 
 
-def test_predicted_points_are_complete(pendulum_model, cartpole_model):
+def test_predicted_points_contain_next_state_observation_reward_and_termination(pendulum_model, cartpole_model):
     points = predict_points(
         cartpole_model, torch.tensor([[2.39, 3.0, 0, 0]]).double().numpy(), torch.ones(1, 1).numpy()
     )
@@ -143,7 +143,7 @@ def test_predicted_points_are_complete(pendulum_model, cartpole_model):
     assert float((points.next_observation[:, :2] ** 2).sum()) == pytest.approx(1)
 
 
-def test_a_model_describes_itself_for_people(pendulum_model):
+def test_a_model_description_lists_outputs_features_and_length_scales(pendulum_model):
     outputs = {o["name"]: o for o in pendulum_model.description["outputs"]}
     assert list(outputs) == ["theta", "speed", "reward"]
     assert outputs["speed"]["points"] + outputs["speed"]["left_out"] == pendulum_model.samples
@@ -153,7 +153,7 @@ def test_a_model_describes_itself_for_people(pendulum_model):
     assert outputs["speed"]["rates"] == {}
 
 
-def test_a_description_names_features_left_out_and_rates(pendulum_model):
+def test_a_model_description_names_dropped_features_and_growth_rates(pendulum_model):
     speed = pendulum_model.transitions[1]
     feature_map = FeatureMap("cos_sin", dropped=(1,), rates=(0.0, 0.4, 0.0))
     described = describe(pendulum_model.definition, replace(speed, feature_map=feature_map))

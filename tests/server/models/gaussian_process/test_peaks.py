@@ -44,7 +44,7 @@ def without_peaks() -> GaussianProcessModel:
     return gaussian_processes(definition_from_spec(plane().model_copy(update={"design": design})), drifting(bump, 12))
 
 
-def test_bump_is_known_from_samples_that_it_hardly_paid():
+def test_a_narrow_reward_peak_is_learned_from_small_rewards_around_it():
     samples = drifting(bump, 12)
     assert float(samples.reward.max()) < 0.05
     model = gaussian_processes(DEFINITION, samples)
@@ -53,7 +53,7 @@ def test_bump_is_known_from_samples_that_it_hardly_paid():
     assert float(around(bump, without_peaks()).abs().max()) > 0.5
 
 
-def test_the_step_in_c_pays_the_bump():
+def test_the_exported_c_step_reproduces_a_narrow_reward_peak():
     near = PLACE + 0.1 * torch.randn(50, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     check_in_c(
         gaussian_processes(DEFINITION, drifting(bump, 12)), (near, torch.zeros(50, 1, dtype=torch.float64)), loose=True
@@ -67,19 +67,19 @@ def test_the_step_in_c_pays_the_bump():
         (lambda q, u: bump(q, u) - 1, "log(reward +1)"),
     ],
 )
-def test_bump_below_nothing_or_beside_a_constant_is_known_too(pay, learned):
+def test_a_negative_or_shifted_reward_peak_is_learned_too(pay, learned):
     model = gaussian_processes(DEFINITION, drifting(pay, 150))
     assert model.description["outputs"][-1]["learned"] == learned
     assert float(around(pay, model).abs().max()) < 0.1
 
 
-def test_samples_that_paid_nothing_at_all_do_not_hide_the_bump():
+def test_samples_with_exactly_zero_reward_do_not_hide_a_reward_peak():
     samples = drifting(lambda q, u: torch.where(bump(q, u) < 1e-40, 0.0, bump(q, u)), 60)
     assert int((samples.reward == 0).sum()) >= 5
     assert float(around(bump, gaussian_processes(DEFINITION, samples)).abs().max()) < 0.1
 
 
-def test_samples_that_agree_with_a_fit_add_no_structure_to_it():
+def test_zero_reward_samples_that_the_fit_predicts_do_not_change_its_score():
     """Samples that paid nothing, where the others foretell as little, had no say in it."""
     samples = drifting(lambda q, u: torch.where(bump(q, u) < 1e-40, 0.0, bump(q, u)), 60)
     maps = (feature_map for feature_map in reward_candidates(DEFINITION) if feature_map.after)
@@ -105,20 +105,20 @@ def test_samples_that_agree_with_a_fit_add_no_structure_to_it():
     ],
     ids=["squares", "step", "ramp", "constant", "nothing", "bump with a cost"],
 )
-def test_rewards_of_other_forms_are_learned_as_they_are(pay):
+def test_rewards_without_a_narrow_peak_are_not_learned_by_logarithm(pay):
     model = gaussian_processes(DEFINITION, drifting(pay, 24))
     assert model.reward.warp is None
     assert not model.reward_hides
 
 
-def test_promise_tells_points_apart_that_are_paid_nothing():
+def test_the_log_reward_ranks_points_whose_reward_is_practically_zero():
     model = gaussian_processes(DEFINITION, drifting(bump, 12))
     q = PLACE + torch.tensor([[0.0, 0.0], [0.5, 0.0], [1.6, 0.0]], dtype=torch.float64)
     near, far, farthest = model.promise(q, torch.zeros(3, 1, dtype=torch.float64)).tolist()
     assert near > far + 50 > farthest + 100
 
 
-def test_model_by_logarithms_survives_storage():
+def test_a_model_of_the_log_reward_survives_storage():
     model = gaussian_processes(DEFINITION, drifting(bump, 12))
     loaded = from_bytes(DEFINITION, to_bytes(model))
     q, u = PLACE.expand(5, 2), torch.linspace(-1, 1, 5, dtype=torch.float64)[:, None]
@@ -128,7 +128,7 @@ def test_model_by_logarithms_survives_storage():
 
 
 @pytest.mark.parametrize("change", [{"sign": 2.0}, {"size": -1.0}, {"base": float("inf")}])
-def test_stored_logarithm_of_impossible_numbers_is_refused(change):
+def test_a_stored_log_reward_model_with_invalid_numbers_is_refused(change):
     stored = CODEC.encode(gaussian_processes(DEFINITION, drifting(bump, 12)))
     stored.header["outputs"][-1]["warp"] |= change
     with pytest.raises(InvalidInput, match="warp"):

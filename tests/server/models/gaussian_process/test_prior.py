@@ -47,21 +47,21 @@ def speed_error(model: GaussianProcessModel, plant: Textbook) -> float:
 
 
 @pytest.mark.parametrize(("plant", "most"), [(Real, 0.6), (Stiff, 1.0)])
-def test_a_rough_prior_saves_samples(textbook, plant, most):
+def test_a_rough_prior_model_reduces_the_error_at_equal_samples(textbook, plant, most):
     few = [samples(plant(), 12, seed=seed) for seed in (3, 4, 5)]
     beside, alone = ([learned(one, *prior) for one in few] for prior in ((textbook,), ()))
     errors = [sum(speed_error(model, plant()) for model in models) for models in (beside, alone)]
     assert errors[0] < most * errors[1]
 
 
-def test_an_output_says_that_it_uses_the_prior(textbook):
+def test_the_description_of_an_output_tells_that_it_uses_the_prior(textbook):
     beside = learned(samples(Real(), 12, seed=3), textbook)
     assert beside.transitions[1].size_with_prior is not None
     assert beside.structures[1].startswith("prior + ")
     assert beside.description["prior"]["samples"] == 80
 
 
-def test_a_right_prior_leaves_nothing_uncertain(textbook):
+def test_with_a_correct_prior_model_the_uncertainty_is_near_zero(textbook):
     beside, test = learned(samples(Textbook(), 6, seed=3), textbook), samples(Textbook(), 50, seed=9)
     found = beside.transition(test.q, test.u, stds=True)
     assert found.std is not None
@@ -69,34 +69,34 @@ def test_a_right_prior_leaves_nothing_uncertain(textbook):
     assert speed_error(beside, Textbook()) < 0.01
 
 
-def test_a_prior_of_another_plant_is_left_out_as_soon_as_samples_tell(textbook):
+def test_a_wrong_prior_model_is_ignored_once_samples_contradict_it(textbook):
     wrong = learned(samples(Backwards(), 80, seed=1))
     many = samples(Real(), 30, seed=3)
     beside, alone = learned(many, wrong), learned(many)
     assert speed_error(beside, Real()) <= 1.1 * speed_error(alone, Real())
 
 
-def test_tolerances_follow_the_output_and_not_what_the_prior_leaves(textbook):
+def test_output_scales_do_not_depend_on_the_prior(textbook):
     few = samples(Real(), 8, seed=3)
     torch.testing.assert_close(learned(few, textbook).scales[:2], learned(few).scales[:2])
 
 
-def test_leave_one_out_and_noise_are_in_the_unit_of_the_output(textbook):
+def test_leave_one_out_errors_with_a_prior_are_in_output_units(textbook):
     beside = learned(samples(Real(), 12, seed=3), textbook)
     assert 0 < beside.leave_one_out()[1].error < 0.2 * float(beside.scales[1])
 
 
 @pytest.mark.parametrize("way", [way for way in WAYS if way != "in C"])
-def test_compiled_steps_are_the_same(textbook, way):
+def test_compiled_steps_with_a_prior_equal_the_model(textbook, way):
     test = samples(Real(), 40, seed=5)
     check_compiled(learned(samples(Real(), 10, seed=3), textbook), (test.q, test.u), way)
 
 
-def test_no_steps_in_c_are_written_without_the_prior(textbook):
+def test_a_model_with_a_prior_has_no_c_export(textbook):
     assert learned(samples(Real(), 10, seed=3), textbook).step_source() is None
 
 
-def test_drawn_functions_pass_through_the_samples(textbook):
+def test_drawn_functions_with_a_prior_pass_through_the_samples(textbook):
     of = samples(Real(), 10, seed=3)
     beside = learned(of, textbook)
     paths = beside.draw(torch.randn(10, beside.path_size, generator=torch.Generator().manual_seed(1)).double())
@@ -104,7 +104,7 @@ def test_drawn_functions_pass_through_the_samples(textbook):
     assert float(off.abs().max()) < 0.02 * float(beside.scales[1])
 
 
-def test_a_stored_model_has_its_prior_within(textbook):
+def test_a_stored_model_contains_its_prior(textbook):
     beside = learned(samples(Real(), 8, seed=3), textbook)
     again = from_bytes(HINGE, to_bytes(beside))
     test = samples(Real(), 20, seed=5)
@@ -113,7 +113,7 @@ def test_a_stored_model_has_its_prior_within(textbook):
     torch.testing.assert_close(again.means(test.q, test.u), beside.means(test.q, test.u), rtol=0, atol=0)
 
 
-def test_a_model_whose_prior_is_missing_is_refused(textbook):
+def test_a_stored_model_without_its_required_prior_is_refused(textbook):
     codec = GaussianProcessCodec()
     stored = codec.encode(learned(samples(Real(), 8, seed=3), textbook))
     with pytest.raises(InvalidInput, match="with its prior"):
@@ -121,7 +121,7 @@ def test_a_model_whose_prior_is_missing_is_refused(textbook):
 
 
 @pytest.mark.parametrize("size", [0.0, -1.0, math.inf, math.nan])
-def test_a_size_that_makes_no_sense_is_refused(textbook, size):
+def test_a_stored_model_with_an_invalid_prior_size_is_refused(textbook, size):
     codec = GaussianProcessCodec()
     stored = codec.encode(learned(samples(Real(), 8, seed=3), textbook))
     stored.header["outputs"][1]["size_with_prior"] = size
@@ -129,6 +129,6 @@ def test_a_size_that_makes_no_sense_is_refused(textbook, size):
         codec.decode(HINGE, stored)
 
 
-def test_the_family_takes_priors_of_its_own_kind_only():
+def test_gaussian_processes_refuse_a_prior_that_is_not_a_gaussian_process_model():
     with pytest.raises(TypeError, match="Gaussian processes"):
         GaussianProcesses().learn_beside(object(), HINGE, samples(Real(), 4))  # type: ignore[arg-type]

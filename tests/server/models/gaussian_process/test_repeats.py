@@ -67,7 +67,7 @@ def points() -> tuple[Tensor, Tensor]:
     return test.q, test.u
 
 
-def test_tanks_that_are_filled_by_another_tank_share_samples(model):
+def test_tanks_with_equal_dynamics_share_samples(model):
     assert [set(output.shared) for output in model.transitions] == [
         set(),
         {"third", "fourth"},
@@ -79,53 +79,53 @@ def test_tanks_that_are_filled_by_another_tank_share_samples(model):
     assert describe(ROW, model.transitions[1])["shares_samples_with"] == list(model.transitions[1].shared)
 
 
-def test_predictions_are_much_better_with_them(model):
+def test_predictions_are_much_better_with_shared_samples(model):
     apart = gaussian_processes(APART, steps(SAMPLES, 0))
     assert not any(output.shared for output in apart.outputs)
     for column in (1, 2, 3):
         assert error(model, column) < 0.3 * error(apart, column)
 
 
-def test_errors_are_within_the_stds(model):
+def test_errors_of_a_model_with_shared_samples_are_within_its_deviations(model):
     test = steps(400, 9)
     moved = model.transition(test.q, test.u, stds=True)
     within = (moved.q_next - test.q_next).abs() <= 1.645 * moved.std + 1e-4
     assert float(within[:, 1:].double().mean()) > 0.85
 
 
-def test_a_tank_with_another_valve_learns_alone():
+def test_a_tank_with_different_dynamics_shares_no_samples():
     model = gaussian_processes(ROW, steps(SAMPLES, 0, narrow=0.25))
     assert model.transitions[3].shared == ()
     assert model.transitions[1].shared == ("third",)
 
 
-def test_preset_paper_shares_nothing():
+def test_with_preset_paper_outputs_share_no_samples():
     paper = definition_from_spec(spec({"preset": "paper"}))
     assert not any(output.shared for output in gaussian_processes(paper, steps(SAMPLES, 0)).outputs)
 
 
-def test_an_output_that_is_known_keeps_its_process(model):
+def test_with_many_samples_outputs_share_no_samples(model):
     """With many samples each tank is known without the others."""
     known = gaussian_processes(ROW, steps(100, 0))
     assert not any(output.shared for output in known.outputs)
 
 
-def test_the_samples_of_others_are_limited(monkeypatch):
+def test_the_number_of_shared_samples_is_limited(monkeypatch):
     monkeypatch.setattr(repeats, "MOST", 40)
     model = gaussian_processes(ROW, steps(SAMPLES, 0))
     assert max(len(output.posterior.y) for output in model.transitions) == 40
 
 
-def test_predictions_are_those_of_the_processes(model, points):
+def test_predictions_with_shared_samples_equal_those_of_the_processes(model, points):
     check_processes(model, points)
 
 
 @pytest.mark.parametrize("how", WAYS)
-def test_compiled_steps_are_the_same(model, points, how):
+def test_compiled_steps_with_shared_samples_equal_the_model(model, points, how):
     check_compiled(model, points, how)
 
 
-def test_what_is_shared_survives_storage(model, points):
+def test_sample_sharing_survives_storage(model, points):
     loaded = from_bytes(ROW, to_bytes(model))
     assert isinstance(loaded, GaussianProcessModel)
     assert [o.shared for o in loaded.outputs] == [o.shared for o in model.outputs]
@@ -133,6 +133,6 @@ def test_what_is_shared_survives_storage(model, points):
 
 
 @pytest.mark.parametrize("shared", [("fifth",), ("reward",)])
-def test_samples_of_what_is_no_transition_are_refused(model, shared):
+def test_a_stored_model_that_shares_samples_with_a_non_transition_is_refused(model, shared):
     with pytest.raises(InvalidInput, match="share samples"):
         require_output(ROW, replace(model.transitions[1], shared=shared))

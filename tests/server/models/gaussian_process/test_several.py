@@ -41,7 +41,7 @@ def drawn(draws: FunctionDraws, count: int) -> torch.Tensor:
     return draws.draw(torch.randn(count, draws.path_size, generator=generator, dtype=torch.float64))
 
 
-def test_each_row_follows_the_model_that_its_draw_names(model, points):
+def test_each_row_steps_by_the_hyperparameter_sample_of_its_drawn_function(model, points):
     several = model.uncertain_functions
     assert isinstance(several, FunctionsOfSeveral)
     paths = drawn(several, ROWS)
@@ -56,7 +56,7 @@ def test_each_row_follows_the_model_that_its_draw_names(model, points):
             torch.testing.assert_close(getattr(moved, name)[at], getattr(one, name), rtol=1e-9, atol=1e-9)
 
 
-def test_compiled_steps_follow_the_same_functions(model, points):
+def test_compiled_steps_of_drawn_functions_equal_uncompiled_ones(model, points):
     several = model.uncertain_functions
     assert isinstance(several, CompiledSteps)
     steps = several.compiled()
@@ -70,7 +70,7 @@ def test_compiled_steps_follow_the_same_functions(model, points):
     np.testing.assert_allclose(moved.reward, reference.reward, atol=1e-8)
 
 
-def test_functions_differ_more_than_those_of_one_optimum(model, points):
+def test_functions_with_sampled_hyperparameters_vary_more_than_with_optimal_ones(model, points):
     """Six samples of a pendulum: the deviation over functions, as a median over points."""
     spreads = []
     for draws in (model, model.uncertain_functions):
@@ -82,20 +82,20 @@ def test_functions_differ_more_than_those_of_one_optimum(model, points):
     assert spreads[1] > 1.2 * spreads[0]
 
 
-def test_many_samples_leave_the_functions_as_they_are():
+def test_with_many_samples_functions_use_only_the_optimal_hyperparameters():
     samples = random_steps(pendulum(), 2 * MOST_POINTS, seed=0)
     known = gaussian_processes(definition_from_spec(pendulum()), samples)
     assert known.uncertain_functions is known
 
 
-def test_hyperparameters_are_sampled_once(model):
+def test_a_model_samples_its_hyperparameters_once(model):
     several = model.uncertain_functions
     assert several is model.uncertain_functions
     assert isinstance(several, FunctionsOfSeveral)
     assert len(several.models) == MODELS
 
 
-def test_functions_of_a_learned_logarithm_keep_its_noise_floor():
+def test_functions_of_a_log_reward_keep_its_small_noise():
     """A hundred times that noise is several per cent of a reward whose logarithm spreads over hundreds."""
 
     def bump(q: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
@@ -125,7 +125,7 @@ def shaken(repeats: int) -> Samples:
         pytest.param(plane().model_copy(update={"query": "rollout", "max_rollout": 20}), 0, True, id="none can be"),
     ],
 )
-def test_functions_have_no_noise_that_repeated_steps_do_not_show(spec, repeats, kept):
+def test_drawn_functions_have_noise_only_if_repeated_steps_show_it(spec, repeats, kept):
     known = gaussian_processes(definition_from_spec(spec), shaken(repeats))
     assert known.transitions[0].posterior.hyper.noise_variance > NEGLIGIBLE
     several = known.uncertain_functions

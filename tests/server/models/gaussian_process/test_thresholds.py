@@ -46,7 +46,7 @@ def words(form: Thresholds) -> list[set[str]]:
         (lambda q: (q[:, 0] > 0.7) | (q[:, 1] < -0.7), [{"x >"}, {"y <"}]),
     ],
 )
-def test_the_axes_that_tell_are_found(plane, inside, rules):
+def test_thresholds_find_the_coordinates_that_determine_termination(plane, inside, rules):
     q = points(200)
     (form, score), *_ = thresholds(plane, q, inside(q))
     assert not form.complement
@@ -56,7 +56,7 @@ def test_the_axes_that_tell_are_found(plane, inside, rules):
     assert float(((form.probability(unseen) > 0.5) != inside(unseen)).double().mean()) < 0.02
 
 
-def test_what_needs_several_conditions_at_once_is_the_complement_of_a_union(plane):
+def test_conditions_that_must_hold_together_are_learned_as_complement_of_a_union(plane):
     q = points(200)
     box = (q[:, 0] > 0.2) & (q[:, 1].abs() < 0.5)
     (form, _), *others = thresholds(plane, q, box)
@@ -67,7 +67,7 @@ def test_what_needs_several_conditions_at_once_is_the_complement_of_a_union(plan
     assert float(((form.probability(unseen) > 0.5) != expected).double().mean()) < 0.03
 
 
-def test_the_boundary_lies_midway_in_its_gap(plane):
+def test_a_learned_threshold_lies_midway_between_the_nearest_samples(plane):
     q = torch.tensor([[-0.5, 0.1], [0.2, -0.4], [0.0, 0.9], [0.6, 0.2], [0.9, -0.3]], dtype=torch.float64)
     rules = explain(np.stack([q[:, 0].numpy(), -q[:, 0].numpy()], 1), np.array([False, False, False, True, True]))
     ((cut,),) = rules
@@ -76,7 +76,7 @@ def test_the_boundary_lies_midway_in_its_gap(plane):
     assert Thresholds(plane, rules).probability(at).tolist() == pytest.approx([0, 0.25, 0.5, 1])
 
 
-def test_axes_compete_until_a_sample_distinguishes_them(plane):
+def test_equally_good_threshold_coordinates_are_kept_until_a_sample_decides(plane):
     q = torch.tensor([[0.0, 0.0], [-0.8, -0.8], [0.2, -0.8], [-0.8, 0.2], [0.8, 0.8]], dtype=torch.float64)
     ended = torch.arange(5) == 4
     (form, _), *_ = thresholds(plane, q, ended)
@@ -90,18 +90,18 @@ def test_axes_compete_until_a_sample_distinguishes_them(plane):
     assert words(form) == [{"x >"}]
 
 
-def test_labels_that_no_threshold_separates_have_none(plane):
+def test_no_threshold_is_learned_for_labels_it_cannot_separate(plane):
     q = points(100)
     ring = (q.square().sum(1) > 0.2) & (q.square().sum(1) < 0.5)
     assert thresholds(plane, q, ring) == []
 
 
 @pytest.mark.parametrize("label", [False, True])
-def test_equal_labels_say_nothing(plane, label):
+def test_no_threshold_is_learned_from_equal_labels(plane, label):
     assert thresholds(plane, points(10), torch.full((10,), label)) == []
 
 
-def test_the_goal_of_mountain_car_is_a_position_and_a_velocity():
+def test_the_learned_goal_of_mountain_car_is_a_position_and_velocity_threshold():
     steps = random_steps(mountain_car_continuous(), 400, seed=1)
     definition = definition_from_spec(mountain_car_continuous())
     best, _ = max(thresholds(definition, steps.q_next, steps.terminated), key=lambda pair: pair[1])
@@ -109,6 +109,6 @@ def test_the_goal_of_mountain_car_is_a_position_and_a_velocity():
     assert sorted(words(best), key=str) == [{"position <"}, {"velocity <"}]
 
 
-def test_no_label_is_surer_than_succession_allows():
+def test_certain_threshold_labels_are_scored_by_the_rule_of_succession():
     inside = torch.tensor([True, False])
     assert log_probability(torch.tensor([1.0, 1.0], dtype=torch.float64), inside) == pytest.approx(-np.log(4))
