@@ -28,9 +28,9 @@ Array = NDArray[np.floating[Any]]
 
 
 class NoiseKey(NamedTuple):
-    """Key of the actions' noise.
+    """Key of the random noise that is added to a policy's actions. Equal keys give equal noise.
 
-    Held noise explores further: a push that lasts moves an environment farther than pushes that change at every step.
+    Noise that is held for several steps explores further than noise that changes at every step.
     """
 
     seed: int
@@ -38,12 +38,12 @@ class NoiseKey(NamedTuple):
     hold: int = 1  # number of steps that share the same noise
 
     def later(self, steps: int) -> NoiseKey:
-        """Return the key of a rollout that begins ``steps`` steps after this one."""
+        """Return the key of a rollout that begins ``steps`` steps after this key's rollout."""
         return self._replace(step=self.step + steps)
 
 
 class KeyedGenerator:
-    """A single random generator that is set to the noise of each key. A new generator for each step would read
+    """Random generator that is reset to each key, because making a new generator for each step would be slow: it reads
     system entropy."""
 
     def __init__(self) -> None:
@@ -51,8 +51,8 @@ class KeyedGenerator:
         self._generator = np.random.Generator(self._bits)
 
     def at(self, key: NoiseKey) -> np.random.Generator:
-        """Return the generator, set to one step. Lane i reads after lane i - 1, so no lane depends on how many
-        follow it."""
+        """Return the generator, set to the step of a key. Lane i draws its noise after lane i - 1, so the noise of a
+        lane does not depend on the number of lanes after it."""
         self._bits.state = {
             "bit_generator": "Philox",
             "state": {"counter": _words(0, 0, key.step // key.hold, 0), "key": _words(key.seed, 0)},
@@ -154,7 +154,7 @@ class PolicyRun:
     policy: ActingPolicy
     steps: int
     noise: NoiseKey | None = None
-    until: NDArray[np.bool_] | None = None  # (N,) lanes: stop once the episode of each has ended; None: take T steps
+    until: NDArray[np.bool_] | None = None  # (N,) stop once the episodes of these lanes have ended; None: take T steps
 
     def __post_init__(self) -> None:
         if not 1 <= self.steps <= MAX_ROLLOUT:
@@ -167,9 +167,9 @@ class PolicyRun:
 class Acted(NamedTuple):
     """Actions of a policy in one step."""
 
-    action: Array  # (N, F) before it is clipped to its bounds
-    log_probability: Array | None  # (N,) of the action; None without noise
-    sent: NDArray[Any]  # the action as a surrogate takes it
+    action: Array  # (N, F) actions before they are clipped to their bounds
+    log_probability: Array | None  # (N,) log probability of each lane's action; None without noise
+    sent: NDArray[Any]  # actions as a surrogate takes them: clipped, or numbers of choices
 
 
 @dataclass(frozen=True)
@@ -181,10 +181,10 @@ class Actor:
     """
 
     policy: ActingPolicy
-    observation: int  # D
-    low: NDArray[np.float64]  # (F,) of continuous actions
-    high: NDArray[np.float64]  # (F,)
-    counts: tuple[int, ...] = ()  # choices of each entry of a discrete action
+    observation: int  # number of entries of an observation, D
+    low: NDArray[np.float64]  # (F,) lower bounds of continuous actions
+    high: NDArray[np.float64]  # (F,) upper bounds of continuous actions
+    counts: tuple[int, ...] = ()  # number of choices of each entry of a discrete action; empty for a continuous one
     noisy: bool = False
 
     def __post_init__(self) -> None:
@@ -202,7 +202,8 @@ class Actor:
             raise ValueError(f"policy: expected log_deviations of {len(self.low)} entries, got {log.size}")
 
     def act(self, observation: NDArray[Any], noise: NoiseKey | None) -> Acted:
-        """Return the actions for observations (N, D) in one step, with the noise of a key, or the most probable ones.
+        """Return the actions for observations (N, D) in one step: with the noise of a key, or the most probable
+        actions if ``noise`` is None.
 
         Raises:
             ValueError: the network's outputs are not finite.

@@ -16,12 +16,14 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+# Compression methods that numpy and torch write. The output of other methods can't be limited during decompression.
 INFLATED = (
     zipfile.ZIP_STORED,
     zipfile.ZIP_DEFLATED,
-)  # methods that numpy and torch write; others can't be limited while they decompress
+)
 ARRAY = ".npy"
-SHOWN = 80  # largest number of characters of a name from a file
+SHOWN = 80  # most characters of an entry's name that an error shows
+# Errors of NumPy's reader of array headers, which parses them as Python.
 MALFORMED = (
     ValueError,
     LookupError,
@@ -31,7 +33,7 @@ MALFORMED = (
     RecursionError,
     MemoryError,
     OverflowError,
-)  # errors of NumPy's reader of headers, which parses them as Python
+)
 
 
 class Header(NamedTuple):
@@ -42,7 +44,7 @@ class Header(NamedTuple):
 
 
 def read_entries(zipped: Path | bytes, limit: int) -> dict[str, bytes]:
-    """Return the contents of a zip by name.
+    """Return the content of each entry of a zip file, by its name.
 
     Args:
         zipped: path of the file, or its contents.
@@ -57,7 +59,7 @@ def read_entries(zipped: Path | bytes, limit: int) -> dict[str, bytes]:
 
 
 def stored(entries: Mapping[str, bytes]) -> bytes:
-    """Return an uncompressed zip of these contents."""
+    """Return an uncompressed zip file with these entries, given as contents by name."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         for name, content in entries.items():
@@ -86,7 +88,7 @@ def read_arrays(
 
 
 def require_finite(arrays: Mapping[str, NDArray[Any]], positive: str) -> None:
-    """Raise ValueError if an array has a number that is not finite, or that named ``positive`` one of 0 or less."""
+    """Raise ValueError if an array has NaN or infinity, or if the one named ``positive`` has a number of 0 or less."""
     for name, array in arrays.items():
         if not np.isfinite(array).all() or (name == positive and (array <= 0).any()):
             kind = "finite numbers above 0" if name == positive else "finite numbers"
@@ -95,7 +97,7 @@ def require_finite(arrays: Mapping[str, NDArray[Any]], positive: str) -> None:
 
 @contextmanager
 def _open_zip(zipped: Path | bytes, limit: int) -> Iterator[zipfile.ZipFile]:
-    """Open a zip with names that differ, whose entries have at most ``limit`` bytes together. Its errors become
+    """Open a zip file whose entries have different names and at most ``limit`` bytes together; otherwise raise
     ValueError."""
     try:
         with zipfile.ZipFile(io.BytesIO(zipped) if isinstance(zipped, bytes) else zipped) as archive:
@@ -109,14 +111,14 @@ def _open_zip(zipped: Path | bytes, limit: int) -> Iterator[zipfile.ZipFile]:
 
 
 def _require_once(names: list[str]) -> None:
-    """Raise ValueError if a name stands twice: one reader would take the first entry, another the last."""
+    """Raise ValueError if two entries have the same name: one reader would take the first, another the last."""
     if len(names) > len(set(names)):
         twice = next(name for name, count in Counter(names).items() if count > 1)
         raise ValueError(f"expected each entry once, got {twice[:SHOWN]!r} twice")
 
 
 def _stream(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> IO[bytes]:
-    """Open an entry. It is decompressed to the size in its header, and no further."""
+    """Open an entry for reading. It is decompressed up to the size in its header, and no further."""
     if entry.compress_type not in INFLATED:
         raise ValueError(f"expected {entry.filename!r} uncompressed or deflated, got zip method {entry.compress_type}")
     return archive.open(entry)
@@ -131,7 +133,7 @@ def _content(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
 
 
 def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> Header:
-    """Read the header of an array of numbers. Its size must match the bytes that follow it."""
+    """Read the header of an array in a zip entry. Its shape and type must match the number of bytes that follow."""
     with _stream(archive, entry) as file:
         try:
             version = np.lib.format.read_magic(file)

@@ -11,16 +11,16 @@ from pathlib import Path
 
 COMPILERS = ("cc", "gcc", "clang")
 SECONDS = 600  # longest time of a compilation
-SHOWN = 2_000  # characters of a compiler's errors
+SHOWN = 2_000  # most characters of the compiler's output that an error shows
 
 
 class CannotCompile(RuntimeError):
-    """There is no C compiler, or it refused the sources. The message has what it printed."""
+    """No C compiler was found, or the compiler refused the sources. The message has the compiler's output."""
 
 
 def c_compiler() -> tuple[str, ...] | None:
     """Return the command of the C compiler: the variable ``CC``, or the first of cc, gcc and clang on the search path.
-    None without one.
+    None if there is no compiler.
 
     Raises:
         CannotCompile: ``CC`` names no program.
@@ -37,7 +37,7 @@ def c_compiler() -> tuple[str, ...] | None:
 
 
 def require_c_compiler() -> tuple[str, ...]:
-    """Return the command of the C compiler. Raises ``CannotCompile`` without one."""
+    """Return the command of the C compiler. Raises ``CannotCompile`` if there is none."""
     if (command := c_compiler()) is None:
         raise CannotCompile(f"expected a C compiler ({', '.join(COMPILERS)}) on the search path, or the variable CC")
     return command
@@ -47,9 +47,11 @@ def compile_c(command: Sequence[str], flags: Sequence[str], sources: Sequence[st
     """Compile C sources.
 
     Args:
-        command: of the compiler.
-        sources: file names in the folder.
+        command: the compiler's program and its first arguments.
+        flags: further options of the compiler.
+        sources: names of the C files in ``folder``.
         out: file to write.
+        folder: folder in which the compiler runs.
 
     Raises:
         CannotCompile: the compiler refused the sources.

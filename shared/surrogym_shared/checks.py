@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-SHOWN = 40  # characters of a wrong value in a message
+SHOWN = 40  # most characters of a wrong value that a message shows
 LARGEST, NARROWEST = 1e12, 1e-12  # bounds of numbers, so that squares, products and float32 observations stay finite
 RESOLUTION = 1e-9  # narrowest range relative to the size of its numbers; in a narrower one rounding errors dominate
 
@@ -51,8 +51,8 @@ def trace_fault(
     c: int,
     f: int,
 ) -> str | None:
-    """What is wrong with the shape of an episode of T steps; None for (T + 1, c) states, (T, f) actions and T rewards,
-    with T at least 1."""
+    """Describe what is wrong with the shapes of an episode of T steps; None if nothing is: (T + 1, c) states, (T, f)
+    actions and T rewards, with T at least 1."""
     steps, widths = len(reward), ({*map(len, coordinates)}, {*map(len, action)})
     if steps and (len(coordinates), len(action)) == (steps + 1, steps) and widths == ({c}, {f}):
         return None

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 HALF_LOG_TAU = 0.5 * float(np.log(2 * np.pi))
 
-Array = NDArray[np.floating[Any]]  # float32 in a training
+Array = NDArray[np.floating[Any]]  # float32 during training
 
 
 class Sampled(Protocol):
@@ -31,7 +31,8 @@ class Sampled(Protocol):
         ...
 
     def sent(self, actions: Array) -> NDArray[Any]:
-        """Convert actions to the form that a surrogate takes."""
+        """Convert sampled actions (B, F) to those that a surrogate takes: within their bounds, discrete ones as
+        integers."""
         ...
 
     def log_probability(self, outputs: Array, further: Array, actions: Array) -> Array:
@@ -41,11 +42,11 @@ class Sampled(Protocol):
 
 @dataclass(frozen=True)
 class Bounded:
-    """Continuous actions: normal around centre + reach tanh(y). The further parameters are log standard deviations
-    (F,)."""
+    """Normal distribution of continuous actions around centre + reach tanh(outputs). The further parameters are log
+    standard deviations (F,)."""
 
-    centre: Array  # (F,)
-    reach: Array  # (F,)
+    centre: Array  # (F,) middle of each action entry's range
+    reach: Array  # (F,) half the width of each action entry's range
 
     @property
     def outputs(self) -> int:
@@ -68,7 +69,8 @@ class Bounded:
 
 @dataclass(frozen=True)
 class Choices:
-    """Discrete actions: an independent choice for each entry. There are no further parameters."""
+    """Categorical distribution of discrete actions: an independent choice for each action entry, with the outputs as
+    logits and without further parameters."""
 
     counts: tuple[int, ...]
 
@@ -77,7 +79,7 @@ class Choices:
         return sum(self.counts)
 
     def sample(self, outputs: Array, further: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        with np.errstate(divide="ignore"):  # a random number may be 0; its choice then wins with the score inf
+        with np.errstate(divide="ignore"):  # an exponential draw of 0 gives the score inf, which wins
             gumbel = -np.log(rng.standard_exponential(outputs.shape, dtype=_kind(outputs)))
         # The largest output with Gumbel noise is a random choice with the probabilities of the softmax.
         choices = [part.argmax(1) for part in self.parts(outputs + gumbel)]
@@ -95,12 +97,12 @@ class Choices:
         return log
 
     def parts(self, outputs: Array) -> list[Array]:
-        """Split the outputs by entry of the action."""
+        """Split the outputs (B, A) of an actor into the logits of each action entry."""
         return np.split(outputs, np.cumsum(self.counts)[:-1], axis=1)
 
 
 def middle_and_reach(low: NDArray[np.float64], high: NDArray[np.float64], dtype: np.dtype[Any]) -> tuple[Array, Array]:
-    """Return centre and half width (F,) of bounds (F,)."""
+    """Return the middle and half the width (F,) of the ranges with the ends ``low`` and ``high`` (F,)."""
     return ((low + high) / 2).astype(dtype), ((high - low) / 2).astype(dtype)
 
 

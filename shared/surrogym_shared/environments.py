@@ -6,16 +6,17 @@ import re
 from pathlib import PurePath
 
 GYMNASIUM_ID = re.compile(r"(?:[A-Za-z_][\w.]*:)?[\w./-]+-v\d+")  # package:Id-v0 is Gymnasium's own spelling
-FILES = (".fmu", ".json")  # endings of names that are files
+FILES = (".fmu", ".json")  # suffixes of names that refer to files
 
 
 def is_name(text: str) -> bool:
-    """Whether a text may open an environment. Others are free text, such as "two tanks"."""
+    """Whether a text has the form of an environment's name. Other texts, such as "two tanks", only describe one."""
     return ":" in text or GYMNASIUM_ID.fullmatch(text) is not None
 
 
 def is_same(name: str, other: str) -> bool:
-    """Whether two names mean the same environment. A file may lie in another folder on another machine."""
+    """Whether two names refer to the same environment. Files are compared by name only, because their folder may differ
+    between machines."""
     (kind, _, file), (other_kind, _, other_file) = name.partition(":"), other.partition(":")
     paths = PurePath(file), PurePath(other_file)
     by_file = kind == other_kind and all(path.suffix in FILES for path in paths)

@@ -13,7 +13,7 @@ from pydantic_core import ErrorDetails
 from surrogym_shared.checks import SHOWN
 from surrogym_shared.patterns import IN_WORDS
 
-REWORDED = (  # what pydantic says, and what a person reads instead
+REWORDED = (  # regular expressions of pydantic's messages, and their replacements
     (r"^Value error, ", ""),
     (r"^Field required$", "expected a value, got nothing"),
     (r"^Extra inputs are not permitted$", "expected no entry of this name"),
@@ -29,13 +29,13 @@ REWORDED = (  # what pydantic says, and what a person reads instead
 
 
 def first_fault(error: ValidationError, *, got: bool = False, of: type[BaseModel] | None = None) -> str:
-    """Describe the first thing that is wrong, with its place.
+    """Describe the first fault of a validation error, after the path of the wrong entry, such as ``action.low.0``.
 
     Args:
-        error: the error.
-        got: whether to add the value that came to this place.
-        of: model of the input. An unknown entry is then described by the allowed ones, and precedes a missing entry,
-            because it may be that one with a wrong name.
+        error: error of a pydantic validation.
+        got: whether to add the wrong value.
+        of: model of the input. With it, an unknown entry is described together with the allowed ones. It is also
+            described before a missing entry, because it may be the missing one with a wrong name.
     """
     faults = error.errors()
     unknown = next((fault for fault in faults if fault["type"] == "extra_forbidden"), None)
@@ -48,7 +48,7 @@ def first_fault(error: ValidationError, *, got: bool = False, of: type[BaseModel
 
 
 def in_words(fault: ErrorDetails) -> str:
-    """Say what a validation expected, without words of Python."""
+    """Describe what a validation expected, in words for people who don't know Python."""
     context = fault.get("ctx", {})
     match fault["type"]:
         case "too_short":
@@ -69,11 +69,11 @@ def in_words(fault: ErrorDetails) -> str:
 
 
 def of_unknown(model: type[BaseModel], place: Sequence[int | str]) -> str:
-    """Describe an unknown entry of an input: the allowed ones at its place, and the one that is meant perhaps.
+    """Describe an unknown entry of an input: list the allowed names, and suggest the most similar one.
 
     Args:
         model: model of the whole input.
-        place: place of the entry, as pydantic gives it.
+        place: path of the entry, in the form of pydantic's ``loc``.
     """
     *above, name = place
     fields = list(dict.fromkeys(field for model in _models_at(model, above) for field in model.model_fields))
@@ -83,7 +83,7 @@ def of_unknown(model: type[BaseModel], place: Sequence[int | str]) -> str:
 
 
 def _models_at(model: type[BaseModel], place: Sequence[int | str]) -> list[type[BaseModel]]:
-    """Return the models that the input at a place may be of. A place also has the tags of unions."""
+    """Return the models that may apply at a path into the input. A path has names of fields, indices and union tags."""
     models = [model]
     inner: list[Any] = [model]
     for part in place:
@@ -98,7 +98,7 @@ def _models_at(model: type[BaseModel], place: Sequence[int | str]) -> list[type[
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Yield the models of an annotation, within unions and collections too."""
+    """Yield the pydantic models in a type annotation, also those within unions and collections."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for inner in get_args(annotation):
@@ -106,7 +106,7 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def _has_tag(model: type[BaseModel], tag: str) -> bool:
-    """Whether a union names a model by ``tag``: its class, or a value of a literal field."""
+    """Whether ``tag`` selects this model in a union: it is the class name, or a value of one of its literal fields."""
     values = (
         value
         for field in model.model_fields.values()

@@ -109,7 +109,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
 
 
 class PolicyRequest(Frame, frozen=True, tag="policy", kw_only=True):
-    """Request of a policy's rollout. ``units`` are the numbers of outputs of each layer."""
+    """Request to let a policy act for several steps. ``units`` are the numbers of outputs of its network's layers."""
 
     seq: Seq | None = None
     steps: Annotated[int, msgspec.Meta(ge=1, le=MAX_ROLLOUT)]
@@ -256,7 +256,7 @@ def policy_request(
 
 
 def seed_of(request: ResetRequest, shape: Shape) -> int | list[int] | None:
-    """Return the seed of a request, or the seeds of the N lanes. Raises ``FrameError``."""
+    """Return the seed of a reset request: one, or one for each of N lanes, or None. Raises ``FrameError``."""
     if not isinstance(request.seed, memoryview):
         return request.seed
     seeds: list[int] = _array("seed", request.seed, INT64, (shape.lanes,)).tolist()
@@ -264,7 +264,7 @@ def seed_of(request: ResetRequest, shape: Shape) -> int | list[int] | None:
 
 
 def mask_of(request: ResetRequest | StepRequest, shape: Shape) -> Bools | None:
-    """Return the mask (N,) of a request. Raises ``FrameError``."""
+    """Return the mask (N,) of the lanes to reset or step; None for all. Raises ``FrameError``."""
     return None if request.mask is None else _array("mask", _checked("mask", request.mask), BOOL, (shape.lanes,))
 
 
@@ -376,7 +376,7 @@ def policy_rollout(reply: PolicyReply, shape: Shape) -> PolicyRollout:
 
 
 def _versions(view: memoryview, each: tuple[int, int]) -> Array:
-    """Return model versions (T, N), also if the frame has one for each lane only."""
+    """Return model versions (T, N). If the frame has one for each lane only, repeat it for each step."""
     one = each[1] * INT64.itemsize
     if view.nbytes == one:
         return np.repeat(_own("model_version", view, INT64, each[1:])[None], each[0], 0)
@@ -433,7 +433,7 @@ def _step(result: StepResult) -> Step:
 
 
 def _final_steps(reply: PolicyReply, steps: int, count: int) -> Array:
-    """Return the steps (K,) of the final lanes, in order."""
+    """Return the steps (K,) at which the K episodes in ``final_lanes`` ended, in order."""
     final_steps = _own(
         "final_steps", memoryview(b"") if reply.final_steps is None else reply.final_steps, INT64, (count,)
     )
@@ -443,7 +443,7 @@ def _final_steps(reply: PolicyReply, steps: int, count: int) -> Array:
 
 
 def _final(step: Step | PolicyReply, shape: Shape) -> tuple[Array, Array]:
-    """Return final_lanes (K,) and final_observation (K, D). They are empty if the frame has none."""
+    """Return the lanes (K,) whose episode ended, and its last observation (K, D). Both are empty if none ended."""
     if step.final_lanes is None or step.final_observation is None:
         if step.final_lanes is not step.final_observation:
             raise FrameError("expected final_lanes and final_observation together, got one of them")
@@ -475,20 +475,20 @@ def _flat(array: Array, dtype: np.dtype[Any]) -> memoryview:
 
 
 def _array(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
-    """Return an array as a view of the frame."""
+    """Return bytes as an array, which is a view of the frame."""
     _require_size(name, view, dtype, shape)
     return np.ndarray(shape, dtype, view)
 
 
 def _own(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
-    """Return an array as a copy."""
+    """Return bytes as an array, which is a writable copy."""
     _require_size(name, view, dtype, shape)
     return np.ndarray(shape, dtype, bytearray(view))
 
 
 def _aligned(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
-    """Return an array as an aligned copy. Matrix products read it faster, and its address has no effect on their
-    bits."""
+    """Return bytes as an aligned copy. Matrix products of it are faster, and their rounding does not depend on its
+    address."""
     return _array(name, view, dtype, shape).copy()
 
 
@@ -499,7 +499,7 @@ def _require_size(name: str, view: memoryview, dtype: np.dtype[Any], shape: tupl
 
 
 def _checked(name: str, view: memoryview) -> memoryview:
-    if bytes(view).strip(b"\x00\x01"):  # what remains without bytes 0 and 1
+    if bytes(view).strip(b"\x00\x01"):  # not empty if a byte is neither 0 nor 1
         raise FrameError(f"{name}: expected bytes 0 and 1, got others")
     return view
 

@@ -4,7 +4,7 @@ from typing import Literal
 
 CoordinateKind = Literal["linear", "angle", "constant"]
 LagKind = Literal["change", "value", "action", "steps"]
-Function = Literal["one", "linear", "sin", "cos"]  # phi of a part of a term
+Function = Literal["one", "linear", "sin", "cos"]  # basis function of a summand of a term
 Relation = Literal["<", "<=", ">", ">="]  # relation of the two sides of an inequality
 RewardShape = Literal["one", "linear", "absolute", "square", "bump", "ball"]  # function of a term in a declared reward
 RewardTiming = Literal["before", "after", "auto"]  # the state that a learned reward depends on

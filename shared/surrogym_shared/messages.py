@@ -25,10 +25,10 @@ KEY_BYTES = 4
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """Positions in a frame, counted from its first byte: the beginning of its key, the beginning of its payload, and
-    its end."""
+    """Positions in a WebSocket frame, counted from its first byte: the beginning of its masking key, the beginning of
+    its payload, and its end."""
 
-    key: int  # position of the mask's key; equal to ``payload`` without a mask
+    key: int  # position of the masking key; equal to ``payload`` if the frame is not masked
     payload: int
     end: int
 
@@ -61,11 +61,11 @@ def header(size: int, masked: int = 0) -> bytes:
 
 
 class FrameSplitter:
-    """Joins incoming chunks into whole frames.
+    """Splits and joins incoming chunks of bytes into whole WebSocket frames.
 
-    ``max_bytes`` is the longest payload to join. The chunks of a longer one are returned unchanged, so that the library
-    refuses it. ``max_frames`` is the most frames of one chunk; one frame more is returned as a sign that there are too
-    many, and the rest is dropped.
+    ``max_bytes`` is the longest payload to join. Chunks of a longer payload are returned unchanged, so that the library
+    refuses them. ``max_frames`` is the largest number of frames in one chunk; from a chunk with more, one frame more is
+    returned, which shows that there are too many, and the rest is dropped.
     """
 
     def __init__(self, max_bytes: float = float("inf"), max_frames: float = float("inf")) -> None:
@@ -76,11 +76,11 @@ class FrameSplitter:
 
     @property
     def rest_bytes(self) -> int:
-        """Bytes of the frame that is not complete yet."""
+        """Number of bytes that were received of a frame that is not complete yet."""
         return len(self._rest)
 
     def split(self, chunk: bytes) -> list[tuple[bytes, Extent | None]]:
-        """Return the frames that this chunk completes, in order, each with its extent. None marks one that is too
+        """Return the frames that this chunk completes, in order, each with its extent; None for a frame that is too
         long."""
         if self._rest:
             self._rest += chunk

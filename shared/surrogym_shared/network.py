@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 Activation = Literal["tanh", "relu"]
 HEAD = "surrogym-network.json"
 ARRAYS = "network.npz"
-MAX_BYTES = 16 * 1024 * 1024  # largest contents of a file
+MAX_BYTES = 16 * 1024 * 1024  # most bytes of a policy's file after decompression
 MAX_HEAD_BYTES = 64 * 1024
 MAX_LAYERS = 8
 OUTSIDE = ("mean", "deviation", "low", "high")  # arrays of a policy's file that belong to no layer
@@ -36,12 +36,12 @@ OUTSIDE = ("mean", "deviation", "low", "high")  # arrays of a policy's file that
 class Layer(NamedTuple):
     """One layer of a network: x @ weights + bias."""
 
-    weights: NDArray[np.floating[Any]]  # (..., I, O)
-    bias: NDArray[np.floating[Any]]  # (..., O)
+    weights: NDArray[np.floating[Any]]  # (..., I, O) for I inputs and O outputs
+    bias: NDArray[np.floating[Any]]  # (..., O) for O outputs
 
 
 class _Head(BaseModel):
-    """JSON header in the file of a policy network. Version 1 has one hidden layer of tanh."""
+    """JSON header in the file of a policy network. A file of version 1 has a single hidden layer, with tanh."""
 
     version: Literal[1, 2]
     counts: tuple[PositiveInt, ...]
@@ -65,20 +65,20 @@ class Network:
     whose bounds are ``low`` and ``high`` (F,).
     """
 
-    mean: Array  # (D,)
-    deviation: Array  # (D,)
+    mean: Array  # (D,) subtracted from an observation
+    deviation: Array  # (D,) standard deviation by which the difference is divided
     layers: tuple[Layer, ...]
     low: Array
     high: Array
     counts: tuple[int, ...] = ()
-    activation: Activation = "tanh"  # of the hidden layers
+    activation: Activation = "tanh"  # activation function of the hidden layers
 
     @classmethod
     def of(
         cls, spec: EnvironmentSpec, mean: Array, deviation: Array, units: int | Sequence[int], vector: Array
     ) -> Self:
-        """Make policies from parameter vectors (..., ``size``), in which layer weights have the unit 1 /
-        sqrt(inputs)."""
+        """Make policies from parameter vectors (..., ``size``). The weights of a layer are those of the vector divided
+        by sqrt(number of its inputs)."""
         layers, begin = [], 0
         for inputs, outputs in pairwise(_sizes(spec, units)):
             middle, end = begin + inputs * outputs, begin + (inputs + 1) * outputs
@@ -89,12 +89,12 @@ class Network:
 
     @staticmethod
     def size(spec: EnvironmentSpec, units: int | Sequence[int]) -> int:
-        """Number of parameters of a policy; ``units`` of its hidden layer, or of each."""
+        """Return the number of parameters of a policy with a hidden layer of ``units``, or with one for each entry."""
         return sum((inputs + 1) * outputs for inputs, outputs in pairwise(_sizes(spec, units)))
 
     @property
     def vector(self) -> Array:
-        """Return the parameters of one policy, in the form that ``of`` takes."""
+        """Return the parameters of one policy as the vector from which ``of`` makes it."""
         parts = [(layer.weights * np.sqrt(len(layer.weights)), layer.bias) for layer in self.layers]
         return np.concatenate([part.ravel() for layer in parts for part in layer])
 
@@ -103,13 +103,13 @@ class Network:
         return most_probable(self.outputs(observation), self.low, self.high, self.counts)
 
     def outputs(self, observation: NDArray[Any]) -> NDArray[np.floating[Any]]:
-        """Return the last layer's outputs (..., N, A), before the tanh of a continuous action; scores of discrete
+        """Return the outputs (..., N, A) of the last layer: continuous actions before their tanh, or scores of discrete
         choices."""
         x = (np.asarray(observation, dtype=np.float64) - self.mean) / self.deviation
         return forward(self.layers, self.activation, x)
 
     def save(self, path: Path) -> None:
-        """Write one policy to a zip of arrays with a JSON head. It contains no code."""
+        """Write one policy to a zip file with its arrays and a JSON header. The file contains no code."""
         head = _Head(version=2, counts=self.counts, activation=self.activation, layers=len(self.layers))
         arrays = {name: getattr(self, name) for name in OUTSIDE}
         for names, layer in zip(head.names, self.layers, strict=True):
@@ -126,7 +126,7 @@ class Network:
         Raises:
             ValueError: the file has another form, or more than ``MAX_BYTES``.
         """
-        from surrogym_shared.archives import read_arrays, read_entries, require_finite  # only reading needs it
+        from surrogym_shared.archives import read_arrays, read_entries, require_finite  # only for reading
 
         try:
             entries = read_entries(path, MAX_BYTES)
@@ -143,7 +143,7 @@ class Network:
 
     @staticmethod
     def is_at(path: Path) -> bool:
-        """Whether a file looks like one that ``save`` wrote."""
+        """Whether a file is a zip file with the header that ``save`` writes."""
         try:
             with zipfile.ZipFile(path) as file:
                 return HEAD in file.namelist()
@@ -152,7 +152,7 @@ class Network:
 
 
 def forward(layers: Sequence[Layer], activation: Activation, x: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """Return outputs (..., N, A) for inputs (..., N, D)."""
+    """Return the outputs (..., N, A) of a network's layers for inputs (..., N, D)."""
     *hidden, last = layers
     for weights, bias in hidden:
         x = x @ weights + bias[..., None, :]
@@ -162,7 +162,8 @@ def forward(layers: Sequence[Layer], activation: Activation, x: NDArray[np.float
 
 
 def most_probable(y: NDArray[np.floating[Any]], low: Array, high: Array, counts: tuple[int, ...]) -> NDArray[Any]:
-    """Return actions (..., N, F) for outputs y (..., N, A); int64 (..., N) for a single discrete choice."""
+    """Return the most probable actions (..., N, F) for a network's outputs y (..., N, A); int64 (..., N) for a single
+    discrete choice."""
     if not counts:
         centre, reach = (low + high) / 2, (high - low) / 2
         return np.asarray(centre + reach * np.tanh(y), dtype=np.float32)
@@ -172,7 +173,7 @@ def most_probable(y: NDArray[np.floating[Any]], low: Array, high: Array, counts:
 
 
 def counts_of(spec: EnvironmentSpec) -> tuple[int, ...]:
-    """Numbers of choices of each entry of a policy's action; empty for a continuous one."""
+    """Return the number of choices of each entry of a policy's action; empty for a continuous action."""
     match spec.action:
         case BoxAction(bins=bins):
             return bins or ()
@@ -190,7 +191,7 @@ def bounds_of(spec: EnvironmentSpec) -> tuple[Array, Array]:
 
 
 def _sizes(spec: EnvironmentSpec, units: int | Sequence[int]) -> list[int]:
-    """Return the numbers of inputs, hidden units and outputs. No units make a linear policy."""
+    """Return the numbers of inputs, hidden units and outputs of a policy. Without hidden units it is linear."""
     hidden = ([units] if units else []) if isinstance(units, int) else units
     return [len(spec.observation), *hidden, sum(counts_of(spec)) or spec.action.size]
 
@@ -201,15 +202,15 @@ def _read_head(content: bytes) -> _Head:
     try:
         return _Head.model_validate_json(content)
     except ValidationError as error:
-        from surrogym_shared.faults import first_fault  # only a fault needs it
+        from surrogym_shared.faults import first_fault  # imported late, because only an error needs it
 
         raise ValueError(f"{HEAD}: {first_fault(error)}") from error
 
 
 def _require_chain(head: _Head, headers: Mapping[str, Header]) -> None:
-    """Check that the arrays are those of one policy, with layers and bounds that fit together.
+    """Check by their headers that the arrays of a file are those of one policy, with layers and bounds that fit.
 
-    Shapes that would only broadcast are refused, because a call would compute far larger arrays than the file contains.
+    Shapes have to match without broadcasting, which could compute far larger arrays than the file contains.
 
     Raises:
         ValueError: the arrays don't fit.
@@ -227,7 +228,8 @@ def _require_chain(head: _Head, headers: Mapping[str, Header]) -> None:
 
 
 def _chained(head: _Head, headers: Mapping[str, Header]) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of one policy with the observation entries, layer units and bounds that the headers name."""
+    """Return the shape that each array of a policy must have, given the sizes of the observation and of the layers in
+    the headers."""
 
     def length(name: str) -> int:
         return (headers[name].shape or (0,))[0]
@@ -237,5 +239,5 @@ def _chained(head: _Head, headers: Mapping[str, Header]) -> dict[str, tuple[int,
     for weights, bias in head.names:
         shapes |= {weights: (size, length(bias)), bias: (length(bias),)}
         size = length(bias)
-    limits = (length("low") if head.counts else size,)  # a discrete action may have none
+    limits = (length("low") if head.counts else size,)  # a discrete action may have no bounds
     return shapes | {"low": limits, "high": limits}

@@ -29,8 +29,8 @@ class Query:
     """
 
     coordinates: Vector  # (C,) state to set; () for a query that begins at a snapshot or a reset
-    actions: tuple[Vector, ...]  # (T, F) to apply, one after the other
-    snapshot: str | None = None  # name of the snapshot to begin at
+    actions: tuple[Vector, ...]  # (T, F) actions to apply, one after the other
+    snapshot: str | None = None  # name of the snapshot at which the steps begin; None: at coordinates or a reset
 
     @staticmethod
     def step(coordinates: Iterable[float], action: Iterable[float]) -> Query:
@@ -61,24 +61,24 @@ class Query:
 class RealStep:
     """One real step. ``coordinates`` and ``action`` are the achieved values, not the requested ones."""
 
-    coordinates: ArrayLike  # (C,) before the step
-    action: ArrayLike  # (F,) that was applied
-    next_coordinates: ArrayLike  # (C,) after the step
+    coordinates: ArrayLike  # (C,) state before the step
+    action: ArrayLike  # (F,) applied action
+    next_coordinates: ArrayLike  # (C,) state after the step
     reward: float
     terminated: bool = False
     truncated: bool = False
-    observation: ArrayLike | None = None  # (D,) before the step, if it was measured
-    next_observation: ArrayLike | None = None  # (D,) after the step, if it was measured
+    observation: ArrayLike | None = None  # (D,) observation before the step; None if it was not measured
+    next_observation: ArrayLike | None = None  # (D,) observation after the step; None if it was not measured
 
 
 @dataclass(frozen=True)
 class RealSteps:
-    """Real steps as columns, in order of arrival: the samples from which a model is learned."""
+    """Real steps as arrays with a row for each step, in order of arrival: the samples from which a model is learned."""
 
-    coordinates: NDArray[np.float64]  # (n, C) before each step
-    action: NDArray[np.float64]  # (n, F) applied in each step
-    next_coordinates: NDArray[np.float64]  # (n, C) after each step
-    reward: NDArray[np.float64]  # (n,) of each step
+    coordinates: NDArray[np.float64]  # (n, C) state before each step
+    action: NDArray[np.float64]  # (n, F) action applied in each step
+    next_coordinates: NDArray[np.float64]  # (n, C) state after each step
+    reward: NDArray[np.float64]  # (n,) reward of each step
     terminated: NDArray[np.bool_]  # (n,) whether each step ended the episode
     purpose: tuple[SamplePurpose, ...]  # (n,) why each step was taken
 
@@ -87,7 +87,7 @@ class RealSteps:
 
     @classmethod
     def of(cls, steps: Sequence[RealStep], purpose: SamplePurpose) -> Self:
-        """Return the columns of steps that were taken for one purpose."""
+        """Return the arrays of steps that were all taken for the same purpose."""
         return cls(
             coordinates=np.array([step.coordinates for step in steps], dtype=np.float64),
             action=np.array([step.action for step in steps], dtype=np.float64),

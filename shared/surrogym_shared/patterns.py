@@ -1,4 +1,4 @@
-"""Regular expressions of the texts that requests and specifications have, each with its words for an error message."""
+"""Regular expressions for texts in requests and specifications, each with a description for error messages."""
 
 from __future__ import annotations
 

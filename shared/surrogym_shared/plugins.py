@@ -23,14 +23,14 @@ MOST_CHARACTERS = 500  # most characters of the message of a package's exception
 
 
 class UnknownMember(ValueError):
-    """No class has this name, or its package is broken.
+    """No class in a registry has this name, or the package of the class can't be loaded.
 
-    The message lists the known names, and what takes the place of a removed one.
+    The message lists the known names, and what replaces a removed one.
     """
 
 
 class _Unfit(ValueError):
-    """An entry point breaks a rule of its group. The message explains it."""
+    """An entry point of a package breaks a rule of the registry. The message explains the rule."""
 
 
 def one_line(error: BaseException, *, typed: bool = True) -> str:
@@ -51,8 +51,8 @@ class Registry(Generic[T]):
     """Classes by name, without regard to upper and lower case.
 
     Args:
-        kind: what the classes are, for messages: "algorithm".
-        noun: the same in front of a name, if it differs from ``kind``: "model family".
+        kind: word for the classes in messages, such as "algorithm".
+        noun: word in front of a class's name in messages, if it differs from ``kind``, such as "model family".
         group: group of the entry points of other packages.
         base: base class of all classes.
         built_in: classes by name, or ``module:class``, which is imported on first use; no other package may take these
@@ -77,16 +77,16 @@ class Registry(Generic[T]):
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """Return one sentence for each entry point that can't be used, by its name."""
+        """Return a sentence with the reason for each entry point that can't be used, by the entry point's name."""
         self._others()
         return self._broken
 
     def why_broken(self, name: str) -> str | None:
-        """Return why an entry point can't be used; None if it can, or if there is none of this name."""
+        """Return why the entry point ``name`` can't be used; None if it can, or if there is no such entry point."""
         return next((why for plugin, why in self.broken.items() if plugin.casefold() == name.casefold()), None)
 
     def instead_of(self, name: str) -> str | None:
-        """Return what takes the place of a member that an earlier version had; None if there was none of this name."""
+        """Return what replaces a class that was removed in an earlier version; None if no such class was removed."""
         return instead_of(self.kind, name)
 
     def name_of(self, name: str) -> str:
@@ -103,7 +103,7 @@ class Registry(Generic[T]):
         return member
 
     def get(self, name: str) -> type[T]:
-        """Return the class of a name. Raises as ``name_of``."""
+        """Return the class of this name. Raises ``UnknownMember`` if there is none."""
         member_name = self.name_of(name)
         if member_name not in self._built_in:
             return self._others()[member_name]
@@ -129,12 +129,12 @@ class Registry(Generic[T]):
         return self._installed
 
     def _described(self, entries: list[EntryPoint]) -> str:
-        """Describe the origin of a name's entry points: "package 'a', entry point x = 'a:X' of surrogym.models"."""
+        """Describe where entry points come from, as "package 'a', entry point x = 'a:X' of surrogym.models"."""
         parts = [f"{_package(entry)}, entry point {entry.name} = {entry.value!r}" for entry in entries]
         return f"{'; '.join(parts)} of {self._group}"
 
     def _load(self, entries: list[EntryPoint]) -> type[T]:
-        """Load the class of a name. Raises the module's own error, or ``_Unfit``.
+        """Load the class of the entry points with one name. Raises ``_Unfit``, or the error of the imported module.
 
         If several packages add the same name, none is loaded, because the order of the search path must not decide.
         """

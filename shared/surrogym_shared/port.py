@@ -28,23 +28,23 @@ T = TypeVar("T")
 class ResetResult:
     """Result of a reset of N lanes."""
 
-    observation: Floats  # (N, D)
-    model_version: Ints  # (N,)
+    observation: Floats  # (N, D) first observations of the episodes
+    model_version: Ints  # (N,) version of the model in each lane
 
 
 @dataclass(frozen=True)
 class StepResult:
     """Result of one step of N lanes."""
 
-    observation: Floats  # (N, D)
-    reward: Floats  # (N,), penalised
-    terminated: Bools  # (N,)
-    truncated: Bools  # (N,)
-    final_lanes: Ints  # (K,) lanes that ended and were reset within this step
-    final_observation: Floats  # (K, D)
-    model_version: Ints  # (N,)
-    reward_mean: Floats  # (N,), before the penalty
-    deviation: Floats | None  # (N, O) when asked for
+    observation: Floats  # (N, D) observations after the step
+    reward: Floats  # (N,) rewards, less the penalty for uncertainty
+    terminated: Bools  # (N,) whether the episode ended in a terminal state
+    truncated: Bools  # (N,) whether the episode ended for another reason
+    final_lanes: Ints  # (K,) lanes whose episode ended and that were reset within this step
+    final_observation: Floats  # (K, D) last observations of the ended episodes
+    model_version: Ints  # (N,) version of the model in each lane
+    reward_mean: Floats  # (N,) rewards without the penalty for uncertainty
+    deviation: Floats | None  # (N, O) predicted standard deviation of each output; None if it was not requested
     untrusted: Bools | None = (
         None  # (N,) lanes truncated because they left the trusted range; None in a session without one
     )
@@ -54,18 +54,18 @@ class StepResult:
 class PolicyRollout:
     """Result of T steps of N lanes under a policy, with the policy's actions."""
 
-    action: Floats  # (T, N, F) float64, before it is clipped to its bounds
-    log_probability: Floats | None  # (T, N) float64, of the action; None without noise
-    observation: Floats  # (T, N, D) after the step; the first action is for the observations before the rollout
-    reward: Floats  # (T, N), penalised
-    terminated: Bools  # (T, N)
-    truncated: Bools  # (T, N)
+    action: Floats  # (T, N, F) float64 actions before they are clipped to their bounds
+    log_probability: Floats | None  # (T, N) float64 log probability of each action; None without noise
+    observation: Floats  # (T, N, D) observations after each step; the first action is for the ones before the rollout
+    reward: Floats  # (T, N) rewards, less the penalty for uncertainty
+    terminated: Bools  # (T, N) whether the episode ended in a terminal state
+    truncated: Bools  # (T, N) whether the episode ended for another reason
     final_steps: Ints  # (K,) steps in which a lane's episode ended and the lane was reset, in order
-    final_lanes: Ints  # (K,) the lane of each of these steps
-    final_observation: Floats  # (K, D)
-    model_version: Ints  # (T, N)
-    reward_mean: Floats  # (T, N), before the penalty
-    untrusted: Bools | None = None  # (T, N); None in a session without a trusted range
+    final_lanes: Ints  # (K,) lane of each episode in ``final_steps``
+    final_observation: Floats  # (K, D) last observation of each episode in ``final_steps``
+    model_version: Ints  # (T, N) version of the model in each step
+    reward_mean: Floats  # (T, N) rewards without the penalty for uncertainty
+    untrusted: Bools | None = None  # (T, N) whether a lane left the trusted range; None without such a range
 
     def __len__(self) -> int:
         return len(self.reward)
@@ -90,7 +90,7 @@ class PolicyRollout:
         )
 
     def steps(self) -> list[StepResult]:
-        """Return each step as ``SurrogatePort.step`` does, as views of these arrays."""
+        """Return the result of each step, as ``SurrogatePort.step`` would, as views of the rollout's arrays."""
         ends = np.searchsorted(self.final_steps, np.arange(len(self) + 1))
         return [
             StepResult(
@@ -110,8 +110,8 @@ class PolicyRollout:
 
 
 def quick(kind: type[T], **fields: Any) -> T:
-    """Make a frozen dataclass from all its fields, in half the time of its constructor. Every step makes two of
-    them."""
+    """Make an instance of a frozen dataclass from all its fields, in half the time of its constructor, because every
+    step needs two."""
     instance = object.__new__(kind)
     instance.__dict__.update(fields)
     return instance
@@ -149,10 +149,9 @@ class SurrogatePort(Protocol):
         ...
 
     def submit_occupancy(self, session: str, checkpoint: str) -> SubmittedOccupancy:
-        """Submit the states that the session visited as the occupancy of a checkpoint, for the design to choose queries
-        by.
+        """Submit the states that a session visited as those of a policy's checkpoint, so that queries are chosen there.
 
-        Returns how well the model is known over these states.
+        Returns how certain the model is at these states.
         """
         ...
 
@@ -163,7 +162,7 @@ class SurrogatePort(Protocol):
 
 @runtime_checkable
 class PolicyPort(SurrogatePort, Protocol):
-    """A surrogate that also lets a policy act where the lanes are stepped, so that a rollout is one request.
+    """A surrogate that also runs a policy on the server's side, so that a rollout of many steps is one request.
 
     Law: the result equals stepping all lanes one by one with the actions of ``surrogym_shared.acting.Actor``, bit for
     bit if both run the same NumPy on the same kind of processor.

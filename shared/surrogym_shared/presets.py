@@ -1,4 +1,4 @@
-"""Presets: what a specification and a training leave open is chosen by one of them, once.
+"""Presets: values for all settings that a specification and a training leave out.
 
 ``default`` is this product's method. ``paper`` is the method as published, changed only where it can't work.
 """
@@ -19,18 +19,18 @@ Stopping = Literal["confidence", "tested_confidence"]
 
 @dataclass(frozen=True)
 class Preset:
-    """One method, from the first query to the policy."""
+    """Values of all settings of one method, from the choice of queries to the training of a policy."""
 
     name: PresetName
 
-    # What is learned.
-    moves: Moves  # what the model of the transition predicts
+    # Settings of the model.
+    moves: Moves  # quantities whose change the model of the transition predicts
     takes_declared_rewards: bool
     penalty: float  # k of eq. 14: standard deviations that are subtracted from a predicted reward
-    limits_rewards: bool  # whether virtual rewards are limited by the samples' rewards
+    limits_rewards: bool  # whether virtual rewards are limited to about the range of the samples' rewards
     gaussian_process: Mapping[str, float | bool | str]  # settings of the Gaussian processes, by name
 
-    # How queries are chosen.
+    # Settings of the choice of queries.
     takes_rollouts: bool  # whether a query may be a rollout, not only a single step
     hypercube_tries: int
     acquisition: str
@@ -39,10 +39,10 @@ class Preset:
     input_probability: InputProbability
     stopping: Stopping
 
-    # How a policy is trained and judged.
-    algorithm: str  # policy search
+    # Settings of the training and the audit of a policy.
+    algorithm: str  # name of the policy search
     wide_networks: bool
-    adapts_training: bool  # to the surrogate's noise and phase, to long episodes, and to a return that still rises
+    adapts_training: bool  # whether a training adapts to noise, phase, long episodes, and a return that still rises
     audits: bool
 
     def initial_steps(self, coordinates: int, observations: int, actions: int, by_steps: bool) -> int:
@@ -55,13 +55,13 @@ class Preset:
             by_steps: whether a query is one step from a state that can be set, or that the environment returns to.
         """
         if self.name == "paper":
-            return 10 * (observations + actions)  # section 3.1
+            return 10 * (observations + actions)  # section 3.1 of the paper
         return max(4, coordinates + actions) if by_steps else 4 * (coordinates + actions)
 
     def budget(self, initial: int, coordinates: int, actions: int, by_steps: bool) -> int:
-        """Return the default number of real steps of a design, ``initial`` ones included.
+        """Return the default number of real steps of a design, with the ``initial`` ones.
 
-        The paper needed 125 and 120 in all after 40 and 50 initial ones.
+        The paper needed 125 steps in all after 40 initial steps, and 120 after 50.
         """
         if self.name == "paper":
             return 3 * initial

@@ -1,4 +1,4 @@
-"""How a Ray cluster is reached: its address, and the token that it asks for."""
+"""Reach a Ray cluster: check its address, and send the token that it requires."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ AUTH_MODE, TOKEN, TOKEN_PATH = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKE
 
 
 def send_token() -> None:
-    """Let Ray send this user's token, if there is one. To be called before Ray is imported.
+    """Set the environment so that Ray sends this user's token, if there is one. Call this before Ray is imported.
 
-    ``ray start`` asks for the token if there is one. But Ray 2.60 reads whether to send it when it is imported, and
-    decides to send it later, in ``ray.init``. A cluster that asks for no token ignores it.
+    A cluster from ``ray start`` requires the user's token if there is one. Ray 2.60 reads at import whether to send it,
+    before ``ray.init`` would set this. A cluster that requires no token ignores it.
     """
     path = Path(os.environ.get(TOKEN_PATH) or Path.home() / ".ray" / "auth_token")
     if os.environ.get(TOKEN) or path.is_file():
@@ -22,7 +22,7 @@ def send_token() -> None:
 
 
 def require_cluster(address: str) -> None:
-    """Raise ``ValueError`` if nobody listens at an address: Ray would try for minutes, and then end this process.
+    """Raise ``ValueError`` if no process listens at an address: Ray would try for minutes, and then end this process.
 
     Args:
         address: ``auto`` for the cluster that this machine belongs to, which Ray looks up itself, or ``host:port``.
@@ -39,6 +39,6 @@ def require_cluster(address: str) -> None:
 
 
 def no_cluster(address: str, reason: str = "") -> str:
-    """Return the sentence for an address without a cluster, with what to do about it."""
+    """Return the error message for an address without a Ray cluster, with the command that starts one."""
     why = f" ({reason})" if reason else ""
     return f"expected a cluster at {address!r}, got none{why}; begin one with RAY_worker_niceness=0 ray start --head"

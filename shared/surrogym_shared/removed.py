@@ -1,7 +1,6 @@
-"""Names that earlier versions knew, each with one sentence about what takes its place.
+"""Names of removed models, options and the like, each with its replacement.
 
-Specifications, files and scripts keep such names. Code that refuses an unknown name asks here, so its message also
-says what to do instead.
+Old specifications, files and scripts may have such names. An error about an unknown name adds the replacement.
 """
 
 from __future__ import annotations
@@ -31,12 +30,12 @@ REMOVED: Mapping[str, Mapping[str, str]] = {
 
 
 def instead_of(kind: str, name: str) -> str | None:
-    """Return what takes the place of a removed name of a kind, such as "model"; None if it was never known."""
+    """Return what replaces a removed name of a kind such as "model"; None if no such name was removed."""
     matches = (instead for removed, instead in REMOVED.get(kind, {}).items() if removed.casefold() == name.casefold())
     return next(matches, None)
 
 
 def remark(kind: str, name: str) -> str:
-    """Return the end of a message "expected ..., got NAME": "; NAME was removed: ...", or nothing."""
+    """Return an addition to the error about an unknown name, "; NAME was removed: ...", or "" if it was not removed."""
     instead = instead_of(kind, name)
     return "" if instead is None else f"; {name!r} was removed: {instead}"

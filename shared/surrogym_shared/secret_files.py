@@ -20,14 +20,14 @@ def open_to_others(path: Path) -> str | None:
         return None
     mode = stat.S_IMODE(status)
     if stat.S_ISDIR(status):
-        return None  # reading it raises the error
+        return None  # reading the folder as a file raises an error later
     if os.name != "posix" or not mode & OTHERS:
         return None
     return f"{path} may be read by other users of this machine (mode {mode:o}): chmod 600 {path} prevents this"
 
 
 def tokens_in(path: Path) -> dict[str, Role]:
-    """Return the tokens of a file with their roles, one per line.
+    """Read a file with one ``role:token`` per line. Return the role of each token.
 
     Raises:
         OSError: the file can't be read.

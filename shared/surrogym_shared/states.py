@@ -1,15 +1,15 @@
-"""Phases, verdicts, purposes and kinds, each listed once."""
+"""Types of the phases of a design, of the purposes of queries and samples, and of kinds and statuses."""
 
 from typing import Literal
 
 Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "unsure", "from_log", "failed"]
-"""Phase of a design."""
+"""Phase of a design of queries."""
 
-COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "unsure", "from_log")  # the model will not improve by itself
+COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "unsure", "from_log")  # the design makes no further queries
 ENDED: tuple[Phase, ...] = (*COMPLETED, "failed")  # a sampler has nothing left to do
 
 Verdict = Literal["continue", "ready", "over_budget", "unsure", "from_log"]
-"""Verdict of one round. Unless it is ``continue``, it is also the phase of the design that ends with the round."""
+"""Verdict of one round of a design. Unless it is ``continue``, the design ends, and the verdict is also its phase."""
 
 Purpose = Literal["initial", "adaptive", "manual", "audit"]
 """Why a query was made."""

@@ -3,8 +3,8 @@ pickles.
 
 The file is safetensors: eight bytes with the length of a JSON header, the header, then arrays as raw bytes. The model's
 arrays and metadata are stored as the server exports them. In addition there are ``samples.*`` arrays and, as metadata
-``surrogate``, format, name, specification, tolerances, ledger and predictions of new samples. So any reader of
-safetensors can open the file, and the server reads ``model`` as an exported model.
+``surrogate``, format, name, specification, tolerances, counts of real steps (ledger) and predictions of new samples. So
+any reader of safetensors can open the file, and the server reads ``model`` as an exported model.
 
 Shapes: n samples, C coordinates, F action entries.
 """
@@ -31,9 +31,9 @@ MAX_FILE_BYTES = 256 * 1024 * 1024
 MAX_HEADER_BYTES = 16 * 1024 * 1024
 LENGTH_BYTES = 8
 METADATA = "__metadata__"
-OWN = "surrogate"  # key of this file's own metadata
+OWN = "surrogate"  # key of the metadata that is not the model's
 SAMPLES = "samples."
-LOGGED = "logged"  # array of the samples; absent in files without a log
+LOGGED = "logged"  # array that marks samples from a log; absent in a file without such samples
 DTYPES: dict[str, np.dtype[Any]] = {"F64": np.dtype("<f8"), "BOOL": np.dtype("?")}
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError)
 
@@ -48,15 +48,15 @@ class NotASurrogateFile(ValueError):
 
 @dataclass(frozen=True)
 class RealSamples:
-    """Real steps that the model was fitted to, and any later ones."""
+    """Real steps of a surrogate: those that its model was fitted to, and any later steps."""
 
-    coordinates: Floats  # (n, C)
-    action: Floats  # (n, F)
-    next_coordinates: Floats  # (n, C)
-    reward: Floats  # (n,)
-    terminated: Bools  # (n,)
-    truncated: Bools  # (n,)
-    logged: Bools | None = None  # (n,) whether a sample is from a log, and so not from the budget; None: no sample is
+    coordinates: Floats  # (n, C) state before each step
+    action: Floats  # (n, F) action of each step
+    next_coordinates: Floats  # (n, C) state after each step
+    reward: Floats  # (n,) reward of each step
+    terminated: Bools  # (n,) whether the episode ended in a terminal state
+    truncated: Bools  # (n,) whether the episode ended for another reason
+    logged: Bools | None = None  # (n,) whether a step is from a log, and so not from the budget; None: no step is
 
     def __len__(self) -> int:
         return len(self.reward)
@@ -76,12 +76,12 @@ class SurrogateFile:
     spec: EnvironmentSpec
     model: bytes
     samples: RealSamples
-    tolerances: dict[str, float] = field(default_factory=dict)  # by output, as used to judge the model
-    ledger: dict[str, int] = field(default_factory=dict)  # real steps by purpose, on the server that exported the file
+    tolerances: dict[str, float] = field(default_factory=dict)  # errors of outputs that are too small to matter
+    ledger: dict[str, int] = field(default_factory=dict)  # counts of real steps by purpose, on the exporting server
     predictions: list[list[list[float]]] = field(
         default_factory=list
-    )  # [error, deviation] of each new sample, by output
-    about: dict[str, Any] = field(default_factory=dict)  # of a prior: what it was made from, see ``wire.priors``
+    )  # for each output, [error, standard deviation] of the prediction of each new sample
+    about: dict[str, Any] = field(default_factory=dict)  # what a prior was made from, as in ``wire.priors``
 
     def to_bytes(self) -> bytes:
         """Return the contents of the file.
@@ -112,12 +112,12 @@ class SurrogateFile:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Read what ``to_bytes`` returned.
+        """Read the contents of a surrogate's file, as ``to_bytes`` returned them.
 
-        The model's arrays are not checked here. The reader of models checks them against the specification.
+        The arrays of the model are not checked: the code that reads models checks them against the specification.
 
         Raises:
-            NotASurrogateFile: the bytes are too many, or not of this form.
+            NotASurrogateFile: the bytes are too many, or have another form.
         """
         header, body = _split(data)
         try:
@@ -155,12 +155,12 @@ class SurrogateFile:
         return cls(name, spec, model, samples, tolerances, ledger, predictions, about)
 
     def about_as_json(self) -> str:
-        """Return what a prior was made from; without a description, that it is this surrogate."""
+        """Return as JSON what a prior was made from. Without a description, name this surrogate as its source."""
         return json.dumps(self.about or {"source": self.name})
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file.
+        """Read a surrogate's file.
 
         Raises:
             OSError: the file can't be read.
@@ -204,7 +204,7 @@ def _join(header: Header, body: bytes) -> bytes:
 
 
 def _array(entry: Any, body: bytes) -> NDArray[Any]:
-    """Return the array that an entry of the header describes. Raises one of ``UNREADABLE`` if the entry is invalid."""
+    """Return the array that an entry of the header describes. Raises an error in ``UNREADABLE`` if it is invalid."""
     dtype, shape, (start, stop) = DTYPES[entry["dtype"]], [int(n) for n in entry["shape"]], entry["data_offsets"]
     if min(shape, default=0) < 0 or not 0 <= start <= stop <= len(body):
         raise ValueError(f"an array of shape {shape} from byte {start} to {stop}, where the file has {len(body)}")
@@ -215,7 +215,7 @@ def _array(entry: Any, body: bytes) -> NDArray[Any]:
 
 
 def _pair(pair: Any) -> list[float]:
-    """Return the error and the standard deviation of a prediction. Raises one of ``UNREADABLE`` if they are invalid."""
+    """Return [error, standard deviation] of a prediction. Raises an error of ``UNREADABLE`` if they are invalid."""
     error, std = (float(one) for one in pair)
     if not math.isfinite(error) or not 0 <= std < math.inf:
         raise ValueError(f"a prediction with the error {error} and the standard deviation {std}")

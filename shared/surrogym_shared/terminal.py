@@ -17,10 +17,10 @@ import typer
 from surrogym_shared.words import visible
 
 PLAIN_SECONDS = 5.0  # time between lines of progress if no bar can be drawn
-FIRST_SECONDS = 2.0  # time before the first line, so that short or refused work shows none
+FIRST_SECONDS = 2.0  # time before the first line of progress, so that short or refused work shows none
 WATCH_SECONDS = 1.0  # time between two updates of a watched output
 
-Update = Callable[[float | None, str], None]  # arguments: share done in [0, 1], None if unchanged; a few words
+Update = Callable[[float | None, str], None]  # arguments: share done in [0, 1], None if unchanged; a short description
 
 
 def say(text: str, *, quiet: bool = False) -> None:
@@ -30,7 +30,7 @@ def say(text: str, *, quiet: bool = False) -> None:
 
 
 def give(result: dict[str, Any], text: Callable[[], str], *, as_json: bool, quiet: bool = False) -> None:
-    """Print the result on standard output, as JSON or as text. ``quiet`` suppresses text that is only a remark."""
+    """Print the result of a command on standard output, as JSON or as text. ``quiet`` suppresses the text."""
     if as_json:
         typer.echo(json.dumps(result, indent=2))
     elif not quiet:
@@ -38,7 +38,8 @@ def give(result: dict[str, Any], text: Callable[[], str], *, as_json: bool, quie
 
 
 def watch(look: Callable[[], str], seconds: float = WATCH_SECONDS) -> None:
-    """Show the output of ``look`` until Ctrl-C: in place on a terminal, elsewhere again whenever it has changed."""
+    """Show the output of ``look`` until Ctrl-C, updated every few ``seconds``: in place on a terminal, elsewhere as new
+    text when it has changed."""
     with suppress(KeyboardInterrupt), _screen() as show:
         while True:
             show(look())
@@ -71,7 +72,7 @@ def _screen() -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def _interrupt_afterwards() -> Iterator[None]:
-    """Delay Ctrl-C until the block ends, because a half-drawn output would be drawn again below itself."""
+    """Context that delays Ctrl-C until its end, because a half-drawn output would be drawn again below itself."""
     came: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
     try:
@@ -84,7 +85,7 @@ def _interrupt_afterwards() -> Iterator[None]:
 
 @contextmanager
 def on_interrupt(words: Callable[[], str]) -> Iterator[None]:
-    """Context that says after Ctrl-C what was saved and how to continue. It raises the interruption again."""
+    """Context that prints ``words`` after Ctrl-C, such as what was saved and how to continue, and raises it again."""
     try:
         yield
     except KeyboardInterrupt:
@@ -96,8 +97,8 @@ def on_interrupt(words: Callable[[], str]) -> Iterator[None]:
 
 @contextmanager
 def progress(title: str, *, quiet: bool = False) -> Iterator[Update]:
-    """Context that shows progress: a bar on a terminal, lines elsewhere after ``FIRST_SECONDS``, nothing if
-    ``quiet``."""
+    """Context that shows the progress of work: a bar on a terminal, lines elsewhere after ``FIRST_SECONDS``, nothing if
+    ``quiet``. Yields the function that updates it."""
     if quiet:
         yield _silent
     elif sys.stderr.isatty():
@@ -131,7 +132,8 @@ def _bar(title: str) -> Iterator[Update]:
 
 
 class _Lines:
-    """Progress as a limited number of lines, none before ``begin``. The last state is always shown."""
+    """Progress as lines of text, at most one every ``PLAIN_SECONDS``, and none before ``begin`` is called. The last
+    state is always shown."""
 
     def __init__(self, title: str) -> None:
         self._title = title
@@ -144,7 +146,7 @@ class _Lines:
             self.begin()
 
     def begin(self) -> None:
-        """Show the present state. The first call comes from another thread."""
+        """Print the present state, if it has changed. The first call comes from another thread."""
         if self._words != self._last:
             self._last = self._words
             say(f"{self._title}: {self._words}")

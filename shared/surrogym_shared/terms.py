@@ -12,7 +12,7 @@ Bools = NDArray[np.bool_]
 
 
 def evaluate(spec: EnvironmentSpec, term: Term, coordinates: Array) -> Array:
-    """The value (n,) of a term at coordinates (n, C)."""
+    """Return the value (n,) of a term at coordinates (n, C)."""
     total = np.sum([_part(spec, part, coordinates) for part in term.parts], axis=0)
     if term.low is None and term.high is None:
         return np.asarray(total)
@@ -20,18 +20,18 @@ def evaluate(spec: EnvironmentSpec, term: Term, coordinates: Array) -> Array:
 
 
 def observe(spec: EnvironmentSpec, coordinates: Array) -> Array:
-    """The declared observation (n, D) at coordinates (n, C)."""
+    """Return the observation (n, D) that a specification declares, at coordinates (n, C)."""
     return np.stack([evaluate(spec, entry.term, coordinates) for entry in spec.observation], axis=1)
 
 
 def holds(spec: EnvironmentSpec, inequality: Inequality, coordinates: Array) -> Bools:
-    """Whether (n,) an inequality holds at coordinates (n, C)."""
+    """Return whether an inequality holds at each of the coordinates (n, C), as booleans (n,)."""
     compare = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}[inequality.relation]
     return np.asarray(compare(evaluate(spec, inequality.term, coordinates), inequality.value))
 
 
 def terminates(spec: EnvironmentSpec, coordinates: Array) -> Bools:
-    """Whether (n,) any of the declared terminations holds at coordinates (n, C)."""
+    """Return whether any declared termination holds at each of the coordinates (n, C), as booleans (n,)."""
     ended = np.zeros(len(coordinates), dtype=np.bool_)
     for group in spec.termination_groups:
         ended |= np.all([holds(spec, inequality, coordinates) for inequality in group], axis=0)

@@ -1,18 +1,19 @@
-"""Numbers with their nouns, for people."""
+"""Words of messages for people: numbers with their nouns, lists of names, and text without control characters."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-SHOWN = 10  # names of a list
+SHOWN = 10  # most names of a list that a message shows
 
 
+# Control characters; the last two ranges change the direction of text.
 _HIDDEN = (
     *range(32),
     *range(127, 160),
     *range(0x202A, 0x202F),
     *range(0x2066, 0x206A),
-)  # the last two turn a line around
+)
 _CONTROLS = {code: f"\\x{code:02x}" for code in _HIDDEN if chr(code) not in "\n\t"}
 
 
@@ -27,11 +28,11 @@ def counted(count: int, noun: str) -> str:
 
 
 def has(count: int, noun: str) -> str:
-    """Return a number with its noun and verb: 1 row has, 2 rows have."""
+    """Return a number with its noun and the verb "have", such as "1 row has" and "2 rows have"."""
     return f"{counted(count, noun)} {'has' if count == 1 else 'have'}"
 
 
 def listed(names: Iterable[object]) -> str:
-    """Return names as a list: all of them, or the first ones and how many more there are."""
+    """Return names as the text of a list: all names, or the first ten and the number of the others."""
     every = [str(name) if len(str(name)) <= 60 else f"{str(name)[:60]}..." for name in names]
     return str(every) if len(every) <= SHOWN else f"{str(every[:SHOWN])[:-1]} and {len(every) - SHOWN:,} more]"

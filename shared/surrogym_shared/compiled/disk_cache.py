@@ -36,8 +36,8 @@ def has_any(package: str) -> bool:
 
 
 def _digest_of_sources(package: str) -> str:
-    """Return the digest of the source files that a package compiles, and of this folder's. Numba itself only checks
-    the file of the called function."""
+    """Return one digest of all source files that a package compiles and of this folder's files. Numba itself checks
+    only the file of the called function."""
     files = set(Path(__file__).parent.glob("*.py"))
     if source := getattr(sys.modules[package], "__file__", None):
         root = Path(source).parent

@@ -24,8 +24,8 @@ INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, *
 
 
 def compiled(function: F) -> F:
-    """Compile a function that is called from compiled code. The compiler may round a product and the sum that follows
-    it only once."""
+    """Compile a function that only compiled code calls. A product and a following sum may be fused into one operation,
+    which rounds once."""
     return cast(F, njit(fastmath={"contract"}, **INNER)(function))
 
 
@@ -35,7 +35,7 @@ def inlined(function: F) -> F:
 
 
 def summing(function: F) -> F:
-    """Compile a function whose sums may be reordered for speed. The order is always the same."""
+    """Compile a function whose sums may be reordered for speed. The chosen order is the same in every call."""
     return cast(F, njit(fastmath={"contract", "reassoc"}, **INNER)(function))
 
 
@@ -50,7 +50,7 @@ def entry(*arguments: Any) -> Callable[[F], F]:
                 with _kept_in(folder):
                     return cast(F, njit([arguments], cache=True, **chosen)(function))
             except NumbaError:
-                raise  # it would fail again
+                raise  # compiling without the cache would fail too
             except Exception as error:  # numba unpickles its cache files, and its cache folder may be unwritable
                 logger.warning(
                     "compiled code can't be stored in %s, so the functions are compiled again: %s", folder, error

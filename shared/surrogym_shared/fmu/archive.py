@@ -17,8 +17,8 @@ from surrogym_shared.fmu.description import build_description, model_description
 
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off")
 WRAPPER = "fmi3.c"
-LOADS = "import ctypes, sys; ctypes.CDLL(sys.argv[1])"  # CC may compile for another machine
-EPOCH = (1980, 1, 1, 0, 0, 0)  # so that the same block gives the same bytes
+LOADS = "import ctypes, sys; ctypes.CDLL(sys.argv[1])"  # test of the library: CC may compile for another machine
+EPOCH = (1980, 1, 1, 0, 0, 0)  # fixed date of all entries, so that the same block gives the same bytes
 SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("windows", ".dll")}
 MACHINES = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}
 
@@ -37,10 +37,11 @@ def write_fmu(block: Block, path: Path) -> WrittenFmu:
     """Write an FMU, with native code if this machine has a C compiler.
 
     Args:
-        path: file to write; it replaces one of this name only when the new one is whole.
+        block: content of the FMU.
+        path: file to write. An existing file is replaced only after the new one is complete.
 
     Raises:
-        CannotCompile: the compiler refused the sources, or the variable ``CC`` names none.
+        CannotCompile: the compiler refused the sources, or the variable ``CC`` names no compiler.
         OSError: the file can't be written.
     """
     sources = dict(block.sources)
@@ -63,7 +64,7 @@ def write_fmu(block: Block, path: Path) -> WrittenFmu:
 
 
 def here() -> tuple[str, str]:
-    """Name of this platform in FMI 3.0, and the ending of its shared libraries."""
+    """Return the name of this platform in FMI 3.0, such as ``x86_64-linux``, and the suffix of its shared libraries."""
     system, ending = SYSTEMS.get(sys.platform, (sys.platform, ".so"))
     machine = platform.machine().lower()
     return f"{MACHINES.get(machine, machine)}-{system}", ending

@@ -20,11 +20,11 @@ TIME = "time"  # name of the independent variable, which every FMU has
 
 @dataclass(frozen=True)
 class Variable:
-    """One value of a block.
+    """One variable of an FMU.
 
     Attributes:
         start: value at the start. None for an output that ``block_start`` calculates.
-        unit: of the value; empty if it is unknown.
+        unit: unit of the value; empty if it is unknown.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Block:
-    """A step of a fixed period in C99.
+    """Content of an FMU: a model that steps at a fixed period, as C99 source.
 
     ``sources`` define the two functions of ``block.h``, which is generated (see ``header``). Both return 0, or 1 + the
     index of a value that they can't use.
@@ -61,7 +61,7 @@ class Block:
         stop: default end of a simulation, in seconds; None for none.
         sources: contents of C files and headers by name. Each file that ends in .c is compiled.
         memory: number of float64 that a block keeps from step to step besides its values.
-        acts_first: whether it acts at the beginning of a period, as a controller does, or shows the result at its end.
+        acts_first: whether the outputs change at the beginning of a period, as a controller's do, or at its end.
 
     Raises:
         ValueError: two variables have the same name, a name is ``time`` or has control characters, or the period is not
@@ -86,7 +86,7 @@ class Block:
 
     @property
     def identifier(self) -> str:
-        """The name as a C identifier."""
+        """Name of the block, as a C identifier."""
         plain = re.sub(r"\W", "_", self.name, flags=re.ASCII)
         return plain if plain[:1].isalpha() else f"fmu_{plain}"
 
@@ -98,7 +98,7 @@ class Block:
         return "{" + hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32] + "}"
 
     def header(self) -> str:
-        """Content of ``block.h``."""
+        """Return the content of the C header ``block.h``."""
         return "\n".join(self._header())
 
     def _header(self) -> Iterator[str]:
@@ -120,20 +120,20 @@ class Block:
 
 
 class Names:
-    """Names of an FMU's variables. A taken name is preceded by its variable's kind; ``time`` is taken."""
+    """Unique names for the variables of an FMU. A name that is taken gets a prefix; ``time`` is always taken."""
 
     def __init__(self) -> None:
         self._names = {TIME}
 
     def free(self, name: str, kind: str) -> str:
-        """Return a name that no variable has yet, and take it."""
+        """Return a name that no variable has yet, and reserve it: ``name``, or ``kind.name`` if ``name`` is taken."""
         name_of_variable = f"{kind}.{name}" if name in self._names else name
         self._names.add(name_of_variable)
         return name_of_variable
 
 
 def _string(text: str) -> str:
-    """A string of C. What C99 reads in another way is written as octal bytes: quotes, trigraphs, all beyond ASCII."""
+    """Return a text as a C string literal, with quotes, trigraphs and all beyond ASCII as octal escapes."""
     octal = (
         chr(byte) if (chr(byte).isalnum() and byte < 128) or byte in b" ._-" else f"\\{byte:03o}"
         for byte in text.encode()

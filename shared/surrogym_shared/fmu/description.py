@@ -11,7 +11,7 @@ REFERENCE = 0  # value reference of the time; variable i has the reference i + 1
 
 
 def model_description(block: Block) -> bytes:
-    """Content of ``modelDescription.xml``."""
+    """Return the content of ``modelDescription.xml``."""
     root = Element(
         "fmiModelDescription",
         fmiVersion=FMI,
@@ -89,7 +89,7 @@ def _number(one: Variable, value: float) -> str:
 
 
 def build_description(block: Block, sources: list[str]) -> bytes:
-    """Content of ``sources/buildDescription.xml``, with the names of the C files to compile."""
+    """Return the content of ``sources/buildDescription.xml``, with the names of the C files to compile."""
     root = Element("fmiBuildDescription", fmiVersion=FMI)
     configuration = SubElement(root, "BuildConfiguration", modelIdentifier=block.identifier)
     files = SubElement(configuration, "SourceFileSet", language="C99")

@@ -26,7 +26,7 @@ from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 from surrogym_shared.terms import terminates
 
 SHOWN = 8  # most values in a message
-HEADING = ("line", "reason")  # first columns of a file of rejected rows; those of its log follow
+HEADING = ("line", "reason")  # first columns of a file of rejected rows; the columns of the log follow
 OURS = ",".join(HEADING).encode() + b","
 
 
@@ -37,9 +37,9 @@ class ReadLog:
     Attributes:
         table: the log as it was read.
         roles: roles of its columns.
-        steps: its usable steps.
-        spec: the specification that it was checked against, or that was drafted from it.
-        notes: how the file was read, conclusions about the order of the rows, and reasons of the parts of a draft.
+        steps: usable steps of the log.
+        spec: the specification that the log was checked against, or that was drafted from the log.
+        notes: how the file was read, conclusions about the order of the rows, and reasons for a drafted specification.
     """
 
     table: Table
@@ -72,7 +72,7 @@ class ReadLog:
 
 
 def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
-    """Check the rows of a log against a specification. Steps of an evaluation are taken as the environment gave them.
+    """Check the rows of a log against a specification. The log of an evaluation is trusted, and only parsed.
 
     Raises:
         UnusableLog: the columns don't fit the specification, or are in other units.
@@ -128,7 +128,7 @@ def write_rejected(path: Path, table: Table, steps: Transitions) -> None:
 
 
 def is_of_rejected(path: Path) -> bool:
-    """Whether ``write_rejected`` wrote a file, or the file is empty. Its heading tells this."""
+    """Whether a file is empty, or begins with the heading that ``write_rejected`` writes."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -162,10 +162,10 @@ def _of_spec(roles: Roles, spec: EnvironmentSpec) -> Roles:
 
 
 def _require_choices(spec: EnvironmentSpec, roles: Roles, values: Floats) -> None:
-    """Refuse values (n, F) of a discrete action that may be codes of other choices than the numbers that they are.
+    """Raise ``UnusableLog`` if the values (n, F) of a discrete action may be codes instead of the choices' numbers.
 
-    Numbers from 0 include 0. If some are beyond the last choice, as a faulty row's may be, they include all choices. A
-    mapping that declares the choices, or that they are numbered, settles it.
+    Values pass as numbers if they include 0, and either all of them are numbers of choices or each choice occurs. In
+    the second case the other values are faults of single rows. A mapping may also declare codes or numbers explicitly.
     """
     if isinstance(spec.action, BoxAction):
         return
@@ -188,7 +188,7 @@ def _require_choices(spec: EnvironmentSpec, roles: Roles, values: Floats) -> Non
 
 
 def _shaped(spec: EnvironmentSpec, roles: Roles, steps: Transitions) -> Transitions:
-    """Keep only the coordinates of a specification, in its order, and wrap angles to [-pi, pi)."""
+    """Keep only the states that are coordinates of a specification, in its order, and wrap angles to [-pi, pi)."""
     names = list(roles.state)
     columns = [names.index(name) for name in spec.coordinate_names]
     q, q_next = steps.q[:, columns].copy(), steps.q_next[:, columns].copy()

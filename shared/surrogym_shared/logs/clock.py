@@ -16,12 +16,14 @@ from surrogym_shared.logs.rows import Rows
 from surrogym_shared.logs.table import Bools, Floats, Ints
 from surrogym_shared.words import counted
 
-SHARED = 0.1  # share of rows with the time of the row before, from which the clock may be coarser than the rows
-# Shares of these rows that differ in other numbers: up to the first they are repeats, from the second on they are not.
+# If more than this share of the rows has the time of the row before, the clock may be coarser than the rows.
+SHARED = 0.1
+# Of the rows with the time of the row before, some differ from it in other numbers. Up to a share of REPEATS, all these
+# rows are repeats. From a share of DIFFER on, they are steps under a coarse clock. Between the two, the log is refused.
 REPEATS, DIFFER = 0.02, 0.2
-# Share of ticks whose number of rows differs by more than one from the usual, above which a coarse clock is refused.
+# A coarse clock is refused if at more than this share of its times the number of rows is unusual by more than one.
 IRREGULAR = 0.1
-GAP = 1.5  # number of ticks between two times from which on there is a gap
+GAP = 1.5  # from this number of ticks between two times on, rows are missing between them
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Episodes:
         number: number of each row's episode, (n,).
         overlapping: numbers of the episodes that begin at a time within the episode before, as joined files do that
             share some rows.
-        notes: where an episode begins without a mark of its own.
+        notes: sentences that say where an episode begins for another reason than a mark or a new name.
     """
 
     number: Ints
@@ -72,7 +74,8 @@ def episodes_of(rows: Rows) -> Episodes:
 
 
 def _names(rows: Rows, names: Ints, notes: list[str]) -> Ints:
-    """Return a number for each name of an episode, (n,), and a new one where a name returns after others."""
+    """Return the number of each row's episode (n,), by its name. A name that returns after other names gets a new
+    number."""
     changes = np.zeros(len(rows), dtype=np.bool_)
     changes[1:] = names[1:] != names[:-1]
     stretch = np.cumsum(changes, dtype=np.int64)
@@ -92,8 +95,8 @@ def _names(rows: Rows, names: Ints, notes: list[str]) -> Ints:
 
 
 def _restarts(time: Floats) -> Bools:
-    """Return where the time goes back and then continues from there, (n,). A single row that is out of order does
-    not."""
+    """Return a mask (n,) of the rows where the time goes back and continues from there. A single row that is out of
+    order does not count."""
     restarts = np.zeros(len(time), dtype=np.bool_)
     if len(time) > 2:
         restarts[1:-1] = (time[1:-1] < time[:-2]) & (time[2:] > time[1:-1]) & (time[2:] <= time[:-2])
@@ -101,14 +104,24 @@ def _restarts(time: Floats) -> Bools:
 
 
 def _overlapping(time: Floats, number: Ints, restarts: Ints) -> set[int]:
-    """Return the numbers of the episodes that begin at one of ``restarts``, later than the episode before did."""
+    """Return the numbers of the episodes that begin at a row in ``restarts``, at a later time than the episode before
+    them began."""
     start = {int(number[row]): time[row] for row in range(len(time) - 1, -1, -1)}
     return {int(number[row]) for row in restarts if time[row] > start[int(number[row]) - 1]}
 
 
 def repeated(rows: Rows, episodes: Episodes, faults: Mapping[int, str], *, coarse: bool) -> dict[int, str]:
-    """Find rows that repeat an earlier one: equal in every number, at the same time of the same episode unless the
-    clock is ``coarse``, or in a copy of the whole log that follows it."""
+    """Return a reason for each row that repeats an earlier one, by the row's index.
+
+    A row repeats another one if all numbers are equal at the same time of the same episode, or if it belongs to a
+    second copy of the whole log.
+
+    Args:
+        rows: rows of the log.
+        episodes: their episodes.
+        faults: rows that are already rejected.
+        coarse: whether several rows may have the same time; then only copies of the whole log are found.
+    """
     if rows.time is None and rows.episode is None:
         return {}
     whole = _content(rows)
@@ -131,7 +144,7 @@ def repeated(rows: Rows, episodes: Episodes, faults: Mapping[int, str], *, coars
 
 
 def _content(rows: Rows) -> Floats:
-    """Return all numbers of the rows, (n, k)."""
+    """Return the rows as one matrix (n, k) of all their numbers."""
     parts: list[Floats | Ints | Bools | None] = [
         rows.q, rows.u, rows.following, rows.reward, rows.time, rows.episode, rows.terminated, rows.truncated
     ]  # fmt: skip
@@ -140,7 +153,7 @@ def _content(rows: Rows) -> Floats:
 
 
 def _copied(whole: Floats, number: Ints) -> int:
-    """Return the number of rows of the log that ``whole`` (n, k) holds several times; 0 if it holds it once."""
+    """Return the number of rows after which the numbers ``whole`` (n, k) repeat from the start; 0 if they don't."""
     begins = np.flatnonzero(number[1:] != number[:-1]) + 1
     for start in begins[np.array([len(whole) % b == 0 for b in begins.tolist()], dtype=np.bool_)].tolist():
         if np.array_equal(whole[start], whole[0]) and np.array_equal(whole[start:], whole[:-start], equal_nan=True):
@@ -199,7 +212,7 @@ def ticks_of(rows: Rows, episode: Ints, left_out: Mapping[int, str]) -> Ticks | 
     begins = np.concatenate([[True], ~same])
     moment = np.cumsum(begins) - 1
     at, of, size = time[begins], number[begins], np.bincount(moment)
-    inner = np.zeros(len(size), dtype=np.bool_)  # neither the first nor the last time of an episode, which are cut
+    inner = np.zeros(len(size), dtype=np.bool_)  # not the first or last time of an episode, where rows are cut off
     inner[1:-1] = (of[1:-1] == of[:-2]) & (of[1:-1] == of[2:])
     within = of[1:] == of[:-1]
     if not within.any():

@@ -27,10 +27,12 @@ SINGLE = {
     "episode": ("episode", "episode_id", "trajectory", "run"),
     "time": ("time", "t", "timestamp", "time_stamp", "seconds"),
 }
+# Names that Gym and Stable-Baselines3 use for any end of an episode. With a column of timeouts beside it, such a column
+# counts for other ends only.
 EITHER_END = (
     "done",
     "dones",
-)  # what Gym and Stable-Baselines3 call any end; with timeouts beside it, only others count
+)
 SHORT_TIMES = ("s", "ms", "us", "ns")  # units that may follow t: t_s is a time, t_d is not
 ACTION = re.compile(r"^(?:actions?|acts?|u)(?:[._](.+)|\[(\d+)\])?$|^actions?[\s-]+(.+)$", re.IGNORECASE)
 STATE = re.compile(r"^(?:q|states?|obs|observations?|coordinates?)(?:[._](.+)|\[(\d+)\])$", re.IGNORECASE)
@@ -48,9 +50,9 @@ EXPECTED = {
     "constants": NAMES,
     "discrete": "true, false, or a table of actions and the values of their choices, such as switch = [1, 2, 3]",
 }
-SHOWN = 60  # letters of a wrong value that a message shows
-LONGEST = 64  # letters of a coordinate's name
-MOST = 1_000  # columns that a mapping may name for one role
+SHOWN = 60  # most letters of a wrong value that a message shows
+LONGEST = 64  # most letters of a coordinate's name
+MOST = 1_000  # most columns that a mapping may name for one role
 
 Choices = Annotated[list[float], Field(min_length=2, max_length=MOST)]
 Limits = Annotated[list[float | None], Field(min_length=2, max_length=2)]
@@ -104,7 +106,7 @@ class Roles:
 
     @property
     def mapping(self) -> LogMapping:
-        """Mapping that gives these columns the same roles."""
+        """Mapping that declares these roles, as a mapping file would."""
         single = {role: getattr(self, role) for role in SINGLE}
         return LogMapping(
             state=dict(self.state),
@@ -186,7 +188,7 @@ def _units(names: Iterable[str], columns: Iterable[str | None]) -> dict[str, str
 
 
 def _as_time(one: Heading) -> Heading | None:
-    """Return the heading of a column of times with its unit; None if it is no such column."""
+    """Return a column's heading split into name and unit if the column has times; otherwise None."""
     for quantity in (one, timed(one)):
         short = len(quantity.plain) == 1
         units = SHORT_TIMES if short and quantity is not one else TIMES
@@ -196,11 +198,15 @@ def _as_time(one: Heading) -> Heading | None:
 
 
 def mapping_of(mapping: Path | Mapping[str, Any] | LogMapping, where: str) -> LogMapping:
-    """Parse a mapping: a file in JSON or TOML, or what stands in one.
+    """Parse a mapping of columns to roles.
+
+    Args:
+        mapping: a JSON or TOML file, the content of one, or a parsed mapping.
+        where: name of the mapping in error messages.
 
     Raises:
         OSError: the file can't be read.
-        UnusableLog: it is not a mapping.
+        UnusableLog: the content is not a mapping.
     """
     if isinstance(mapping, LogMapping):
         return mapping
@@ -269,7 +275,11 @@ def roles_by_mapping(mapped: LogMapping, names: Sequence[str], where: str = "the
 
 
 def _choices(mapped: LogMapping, action: Mapping[str, str], where: str) -> dict[str, tuple[float, ...]]:
-    """Return the declared choices by action entry. Raises ``UnusableLog`` if they are not those of all entries."""
+    """Return the declared choices of each action entry, by its name; empty if the mapping declares none.
+
+    Raises:
+        UnusableLog: some entries lack choices, or have the same choice twice.
+    """
     if not isinstance(mapped.discrete, dict):
         return {}
     if set(mapped.discrete) != set(action):
@@ -284,7 +294,7 @@ def _choices(mapped: LogMapping, action: Mapping[str, str], where: str) -> dict[
 
 
 def _single(role: str, pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """Return columns by the names of their states or actions. Raises ``UnusableLog`` if two have the same name."""
+    """Return the column of each state or action, by its name. Raises ``UnusableLog`` if two have the same name."""
     columns: dict[str, str] = {}
     for name, column in pairs:
         if name in columns:
@@ -313,7 +323,7 @@ def _require_one_role(mapped: LogMapping, where: str) -> None:
 
 
 def _require_declared(mapped: LogMapping, state: Iterable[str], action: Iterable[str], where: str) -> None:
-    """Raise ``UnusableLog`` if limits, angles or constants of a mapping name nothing, or contradict each other."""
+    """Raise ``UnusableLog`` if limits, angles or constants of a mapping have unknown names or contradict each other."""
     states, actions = list(state), list(action)
     for key, entries, choices in (
         ("limits", mapped.limits, [*states, *actions]),

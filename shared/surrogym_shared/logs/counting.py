@@ -1,4 +1,4 @@
-"""Find out what the cells of a column are: numbers of rows, times of a clock, numbers of episodes, or marks."""
+"""Find out what the cells of a column are: numbers of rows, times of a clock, numbers of episodes, or 0/1 marks."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from surrogym_shared.logs.table import DATES, DURATIONS, Cells, Floats, flags, g
 
 Numbering = Literal["rows", "episodes", "gaps"]
 
-FEWEST = 4  # fewest rows that show what a column is
-MOST_TURNS = 0.5  # share of rows at which numbers of episodes change, or a clock restarts, at most
-EQUAL = 1e-6  # share of a step by which the steps of a clock may differ
+FEWEST = 4  # least number of rows from which the meaning of a column is inferred
+MOST_TURNS = 0.5  # largest share of rows at which the number of the episode changes, or a clock restarts
+EQUAL = 1e-6  # largest relative difference between the steps of a regular clock
 
 
 def measured(cells: Cells) -> Floats | None:
@@ -26,7 +26,10 @@ def measured(cells: Cells) -> Floats | None:
 
 
 def numbering(cells: Cells) -> Numbering | None:
-    """Whether whole numbers count the rows, the rows of each episode, or either with some missing."""
+    """Return what a column of whole numbers counts; None if it counts nothing.
+
+    ``rows``: all rows. ``episodes``: the rows of each episode. ``gaps``: one of these, with some rows missing.
+    """
     values = measured(cells)
     if values is None or cells.dtype.kind in (DATES, DURATIONS) or (values != np.floor(values)).any():
         return None
@@ -44,8 +47,8 @@ def numbering(cells: Cells) -> Numbering | None:
 
 
 def is_unordered(cells: Cells) -> bool:
-    """Whether whole numbers differ in all rows and fall at least once, as an index does whose rows are in another
-    order."""
+    """Whether a column has a different whole number in each row, not in ascending order, as the index of shuffled rows
+    has."""
     values = measured(cells)
     whole = values is not None and bool((values == np.floor(values)).all())
     return values is not None and whole and len(np.unique(values)) == len(values) and bool((np.diff(values) < 0).any())
@@ -58,7 +61,7 @@ def grows_always(cells: Cells) -> bool:
 
 
 def grows(cells: Cells) -> bool:
-    """Whether a column only ever falls to its first value, as a time does that restarts."""
+    """Whether a column grows, and falls only back to about its first value, as a time that restarts does."""
     values = measured(cells)
     if values is None:
         return False
@@ -88,7 +91,7 @@ def is_mark(cells: Cells) -> bool:
 
 
 def is_in_blocks(cells: Cells) -> bool:
-    """Whether a column stays for several rows at a whole number or a text, as numbers of episodes do."""
+    """Whether a column keeps a whole number or a text for several rows before it changes, as names of episodes do."""
     numbers = groups(cells)
     if len(numbers) < FEWEST or numbers[-1] == numbers[0]:
         return False
@@ -98,10 +101,10 @@ def is_in_blocks(cells: Cells) -> bool:
 
 
 def episodes_by(name: str, cells: Cells) -> Cells:
-    """Number the episodes that a column of marks of starts, or a counter that starts again, shows, (n,).
+    """Return the number of each row's episode (n,), from a column that marks first rows or restarts with each episode.
 
     Raises:
-        UnusableLog: the column is neither.
+        UnusableLog: the column has neither marks nor numbers.
     """
     if is_mark(cells):
         return np.cumsum(flags(name, cells)[0])

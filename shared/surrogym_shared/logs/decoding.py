@@ -1,4 +1,4 @@
-"""Decode the bytes of a text log. Bytes of another format are refused with its name and the way out."""
+"""Decode the bytes of a text log. The error for another format has its name, and how to convert the file."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from surrogym_shared.logs.errors import UnusableLog
 
 MARKED = (
     (codecs.BOM_UTF8, "utf-8-sig"),
-    (codecs.BOM_UTF32_LE, "utf-32"),  # begins as UTF-16 does, so it comes first
+    (codecs.BOM_UTF32_LE, "utf-32"),  # before UTF-16, whose mark is the beginning of this one
     (codecs.BOM_UTF32_BE, "utf-32"),
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
 WINDOWS = "cp1252"
 SAMPLED = 4_096  # bytes at the start that show whether a text without a mark is UTF-16
-MOST_ODD = 0.1  # share of zero bytes on the side of the letters
+MOST_ODD = 0.1  # largest share of zero bytes among those bytes of UTF-16 that hold Latin letters
 
 AS_CSV = "save the table as CSV"
 DECOMPRESS = "decompress it first"
@@ -41,13 +41,17 @@ FOREIGN = (
 
 
 def decoded(content: bytes, where: str) -> tuple[str, tuple[str, ...]]:
-    """Return a log as text, and remarks if its encoding is not UTF-8.
+    """Return a log as text, and remarks for its report if the encoding is not UTF-8.
 
-    The encoding is the one that the first bytes mark, otherwise UTF-8. UTF-16 without a mark shows by its zero bytes.
-    Other text without control characters is read as Windows' cp1252, which a remark says.
+    The encoding is that of the byte order mark, otherwise UTF-8. UTF-16 without a mark is recognised by its zero bytes.
+    Other text without control characters is read as Windows' cp1252.
+
+    Args:
+        content: bytes of the log.
+        where: source of the log, for messages.
 
     Raises:
-        UnusableLog: the bytes are another format, or no text in their encoding.
+        UnusableLog: the bytes have another format, or are not valid in their encoding.
     """
     for start, signature, name, way_out in FOREIGN:
         if content[start : start + len(signature)] == signature:
@@ -71,7 +75,7 @@ def decoded(content: bytes, where: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _unmarked(content: bytes) -> str:
-    """Return the encoding of a text without a mark. In UTF-16 every second byte of a letter of Latin script is zero."""
+    """Guess the encoding of text without a byte order mark: UTF-8, or UTF-16 if every second byte is mostly zero."""
     sample = content[:SAMPLED]
     half = max(1, len(sample) // 2)
     first, second = sample[0::2].count(0) / half, sample[1::2].count(0) / half

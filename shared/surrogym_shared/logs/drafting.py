@@ -33,9 +33,9 @@ from surrogym_shared.spec import (
 
 MARGIN = 0.05  # share of the data's width that a sampling range adds on each side
 SATURATED_ROWS = 5  # fewest steps that end exactly at an extreme value before it counts as a limit
-SATURATED_SHARE = 0.002  # the same as a share of all steps
+SATURATED_SHARE = 0.002  # least share of all steps that end exactly at an extreme value before it counts as a limit
 MOST_DISCRETE = 16  # most different values of a discrete action
-FEW_EPISODES = 2  # with fewer, a log shows neither starts nor a time limit
+FEW_EPISODES = 2  # least number of episodes from which the time limit is taken
 USUAL_LIMIT = 200  # time limit of virtual episodes if the log has too few episodes to show one
 MOST_STARTS = 64
 FEW_STARTS = 8  # with fewer episodes, a log begins at too few states to train from
@@ -114,7 +114,7 @@ def _coordinate(roles: Roles, steps: Transitions, name: str, index: int, notes: 
 
 
 def _require_range(name: str, low: float, high: float) -> None:
-    """Raise ``UnusableLog`` if a specification can't have the range [low, high]: too large, or too narrow."""
+    """Raise ``UnusableLog`` if the values of ``name`` from ``low`` to ``high`` are too large or too close together."""
     _require_size(name, low, high)
     least = _narrowest(low, high)
     if high - low < least:
@@ -134,7 +134,7 @@ def _require_size(name: str, low: float, high: float) -> None:
 
 
 def _narrowest(low: float, high: float) -> float:
-    """Return the narrowest range that a specification takes."""
+    """Return the smallest width that a range from ``low`` to ``high`` may have in a specification."""
     return max(NARROWEST, RESOLUTION * max(abs(low), abs(high)))
 
 
@@ -185,7 +185,7 @@ def _stays_at(after: Floats, end: float, ends: tuple[float, float]) -> bool:
 
 
 def _start(coordinate: Coordinate, steps: Transitions, index: int) -> Uniform | Fixed:
-    """Return the range of a coordinate at the starts of the log's episodes. With a single episode, all states count."""
+    """Return the range of a coordinate at the starts of the log's episodes; of one episode, the range of all states."""
     begins = steps.q[steps.first, index]
     values = begins if len(begins) >= FEW_EPISODES else steps.q[:, index]
     if coordinate.kind == "angle":
@@ -197,8 +197,8 @@ def _start(coordinate: Coordinate, steps: Transitions, index: int) -> Uniform | 
 def _starts(steps: Transitions, columns: list[int], coordinates: list[Coordinate]) -> tuple[tuple[float, ...], ...]:
     """Return the states that virtual episodes start at: those at which episodes of the log begin.
 
-    If the log has few episodes, these are evenly spaced states of the whole log. A box around the states would not do,
-    because its corners may lie where the log has never been.
+    If the log has few episodes, these are evenly spaced states of the whole log. Ranges of the states are not enough,
+    because some combinations of values within them may never have occurred.
     """
     rows = np.flatnonzero(steps.first)
     if len(rows) < FEW_STARTS:
@@ -239,8 +239,10 @@ def _entries_of(coordinate: Coordinate) -> Iterator[ObservationEntry]:
 
 
 def _action(roles: Roles, steps: Transitions, notes: list[str]) -> BoxAction | DiscreteAction | MultiDiscreteAction:
-    """Draft the action: choices that are declared, or numbered from 0 in every column; otherwise amounts. Whole numbers
-    that may be choices are asked about.
+    """Draft the action space from the values in the log.
+
+    It is discrete if choices are declared, or if every column has all whole numbers from 0. Otherwise it is continuous,
+    with a note that asks whether few whole numbers are choices.
 
     Raises:
         UnusableLog: a discrete action is declared, and its values are not numbered from 0; or an action never varies.
@@ -279,7 +281,7 @@ def _action(roles: Roles, steps: Transitions, notes: list[str]) -> BoxAction | D
 
 
 def _amounts(roles: Roles, values: Floats) -> BoxAction:
-    """Draft an action of amounts from its values (m, F). Raises ``UnusableLog`` if one never varies."""
+    """Draft a continuous action space from its values (m, F). Raises ``UnusableLog`` if an entry never varies."""
     low, high = [], []
     for index, name in enumerate(roles.action):
         ends = roles.limits.get(name, (None, None))
@@ -297,7 +299,7 @@ def _amounts(roles: Roles, values: Floats) -> BoxAction:
 
 
 def _are_codes(values: Floats) -> bool:
-    """Whether different values of an action are few whole numbers, so that they may be the codes of choices."""
+    """Whether the different ``values`` of an action entry are few whole numbers, which may be codes of choices."""
     return bool(2 <= len(values) <= MOST_DISCRETE and (values == np.floor(values)).all())
 
 
@@ -311,8 +313,13 @@ def _discrete(counts: list[int]) -> DiscreteAction | MultiDiscreteAction:
 
 
 def _questions(names: list[str], codes: list[Floats], whole: list[bool]) -> Iterator[str]:
-    """Remark on actions that are few whole numbers (``whole``) and are drafted as amounts, and ask whether they are
-    choices."""
+    """Yield notes that ask whether actions are choices, because their values are few whole numbers.
+
+    Args:
+        names: names of the action entries.
+        codes: different values of each entry.
+        whole: whether the values of each entry are few whole numbers.
+    """
     values = ", ".join(
         f"{name} of {', '.join(f'{value:g}' for value in one)}"
         for name, one, few in zip(names, codes, whole, strict=True)
@@ -331,7 +338,8 @@ def _questions(names: list[str], codes: list[Floats], whole: list[bool]) -> Iter
 
 
 def declared_choices(names: list[str], codes: list[Floats]) -> str:
-    """Return the line of a mapping that declares these different values of each action entry as choices."""
+    """Return the line of a mapping file that declares the different values (``codes``) of each action entry as its
+    choices."""
     values = ", ".join(
         f"{name} = [{', '.join(f'{value:g}' for value in one[:MOST_DISCRETE])}]"
         for name, one in zip(names, codes, strict=True)
@@ -367,7 +375,7 @@ def _about(roles: Roles, steps: Transitions) -> list[str]:
 
 
 def lost_ends(steps: Transitions) -> list[str]:
-    """Return a note if the ends of episodes are lost, because the log has no states after them."""
+    """Return a note if the log has no states after the last steps of episodes, so that no step shows how one ends."""
     if not steps.lost_ends:
         return []
     count = "1 episode ends" if steps.lost_ends == 1 else f"{steps.lost_ends} episodes end"
@@ -379,7 +387,7 @@ def lost_ends(steps: Transitions) -> list[str]:
 
 
 def _remarks(values: Floats) -> list[str]:
-    """Return a note if some values lie far from all others."""
+    """Return a note if some of the values (m,) lie far from the others; otherwise an empty list."""
     quarter, middle, three = np.quantile(values, [0.25, 0.5, 0.75])
     far: Bools = np.abs(values - middle) > FAR * (three - quarter) if three > quarter else np.zeros(0, dtype=np.bool_)
     if not far.any():
@@ -389,12 +397,12 @@ def _remarks(values: Floats) -> list[str]:
 
 
 def ending(count: int) -> str:
-    """Return a number of steps with its verb: 1 step ends, 2 steps end."""
+    """Return a number of steps with the verb in its right form: "1 step ends", "2 steps end"."""
     return f"{count} step ends" if count == 1 else f"{count} steps end"
 
 
 def limited(spec: EnvironmentSpec) -> Mapping[str, str]:
-    """Describe the range of each coordinate and of the action in words, by name."""
+    """Return a description of the range of each coordinate and of the action, by its name."""
     lines = {}
     for c in spec.coordinates:
         low, high = (c.sampling.low, c.sampling.high) if isinstance(c.sampling, Uniform) else c.sampling.limits

@@ -1,4 +1,4 @@
-"""Errors of whole logs. A fault in one row only sets that row aside."""
+"""Errors that concern a whole log. A fault of a single row is no error: the row is only left out."""
 
 from __future__ import annotations
 

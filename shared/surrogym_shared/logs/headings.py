@@ -1,4 +1,4 @@
-"""Read headings of columns: the name, its words, and the unit that stands beside it."""
+"""Split the headings of columns into the name, its words, and the unit."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class Heading:
     """Heading of a column, such as ``T [K]``.
 
     Attributes:
-        column: the heading as it is.
-        name: without the unit, such as ``T``.
-        unit: such as ``K``; empty without one.
-        words: of the name in lower case, such as ``("step", "reward")`` for ``stepReward``; single letters keep their
-            case, because t is a time and T a temperature.
+        column: the whole heading.
+        name: heading without the unit, such as ``T``.
+        unit: unit, such as ``K``; empty if the heading has none.
+        words: words of the name in lower case, such as ``("step", "reward")`` for ``stepReward``; single letters keep
+            their case, because t is a time and T a temperature.
     """
 
     column: str
@@ -51,7 +51,7 @@ class Heading:
 
 
 def heading(column: str) -> Heading:
-    """Read the heading of a column."""
+    """Split the heading of a column into name, words and unit."""
     match = UNIT.match(column)
     name, unit = column, ""
     if match is not None:
@@ -62,7 +62,8 @@ def heading(column: str) -> Heading:
 
 
 def timed(one: Heading) -> Heading:
-    """Read the last word of a name as a unit of time if it is one, as in ``time_s`` and ``timestampMs``."""
+    """Return the heading with the last word of its name as the unit, if that is a unit of time as in ``time_s`` and
+    ``timestampMs``."""
     if one.unit or len(one.words) < 2 or one.words[-1].lower() not in TIMES:
         return one
     return Heading(one.column, one.name, one.words[-1], one.words[:-1])

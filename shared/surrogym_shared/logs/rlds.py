@@ -16,14 +16,14 @@ FIRST, LAST, TERMINAL = "is_first", "is_last", "is_terminal"
 
 
 def from_rlds(table: Table) -> Table:
-    """Return a log in RLDS with next states and ends by row; any other log as it is.
+    """Convert a log in the format RLDS to rows with their next state and end; return any other log unchanged.
 
     A step of RLDS has an observation, the action taken there, and the reward paid for it. The last step of an episode
     (``is_last``) has only the observation: its action and reward mean nothing, so it is no row here. The step before it
     is the end of the episode, as a terminal state if the last step has ``is_terminal``, otherwise as cut off.
 
     Raises:
-        UnusableLog: the marks contradict each other.
+        UnusableLog: the columns ``is_first``, ``is_last`` and ``is_terminal`` contradict each other.
 
     References:
         S. Ramos et al., "RLDS: an Ecosystem to Generate, Share and Use Datasets in Reinforcement Learning", 2021.

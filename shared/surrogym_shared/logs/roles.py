@@ -34,15 +34,17 @@ from surrogym_shared.logs.rlds import from_rlds
 from surrogym_shared.logs.table import Cells, Table
 from surrogym_shared.words import listed
 
-BY = "episodes by "  # beginning of the name of a column that is made of marks of starts, or of a counter
-STARTS = ("is_first", "episode_start", "episode_starts")  # the names of RLDS and Stable-Baselines3
-INDEX = {"index", "step", "steps", "timestep", "row", "line"}  # words of columns that number rows
-COUNTERS = {"sample", "frame", "tick", "counter", "count", "number", "no", "nr", "id", "i", "k", "n"}  # whole names
+BY = "episodes by "  # prefix of the name of a column of episode numbers that was derived from another column
+STARTS = ("is_first", "episode_start", "episode_starts")  # columns that mark the first step in RLDS and SB3
+INDEX = {"index", "step", "steps", "timestep", "row", "line"}  # words in the names of columns that number rows
+# Whole names of columns that number rows.
+COUNTERS = {"sample", "frame", "tick", "counter", "count", "number", "no", "nr", "id", "i", "k", "n"}
 COUNTED = "it grows by one in each row, as the number of a row does"
 WITHIN = "it numbers the rows of each episode"
-LONGEST_HINT = 600  # letters of a mapping that a message proposes
+LONGEST_HINT = 600  # most letters of a mapping that a message proposes
 
 Shown = Callable[[Cells], bool]
+# For each role: words in a column's name, or whole names, that make the role likely, and a test of the column's cells.
 LIKELY: dict[str, tuple[set[str], set[str], Shown]] = {
     "reward": (
         {"reward", "rewards", "rew", "return", "returns"},
@@ -64,13 +66,13 @@ LIKELY: dict[str, tuple[set[str], set[str], Shown]] = {
     "time": ({"time", "timestamp", "date", "datetime", "clock", "elapsed", "seconds", "millis", "utc"}, {"ms"}, grows),
     "action": ({"action", "actions"}, set(), lambda _: True),
     "next state": ({"next"}, set(), lambda _: True),
-}  # words of a name, whole names, and what the cells of a column with this likely role show
+}
 
 
 def read_roles(table: Table, mapping: Path | Mapping[str, Any] | LogMapping | None) -> tuple[Table, Roles]:
-    """Return the roles of a table's columns, and the table with the columns that they need.
+    """Return the roles of a table's columns, and the table with derived columns, such as numbers of episodes.
 
-    Without a mapping, the names decide. A column that numbers the rows is then left out.
+    Without a mapping, the names of the columns decide, and a column that numbers the rows is left out.
 
     Raises:
         OSError: the mapping file can't be read.
@@ -122,21 +124,23 @@ def _by_name(table: Table) -> tuple[Table, Roles]:
 
 
 def _with_episodes(table: Table, name: str) -> Table:
-    """Return the table with a column of episodes that a column of marks of starts, or a counter, shows."""
+    """Return the table with a new column of episode numbers, derived from the column ``name``: marks of first rows, or
+    a counter that restarts."""
     return replace(table, columns={**table.columns, f"{BY}{name}": episodes_by(name, table.columns[name])})
 
 
 def _plain(table: Table, roles: Roles) -> list[str]:
-    """Return the columns that are states because no name says otherwise."""
+    """Return the columns that are states only because their names suggest no other role."""
     free = [column for name, column in roles.state.items() if name not in roles.following and column in table.columns]
     return [column for column in free if not STATE.match(heading(column).name)]
 
 
 def _numbering(name: str, table: Table) -> Numbering | None:
-    """Return what a column counts. That it restarts or has gaps only counts if its name is that of a counter.
+    """Return what a column counts; None if it counts nothing. A column that restarts or has gaps counts rows only if
+    its name is that of a counter.
 
     Raises:
-        UnusableLog: the rows are in another order than their numbers.
+        UnusableLog: the column numbers the rows, and they are in another order.
     """
     kind, one = numbering(table.columns[name]), heading(name)
     is_index = name in table.unnamed or bool(INDEX.intersection(one.words))
@@ -149,7 +153,7 @@ def _numbering(name: str, table: Table) -> Numbering | None:
 
 
 def _ask(table: Table, roles: Roles, plain: Sequence[str]) -> None:
-    """Refuse columns that are likely a reward, an end, an episode or a time, and would be states or be left out."""
+    """Raise ``UnusableLog`` if columns are likely a reward, an end, an episode or a time, but have no such role."""
     ignored = [name for name in roles.ignored if name in table.columns]
     likely: dict[str, str] = {}
     for name in [*plain, *ignored]:

@@ -12,7 +12,7 @@ from surrogym_shared.logs.headings import heading
 from surrogym_shared.logs.table import Bools, Floats, Ints, Table, flags, groups, numbers, times
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 
-SLACK = 1e-6  # share of a range by which a value may exceed it: the rounding of single precision
+SLACK = 1e-6  # share of a range's width by which a value may lie outside, because of rounding to single precision
 Ends = Mapping[str, tuple[float | None, float | None]]
 
 
@@ -50,7 +50,8 @@ class Rows:
 
 
 def rows_of(table: Table, roles: Roles, spec: EnvironmentSpec | None = None) -> Rows:
-    """Convert the rows to numbers, and check them against the limits of the specification, or else of the mapping."""
+    """Convert the rows of a table to numbers, and check them against the limits of the specification. Without a
+    specification, check them against the limits in the mapping."""
     faults: dict[int, list[str]] = {row: [reason] for row, reason in table.faults.items()}
     whole = np.ones(len(table), dtype=np.bool_)
     whole[list(table.faults)] = False
@@ -108,7 +109,8 @@ def _matrix(
 
 
 def _numbered(column: str, cells: Floats, choices: tuple[float, ...]) -> tuple[Floats, dict[int, str]]:
-    """Return the number of each cell's choice, (n,), and a reason for each cell that is none, by the row's index."""
+    """Convert codes of choices to the numbers of the choices from 0, (n,). Also return a reason for each cell that is
+    not a choice, by the row's index."""
     values = np.array(choices)
     same = cells[:, None] == values
     numbered = np.where(same.any(1), same.argmax(1), np.nan)

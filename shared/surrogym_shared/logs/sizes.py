@@ -1,4 +1,4 @@
-"""Largest logs that are read. Sizes are checked before the cells of a file are converted."""
+"""Limits of the size of a log, which are checked before the cells of a file are converted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LONGEST_CELL = 10_000  # most letters of a cell
 
 
 def require_sizes(where: object, rows: int, cells: int) -> None:
-    """Raise ``UnusableLog`` if a log has more rows or cells than are read."""
+    """Raise ``UnusableLog`` if the log from ``where`` has more rows or cells than allowed."""
     if rows > MOST_ROWS:
         raise UnusableLog(f"expected at most {MOST_ROWS:,} rows in {where}, got {rows:,}: import a part of the log")
     if cells > MOST_CELLS:

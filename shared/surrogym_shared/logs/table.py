@@ -24,9 +24,9 @@ NO_FINITE = ("nan", "+nan", "-nan", "inf", "+inf", "-inf", "infinity", "+infinit
 BOOLEANS = {"True": 1.0, "False": 0.0, "true": 1.0, "false": 0.0, "TRUE": 1.0, "FALSE": 0.0}
 DATES, DURATIONS = "M", "m"  # kinds of NumPy types
 NO_NUMBERS = {DATES: "dates", DURATIONS: "durations", "c": "complex numbers", "V": "records"}
-FEWEST_STAMPS = 3  # least number of dates that show that a column has time stamps
-MOST_STAMPS = 0.9  # least share of a column's numbers that are dates
-MAX_MEASURED = 1e30  # largest number, as in the server's requests
+FEWEST_STAMPS = 3  # least number of numbers from which a column is recognised as time stamps
+MOST_STAMPS = 0.9  # a column has time stamps if more than this share of its numbers are dates
+MAX_MEASURED = 1e30  # largest size of a number in a log, the same as in requests to the server
 
 
 @dataclass(frozen=True)
@@ -36,12 +36,12 @@ class Table:
     Attributes:
         columns: cells of each column (n,), by the column's name; text if the log is CSV, otherwise numbers.
         lines: line of each row in a CSV file, (n,); in other files the number of the row, from 1.
-        faults: reason for each row that can't be read as a whole, by the row's index.
+        faults: reason for each row that can't be used because of its form, by the row's index.
         cells: cells of each row as text, as in the file; empty if the log is not text.
         delimiter: character between two cells of the text.
-        heading: names as the text has them, with empty and repeated ones; empty if the log is not text.
-        unnamed: columns without a name in the file, by the words that stand for it.
-        repeated: how often a name stands in the heading, if more than once. Such columns are not in ``columns``.
+        heading: names of the columns in the file, with empty and repeated ones; empty if the log is not text.
+        unnamed: columns without a name in the file, by the names that they have in ``columns``.
+        repeated: number of columns of each name that several columns have. Such columns are not in ``columns``.
         ignored: reason for each array of the file that is not a column, by its name.
         discrete: whether the file declares the action as discrete; None if it does not say.
         limits: limits of action entries that the file declares, by the entry's name.
@@ -69,7 +69,7 @@ class Table:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the columns that have one, each once."""
+        """Names of all columns that have a name, each name once."""
         return (*(name for name in self.columns if name not in self.unnamed), *self.repeated)
 
     def row(self, index: int) -> list[str]:
@@ -80,7 +80,8 @@ class Table:
 
 
 def numbers(name: str, cells: Cells) -> tuple[Floats, dict[int, str]]:
-    """Convert cells to numbers (n,). A cell that is not a number gives NaN, and a reason by the row's index.
+    """Convert cells of the column ``name`` to numbers (n,), NaN for a cell that is not a number. Also return a reason
+    for each such cell, by the row's index.
 
     Raises:
         UnusableLog: the whole column has dates, durations, complex numbers or records.
@@ -93,7 +94,8 @@ def numbers(name: str, cells: Cells) -> tuple[Floats, dict[int, str]]:
 
 
 def times(name: str, cells: Cells) -> tuple[Floats, dict[int, str]]:
-    """Convert cells to times (n,), with a reason for each cell that is none.
+    """Convert cells of the column ``name`` to times (n,). Also return a reason for each cell that is no time, by the
+    row's index.
 
     Dates and durations of NumPy and text in ISO 8601 become seconds. Numbers keep the column's own unit.
     """
@@ -118,9 +120,10 @@ def times(name: str, cells: Cells) -> tuple[Floats, dict[int, str]]:
 
 
 def stamps(values: Floats) -> Floats | None:
-    """Return the seconds (n,) of time stamps such as 20240331001500, NaN where one is no date.
+    """Convert time stamps such as 20240331001500 to seconds (n,), NaN for a number that is no date.
 
-    Numbers are time stamps if most of them are dates from 1900 to 2199, with or without a time of day. Otherwise None.
+    Numbers are time stamps if most of them are dates from 1900 to 2199, with or without a time of day. Return None for
+    other numbers.
     """
     finite = np.where(np.isfinite(values), values, 0)
     for below in (1, 100, 10_000, 1_000_000):  # to the day, hour, minute or second
@@ -140,7 +143,8 @@ def stamps(values: Floats) -> Floats | None:
 
 
 def flags(name: str, cells: Cells) -> tuple[Bools, dict[int, str]]:
-    """Convert cells such as 1, 0, true and false to booleans (n,), with a reason for each cell that is neither."""
+    """Convert cells such as 1, 0, true and false to booleans (n,). Also return a reason for each other cell, by the
+    row's index."""
     if cells.dtype.kind not in "biuf":
         words = {**dict.fromkeys(TRUE, "1"), **dict.fromkeys(FALSE, "0")}
         cells = np.array([words.get(str(cell).strip().lower(), str(cell)) for cell in cells], dtype=np.str_)
@@ -151,7 +155,8 @@ def flags(name: str, cells: Cells) -> tuple[Bools, dict[int, str]]:
 
 
 def groups(cells: Cells) -> Ints:
-    """Number the different cells in the order of their first appearance, (n,). Each empty cell has its own number."""
+    """Return a number for each cell (n,), equal for equal cells, in the order of their first appearance. Each empty
+    cell has a number of its own."""
     codes: dict[str, int] = {}
     numbers = np.zeros(len(cells), dtype=np.int64)
     for row, cell in enumerate(cells):
@@ -181,7 +186,7 @@ def is_date(cell: str) -> bool:
 
 def _parse(cells: Cells) -> Floats:
     text = "".join(map(str, cells))
-    if text.isascii() and "_" not in text:  # excludes what NumPy reads as a number beyond decimal ones
+    if text.isascii() and "_" not in text:  # NumPy also reads 1_000 and digits of other scripts as numbers
         try:
             return cells.astype(np.float64)
         except ValueError:

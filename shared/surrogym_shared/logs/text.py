@@ -1,4 +1,4 @@
-"""Read a log from text: a heading and rows, whose cells a comma, semicolon, tab, bar or blanks separate."""
+"""Read a log from text: a heading, and rows of cells that are separated by commas, semicolons, tabs, bars or blanks."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from surrogym_shared.words import counted
 
 DELIMITERS = ",;\t|"
 BLANKS = " "
-COMMENTS = ("#", "%", "//", "sep=")  # Excel has sep=; as the first line
+COMMENTS = ("#", "%", "//", "sep=")  # beginnings of lines that are no rows; Excel writes sep=; as the first line
 LONGEST_NAME = 200  # most letters of a column's name
 JSON = re.compile(r"[{\[]\s*[{\[\"]")
-UNIT_APART = re.compile(r"\s+(?=[\[(])")  # time [s] is one name, also where blanks separate the columns
-UNNAMED = re.compile(r"^(?:unnamed column \d+|Unnamed: \d+|__index_level_\d+__)$")  # pandas has the last two
+UNIT_APART = re.compile(r"\s+(?=[\[(])")  # blanks before a unit: time [s] is one name, also if blanks separate columns
+UNNAMED = re.compile(r"^(?:unnamed column \d+|Unnamed: \d+|__index_level_\d+__)$")  # pandas writes the last two names
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def table_of_text(text: str, where: str, most_rows: int = MOST_ROWS, remarks: Se
         text: the log.
         where: source of the text, for messages.
         most_rows: largest number of rows.
-        remarks: what is known of the text, for the report on the log.
+        remarks: sentences about the text for the report on the log, which begin the table's remarks.
 
     Raises:
         UnusableLog: the text has no heading, or too many rows, columns or cells.
@@ -75,7 +75,7 @@ def table_of_text(text: str, where: str, most_rows: int = MOST_ROWS, remarks: Se
     if comments:
         remarks.append(f"{counted(comments, 'comment line')} between the rows left out")
     padded = [row if len(row) == len(names) else [*row, *([""] * len(names))][: len(names)] for row in rows]
-    # An array of text of one width would be as wide as its longest cell, in every row.
+    # Arrays of objects, because an array of text reserves the width of its longest cell in every row.
     columns = {
         name: np.array([row[i] for row in padded], dtype=object)
         for i, name in enumerate(_with_places(names))
@@ -95,7 +95,7 @@ def table_of_text(text: str, where: str, most_rows: int = MOST_ROWS, remarks: Se
 
 
 def is_unnamed(name: str) -> bool:
-    """Whether a name stands for none: that of pandas for the index of a table, or for a column without a heading."""
+    """Whether a name is only a placeholder: pandas' name of a table's index, or that of a column without a heading."""
     return UNNAMED.match(name) is not None
 
 
@@ -104,7 +104,7 @@ def _with_places(names: Sequence[str]) -> list[str]:
 
 
 def _head(text: str) -> _Head:
-    """Return the beginning of a log. Its lines are empty if the text has none."""
+    """Return the comments and the first two other lines of a log. Missing lines are empty."""
     comments, lines, before = [], list[str](), 0
     for number, line in enumerate(io.StringIO(text, newline=None)):
         if not line.strip():
@@ -121,7 +121,8 @@ def _head(text: str) -> _Head:
 
 
 def _delimiter(head: _Head) -> str:
-    """Return the delimiter that gives the first two lines the same number of cells, or the first one most of them."""
+    """Return the delimiter that gives the first two lines the same number of cells, otherwise the one that gives the
+    first line most cells."""
 
     def fit(delimiter: str) -> tuple[bool, int]:
         cells = len(_cells(head.line, delimiter))
@@ -167,7 +168,8 @@ def _heading(head: _Head, delimiter: str, where: str, remarks: list[str]) -> tup
 
 
 def _is_row(cells: Sequence[str]) -> bool:
-    """Whether a line is a row and no heading: numbers, or dates and numbers. 0, 1, 2, ... may name columns."""
+    """Whether the cells of a line are numbers or dates, so that it is a row and no heading. The line 0, 1, 2, ... is
+    taken for a heading."""
     if list(cells) == [str(number) for number in range(len(cells))] and len(cells) > 1:
         return False
     return any(map(is_number, cells)) and all(not cell or is_number(cell) or is_date(cell) for cell in cells)

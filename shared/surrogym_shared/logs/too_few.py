@@ -14,7 +14,8 @@ DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+\s*$")
 
 
 class TooFewSteps(UnusableLog):
-    """A log has too few usable steps. The error carries the log, and the reason of each rejected row."""
+    """A log has too few usable steps. ``table`` is the log, and ``steps.rejected`` has the reason of each unusable
+    row."""
 
     def __init__(self, message: str, table: Table, steps: Transitions) -> None:
         super().__init__(message)
@@ -26,7 +27,7 @@ class TooFewSteps(UnusableLog):
 
 
 def require_steps(table: Table, steps: Transitions, least: int) -> None:
-    """Raise ``TooFewSteps`` if the log has fewer than ``least`` usable steps. The message says what the log has."""
+    """Raise ``TooFewSteps`` with the most frequent reason if the log has fewer than ``least`` usable steps."""
     if len(steps) >= least:
         return
     minimum = "two usable steps" if least == 2 else "one usable step"
@@ -53,5 +54,5 @@ def require_steps(table: Table, steps: Transitions, least: int) -> None:
 
 
 def _kind(reason: str) -> str:
-    """Return a reason without its value and line, so that equal kinds of faults compare as equal."""
+    """Return the reason of a rejected row without value and line number, so that equal kinds of faults are equal."""
     return re.sub(r"line \d+", "line", reason.partition(", got")[0])

@@ -13,7 +13,7 @@ from surrogym_shared.logs.clock import GAP, Ticks, episodes_of, repeated, ticks_
 from surrogym_shared.logs.rows import Rows
 from surrogym_shared.logs.table import Bools, Floats, Ints
 
-ONE_INTERVAL = 0.5  # a step's time may differ from the sampling interval by this share of it
+ONE_INTERVAL = 0.5  # largest difference between a step's duration and the sampling interval, as a share of the latter
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def transitions_of(rows: Rows) -> Transitions:
     order = [row for row in np.argsort(episode, kind="stable").tolist() if rows.faults.get(row) or row not in rejected]
     out_of_order = _backwards(rows, episode, order, rejected, coarse=ticks is not None)
     _reject(rejected, out_of_order)
-    # Without the rows out of order, the row before them continues with the row after them.
+    # Rows that are out of order are skipped: the row before them is followed by the row after them.
     order = [row for row in order if row not in out_of_order]
     follower = {a: b for a, b in pairwise(order) if episode[a] == episode[b]}
     if rows.episode is not None:
@@ -121,8 +121,8 @@ def _reject(rejected: dict[int, str], reasons: dict[int, str]) -> None:
 def _backwards(
     rows: Rows, episode: Ints, order: Iterable[int], rejected: dict[int, str], *, coarse: bool
 ) -> dict[int, str]:
-    """Find rows whose time is not later than that of the row before in their episode; it may be equal if the clock is
-    ``coarse``."""
+    """Return a reason for each row whose time is not later than that of the row before in its episode, by the row's
+    index. With a ``coarse`` clock, equal times are allowed."""
     if rows.time is None:
         return {}
     latest: dict[int, int] = {}
@@ -144,7 +144,8 @@ def _backwards(
 
 
 def _going_on(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) -> dict[int, str]:
-    """Find rows that are marked as the end of their episode, although another row of the episode follows."""
+    """Return a reason for each row that is marked as the end of its episode although another row of it follows, by the
+    row's index."""
     return {
         row: f"{rows.roles.terminated}: expected 0, as line {rows.lines[after]} continues the episode, got 1"
         for row, after in follower.items()
@@ -187,7 +188,7 @@ def _paired(
 
 
 def _firsts(episode: Ints, order: list[int]) -> Iterable[tuple[int, bool]]:
-    """Return the rows in the given order, each with whether it is the first of its episode."""
+    """Yield each row in the given order, and whether it is the first of its episode."""
     earlier: set[int] = set()
     for row in order:
         number = int(episode[row])

@@ -1,8 +1,8 @@
-"""Evidence that a column of a log wraps: an angle, a time of day, an encoder.
+"""Evidence that a column of a log wraps after a full turn, as an angle, a time of day or an encoder does.
 
-A jump alone is no evidence: a siphon empties a tank at once, too. A column wraps if the value after each jump is where
-the motion leads, once a whole turn is added. The motion is what the steps without a jump show: a linear regression of
-the change on the actions, on the other states, on the place in the turn, and on the change before.
+A jump alone is no evidence: a tank with a siphon also empties at once. A column wraps if each value after a jump, with
+a whole turn added, is the one that the motion predicts. The motion is estimated from the steps without a jump: a linear
+regression of the change on the actions, the other states, the position in the turn, and the change before.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ KNOWN = {FULL_TURN: "radians", 360.0: "degrees", 400.0: "gon", 1.0: "turns", 24.
     float(2**bits): "counts" for bits in range(8, 25)
 }
 FILLED = 0.8  # least width of a column's values, as a share of a turn
-MOST_JUMPS = 1 / 3  # most steps that jump, as a share of all
-CONTINUES = 4.0  # standard deviations by which a jump may differ from the motion
-ROUGHLY = 0.1  # the same as a share of a usual change, for a motion that is not linear
-OUTLIERS = 0.05  # share of the jumps that may differ more
-BY_CHANCE = 1e-3  # probability that a column without turns looks as if it had
-NEAR = 1e-3  # share of a turn by which the size of the jumps may differ from it
-FINEST = 1e-6  # least standard deviation of the motion, as a share of the width of the values
+MOST_JUMPS = 1 / 3  # largest share of the steps that may jump
+CONTINUES = 4.0  # most standard deviations by which a jump, with a turn added, may differ from the predicted change
+ROUGHLY = 0.1  # such a difference as a share of a usual change, for a motion that is not linear
+OUTLIERS = 0.05  # largest share of the jumps that may differ more from the predicted change
+BY_CHANCE = 1e-3  # largest probability that jumps of a column without turns match a turn by chance
+NEAR = 1e-3  # largest difference between the size of the jumps and a turn, as a share of the turn
+FINEST = 1e-6  # least standard deviation of the predicted change, as a share of the width of the values
 
 
 @dataclass(frozen=True)
 class Turn:
-    """A turn of a column.
+    """The turn after which the values of a column wrap.
 
     Attributes:
         size: size of the turn, in the unit of the column.
@@ -45,7 +45,7 @@ class Turn:
 
 
 def turn_of(steps: Transitions, index: int) -> Turn | None:
-    """Return the turn of a column of states; None if it does not wrap."""
+    """Return the turn after which column ``index`` of the states wraps; None if it does not wrap."""
     before, after = steps.q[:, index], steps.q_next[:, index]
     change, low, high = after - before, min(before.min(), after.min()), max(before.max(), after.max())
     width = float(high - low)
@@ -75,14 +75,14 @@ def turn_of(steps: Transitions, index: int) -> Turn | None:
 
 
 def _lies_in(low: float, high: float, turn: float) -> bool:
-    """Whether values from ``low`` to ``high`` lie within one turn that begins at 0, or is centred there."""
+    """Whether values from ``low`` to ``high`` lie within one turn that begins at 0 or is centred at 0."""
     slack = NEAR * turn
     return (low >= -slack and high <= turn + slack) or (low >= -turn / 2 - slack and high <= turn / 2 + slack)
 
 
 def _motion(steps: Transitions, index: int, change: Floats, jumps: Bools, width: float) -> tuple[Floats, float]:
-    """Fit the motion to the steps without a jump. Return the changes (m,) that it predicts for all steps, and the
-    standard deviation of the error at the steps without a jump."""
+    """Fit a linear model of a column's change to the steps without a jump. Return the changes (m,) that it predicts for
+    all steps, and the standard deviation of its error at the steps without a jump."""
     slow = ~jumps
     follows = np.zeros(len(change), dtype=np.bool_)
     follows[1:] = (steps.row[1:] == steps.row[:-1] + 1) & (steps.q[1:] == steps.q_next[:-1]).all(1) & slow[:-1]

@@ -1,4 +1,4 @@
-"""Detect columns of a log that are outside a specification's ranges, or in another unit than known rewards."""
+"""Detect columns of a log that lie outside the ranges of a specification, or that seem to be in another unit."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from surrogym_shared.logs.table import Floats
 from surrogym_shared.spec import EnvironmentSpec, limits
 
 BEYOND = 20.0  # distance outside a coordinate's range, in widths of the range, that no real plant reaches
-NARROW, MOST_OUTSIDE = 0.25, 0.1  # share of a range that a log covers, and of its rows outside, that are worth a note
-FEWEST = 8  # least number of known rewards that show how large rewards are
+NARROW = 0.25  # a log that covers a smaller share of a coordinate's range gets a note
+MOST_OUTSIDE = 0.1  # a log with a larger share of its rows outside a coordinate's range gets a note
+FEWEST = 8  # least number of known rewards with which the rewards of a log are compared
 
 
 def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:
-    """Refuse states q (n, C) with a column that is not in its coordinate's unit, or not in its sampling range.
+    """Check that states q (n, C) lie in the sampling ranges of their coordinates, and seem to be in their units.
 
-    A log outside the sampling range shows nothing of the states that the surrogate is for. Angles are not checked,
+    A log outside the sampling ranges says nothing about the states that the surrogate is for. Angles are not checked,
     because they wrap.
 
     Args:
         q: the states.
         spec: specification with the ranges of the coordinates.
-        which: what a message says before the name of a coordinate.
+        which: words before the name of a coordinate in a message, such as "next ".
 
     Raises:
         UnusableLog: the middle half of a column lies outside the coordinate's range, or is far wider than it.
@@ -48,8 +49,8 @@ def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:
 
 
 def unit_notes(q: Floats, spec: EnvironmentSpec) -> list[str]:
-    """Return a sentence for each column of states q (n, C) that may be in another unit: it covers a small part of its
-    coordinate's sampling range, or many of its rows lie outside. Both may be right, so nothing is refused."""
+    """Return a sentence for each column of states q (n, C) that may be in another unit, because it covers a small part
+    of its coordinate's sampling range, or many of its rows lie outside the range."""
     notes = []
     for index, coordinate in enumerate(spec.coordinates):
         column = q[np.isfinite(q[:, index]), index]
@@ -70,9 +71,9 @@ def unit_notes(q: Floats, spec: EnvironmentSpec) -> list[str]:
 
 
 def require_reward_unit(paid: Floats, known: Floats, name: str) -> None:
-    """Refuse rewards that seem to be in another unit than those of a surrogate's samples.
+    """Check that the rewards of a log seem to be in the same unit as those of a surrogate's samples.
 
-    Rewards of 0 have no unit, and few samples may all have small rewards by chance. In both cases nothing is refused.
+    Nothing is checked if the samples are few, whose rewards may be small by chance, or if all their rewards are 0.
 
     Args:
         paid: rewards of the log, (m,).

@@ -11,12 +11,13 @@ import numpy as np
 from surrogym_shared.logs.table import is_number
 from surrogym_shared.words import visible
 
-FORMULA = "=+-@\uff1d\uff0b\uff0d\uff20"  # what begins a formula, also in full width
-EVALUATED = "evaluated"  # array that marks steps of an evaluation in the surrogate's own environment
+FORMULA = "=+-@\uff1d\uff0b\uff0d\uff20"  # first characters of a formula in a spreadsheet, also in full width
+EVALUATED = "evaluated"  # array that marks a file's steps as those of an evaluation in the surrogate's environment
 
 
 def spreadsheet_cell(value: Any) -> Any:
-    """Return a cell of CSV that no spreadsheet reads as a formula and no terminal as an order. Numbers stay numbers."""
+    """Return a cell for CSV that spreadsheets don't read as a formula and terminals don't read as a control sequence.
+    Numbers stay unchanged."""
     if not isinstance(value, str):
         return value
     text = visible(value)

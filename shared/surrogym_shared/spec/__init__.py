@@ -1,8 +1,8 @@
-"""EnvironmentSpec: what is known of an original environment before the first query.
+"""Specification of an original environment (``EnvironmentSpec``): what is known of it before the first query.
 
 Symbols: coordinates ``q`` (n, C), observation ``o`` (n, D), action ``u`` (n, F). A specification is data. Adapters make
 it for known environments, and people write it as JSON or Python for their own. No part of it is ever evaluated as code.
-Contradictions are refused, with what was expected and what came.
+A contradiction raises an error that says what was expected and what came.
 """
 
 from __future__ import annotations

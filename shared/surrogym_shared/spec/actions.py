@@ -13,8 +13,8 @@ from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_DISCRETE_ACTIONS, Froz
 class BoxAction(Frozen):
     """Continuous action in [low, high].
 
-    ``bins`` offers each dimension to the policy as this many equally spaced values (the paper's discretised control).
-    The model and the sampler always get the continuous value.
+    ``bins`` is the number of equally spaced values in each dimension from which a policy chooses (the paper's
+    discretised control); None for a continuous policy. The model and the sampler always get the continuous value.
     """
 
     kind: Literal["box"] = "box"

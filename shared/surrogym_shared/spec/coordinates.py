@@ -162,8 +162,8 @@ class Coordinate(Frozen):
 
     @property
     def settable(self) -> tuple[float, float]:
-        """Range that the original environment can be set to: the coordinate's bounds, or its sampling range without
-        them."""
+        """Range of values to which the original environment can be set: the bounds of the coordinate, or its sampling
+        range where it has no bound."""
         low, high = limits(self.sampling)
         if self.bounds is None:
             return low, high

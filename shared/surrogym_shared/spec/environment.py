@@ -21,7 +21,7 @@ Access = Literal["any", "snapshot", "reset"]
 
 
 def _require_setting(value: object) -> object:
-    """Raise ``ValueError`` if a setting has none of the allowed types. Else a union's error would name one of them."""
+    """Raise ``ValueError`` if a setting has none of the allowed types. Pydantic's error would name only one of them."""
     allowed = isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value))
     require(allowed, f"expected a finite number, true, false or a text, got {str(value)[:SHOWN]}")
     return value
@@ -31,14 +31,14 @@ Setting = Annotated[StrictBool | StrictInt | StrictFloat | StrictStr, BeforeVali
 
 
 class Choice(Frozen):
-    """Choice of one of several named parts, with settings of its own."""
+    """Choice of a component by its name, such as a family of models, with the settings of this component."""
 
     name: Name
     settings: dict[Name, Setting] = Field(default_factory=dict, max_length=64)
 
 
 class AcquisitionChoice(Choice):
-    """Choice of an acquisition, with its settings."""
+    """Choice of an acquisition, the criterion for the next query, with its settings."""
 
 
 class ModelChoice(Choice):
@@ -50,20 +50,20 @@ class Design(Frozen):
 
     ``preset``: ``default``, or ``paper``, the method as published, changed only where it can't work.
 
-    ``budget``: real steps of the design, initial ones included. With 0 the design takes none, and the model is that of
-    a log.
+    ``budget``: number of real steps of the design, with the initial ones. With 0 the design takes no real steps, and
+    the model is learned from a log.
 
-    ``initial``: how many of them form a Latin hypercube, before the first model.
+    ``initial``: number of these steps that form a Latin hypercube, before the first model.
 
     ``acquisition``: criterion that chooses the other queries, by name or with settings. ``integrated_variance``, the
-    default's, takes the query that lowers the variance most, over the range and where policies went. ``variance`` takes
-    the largest standard deviation. ``uncertainty_index`` is the paper's (eq. 12). ``latin_hypercube`` takes the whole
-    budget as one hypercube, whatever ``initial`` is; steps beyond the budget go to the largest gaps. A package on
-    the server may add others.
+    default, takes the query that lowers the variance most, averaged over the sampling range and over states that
+    policies visited. ``variance`` takes the query with the largest standard deviation. ``uncertainty_index`` is the
+    criterion of the paper (eq. 12). ``latin_hypercube`` takes the whole budget as one hypercube, whatever ``initial``
+    is; steps beyond the budget go to the largest gaps. A package on the server may add others.
 
-    ``model``: family of models: ``gaussian_process``, the default, ``sparse_gaussian_process`` (the same with the
-    setting ``inducing`` of 300) for thousands of steps,
-    ``ensemble`` (of networks), or one from a package on the server.
+    ``model``: family of models. ``gaussian_process`` is the default. ``sparse_gaussian_process``, the same with the
+    setting ``inducing`` of 300, is for thousands of steps. ``ensemble`` is of neural networks. A package on the server
+    may add others.
 
     ``tolerance``: numerator of eq. 9 for outputs without a declared tolerance. ``relative`` is 5 % of the output's
     standard deviation over the initial design, ``raw`` is 1 in the output's own unit, as published.
@@ -153,16 +153,18 @@ class EnvironmentSpec(Frozen):
 
     @property
     def unknown_steps(self) -> int:
-        """Number of first steps of an episode that a model does not learn from, because lags are not known yet."""
+        """Number of first steps of an episode that a model does not learn from, because the values of coordinates that
+        repeat the past (lags) are not known yet."""
         return max(c.counted for c in self.coordinates)
 
     @property
     def preset(self) -> Preset:
-        """The preset, which has a value for each choice that the specification leaves out."""
+        """Preset of the design, which has a value for each setting that the specification leaves out."""
         return PRESETS[self.design.preset]
 
     def known(self, coordinates: Sequence[float]) -> bool:
-        """Whether the lags of coordinates (C,) are known, so that a model learns from a step that begins there."""
+        """Whether the entries of coordinates (C,) that repeat the past (lags) are known, so that a model can learn from
+        a step that begins at these coordinates."""
         return all(q >= c.counted for c, q in zip(self.coordinates, coordinates, strict=True) if c.counted)
 
     @model_validator(mode="after")
@@ -227,7 +229,8 @@ class EnvironmentSpec(Frozen):
         return self
 
     def _require_lags(self) -> None:
-        """Check that each lag repeats something that is known, no older than an episode, and that there is a past."""
+        """Check that each lag repeats a known value, is shorter than an episode, and has a past to repeat (queries are
+        rollouts)."""
         earlier: dict[str, Coordinate] = {}
         age = dict.fromkeys(self.coordinate_names, 0)
         longest = min((limit for limit in (self.time_limit, self.max_rollout) if limit is not None), default=math.inf)

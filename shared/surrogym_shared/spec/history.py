@@ -1,4 +1,5 @@
-"""A specification with lags, for an environment whose observation does not determine what happens next."""
+"""Add lags (coordinates that repeat the past) to a specification, for an environment whose observation does not
+determine the next state."""
 
 from __future__ import annotations
 
@@ -21,19 +22,19 @@ def with_history(
     largest: Mapping[str, float] | None = None,
     at_start: Mapping[str, float] | None = None,
 ) -> EnvironmentSpec:
-    """Add lags to the coordinates and to what a policy observes.
+    """Add lags (past actions, and past changes of coordinates) to the coordinates and to the observation.
 
     Args:
-        spec: its coordinates are those that the environment reads; its queries are rollouts.
+        spec: specification whose coordinates can all be measured in the environment, with queries of kind ``rollout``.
         changes: number of earlier changes of each moving coordinate, such as 1 for a hidden speed.
         actions: number of earlier actions. An action that takes effect after a dead time of three steps needs three,
             and one more if the plant is sampled with a zero-order hold and has a lag of its own.
         largest: largest change of each moving coordinate in one step, in its unit; needed for ``changes``.
-        at_start: largest change of a coordinate in the step before a reset, if the environment may move already then.
-            As nobody knows this change, the first steps of each episode are not learned from.
+        at_start: largest change of a coordinate in the step before a reset, if the environment may move at a reset.
+            This change is unknown, so a model does not learn from the first steps of each episode.
 
     Raises:
-        ValueError: the specification can be set to states, or ``largest`` does not fit the moving coordinates.
+        ValueError: the environment can be set to states, or ``largest`` does not fit the moving coordinates.
 
     Examples:
         >>> with_history(spec, changes=1, actions=4, largest={"level": 0.3})
@@ -68,7 +69,7 @@ def with_history(
 
 
 def _of_changes(coordinate: Coordinate, count: int, largest: float) -> Iterable[Coordinate]:
-    """Lags of a coordinate's changes, the latest first."""
+    """Yield coordinates that repeat the last ``count`` changes of a coordinate, the latest change first."""
     name = coordinate.name
     for age in range(1, count + 1):
         lag = Lag(kind="change", of=name) if age == 1 else Lag(kind="value", of=f"{name}.change{age - 1}")
@@ -78,7 +79,7 @@ def _of_changes(coordinate: Coordinate, count: int, largest: float) -> Iterable[
 
 
 def _of_actions(spec: EnvironmentSpec, entry: int, count: int) -> Iterable[Coordinate]:
-    """Lags of an entry of the action, the latest first."""
+    """Yield coordinates that repeat the last ``count`` values of an entry of the action, the latest value first."""
     action = spec.action
     if isinstance(action, BoxAction):
         low, high = action.low[entry], action.high[entry]
@@ -92,13 +93,13 @@ def _of_actions(spec: EnvironmentSpec, entry: int, count: int) -> Iterable[Coord
 
 
 def _counter(steps: int) -> Coordinate:
-    """The number of steps since the reset, up to ``steps``."""
+    """Return the coordinate that counts the steps since the reset, up to ``steps``."""
     bounds = Bounds(low=0.0, high=float(steps))
     return Coordinate(name=COUNTER, sampling=Uniform(low=0.0, high=float(steps)), bounds=bounds, lag=Lag(kind="steps"))
 
 
 def _at_rest(lag: Coordinate) -> float:
-    """The value of a lag before the first step: nothing has changed, and the action was 0, or the nearest to it."""
+    """Return the value of a lag before the first step: no change, and the action closest to 0."""
     if lag.name == COUNTER:
         return lag.settable[1]
     low, high = lag.settable

@@ -16,9 +16,9 @@ class Reward(Frozen):
     """Settings of a learned reward, which is the usual case.
 
     ``timing``: the state that the reward depends on. ``before`` is (q, u), as in Gymnasium's Pendulum; ``after`` is
-    (q', u), as in the paper; ``auto`` chooses at each fit the one that the data favour.
+    (q', u), as in the paper; ``auto`` chooses at each fit the timing that the data favour.
 
-    ``penalty``: k of eq. 14, reward = mean - k * deviation. None takes the preset's (default 0, paper 3).
+    ``penalty``: k of eq. 14, reward = mean - k * deviation. None takes the value of the preset (default 0, paper 3).
     """
 
     kind: Literal["learned"] = "learned"
@@ -63,7 +63,7 @@ class RewardTerm(Frozen):
 
 
 class DeclaredReward(Frozen):
-    """A known reward, the sum of its terms, on which no query is spent. It is data, never evaluated as code.
+    """A known reward, the sum of its terms, so that it is not learned. It is data, never evaluated as code.
 
     ``timing`` chooses the state that the terms depend on. ``terminal`` is added to the reward of a step that ends the
     episode.
@@ -85,7 +85,7 @@ AnyReward = Annotated[
 
 
 class Success(Frozen):
-    """Criteria of a successful evaluation episode. All given ones must hold.
+    """Criteria of a successful evaluation episode. All criteria that are given must hold.
 
     ``hold``: inequalities that all hold in each of the last ``hold_steps`` steps. ``min_steps``: smallest length of the
     episode. ``terminated``: whether the episode has to end by termination. ``min_return``: smallest return.

@@ -12,7 +12,7 @@ from surrogym_shared.spec.base import MAX_INEQUALITIES, MAX_TERM_PARTS, Frozen, 
 
 
 class Part(Frozen):
-    """Part of a term: coefficient * phi(q), where phi is ``one`` = 1, ``linear`` = a.q, ``sin`` = sin(a.q) or
+    """Summand of a term: coefficient * phi(q), where phi is ``one`` = 1, ``linear`` = a.q, ``sin`` = sin(a.q) or
     ``cos`` = cos(a.q)."""
 
     function: Function

@@ -19,14 +19,14 @@ from surrogym_shared.states import QueryStatus as QueryStatus
 from surrogym_shared.states import SamplePurpose as SamplePurpose
 
 PROTOCOL = 1
-LEASE_SECONDS = 60.0  # default of a claim: of a query by a sampler, and of a job by a worker
+LEASE_SECONDS = 60.0  # default duration of a lease, on a query by a sampler or on a job by a worker
 MAX_LANES = 65_536
 MAX_PARTICLES = 1_000_000
 MAX_CLAIM = 256
 MAX_BATCH = 65_536
 MAX_IMAGINED = 500  # most steps of an imagined episode
 MAX_DRAWS = 64
-MAX_MEASURED = 1e30  # variances overflow beyond it, so one larger sample would prevent every fit
+MAX_MEASURED = 1e30  # largest number of a sample; the variance of larger ones overflows, which prevents every fit
 
 Role = Literal["read", "train", "sample", "admin"]
 

@@ -1,4 +1,4 @@
-"""Wire model of drift. It is no part of what a thin client loads."""
+"""Wire model of drift. The thin client does not load this module."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wire models of jobs: what a trainer worker is asked to do, how far it is, and how it ended."""
+"""Wire models of jobs for trainer workers: tasks, progress and results."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from surrogym_shared.states import JobEnd as JobEnd
 from surrogym_shared.states import JobStatus as JobStatus
 from surrogym_shared.wire.base import LEASE_SECONDS, Key, Measured, Reply, Request
 
-MAX_JOB_EPISODES = 1_000  # real episodes of an evaluation
-MAX_JOB_STEPS = 10_000_000  # virtual steps of a training
-MAX_JOB_POINTS = 200  # of a curve
+MAX_JOB_EPISODES = 1_000  # most real episodes of an evaluation
+MAX_JOB_STEPS = 10_000_000  # most virtual steps of a training
+MAX_JOB_POINTS = 200  # most points of a training's curve
 
 JobAlgorithm = Literal["ppo", "fastppo", "a2c", "sac", "td3", "ddpg", "dqn", "cmaes"]
 JobPreset = Literal["default", "quick"]
@@ -78,7 +78,7 @@ class EvaluateTask(Request):
     )
     reference: bool = Field(
         default=False,
-        exclude_if=lambda value: not value,  # older workers don't know it
+        exclude_if=lambda value: not value,  # omitted if false, because older workers refuse the field
         description="also run the same starts with the reference controller that the worker was started with",
     )
     video: bool = Field(
@@ -123,7 +123,7 @@ class ClaimJob(Request):
     )
     reference: bool = Field(
         default=False,
-        exclude_if=lambda offered: not offered,  # older servers don't know it
+        exclude_if=lambda offered: not offered,  # omitted if false, because older servers refuse the field
         description="whether the worker has a reference controller; evaluations that ask for one go to no other",
     )
     wait_seconds: Annotated[float, Field(ge=0, le=60)] = Field(
@@ -145,7 +145,7 @@ class LeasedJob(Reply):
 
 
 class ClaimedJob(Reply):
-    """Reply to a claim."""
+    """Reply to a worker's request for a job."""
 
     job: LeasedJob | None = Field(description="the leased job; null if none came in time")
 
@@ -181,7 +181,7 @@ class JobState(Request):
 
 
 class ReportJob(Request):
-    """Heartbeat of a worker: the lease of its job ends ``lease_seconds`` from now."""
+    """Heartbeat of a worker, with the progress of its job. It renews the lease for ``lease_seconds``."""
 
     lease_token: Key = Field(description="token of the lease")
     lease_seconds: LeaseSeconds = Field(default=LEASE_SECONDS, description="seconds from now until the lease ends")
@@ -189,7 +189,7 @@ class ReportJob(Request):
 
 
 class ReportedJob(Reply):
-    """Reply to a report."""
+    """Reply to a worker's report on its job."""
 
     cancel: bool = Field(
         description="whether a person cancelled the job: the worker then stops, and keeps the best policy so far"

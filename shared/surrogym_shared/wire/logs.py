@@ -11,8 +11,8 @@ from surrogym_shared.patterns import VISIBLE
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire.base import Reply, Request
 
-MAX_LOG = 4 * 1024 * 1024  # letters
-MAX_REJECTED = 1_000  # rows that a reply lists
+MAX_LOG = 4 * 1024 * 1024  # most letters of a log
+MAX_REJECTED = 1_000  # most rejected rows that a reply lists
 
 
 class SentLog(Request):
@@ -49,7 +49,7 @@ class RejectedRow(Reply):
 
 
 class LogReport(Reply):
-    """Result of reading a log's rows."""
+    """Report on the rows of a log and the roles of its columns."""
 
     rows: int = Field(description="number of rows, without the heading")
     steps: int = Field(description="number of usable steps")
@@ -64,14 +64,14 @@ class LogReport(Reply):
 
 
 class DraftedLog(LogReport):
-    """A specification drafted from a log, with the report on the log's rows."""
+    """Reply with a specification drafted from a log, and with the report on the log's rows."""
 
     spec: EnvironmentSpec = Field(description="the draft, to be checked by a person")
     notes: list[str] = Field(description="what each part of the draft was concluded from")
 
 
 class AddedLog(LogReport):
-    """Reply after the usable rows of a log were stored or checked."""
+    """Reply after the usable rows of a log were stored as samples, or only checked, with the report on the rows."""
 
     stored: int = Field(description="number of new samples; 0 if the rows were only checked")
     duplicates: int = Field(description="number of usable steps that were stored before")

@@ -11,24 +11,24 @@ from surrogym_shared.patterns import ALIAS, DIGEST, VISIBLE
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire.base import MAX_MEASURED, Key, Measured, Reply, Request, Vector
 
-PolicyForm = Literal["zip", "onnx", "pt2", "mp4", "gif"]  # endings of policy files
+PolicyForm = Literal["zip", "onnx", "pt2", "mp4", "gif"]  # suffixes of policy files, and of videos of policies
 Controller = Literal["policy", "zero", "random", "reference"]
-TraceRank = Literal["paired", "best", "median", "worst"]  # paired: from the same start for every controller
+TraceRank = Literal["paired", "best", "median", "worst"]  # paired: an episode from the same start for every controller
 Digest = Annotated[str, Field(pattern=DIGEST, description="SHA-256 of the file, as hex")]
 AliasName = Annotated[str, Field(pattern=ALIAS)]
 Count = Annotated[int, Field(ge=0, le=2**53)]
 Text = Annotated[str, Field(max_length=2_000, pattern=VISIBLE)]
 
-FEWEST_TO_JUDGE = 30  # episodes: the mean of fewer is too uncertain to judge a promise
+FEWEST_TO_JUDGE = 30  # least number of episodes whose mean return is certain enough to judge a promised return
 MAX_CURVE = 500
 MAX_EPISODES = 10_000
 MAX_TRACE = 10_000  # most steps of one episode's trace
 MAX_TRACES = 16
-CARD_DEPTH = 8  # levels of lists and objects in the settings of a card
+CARD_DEPTH = 8  # most levels of nested lists and objects in the settings of a policy's training
 
 
 class PolicyPromise(BaseModel):
-    """Mean return over 100 real starts that the surrogate predicts: median, 5 % and 95 % quantile."""
+    """Prediction of a policy's mean return over 100 real episodes: median, 5 % and 95 % quantile."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
@@ -40,7 +40,7 @@ class PolicyPromise(BaseModel):
 
 
 class PolicyRangeLeft(BaseModel):
-    """Where a policy's way leaves the sampling range most often."""
+    """The end of a coordinate's sampling range that a policy's states exceed most often."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
@@ -52,7 +52,7 @@ class PolicyRangeLeft(BaseModel):
 
 
 class PolicyAudit(BaseModel):
-    """Result of comparing the model with real steps, most of them on the policy's way."""
+    """Result of an audit, which compares the model with real steps, most of them at states that the policy visits."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
@@ -78,7 +78,7 @@ class PolicyAudit(BaseModel):
 
 
 class PushedCard(BaseModel):
-    """Settings and results of a policy's training. Unknown fields are dropped."""
+    """Card of a policy: settings and results of its training, as sent to the server. Unknown fields are dropped."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
@@ -110,7 +110,7 @@ class CurvePoint(BaseModel):
 
 
 class FileNotice(Request):
-    """Announcement of a file. The upload is accepted only if it is exactly this file."""
+    """Announcement of a file to be uploaded. The upload is accepted only if size and digest match."""
 
     form: PolicyForm = Field(description="form of the file, which is also the ending of its name")
     bytes: Annotated[int, Field(ge=1)] = Field(description="size of the file")
@@ -118,12 +118,12 @@ class FileNotice(Request):
 
 
 class AddPolicy(Request):
-    """A policy: its card, its training curve, and the announcement of its file.
+    """Request to store a policy: its card, its training curve, and the announcement of its file.
 
-    A version never changes: if the server has this file with another card or curve, this is a new version.
+    A stored version never changes. The same file with another card or curve becomes a new version.
     """
 
-    model_config = ConfigDict(extra="forbid", strict=False)  # the card validates its own types
+    model_config = ConfigDict(extra="forbid", strict=False)  # the card checks its own types
 
     card: PushedCard = Field(description="settings and results of the training")
     curve: list[CurvePoint] = Field(default=[], max_length=MAX_CURVE, description="curve of the training")
@@ -132,7 +132,7 @@ class AddPolicy(Request):
     @field_validator("card")
     @classmethod
     def _sane(cls, card: PushedCard) -> PushedCard:
-        """Refuse numbers that are not finite or are too large, also within the settings, which have any form."""
+        """Refuse numbers that are not finite or are too large, also in the settings, which may have any structure."""
         _require_sane("card", card.model_dump(exclude={"spec"}), CARD_DEPTH)
         promises = [card.promise, *((card.audit.before, card.audit.after) if card.audit else ())]
         for promise in [one for one in promises if one is not None]:
@@ -149,7 +149,8 @@ class AddPolicy(Request):
 
 
 def _require_sane(place: str, value: Any, depth: int) -> None:
-    """Require finite numbers of at most ``MAX_MEASURED`` and text without NUL, at most ``depth`` levels deep."""
+    """Raise ``ValueError`` unless a nested value has finite numbers of at most ``MAX_MEASURED``, text without NUL, and
+    at most ``depth`` levels. ``place`` is its name in the message."""
     if depth < 0:
         raise ValueError(f"{place}: expected at most {CARD_DEPTH} levels of lists and objects, got more")
     if isinstance(value, dict):
@@ -158,14 +159,14 @@ def _require_sane(place: str, value: Any, depth: int) -> None:
     elif isinstance(value, (list, tuple)):
         for number, each in enumerate(value):
             _require_sane(f"{place}.{number}", each, depth - 1)
-    elif isinstance(value, (int, float)) and not abs(value) <= MAX_MEASURED:  # NaN compares false
+    elif isinstance(value, (int, float)) and not abs(value) <= MAX_MEASURED:  # also true for NaN
         raise ValueError(f"{place}: expected a finite number of at most {MAX_MEASURED:g} in size, got {value:g}")
     elif isinstance(value, str) and "\0" in value:
         raise ValueError(f"{place}: expected text without the character NUL, got {value[:40]!r}")
 
 
 class EpisodeTrace(Request):
-    """One real episode of T steps."""
+    """States, actions and rewards of one real episode of T steps."""
 
     rank: TraceRank = Field(
         description="which episode it is: the best, median or worst of the evaluation, or ``paired``, from the "
@@ -180,7 +181,7 @@ class EpisodeTrace(Request):
 
 
 class AddEvaluation(Request):
-    """Add the results of real episodes: of a policy, or of a baseline that ran the same starts.
+    """Request to store the results of real episodes of a policy, or of another controller from the same starts.
 
     ``returns``, ``lengths`` and ``success`` have one entry for each episode.
     """
@@ -229,7 +230,7 @@ class PutAlias(Request):
 
 
 class PolicyFileView(Reply):
-    """A file of a policy."""
+    """Description of a stored or announced file of a policy."""
 
     form: PolicyForm = Field(description="form of the file, which is also the ending of its name")
     bytes: int = Field(description="size of the file")
@@ -248,7 +249,7 @@ class Interval(Reply):
 
 
 class EvaluationView(Reply):
-    """Statistics of real episodes."""
+    """Statistics of the real episodes of one evaluation."""
 
     id: int = Field(description="number of the evaluation")
     controller: Controller = Field(description="who chose the actions")
@@ -294,7 +295,7 @@ class EvaluationDetail(EvaluationView):
 
 
 class PolicyView(Reply):
-    """One version of a surrogate's policies."""
+    """One version of a surrogate's policies, with its files and evaluations."""
 
     version: int = Field(description="version number; it is never used again")
     created_at: float = Field(description="when it was stored, in seconds since 1970, by the server's clock")

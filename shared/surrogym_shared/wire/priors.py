@@ -1,4 +1,4 @@
-"""Priors: what a model of what is known beforehand was made from."""
+"""Wire models of priors: models of what is known of the original environment beforehand, such as a simulator."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Word = Annotated[str, Field(min_length=1, max_length=200, pattern=VISIBLE)]
 
 
 class CalibratedParameter(Request):
-    """A parameter of the simulator."""
+    """A parameter of a simulator, calibrated on real steps."""
 
     name: Word = Field(description="its name")
     value: Measured = Field(description="calibrated value")
@@ -24,7 +24,8 @@ class CalibratedParameter(Request):
 
 
 class PriorAbout(Request):
-    """What a prior was made from. Errors are shares of the standard deviation of each coordinate's changes."""
+    """Origin of a prior, a model learned from a simulator. Errors are shares of the standard deviation of each
+    coordinate's changes."""
 
     source: Word = Field(description="the simulator, or the surrogate")
     parameters: Annotated[list[CalibratedParameter], Field(max_length=64)] = Field(
@@ -37,7 +38,7 @@ class PriorAbout(Request):
 
 
 class PriorView(Reply):
-    """The prior of a surrogate."""
+    """The prior of a surrogate, if it has one, and what it was made from."""
 
     awaited: bool = Field(description="whether the design waits for a prior")
     created_at: float | None = Field(default=None, description="when it was set, in seconds since 1970; null: never")

@@ -1,4 +1,4 @@
-"""Wire models of queries, samples and the ledger."""
+"""Wire models of queries, samples and reports of real steps."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ClaimQueries(Request):
 
 
 class LeasedQuery(Reply):
-    """Fields of every query that a sampler has claimed."""
+    """Base class of the queries that a sampler has claimed, with the fields that all kinds of queries have."""
 
     id: int = Field(description="id of the query; its samples name it as ``query_id``")
     number: int = Field(description="number of the surrogate's earlier queries")
@@ -80,7 +80,7 @@ Query = Annotated[StepQuery | RolloutQuery, Field(discriminator="kind")]
 
 
 class ClaimedQueries(Reply):
-    """The queries that a sampler has leased. There are none if none came in time."""
+    """Reply with the queries that a sampler has leased. It has none if no query became available in time."""
 
     queries: list[Query] = Field(description="leased queries")
     phase: Phase = Field(description="present phase of the design")
@@ -88,7 +88,7 @@ class ClaimedQueries(Reply):
 
 
 class RenewLease(Request):
-    """Heartbeat of a sampler: the lease of a query ends ``lease_seconds`` from now."""
+    """Heartbeat of a sampler. It renews the lease of a query for ``lease_seconds``."""
 
     lease_token: Key = Field(description="token of the lease")
     lease_seconds: Annotated[float, Field(gt=0, le=86_400)] = Field(
@@ -97,7 +97,7 @@ class RenewLease(Request):
 
 
 class FailQuery(Request):
-    """Return of a query that has no answer. Another sampler may claim it."""
+    """Request of a sampler to return a query without an answer. Another sampler may then claim it."""
 
     lease_token: Key = Field(description="token of the lease")
     error: Annotated[str, Field(min_length=1, max_length=4_000)] = Field(
@@ -147,7 +147,7 @@ class QueryList(Reply):
 
 
 class AddQueries(Request):
-    """Request for queries that a person or a program chose.
+    """Request to add queries that a person or a program chose.
 
     Give either ``coordinates`` with ``action``, for single steps, or ``rollouts``.
     """
@@ -161,8 +161,8 @@ class AddQueries(Request):
 
 
 class AuditModel(AddQueries):
-    """Request for the real steps of an audit, which compare the model with the original environment where a policy
-    goes.
+    """Request for the real steps of an audit, which compare the model with the original environment at states that a
+    policy visits.
 
     They don't count towards the design's budget. All audits of a surrogate together have at most as many steps as
     this budget, or 128 if the budget is smaller.
@@ -268,7 +268,7 @@ class SnapshotList(Reply):
 
 
 class DropSnapshots(Request):
-    """Names of snapshots that no sampler holds any more."""
+    """Request to forget snapshots that no sampler holds any more."""
 
     snapshots: Annotated[list[Key], Field(min_length=1, max_length=4_096)] = Field(
         description="name of each snapshot that is gone"
@@ -312,7 +312,7 @@ class SamplePage(Reply):
 
 
 class ReportSteps(Request):
-    """Report of real steps that an evaluation took, for the ledger. They don't count towards the budget."""
+    """Report of the number of real steps that an evaluation took. They don't count towards the budget."""
 
     purpose: Literal["evaluation"] = "evaluation"
     steps: Annotated[int, Field(ge=1, le=1_000_000_000)] = Field(description="number of real steps")
@@ -328,7 +328,7 @@ class ReportSteps(Request):
 class Improve(Request):
     """Request for further queries, which the design's acquisition chooses.
 
-    The budget must have enough real steps left. For a token of role ``admin`` it is raised if it has not.
+    The budget must have enough real steps left. With a token of role ``admin``, it is raised as needed.
     """
 
     queries: Annotated[int, Field(ge=1, le=10_000, description="number of real steps; each step of a rollout counts")]

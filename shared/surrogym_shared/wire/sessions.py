@@ -36,7 +36,7 @@ class Residual(Request):
     """Systematic errors of a model, which a session adds to its predictions: affine functions of state and action.
 
     The P inputs are the coordinates, in their order, with cosine and sine in place of an angle, and then the entries of
-    the action. Each is standardised by ``centre`` and ``scale``, and limited to three deviations.
+    the action. Each input is standardised by ``centre`` and ``scale``, and limited to three standard deviations.
     """
 
     centre: Residuals = Field(description="(P,) value of each input that counts as 0")
@@ -51,9 +51,10 @@ class Residual(Request):
 
 
 class OpenSession(Request):
-    """Options of a session: the virtual environment of one trainer.
+    """Request to open a session, the virtual environment of one trainer, with its options.
 
-    For ``time_limit`` and ``penalty``, None takes the surrogate's value. Each other field says what its None means.
+    For ``time_limit`` and ``penalty``, None takes the surrogate's value. The descriptions of other fields say what None
+    means.
     """
 
     num_envs: Annotated[int, Field(ge=1, le=MAX_LANES)] = Field(default=1, description="number of lanes, N")
@@ -192,7 +193,7 @@ ActionSpace = Annotated[BoxSpace | DiscreteSpace | MultiDiscreteSpace, Field(dis
 
 
 class SessionView(Reply):
-    """An open session: its options, its spaces, and where it is."""
+    """An open session: its options, its spaces, and the number of its last request."""
 
     protocol: int = Field(default=PROTOCOL, description="version of the protocol")
     id: str = Field(description="id of the session, for all its requests")
@@ -221,7 +222,7 @@ class SessionView(Reply):
 
 
 class SessionActivity(Reply):
-    """Activity of a session since this server process knows it."""
+    """Activity of a session since this server process opened or restored it."""
 
     id: str = Field(description="id of the session")
     num_envs: int = Field(description="number of lanes")
@@ -356,7 +357,7 @@ class PolicyArrays(Request):
 
 
 class ActionNoise(Request):
-    """Key of the actions' noise. The same key, lane and entry give the same number."""
+    """Key of the random noise of actions. The same key, lane and action entry give the same number."""
 
     seed: Seed = Field(description="seed of the noise")
     step: Seed = Field(
@@ -424,7 +425,7 @@ class SubmitOccupancy(Request):
 
 
 class SubmittedOccupancy(Reply):
-    """Reply to submitted occupancy."""
+    """Reply after the states that a session visited were stored."""
 
     checkpoint: str = Field(description="name under which the states are stored")
     states: int = Field(description="number of states that were stored")

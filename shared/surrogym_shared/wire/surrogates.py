@@ -15,7 +15,7 @@ from surrogym_shared.wire.base import Phase, Reply, Request, SurrogateName
 class CreateSurrogate(Request):
     """Request to register a surrogate."""
 
-    model_config = ConfigDict(extra="forbid", strict=False)  # the specification validates its own types
+    model_config = ConfigDict(extra="forbid", strict=False)  # the specification checks its own types strictly
 
     name: SurrogateName = Field(description="name of the surrogate")
     spec: EnvironmentSpec = Field(
@@ -43,7 +43,7 @@ class PatchSurrogate(Request):
 
 
 class DoubtfulRegion(Reply):
-    """A range of one coordinate or action entry where an output is in doubt."""
+    """A range of one coordinate or action entry in which the model is uncertain about an output."""
 
     input: str = Field(description="name of the coordinate; ``action``, or ``action 1``, ``action 2``...")
     low: float | None = Field(description="lower end of the range; null: none")
@@ -53,12 +53,12 @@ class DoubtfulRegion(Reply):
 
 
 class PrequentialScores(Reply):
-    """How well an output's samples were predicted before the model learned from them: the last 20 at most.
+    """Scores of how well the last samples of an output, 20 at most, were predicted before the model learned from them.
 
-    Each sample that the design, an audit or a person chose after the first fit is predicted by the last model, with the
-    deviation at the optimum of the hyperparameters and the learned noise. An error within the tolerance counts as
-    inside every interval. The design chooses samples where the model is uncertain, so they are no fair sample of its
-    errors. These scores are reported, and no verdict depends on them.
+    Each sample that the design, an audit or a person chose after the first fit is predicted by the model before it,
+    with the standard deviation at the optimum of the hyperparameters and with the learned noise. An error within the
+    tolerance counts as inside every interval. The design chooses samples where the model is uncertain, so their errors
+    are not representative. These scores are reported, and no verdict depends on them.
     """
 
     predictions: int = Field(description="number of samples that were predicted")
@@ -145,12 +145,12 @@ class Fidelity(Reply):
 
 
 class Ledger(Reply):
-    """Acknowledged real steps by purpose.
+    """Counts of real steps by purpose.
 
-    ``total`` is the cost of the design: initial + adaptive + manual. It excludes evaluation, and ``logged`` steps,
-    which were recorded before and don't count towards the budget. ``unresolved`` counts steps that may have been taken
-    under leases that ended without an answer, so the design took between total and total + unresolved.
-    ``failed`` of the unresolved ones were returned by a sampler with an error; the leases of the others expired.
+    ``total`` is the cost of the design: initial + adaptive + manual. It excludes audits, evaluations, and ``logged``
+    steps, which were recorded before and don't count towards the budget. ``unresolved`` counts steps that may have been
+    taken under leases that ended without an answer, so the design took between total and total + unresolved steps. Of
+    these, ``failed`` steps were returned by a sampler with an error; the leases of the others expired.
     """
 
     initial: int = Field(default=0, description="steps of the first queries, before any model")
@@ -175,7 +175,7 @@ class QueryCounts(Reply):
 
 
 class SurrogateSummary(Reply):
-    """A surrogate in a list."""
+    """Summary of a surrogate, as in a list of surrogates."""
 
     name: str = Field(description="name of the surrogate")
     environment: str = Field(description="name of the original environment")
@@ -246,6 +246,6 @@ class SurrogateList(Reply):
     surrogates: list[SurrogateSummary] = Field(description="surrogates of this page")
     next_after: int | None = Field(
         default=None,
-        exclude_if=lambda after: after is None,  # left out of a complete list, because older clients don't know pages
+        exclude_if=lambda after: after is None,  # omitted on the last page, because older clients refuse the field
         description="value of ``after`` for the next page; omitted on the last page",
     )
