@@ -1,4 +1,4 @@
-"""The adaptive design of queries in this process.
+"""The adaptive design of queries, run in this process without a server.
 
 It calls the same functions as the server's designer, so the same samples lead to the same queries. It keeps everything
 in memory; ``save`` writes it to a file.
@@ -38,7 +38,7 @@ LEAST_SAMPLES = 2  # fewest samples that a model can be fitted to
 
 
 class QueriesOpen(RuntimeError):
-    """Queries of this round still lack an answer. ``ids`` are their numbers."""
+    """Queries of this round still lack an answer. ``ids`` are the numbers of these queries."""
 
     def __init__(self, ids: Sequence[int]) -> None:
         self.ids = tuple(ids)
@@ -47,21 +47,21 @@ class QueriesOpen(RuntimeError):
 
 @dataclass(frozen=True, kw_only=True)
 class Query(nouns.Query):
-    """A query: one step from ``coordinates``, or several ``actions`` from a snapshot or a reset if not any state can be
-    set. An action has continuous values, or the number of each discrete action."""
+    """Request for real steps: one step from ``coordinates``, or, if the environment can't be set to any state, several
+    ``actions`` from a snapshot or a reset. A discrete action is given by its number."""
 
     id: int
     purpose: Literal["initial", "adaptive"]
-    design: str = field(default="", repr=False)  # identifies the design: equal specifications begin with equal queries
+    design: str = field(default="", repr=False)  # id of the design; designs may have queries that are else equal
 
 
 class CalibratedPrior(Protocol):
-    """What a design needs of a simulator as a prior, see ``surrogym.Prior``."""
+    """Protocol of a simulator whose model is the prior of a design, as ``surrogym.Prior`` implements it."""
 
     file: SurrogateFile | None  # the simulator's model; None before the first update
 
     def update(self, real: Sequence[RealStep], /) -> bool:
-        """Calibrate the simulator on all real steps so far."""
+        """Calibrate the simulator's parameters on all real steps so far, and return whether its model changed."""
         ...
 
 
@@ -73,8 +73,8 @@ class Design:
         budget: maximum number of real steps, 2 or more; None takes that of the specification.
         target: confidence index to reach for each output, above 0.5 and below 1; None takes that of the specification.
         threads: number of threads of a fit.
-        prior: what is known beforehand: a ``Prior``, whose parameters are calibrated before each fit, or the file of
-            another surrogate with the same coordinates and actions.
+        prior: model of what is known beforehand: a ``Prior``, a simulator that is calibrated before each fit, or the
+            file of another surrogate with the same coordinates and actions.
 
     Raises:
         InvalidInput: ``spec`` is not a specification; or another argument is out of its range; or the specification
@@ -116,7 +116,7 @@ class Design:
         self._result: DesignResult | None = None
         self._settled = 0  # number of samples and abandoned queries at the last fit
         self._state: dict[str, Any] = {}
-        self._snapshots: dict[str, nouns.Vector] = {}  # coordinates (C,) by name
+        self._snapshots: dict[str, nouns.Vector] = {}  # state (C,) of each snapshot, by the snapshot's name
         self._queue = deque(self._numbered("initial", initial_queries(self._definition, self.budget)))
 
     def __repr__(self) -> str:
@@ -137,8 +137,8 @@ class Design:
 
     @property
     def fidelity(self) -> dict[str, Any]:
-        """How well the model is known: ``confidence_index`` and more, overall and for each output. Empty before the
-        first fit."""
+        """Measures of how well the model predicts, such as ``confidence_index``, overall and for each output. Empty
+        before the first fit."""
         return {} if self._result is None else self._result.fidelity
 
     def ask(self) -> Query | None:
@@ -243,7 +243,7 @@ class Design:
         Path(path).write_bytes(self.to_file(name).to_bytes())
 
     def to_file(self, name: str = "surrogate") -> SurrogateFile:
-        """Return what ``save`` writes. Raises ``InvalidInput``."""
+        """Return the content of the file that ``save`` writes. Raises ``InvalidInput`` if there is no model yet."""
         result, steps = self._last(), self._steps()
         truncated = np.array([step.truncated for step in self._samples], dtype=np.bool_)
         columns = (steps.coordinates, steps.action, steps.next_coordinates, steps.reward, steps.terminated)
@@ -279,7 +279,7 @@ class Design:
         return design
 
     def _take_up(self, file: SurrogateFile) -> None:
-        """Continue after the round that made the file's model.
+        """Restore result and phase from the model of a loaded file, to continue after the round that fitted it.
 
         The next ``ask`` fits again if the file has later samples, or if the budget or the target requires more.
         """

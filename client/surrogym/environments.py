@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
-import surrogym_client  # noqa: F401  enters the environments into Gymnasium's registry
+import surrogym_client  # noqa: F401  registers the environments with Gymnasium
 from surrogym.files import SUFFIX, existing
 from surrogym_client.environments.env import RemoteEnv
 from surrogym_client.environments.file_factories import open_file

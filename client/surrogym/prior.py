@@ -1,4 +1,4 @@
-"""A simulator as a prior of a design in this process."""
+"""A simulator as the prior (a model of what is known beforehand) of a design in this process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors between a client and the service.
+"""Errors that requests to a server raise in the client.
 
 SurrogymClientError
 ├── ServerUnreachable       no answer within the retry budget; the last request may have been carried out
@@ -46,7 +46,7 @@ from surrogym_shared.codes import STATUS, Code, Problem
 class SurrogymClientError(Exception):
     """Base class of all errors of the client. ``str(error)`` is one sentence for a person."""
 
-    way_out = ""  # what to do; a traceback shows it as a note
+    way_out = ""  # advice on what to do, which a traceback shows as a note
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)
@@ -77,7 +77,7 @@ class ProtocolMismatch(SurrogymClientError):
 
 
 class ProblemError(SurrogymClientError):
-    """The server refused the request. ``problem`` says why, as text and as a code."""
+    """The server refused the request. ``problem`` has the reason as text and as a code."""
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem)
@@ -135,7 +135,7 @@ class UnknownSession(SessionLost):
 
 
 class SessionExpired(SessionLost):
-    """The session was idle for too long, or was lost with a crash."""
+    """The session was idle for too long, or the server lost it in a crash."""
 
 
 class Conflict(ProblemError):
@@ -185,7 +185,7 @@ class Unauthenticated(Refused):
 
 
 class Forbidden(Refused):
-    """The token's role does not allow this."""
+    """The role of the token does not allow this request."""
 
     way_out = "surrogym doctor shows what this token may do"
 
@@ -250,7 +250,6 @@ def error_from_problem(problem: Problem) -> ProblemError:
 
 
 def refused_here(code: Code, detail: str) -> ProblemError:
-    """Return the exception that the server would have caused. Used for values that can't be sent, such as NaN in
-    JSON."""
+    """Return the exception that the server's refusal would raise, for values that can't be sent, such as NaN."""
     title = code.value.replace("_", " ").capitalize()
     return error_from_problem(Problem(title=title, status=STATUS[code], code=code, detail=detail))

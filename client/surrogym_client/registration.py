@@ -1,5 +1,5 @@
-"""Register this package's environments with Gymnasium: surrogates on a server, surrogates in files, and the
-swing-up."""
+"""Register environments with Gymnasium: surrogates on a server, surrogates in files, and the swing-up of a pole on a
+cart."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ ENVIRONMENT_ID = "surrogym/Remote-v0"
 FILE_ID = "surrogym/File-v0"
 SWING_UP = "surrogym/CartPoleSwingUp-v0"
 SWING_UP_NARROW = "surrogym/CartPoleSwingUpNarrow-v0"
-SWING_UP_STEPS = 40  # of 0.1 s
+SWING_UP_STEPS = 40  # time limit of an episode, in steps of 0.1 s
 
 
 def register() -> None:
     """Register this package's environments with Gymnasium. Repeating it is harmless."""
-    import gymnasium  # whoever reads the names alone need not load it
+    import gymnasium  # imported late, so that reading the names does not load it
 
     for environment_id, module in ((ENVIRONMENT_ID, "gym_factories"), (FILE_ID, "file_factories")):
         if environment_id not in gymnasium.registry:

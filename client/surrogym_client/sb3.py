@@ -75,7 +75,7 @@ class SurrogateVecEnv(VecEnv):
         view = self._lanes.view
         super().__init__(num_envs, space(view.observation_space), space(view.action_space))
         self._actions: NDArray[Any] | None = None
-        self._penalty = np.zeros(num_envs)  # subtracted from the return of each running episode so far
+        self._penalty = np.zeros(num_envs)  # (N,) sum of the penalties in each running episode
 
     @property
     def session(self) -> str:
@@ -83,10 +83,10 @@ class SurrogateVecEnv(VecEnv):
         return self._lanes.view.id
 
     def submit_occupancy(self, checkpoint: str) -> SubmittedOccupancy:
-        """Submit the states visited since the session was opened, as the occupancy of a checkpoint. Its name is free.
+        """Submit the states that were visited since the session was opened, under any name for the policy's checkpoint.
 
-        The design can then choose queries near these states. Returns the number of states, and the confidence index
-        over them.
+        The design can then choose queries near these states. Returns the number of states, and the confidence index of
+        the model at them.
         """
         return self.port.submit_occupancy(self.session, checkpoint)
 

@@ -202,8 +202,7 @@ class Actor:
             raise ValueError(f"policy: expected log_deviations of {len(self.low)} entries, got {log.size}")
 
     def act(self, observation: NDArray[Any], noise: NoiseKey | None) -> Acted:
-        """Return the actions for observations (N, D) in one step: with the noise of a key, or the most probable
-        actions if ``noise`` is None.
+        """Return actions for observations (N, D): with the noise of a key, or the most probable ones if it is None.
 
         Raises:
             ValueError: the network's outputs are not finite.

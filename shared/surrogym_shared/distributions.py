@@ -31,8 +31,7 @@ class Sampled(Protocol):
         ...
 
     def sent(self, actions: Array) -> NDArray[Any]:
-        """Convert sampled actions (B, F) to those that a surrogate takes: within their bounds, discrete ones as
-        integers."""
+        """Convert sampled actions (B, F) to those that a surrogate takes: clipped to bounds, or integer choices."""
         ...
 
     def log_probability(self, outputs: Array, further: Array, actions: Array) -> Array:
@@ -69,8 +68,7 @@ class Bounded:
 
 @dataclass(frozen=True)
 class Choices:
-    """Categorical distribution of discrete actions: an independent choice for each action entry, with the outputs as
-    logits and without further parameters."""
+    """Independent categorical distributions of discrete action entries. The outputs are their logits."""
 
     counts: tuple[int, ...]
 

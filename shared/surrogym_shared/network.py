@@ -162,8 +162,7 @@ def forward(layers: Sequence[Layer], activation: Activation, x: NDArray[np.float
 
 
 def most_probable(y: NDArray[np.floating[Any]], low: Array, high: Array, counts: tuple[int, ...]) -> NDArray[Any]:
-    """Return the most probable actions (..., N, F) for a network's outputs y (..., N, A); int64 (..., N) for a single
-    discrete choice."""
+    """Return the most probable actions (..., N, F) for outputs y (..., N, A); int64 (..., N) for one discrete entry."""
     if not counts:
         centre, reach = (low + high) / 2, (high - low) / 2
         return np.asarray(centre + reach * np.tanh(y), dtype=np.float32)
@@ -228,8 +227,7 @@ def _require_chain(head: _Head, headers: Mapping[str, Header]) -> None:
 
 
 def _chained(head: _Head, headers: Mapping[str, Header]) -> dict[str, tuple[int, ...]]:
-    """Return the shape that each array of a policy must have, given the sizes of the observation and of the layers in
-    the headers."""
+    """Return the shape that each array of a policy must have, given the sizes of the vectors in the headers."""
 
     def length(name: str) -> int:
         return (headers[name].shape or (0,))[0]

@@ -1,4 +1,4 @@
-"""Lanes in which a policy of arrays acts: in one request for a whole rollout if the port can, else step by step.
+"""Run a policy in the lanes of a session: one request for a whole rollout if the port supports it, else step by step.
 
 Shapes: N lanes, D observation entries, F action entries, T steps.
 """
@@ -21,12 +21,12 @@ class Taken:
     """Record of T steps of a policy, with the observations that it acted on."""
 
     rollout: PolicyRollout
-    seen: Floats  # (T, N, D) before each step
-    cut: Bools  # (T, N) whether this step ends an episode because the session was lost
+    seen: Floats  # (T, N, D) observations before each step
+    cut: Bools  # (T, N) whether a step ends an episode because the server lost the session
 
 
 class ActingLanes:
-    """Lanes that a policy steps in rollouts. Each rollout begins with the observations that the last one ended with.
+    """Lanes in which a policy acts in rollouts. Each rollout continues from the last observations of the one before.
 
     Args:
         lanes: lanes of a session with autoreset in the same step.
@@ -43,7 +43,7 @@ class ActingLanes:
     def take(
         self, policy: ActingPolicy, steps: int, noise: NoiseKey | None = None, until: Bools | None = None
     ) -> Taken:
-        """Step all lanes T times with a policy; see ``PolicyPort.rollout_policy``."""
+        """Step all lanes ``steps`` times with a policy. The arguments are those of ``PolicyPort.rollout_policy``."""
         first, done = self._observation, _Done([], [], [], [])
         waiting = np.ones(self.lanes.num_envs, dtype=bool) if until is None else until
         while len(done.results) < steps and waiting.any():
@@ -92,12 +92,12 @@ class ActingLanes:
 
 @dataclass(frozen=True)
 class _Done:
-    """Record of the steps taken so far."""
+    """Record of the steps that a rollout has taken so far, with an entry of each list for each step."""
 
     results: list[StepResult]
-    actions: list[Floats]  # (N, F) each
-    logs: list[Floats]  # (N,) each; none without noise
-    cut: list[Bools]  # (N,) each
+    actions: list[Floats]  # (N, F) actions of each step
+    logs: list[Floats]  # (N,) log probabilities of each step's actions; empty without noise
+    cut: list[Bools]  # (N,) lanes whose episode each step ends because the server lost the session
 
     def step(self, result: StepResult, acted: Acted, cut: Bools) -> None:
         self.results.append(result)

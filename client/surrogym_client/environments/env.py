@@ -22,10 +22,10 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
     """Virtual environment of a surrogate, stepped like any Gymnasium environment.
 
     ``reset(seed=s)`` starts episode 0 of seed s, and ``reset()`` starts the next episode. The server applies the time
-    limit; it shows as ``truncated``. ``info`` has ``model_version`` and, after a step, ``reward_mean`` (the reward
-    before the penalty) and, if requested, ``deviation`` (O,). In a session with a trust region, ``untrusted`` says
-    whether leaving it truncated the episode. If the server loses the session, the episode ends as truncated with the
-    reason in ``info["surrogym_session_lost"]``, and the next reset begins in a new session.
+    limit, after which an episode is ``truncated``. ``info`` has ``model_version`` and, after a step, ``reward_mean``
+    (the reward before the penalty) and, if requested, ``deviation`` (O,). In a session with a trust region,
+    ``untrusted`` is whether leaving it truncated the episode. If the server loses the session, the episode is truncated
+    with the reason in ``info["surrogym_session_lost"]``, and the next reset begins in a new session.
 
     Args:
         port: the surrogate.
@@ -69,7 +69,7 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
         self,
         *,
         seed: int | None = None,
-        options: dict[str, Any] | None = None,  # noqa: ARG002  a surrogate has none
+        options: dict[str, Any] | None = None,  # noqa: ARG002  a surrogate has no options of a reset
     ) -> tuple[Observation, dict[str, Any]]:
         super().reset(seed=seed)
         start = self._lanes.reset(seed)
@@ -84,7 +84,7 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
         return self._shown, float(result.reward[0]), terminated, truncated, step_info(step, 0)
 
     def render(self) -> Picture | None:
-        """Draw the state that was observed last, as an array (height, width, 3). None without a render mode."""
+        """Return a picture (height, width, 3) of the state that was observed last; None without a render mode."""
         return None if self._pictures is None else self._pictures.of(self._shown)
 
     def close(self) -> None:
@@ -94,7 +94,7 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
 
 
 def start_info(start: LaneReset, lane: int) -> dict[str, Any]:
-    """Return the info of one lane's reset."""
+    """Return Gymnasium's ``info`` of the reset of one lane."""
     info: dict[str, Any] = {"model_version": int(start.model_version[lane])}
     if start.lost is not None:
         info[LOST] = start.lost
@@ -102,7 +102,7 @@ def start_info(start: LaneReset, lane: int) -> dict[str, Any]:
 
 
 def step_info(step: LaneStep, lane: int) -> dict[str, Any]:
-    """Return the info of one lane's step."""
+    """Return Gymnasium's ``info`` of the step of one lane."""
     result = step.result
     info: dict[str, Any] = {
         "model_version": int(result.model_version[lane]),

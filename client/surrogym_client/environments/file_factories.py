@@ -10,11 +10,11 @@ from surrogym_client.environments.env import RemoteEnv
 from surrogym_client.environments.vector import RemoteVectorEnv
 from surrogym_shared.port import SurrogatePort
 
-ENTRY_POINTS = "surrogym.ports"  # implementations that step a surrogate in this process, from the server's package
+ENTRY_POINTS = "surrogym.ports"  # group of entry points with which the server's package steps a surrogate in process
 
 
 def open_file(path: str | Path) -> SurrogatePort:
-    """Open a surrogate's file and step it in this process, without a server. The same seeds give the same steps, bit
+    """Open a surrogate's file, to step it in this process without a server. The same seeds give the same steps, bit
     for bit.
 
     Raises:

@@ -21,7 +21,7 @@ def make_env(
     transport: Transport = "auto",
     **options: Any,
 ) -> RemoteEnv:
-    """Make an environment of a surrogate on a server. Options are those of ``RemoteEnv``.
+    """Make an environment of a surrogate on a server. ``options`` are those of ``RemoteEnv``.
 
     Raises:
         ValueError: no surrogate was given.
@@ -38,7 +38,7 @@ def make_vector_env(
     transport: Transport = "auto",
     **options: Any,
 ) -> RemoteVectorEnv:
-    """Make a vector environment of a surrogate on a server. Options are those of ``RemoteVectorEnv``.
+    """Make a vector environment of a surrogate on a server. ``options`` are those of ``RemoteVectorEnv``.
 
     Raises:
         ValueError: no surrogate was given.

@@ -35,21 +35,21 @@ OPTIONS = tuple(name for name in OpenSession.model_fields if name not in ("num_e
 
 @dataclass(frozen=True)
 class LaneReset:
-    """Result of a reset. ``lost`` is the reason if the session was lost just before, else None."""
+    """Result of a reset. If the server had lost the session, ``lost`` is the reason, else None."""
 
-    observation: Floats  # (N, D)
-    model_version: Ints  # (N,)
+    observation: Floats  # (N, D) observation of each lane
+    model_version: Ints  # (N,) version of the model in each lane
     lost: str | None = None
 
 
 @dataclass(frozen=True)
 class LaneStep:
-    """Result of a step, with what the environment classes need to report it in their own form."""
+    """Result of a step, with further facts that the environment classes report in their own form."""
 
     result: StepResult
     began: Bools  # (N,) lanes that were reset instead of stepped (autoreset mode next_step); their action had no effect
-    ended_under: Ints  # (N,) model version the step was computed under
-    cut: Bools  # (N,) lanes whose episode this step ends, because the session was lost
+    ended_under: Ints  # (N,) version of the model that computed the step
+    cut: Bools  # (N,) lanes whose episode this step ends, because the server lost the session
     lost: str | None = None
 
 
@@ -67,7 +67,7 @@ def session_request(num_envs: int, mode: AutoresetMode, options: dict[str, Any])
     try:
         return OpenSession(num_envs=num_envs, autoreset_mode=mode, **options)
     except ValidationError as error:
-        from surrogym_shared.faults import first_fault  # only a fault needs it
+        from surrogym_shared.faults import first_fault  # imported late, because only an error needs it
 
         raise ValueError(f"session options: {first_fault(error, got=True)}") from error
 
@@ -95,8 +95,8 @@ class Lanes:
         self._start = self._observation  # first observations of the episodes in a new session
         self._version: Ints = np.array(self.view.model_version, dtype=np.int64)
         self._running = _none(lanes)
-        self._cut = _none(lanes)  # lost with a session, and not yet reported as ended
-        self._held = _none(lanes)  # reset in the new session ahead of the step that shows it
+        self._cut = _none(lanes)  # lanes whose episode was lost with a session, and is not yet reported as truncated
+        self._held = _none(lanes)  # lanes that a new session has reset already, before the step that reports the reset
 
     @property
     def num_envs(self) -> int:
@@ -104,7 +104,7 @@ class Lanes:
 
     @property
     def penalised(self) -> bool:
-        """Whether rewards are lowered where the model is unsure."""
+        """Whether the session subtracts a penalty from rewards where the model is uncertain."""
         return self.view.penalty > 0 or self._request.caution > 0
 
     @property
@@ -131,7 +131,7 @@ class Lanes:
         return LaneReset(self._observation.copy(), self._version.copy(), lost)
 
     def step(self, action: NDArray[Any], mask: Bools | None = None) -> LaneStep:
-        """Step all lanes, or with autoreset disabled only those of the mask (N,), with actions (N, F) or (N,)."""
+        """Step all lanes with actions (N, F) or (N,). With autoreset disabled, a mask (N,) selects the lanes."""
         chosen = np.ones(self.num_envs, dtype=bool) if mask is None else mask
         try:
             result = self._advance(action, chosen)
@@ -153,15 +153,15 @@ class Lanes:
 
     @property
     def rolls_policies(self) -> bool:
-        """Whether ``rollout`` is possible. The port must support it, and autoreset must happen in the same step."""
+        """Whether ``rollout`` can be used: the port supports it, and the autoreset mode is ``same_step``."""
         return self._rolls
 
     def rollout(
         self, policy: ActingPolicy, steps: int, noise: NoiseKey | None = None, until: Bools | None = None
     ) -> PolicyRollout | None:
-        """Step all lanes with a policy, in one request; see ``PolicyPort.rollout_policy``.
+        """Step all lanes with a policy, in one request. Arguments are those of ``PolicyPort.rollout_policy``.
 
-        Returns None if the session was lost. Then no step was taken, and the next ``step`` ends the episodes.
+        Returns None if the server lost the session. Then no step was taken, and the next ``step`` ends the episodes.
         """
         assert isinstance(self.port, PolicyPort)
         if not self._cut.any():
@@ -175,7 +175,7 @@ class Lanes:
         return None
 
     def close(self) -> None:
-        """Close the session. If the server no longer has it, nothing happens."""
+        """Close the session. A session that the server no longer has is no error."""
         with suppress(SurrogymClientError):
             self.port.close(self.view.id)
 
@@ -233,9 +233,9 @@ class Lanes:
         )
 
     def _reopen(self, error: SessionLost, attempts: int = REOPENINGS) -> None:
-        """Open a session in place of the lost one, and begin the episodes that the caller will not reset.
+        """Open a session in place of the lost one, and, if lanes reset automatically, begin their new episodes.
 
-        The new seed follows from the first session's seed and the number of losses. So the starts are new, and still
+        The new seed is derived from the first session's seed and the number of losses. So the starts differ, and are
         repeatable.
         """
         self._losses += 1

@@ -1,7 +1,7 @@
 """Pictures of virtual states: an observation is converted to coordinates, and the original environment's renderer draws
 them.
 
-The renderer is a part of the sampler's side, and is imported when the first picture is asked for.
+The renderer belongs to the sampler's package, and is imported only when an environment is made with a render mode.
 
 Shapes: D observation entries, C coordinates; a picture is (height, width, 3) uint8.
 """
@@ -23,8 +23,9 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Read = Callable[[Array], float]  # computes a coordinate from an observation (D,)
 RENDER_MODES = ["rgb_array"]
-RENDERERS = "surrogym_sampler.original.rendering"  # the module that has renderer_of
-# What draws an environment of Gymnasium, and the extra that brings it, by the package of its class; None: numpy alone.
+RENDERERS = "surrogym_sampler.original.rendering"  # module with the function renderer_of
+# Module that draws an environment of Gymnasium, and the extra that installs it, by the package of the environment's
+# class; None: NumPy is enough.
 DRAWN_WITH: dict[str, tuple[str, str] | None] = {
     "gymnasium.envs.classic_control.": ("pygame", "render"),
     "gymnasium.envs.mujoco.": ("mujoco", "mujoco"),
@@ -46,7 +47,7 @@ class Renderer(Protocol):
         ...
 
     def close(self) -> None:
-        """Release what the renderer holds."""
+        """Release windows and memory of the renderer."""
         ...
 
 
@@ -83,11 +84,11 @@ class Pictures:
 
 
 def pictures_for(render_mode: str | None, spec: EnvironmentSpec, original: str | None) -> Pictures | None:
-    """Return an object that draws in the given render mode; None without a render mode.
+    """Return an object that draws observations in the given render mode; None without a render mode.
 
     Raises:
         ValueError: an unknown render mode.
-        NotRenderable: as ``Pictures``.
+        NotRenderable: there is no renderer, or the state can't be computed from observations.
     """
     if render_mode is None:
         return None
@@ -109,8 +110,8 @@ def _render_modes(spec: EnvironmentSpec, original: str | None) -> list[str]:
 
 
 def can_be_drawn(spec: EnvironmentSpec, original: str | None = None) -> bool:
-    """Whether a renderer is to be expected here: Gymnasium's with its package installed, or the one of a person's own
-    ``package.module:factory``. Finding out imports no renderer."""
+    """Whether this process can probably draw an environment: it has its own ``package.module:factory``, or Gymnasium
+    draws it and the package for this is installed. No renderer is imported."""
     if original is not None and ":" in original:
         return True
     name = original or spec.environment
@@ -118,13 +119,14 @@ def can_be_drawn(spec: EnvironmentSpec, original: str | None = None) -> bool:
 
 
 def is_drawn_by_gymnasium(name: str) -> bool:
-    """Whether a name from a server may be opened to be drawn: it is an id of Gymnasium's own packages, or of ours."""
+    """Whether a name from a server is safe to open for drawing: an id of Gymnasium's own packages, or of this one."""
     entry = gymnasium.registry.get(name)
     return entry is not None and str(entry.entry_point).startswith(tuple(DRAWN_WITH))
 
 
 def drawn_with(name: str) -> list[tuple[str, str]]:
-    """Return the module that draws an id of Gymnasium, and the extra that brings it. Empty if numpy is enough."""
+    """Return the module that draws an environment with a Gymnasium id, and the extra that installs it. Empty if NumPy
+    is enough."""
     place = str(gymnasium.spec(name).entry_point)
     return [needs for package, needs in DRAWN_WITH.items() if needs is not None and place.startswith(package)]
 
@@ -132,7 +134,7 @@ def drawn_with(name: str) -> list[tuple[str, str]]:
 def coordinates_from_observation(spec: EnvironmentSpec) -> Callable[[Array], Array]:
     """Return a function that computes coordinates (C,) from an observation (D,).
 
-    It uses entries that show a coordinate unchanged, and pairs that show the sine and cosine of an angle.
+    It uses entries that are linear in one coordinate, and pairs of entries with the sine and cosine of an angle.
 
     Raises:
         NotRenderable: a coordinate can't be computed from the observation.
@@ -147,7 +149,7 @@ def coordinates_from_observation(spec: EnvironmentSpec) -> Callable[[Array], Arr
 
 
 def _read(spec: EnvironmentSpec, name: str) -> Read | None:
-    found: dict[str, tuple[int, float, float]] = {}  # function: entry, factor, offset
+    found: dict[str, tuple[int, float, float]] = {}  # index of the entry, factor and offset, by the entry's function
     for index, entry in enumerate(spec.observation):
         parts = [part for part in entry.term.parts if part.function != "one"]
         if len(parts) != 1 or not _of_alone(parts[0], name):

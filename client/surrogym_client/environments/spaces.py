@@ -1,4 +1,4 @@
-"""Convert the spaces of the wire to Gymnasium's."""
+"""Convert the spaces in a server's reply to spaces of Gymnasium."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         options = _with_time_limit(options, max_episode_steps)
         request, spec = session_request(num_envs, WIRE_MODE[mode], options), port.spec()
         self.num_envs = num_envs
-        self.autoreset_mode = mode  # as SyncVectorEnv has it; TorchRL reads it here
+        self.autoreset_mode = mode  # an attribute, as in SyncVectorEnv, because TorchRL reads it
         self.render_mode = render_mode
         self._pictures = pictures_for(render_mode, spec, original)
         self._shown: Observation | None = None
@@ -80,7 +80,7 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def __len__(self) -> int:
-        """The number of lanes."""
+        """Return the number of lanes, N."""
         return self.num_envs
 
     def reset(
@@ -111,7 +111,7 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         return result.observation.copy(), result.reward, result.terminated, result.truncated, infos
 
     def render(self) -> tuple[Picture, ...] | None:
-        """Draw every lane as an array (height, width, 3). None without a render mode."""
+        """Return a picture (height, width, 3) of each lane; None without a render mode."""
         if self._pictures is None:
             return None
         shown = [None] if self._shown is None else self._shown
@@ -135,7 +135,7 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         }
 
     def _checked(self, mask: Any) -> Bools:
-        """Check the mask of a partial reset, with the errors that Gymnasium raises."""
+        """Check the mask of a partial reset, and raise the same types of errors as Gymnasium does."""
         if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
             found = f"dtype {mask.dtype}" if isinstance(mask, np.ndarray) else type(mask).__name__
             raise TypeError(f"options['reset_mask']: expected an array of dtype bool, got {found}")
@@ -162,7 +162,7 @@ def _with_time_limit(options: dict[str, Any], max_episode_steps: int | None) -> 
 
 
 def _step_infos(step: LaneStep, lanes: Bools) -> dict[str, Any]:
-    """Return the infos of a step for the given lanes: those that acted, or those whose episode ended."""
+    """Return Gymnasium's infos of a step, with values for the given lanes (N,) only."""
     if not lanes.any():
         return {}
     infos = _entry("reward_mean", step.result.reward_mean, lanes)
@@ -176,7 +176,7 @@ def _step_infos(step: LaneStep, lanes: Bools) -> dict[str, Any]:
 
 
 def _entry(key: str, values: NDArray[Any], lanes: Bools) -> dict[str, Any]:
-    """Return an info in Gymnasium's form: an array over lanes, zero for lanes without a value, and its mask."""
+    """Return an info in Gymnasium's form: an array with a value for each of ``lanes``, 0 for others, and its mask."""
     shown = np.zeros_like(values)
     shown[lanes] = values[lanes]
     return {key: shown, f"_{key}": lanes.copy()}

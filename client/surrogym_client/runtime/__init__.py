@@ -1,1 +1,1 @@
-"""The process and the machine that the client runs on."""
+"""Functions about the process and the machine of the client: imports, signals, versions, and Ray clusters."""

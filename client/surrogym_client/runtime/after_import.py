@@ -1,4 +1,4 @@
-"""Something to be done as soon as another module is loaded."""
+"""Call a function as soon as another module is imported."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # importlib.abc takes as long to load as all commands togethe
 
 
 def after_import(module: str, function: str) -> None:
-    """Call ``package.module:function`` once the named module is loaded; at once if it is."""
+    """Call ``function``, given as ``package.module:name``, after ``module`` is imported; at once if it already is."""
     if module in sys.modules:
         _call(function)
     else:
@@ -23,7 +23,7 @@ def after_import(module: str, function: str) -> None:
 
 
 class _Finder:
-    """Finds one module as Python does, once, and has something done after it is executed."""
+    """Finder that finds one module once, as Python does, and whose loader calls a function after the import."""
 
     def __init__(self, module: str, function: str) -> None:
         self._module, self._function = module, function
@@ -39,12 +39,12 @@ class _Finder:
         sys.meta_path.remove(self)
         spec = PathFinder.find_spec(fullname, path, target)
         if spec is not None and spec.loader is not None:
-            spec.loader = cast("Loader", _Loader(spec.loader, self._function))  # it has both methods that are asked
+            spec.loader = cast("Loader", _Loader(spec.loader, self._function))  # it has both methods that Python calls
         return spec
 
 
 class _Loader:
-    """Another loader, and a function after it."""
+    """Loader that loads a module by another loader, and then calls a function."""
 
     def __init__(self, loader: Loader, function: str) -> None:
         self._loader, self._function = loader, function

@@ -1,4 +1,4 @@
-"""How a process ends: with the one that started it, so that a killed parent leaves nothing behind, and in order."""
+"""End a process together with its parent, and handle the signals that end it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TERMINATIONS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if 
 
 
 def exit_with_parent() -> None:
-    """Watch the parent from a thread; when it is gone, end this process at once."""
+    """Start a thread that ends this process as soon as its parent process has ended."""
     parent = os.getppid()
     threading.Thread(target=_watch, args=(parent,), name="exit-with-parent", daemon=True).start()
 
@@ -28,13 +28,14 @@ def _watch(parent: int) -> None:
 
 
 def terminations() -> list[signal.Signals]:
-    """The signals of a polite kill and of a closed terminal, but those that are ignored, as nohup asks."""
+    """Return the signals that ask this process to end (SIGTERM, SIGHUP), without those that it ignores, as under
+    nohup."""
     return [number for number in TERMINATIONS if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 @contextmanager
 def terminations_as_interrupts() -> Iterator[None]:
-    """A polite kill is taken like Ctrl-C, so that the children are ended on the way out."""
+    """Context in which SIGTERM and SIGHUP raise KeyboardInterrupt, so that child processes are ended on exit."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         del number, frame
@@ -50,11 +51,13 @@ def terminations_as_interrupts() -> Iterator[None]:
 
 @contextmanager
 def signals_between_steps() -> Iterator[Callable[[], None]]:
-    """Hold back Ctrl-C, and the other signals that ask this process to end, while a machine moves. The second signal in
-    a row is not held back. What is ignored, ends the process at once, or comes outside the main thread stays as it is.
+    """Context that delays Ctrl-C, SIGTERM and SIGHUP, so that they don't interrupt a step of a machine.
+
+    A second signal is not delayed. Signals without a Python handler, and threads other than the main one, are not
+    affected.
 
     Yields:
-        what to call between two steps: it does what a signal that was held back asks for.
+        a function to call between two steps, which handles a signal that was delayed.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None

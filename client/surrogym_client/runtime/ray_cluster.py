@@ -1,4 +1,4 @@
-"""A Ray cluster that a command works in."""
+"""Connect a command to a Ray cluster."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ def connect(address: str, runtime_env: Mapping[str, Any] | None = None) -> None:
 
     Args:
         address: ``auto`` for the cluster that this machine belongs to, or ``host:port``.
-        runtime_env: what Ray prepares on each machine before it runs code of this process, as Ray documents it.
+        runtime_env: Ray's runtime environment, which it prepares on each machine before it runs code of this process.
 
     Raises:
-        NoCluster: Ray is not installed, or there is no cluster, or one of another version, or Ray refuses
-            ``runtime_env``.
+        NoCluster: Ray is not installed, there is no cluster at the address, the cluster has another version of Ray, or
+            Ray refuses ``runtime_env``.
     """
     if find_spec("ray") is None:
         raise NoCluster("--on-ray: expected the package ray, got none: pip install 'surrogym[ray]'")

@@ -1,4 +1,4 @@
-"""Versions of what a result depends on, and where it was made."""
+"""Versions of the packages that a result depends on, and the machine that it was made on."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PACKAGES = ("surrogym", "gymnasium", "numpy", "torch", "stable-baselines3")
 
 
 def versions() -> dict[str, str]:
-    """By name; packages that are not installed are left out."""
+    """Return the versions of Python and of the installed packages in ``PACKAGES``, by name."""
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -23,7 +23,7 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str:
-    """The commit of the checkout this code runs from, ``-dirty`` with changes; else the version of the package."""
+    """Return the git commit of this code, with ``-dirty`` if it has changes; outside of git the package's version."""
     here = Path(__file__)
     git = ["git", "-C", str(here.parent)]
     try:
@@ -40,7 +40,7 @@ def commit() -> str:
 
 
 def machine() -> str:
-    """Processor, cores and system, in words."""
+    """Describe the processor, the number of cores and the operating system in words."""
     return f"{_processor()}, {os.cpu_count()} cores, {platform.system()} {platform.machine()}"
 
 

@@ -1,8 +1,8 @@
-"""Advice for a person about missing packages."""
+"""Advice for missing packages: the extra of surrogym that installs them."""
 
 from __future__ import annotations
 
-EXTRAS = {  # their packages
+EXTRAS = {  # modules that each extra of surrogym installs
     "server": (
         *("alembic", "fastapi", "jiter", "numba", "prometheus_client", "psycopg", "safetensors", "scipy", "sqlalchemy"),
         *("starlette", "threadpoolctl", "uvicorn"),
@@ -20,7 +20,7 @@ EXTRAS = {  # their packages
 
 
 def missing(module: str) -> str | None:
-    """Say which extra brings a module; None for a module of no extra."""
+    """Return the advice to install the extra that contains a missing module; None if no extra contains it."""
     for extra, modules in EXTRAS.items():
         if module in modules:
             return f"this needs {module}, which is not installed: pip install 'surrogym[{extra}]'"

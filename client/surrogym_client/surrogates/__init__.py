@@ -1,1 +1,1 @@
-"""Operations on a whole surrogate: wait for its design, check its budget, move it to a file and back."""
+"""Operations on a whole surrogate: wait for its design, advise on it, check its budget, export and import it."""

@@ -1,4 +1,4 @@
-"""The design's verdict in words by degree, and the most useful next step."""
+"""Describe how certain a surrogate's model is, and advise on the most useful next step."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from surrogym_shared.environments import is_name
 from surrogym_shared.wire import DoubtfulRegion, ModelView, OutputFidelity, ReachedLimit, SurrogateView
 
 NEARLY = 0.9  # share of the target that counts as nearly reached
-MOST_STEPS = 10.0  # longest forecast, as a multiple of the present samples
+MOST_STEPS = 10.0  # most real steps that a forecast may need, as a multiple of the present samples
 NOTICEABLE = 0.9  # factor on the leave-one-out error: a smaller one shows that real steps helped
 FEWEST_MODELS = 4  # fewest models from which to estimate a rate
 NOISY_SLACK = 1.25  # factor on the allowed leave-one-out error once noise is confirmed
-NOISE_BAND = 1.5  # deviations of the noise within which the server's index does not ask for more
-MOSTLY_NOISE = 0.8  # share of the squared leave-one-out error; then the function is known to half the noise
-TOLERABLE = 1e-6  # share of the leave-one-out error: a smaller tolerance comes from samples that were all alike
+NOISE_BAND = 1.5  # standard deviations of the noise that the server adds to a tolerance in the confidence index
+MOSTLY_NOISE = 0.8  # share of noise in the squared leave-one-out error from which more real steps hardly help
+TOLERABLE = 1e-6  # share of the leave-one-out error; a smaller tolerance comes from samples with equal values
 
 
 def verdict(view: SurrogateView) -> str:
-    """Describe how certain the model is: ready, ready but for one output, nearly, or not. Empty without a model."""
+    """Describe how certain the model is: ready, ready but for one output, nearly ready, or not. Empty without a
+    model."""
     if view.fidelity is None:
         return ""
     outputs = view.fidelity.outputs
@@ -40,11 +41,11 @@ def verdict(view: SurrogateView) -> str:
 
 def advice(view: SurrogateView, models: Sequence[ModelView]) -> str:
     """Describe the next step for a design that has ended without being ready, with its cost in real steps. Empty if
-    there is none.
+    there is no advice.
 
     Args:
         view: the surrogate.
-        models: its fits, oldest first, which show how fast it learns.
+        models: all versions of its model, oldest first, which show how fast it learns.
     """
     doubtful = _doubtful(view)
     if view.phase not in COMPLETED or view.phase in ("ready", "from_log") or not doubtful:
@@ -99,7 +100,8 @@ def _share_of_noise(output: OutputFidelity) -> float:
 
 
 def _of_past(view: SurrogateView, outputs: Sequence[OutputFidelity]) -> str:
-    """Describe how to find what the specification lacks, if steps depend on the step before."""
+    """Advise on outputs whose errors depend on the step before: a dead time or a state is missing in the
+    specification."""
     shares = ", ".join(f"{100 * output.past:.0f} % of the squared error of {output.name}" for output in outputs)
     name = view.environment
     env = shlex.quote(name) if is_name(name) and not name.startswith("exec:") else "ENVIRONMENT"
@@ -110,7 +112,7 @@ def _of_past(view: SurrogateView, outputs: Sequence[OutputFidelity]) -> str:
 
 
 def _of_noise(view: SurrogateView, output: OutputFidelity) -> str:
-    """Describe what helps an output whose error is nearly all noise."""
+    """Advise on an output whose error is nearly all noise."""
     remedy = "average several readings of its sensor" if output.sensor_noise else "reduce the noise itself"
     return (
         f"the error of {output.name} is nearly all noise ({100 * _share_of_noise(output):.0f} % of its square), which "
@@ -120,7 +122,7 @@ def _of_noise(view: SurrogateView, output: OutputFidelity) -> str:
 
 
 def _of_limit(limit: ReachedLimit) -> str:
-    """Describe what helps a design of which many samples end at a limit."""
+    """Advise on a design whose samples often end at a limit of a coordinate."""
     return (
         f"{100 * limit.share:.0f} % of the samples end at the {limit.side} limit of {limit.coordinate}, "
         f"{limit.value:.4g}, and say little about the dynamics; register under a new name with sampling ranges from "
@@ -134,7 +136,7 @@ def _widen(view: SurrogateView, output: OutputFidelity) -> str:
 
 
 def _declarable(output: OutputFidelity) -> float:
-    """Return the tolerance without the noise that the server adds to it."""
+    """Return an output's tolerance without the noise that the server adds to it."""
     return _beyond(output.tolerance, output.noise) if output.noise else output.tolerance
 
 
@@ -168,7 +170,8 @@ def _named(output: OutputFidelity, target: float) -> str:
 
 
 def _where(region: DoubtfulRegion | None) -> str:
-    """Describe a region, with a space before it; empty without one."""
+    """Describe the region where a model is uncertain as the end of a sentence, such as " where x is above 2"; empty for
+    None."""
     if region is None:
         return ""
     name, low, high = region.input, _end(region.low), _end(region.high)
@@ -202,7 +205,7 @@ def _steps_to_go(view: SurrogateView, worst: OutputFidelity, models: Sequence[Mo
 
 
 def _too_slow(worst: OutputFidelity, models: Sequence[ModelView]) -> str:
-    """Describe why no number of real steps is advised, by the leave-one-out error over the last half of the fits."""
+    """Describe that more real steps don't help an output enough, by its error over the last half of the fits."""
     seen = [
         (model.samples, output.leave_one_out_error)
         for model in models[len(models) // 2 :]
@@ -219,8 +222,8 @@ def _too_slow(worst: OutputFidelity, models: Sequence[ModelView]) -> str:
 
 
 def _forecast(samples: Sequence[float], values: Sequence[float], limit: float) -> float | None:
-    """Forecast how many samples are missing until values that decrease exponentially reach the limit; None if they
-    don't."""
+    """Forecast the number of further samples until values that decrease exponentially reach the limit; None if the
+    values don't decrease."""
     if values[-1] <= limit:
         return 0.0
     logs = [log(max(value, 1e-300)) for value in values]
@@ -249,5 +252,5 @@ def _within_reach(view: SurrogateView, output: OutputFidelity) -> float:
 
 
 def _beyond(value: float, part: float) -> float:
-    """Return what remains of a value without an independent part: sqrt(value^2 - part^2); 0 if the part is larger."""
+    """Return a standard deviation without an independent part: sqrt(value^2 - part^2); 0 if the part is larger."""
     return sqrt(max(value**2 - part**2, 0.0))

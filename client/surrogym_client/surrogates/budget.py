@@ -7,11 +7,17 @@ from surrogym_client.transport.api import Api
 
 
 class BudgetTooSmall(SurrogymClientError):
-    """The budget has too few steps for the rounds, and the token may not raise it."""
+    """The budget has too few real steps for the rounds of a training, and the token may not raise it."""
 
 
 def words_of_rounds(api: Api, name: str, queries: int, rounds: int) -> str:
-    """Describe how many real steps the rounds may cost, before the first query.
+    """Describe how many real steps the rounds of a training may cost.
+
+    Args:
+        api: the server.
+        name: name of the surrogate.
+        queries: real steps of each round.
+        rounds: number of rounds.
 
     Raises:
         BudgetTooSmall: the budget has fewer steps left, and the token may not raise it.

@@ -17,11 +17,11 @@ IN_WORDS: dict[Phase, str] = {
 
 
 def awaits_log(view: SurrogateView) -> bool:
-    """Whether nothing happens until a log is imported: the budget is 0, and there are neither samples nor queries."""
+    """Whether a design waits for the import of a log: its budget is 0, and it has neither samples nor queries."""
     asked = view.queries.pending + view.queries.leased
     return view.budget == 0 and view.model_version is None and not view.samples and not asked
 
 
 def words_of_no_log(name: str) -> str:
-    """Describe a surrogate that awaits a log, with the next command."""
+    """Describe the state of a surrogate that waits for a log, with the command that imports one."""
     return f"the design requests no real steps, and there is no log yet; next: surrogym import LOG --to {name}"

@@ -14,12 +14,12 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 from surrogym_shared.wire import NewSample, SurrogateView
 
-BATCH = 1_024  # samples of one request
+BATCH = 1_024  # most samples in one request
 PURPOSES = ("initial", "adaptive", "manual", "audit", "logged", "evaluation")
 
 
 class NotImportable(SurrogymClientError):
-    """The surrogate can't be imported under this name."""
+    """A surrogate can't be imported under this name, because the name is in use."""
 
 
 def export_surrogate(api: Api, name: str) -> SurrogateFile:
@@ -27,7 +27,7 @@ def export_surrogate(api: Api, name: str) -> SurrogateFile:
 
     Raises:
         NoModel: there was no fit yet.
-        SurrogymClientError: as every request.
+        SurrogymClientError: the server can't be reached, or refuses the request.
     """
     latest, view = api.model(name), api.surrogate(name)
     return SurrogateFile(
@@ -57,7 +57,7 @@ def import_surrogate(
     Raises:
         NotImportable: there is a surrogate of this name.
         InvalidInput: the model does not fit the specification.
-        SurrogymClientError: as every request.
+        SurrogymClientError: the server can't be reached, or refuses the request.
     """
     name = name or file.name
     if not _created(api, name, file):
@@ -77,8 +77,8 @@ def import_surrogate(
 
 
 def _created(api: Api, name: str, file: SurrogateFile) -> bool:
-    """Create the surrogate, and return whether the name was free. The server decides, so only one of two imports
-    succeeds."""
+    """Create the surrogate, and return whether the name was free. The server decides this, so that only one of two
+    simultaneous imports succeeds."""
     try:
         return api.create_surrogate(name, file.spec).created
     except SpecConflict:
@@ -100,7 +100,7 @@ def _samples(api: Api, name: str) -> RealSamples:
 
 
 def _batches(samples: RealSamples) -> Iterator[list[int]]:
-    """Iterate over the rows in order, in batches with one purpose each."""
+    """Yield the indices of the samples in order, in batches of either logged or other samples."""
     for _, group in groupby(range(len(samples)), partial(_is_logged, samples)):
         rows = list(group)
         yield from (rows[first : first + BATCH] for first in range(0, len(rows), BATCH))

@@ -11,13 +11,13 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.wire import SurrogateView
 
 LOOK_SECONDS = 0.25
-MANY = 1_500  # samples from which on a fit by the default model takes about the same time
+MANY = 1_500  # number of samples from which the time of a fit by the default model hardly grows
 USUAL_FIT = "such a fit takes about 15 s with noise, and up to 100 s without, on two free cores"
-FIRST_LEASE_SECONDS = 5.0  # a running sampler begins queries within a second
+FIRST_LEASE_SECONDS = 5.0  # time for a sampler to begin a query, which a running sampler does within a second
 
 
 def share_of_design(view: SurrogateView) -> float:
-    """Return how much of a design is done, in [0, 1]: 1 if it has ended, else the share of its budget."""
+    """Return how much of a design is done, in [0, 1]: 1 if it has ended, else the share of its budget that is spent."""
     return 1.0 if view.phase in COMPLETED else min(1.0, view.ledger.total / max(1, view.budget))
 
 
@@ -32,7 +32,7 @@ def words_of_design(view: SurrogateView) -> str:
 
 
 def words_of_long_fit(view: SurrogateView, seconds: float) -> str:
-    """Describe a fit that has been waited for: its steps, the time so far, and how long such a fit takes."""
+    """Describe a fit that has taken ``seconds`` so far: its samples, and how long such a fit usually takes."""
     waited = f" for {seconds:.0f} s" if view.phase == "fitting" else ""
     usual = f"; {USUAL_FIT}" if waited and view.samples >= MANY else ""
     return f"{words_of_design(view)}{waited}{usual}"
@@ -44,13 +44,13 @@ def words_of_audit(view: SurrogateView) -> str:
 
 
 def _words_of_fit(view: SurrogateView) -> str:
-    """Say that the server fits a model; empty if it does not."""
+    """Return the words that the server is fitting a model; empty if it is not."""
     return f"; a model is being fitted to {view.samples} steps" if view.phase == "fitting" else ""
 
 
 def words_of_waiting(view: SurrogateView, start: str) -> str:
-    """Describe for what a training waits: for a sampler to be started by the command ``start``, for the answers of one
-    that runs, or for a model."""
+    """Describe what a training waits for: a sampler, which the command ``start`` starts, the answers of a running
+    sampler, or a model."""
     if view.phase == "fitting" and not _under_way(view):
         return words_of_design(view)
     awaited = "the sampler's answers" if view.samplers else f"a sampler ({start})"
@@ -64,11 +64,11 @@ def words_of_uncertainty(view: SurrogateView) -> str:
 
 
 class DesignUnfinished(SurrogymClientError):
-    """The design has failed, or did not end in time. ``surrogym status`` says more."""
+    """The design has failed, or did not end in time. ``surrogym status`` shows the reason."""
 
 
 class NobodyAnswers(SurrogymClientError):
-    """No sampler has begun the queries."""
+    """No sampler has begun to answer the queries that a command waits for."""
 
 
 def wait_for_surrogate(api: Api, name: str, seconds: float) -> SurrogateView:
@@ -128,8 +128,8 @@ def wait_for_answers(
     """Wait until samplers have answered the given queries, or given up on them.
 
     Raises:
-        NobodyAnswers: no sampler has begun any of them after ``FIRST_LEASE_SECONDS``.
-        DesignUnfinished: some were still open after ``seconds``.
+        NobodyAnswers: no sampler has begun any of the queries after ``FIRST_LEASE_SECONDS``.
+        DesignUnfinished: some of the queries were still open after ``seconds``.
         UnknownSurrogate: there is no surrogate of this name.
     """
     started, begun = time.monotonic(), False
@@ -153,8 +153,8 @@ def wait_for_answers(
 def wait_for_model(
     api: Api, name: str, seconds: float, progress: Callable[[SurrogateView], None] | None = None
 ) -> SurrogateView:
-    """Wait until the surrogate has a model of all its samples, and return it. Arguments and errors as
-    ``wait_for_design``."""
+    """Wait until the surrogate has a model of all its samples, and return the surrogate. Arguments and errors are those
+    of ``wait_for_design``."""
     view = None
     for view in _looks(api, name, seconds, progress):
         if view is None:
@@ -202,5 +202,5 @@ def _look(api: Api, name: str, deadline: float) -> SurrogateView | None:
 
 
 def _under_way(view: SurrogateView) -> bool:
-    """Number of open queries that were added after the design had ended."""
+    """Whether a design has open queries, also such that were added after its end."""
     return view.queries.pending + view.queries.leased > 0

@@ -153,8 +153,7 @@ class EnvironmentSpec(Frozen):
 
     @property
     def unknown_steps(self) -> int:
-        """Number of first steps of an episode that a model does not learn from, because the values of coordinates that
-        repeat the past (lags) are not known yet."""
+        """Number of an episode's first steps that a model does not learn from, because lags are not known yet."""
         return max(c.counted for c in self.coordinates)
 
     @property
@@ -163,8 +162,7 @@ class EnvironmentSpec(Frozen):
         return PRESETS[self.design.preset]
 
     def known(self, coordinates: Sequence[float]) -> bool:
-        """Whether the entries of coordinates (C,) that repeat the past (lags) are known, so that a model can learn from
-        a step that begins at these coordinates."""
+        """Whether all lags in a state (C,) are known, so that a model can learn from a step that begins there."""
         return all(q >= c.counted for c, q in zip(self.coordinates, coordinates, strict=True) if c.counted)
 
     @model_validator(mode="after")
@@ -229,8 +227,7 @@ class EnvironmentSpec(Frozen):
         return self
 
     def _require_lags(self) -> None:
-        """Check that each lag repeats a known value, is shorter than an episode, and has a past to repeat (queries are
-        rollouts)."""
+        """Check that each lag repeats a known value, is shorter than an episode, and that queries are rollouts."""
         earlier: dict[str, Coordinate] = {}
         age = dict.fromkeys(self.coordinate_names, 0)
         longest = min((limit for limit in (self.time_limit, self.max_rollout) if limit is not None), default=math.inf)

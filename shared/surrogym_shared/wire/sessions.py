@@ -53,8 +53,7 @@ class Residual(Request):
 class OpenSession(Request):
     """Request to open a session, the virtual environment of one trainer, with its options.
 
-    For ``time_limit`` and ``penalty``, None takes the surrogate's value. The descriptions of other fields say what None
-    means.
+    For ``time_limit`` and ``penalty``, None takes the surrogate's value.
     """
 
     num_envs: Annotated[int, Field(ge=1, le=MAX_LANES)] = Field(default=1, description="number of lanes, N")
