@@ -154,7 +154,7 @@ def test_a_snapshot_of_something_else_is_refused(tanks: Path, tmp_path: Path) ->
     one = opened(f"fmu:{tanks}")
     other = opened(mapping(tmp_path, fmu=str(tanks), start={"flow": 1e-4}))
     try:
-        with pytest.raises(StepFailed, match="as it is now, got one of another file, step or start: delete"):
+        with pytest.raises(StepFailed, match="as it is now, .* another file, step or start: delete"):
             other.go_back(one.snapshot())
         with pytest.raises(StepFailed, match=r"expected a snapshot of TwoTanks.fmu, got 5 other bytes"):
             other.go_back(b"hello")
@@ -247,7 +247,7 @@ def test_an_fmu_is_never_opened_for_a_server() -> None:
     ("push", "message"),
     [
         (1.5, r"the process of Moody.fmu ended with exit code -6 \(SIGABRT\) during step"),
-        (3.0, r"Moody.fmu: expected finite values of the FMU, but x is nan$"),
+        (3.0, r"Moody.fmu: expected finite values from the FMU, got x is nan"),
         (4.0, r"Moody.fmu: the FMU answered fmi2DoStep with status"),
     ],
 )
@@ -257,7 +257,7 @@ def test_a_fault_of_native_code_costs_one_step(moody: Path, tmp_path: Path, push
         good = plant.step_from(np.array([0.5]), np.array([-1.0]))
         with pytest.raises(StepFailed, match=message):
             plant.step_from(np.array([0.5]), np.array([push]))
-        with pytest.raises(StepFailed, match=r"at a state, got none"):
+        with pytest.raises(StepFailed, match=r"to have a state, got none"):
             plant.act(np.zeros(1))
         again = plant.step_from(np.array([0.5]), np.array([-1.0]))
         assert bits(again.next_coordinates) == bits(good.next_coordinates)

@@ -66,7 +66,7 @@ def test_broken_files_are_named(tanks: Path, tmp_path: Path) -> None:
         ({"start": {"flow": "much"}}, "expected a finite number for 'flow'"),
         ({"start": {"depth": 1.0}}, "has no scalar variable 'depth': expected one of pump, upper, lower, flow"),
         ({"actions": {"pump": [1, 0]}}, r"expected low < high, got \[1, 0\]"),
-        ({"actions": ["flow"]}, "expected some of the continuous inputs of .*, pump, got flow"),
+        ({"actions": ["flow"]}, "of the continuous inputs of .*pump.*, got flow"),
         ({"coordinates": []}, "expected continuous variables of .*, got none"),
         ({"steps": 1.0}, "expected fmu, and optionally step, actions, coordinates and start"),
         ({"actions": ["pump", "pump"]}, "actions: expected each variable once, got 'pump' twice"),

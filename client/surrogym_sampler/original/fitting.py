@@ -1,4 +1,4 @@
-"""Whether a policy that was trained for one specification may act in an environment of another one."""
+"""Checks of whether a policy that was trained for one specification may act in an environment with another one."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Range: TypeAlias = tuple[float, float]
 
 
 def check_shape(trained: EnvironmentSpec, own: EnvironmentSpec, called: str) -> None:
-    """Check that another specification has the coordinates and the kind of action that a policy was trained for.
+    """Check that a specification has the coordinates and the kind of action that a policy was trained for.
 
     Args:
-        trained: specification that the policy was trained for.
+        trained: the specification that the policy was trained for.
         own: the other specification.
-        called: what the message calls it, such as "the environment".
+        called: the owner of the other specification in messages, such as "the environment".
 
     Raises:
-        PolicyMisfit: they differ.
+        PolicyMisfit: the coordinates or the actions differ.
     """
     expected, got = shape_in_words(trained), shape_in_words(own)
     if expected != got:
@@ -32,15 +32,15 @@ def check_shape(trained: EnvironmentSpec, own: EnvironmentSpec, called: str) -> 
 
 
 def check_policy(trained: EnvironmentSpec, own: EnvironmentSpec) -> None:
-    """Check that an environment has what a policy was trained for: coordinates, action, observation and
-    sampling period.
+    """Check that an environment has what a policy was trained for: coordinates, action, observation and sampling
+    period.
 
-    Limits of continuous actions must lie within the environment's, because every action beyond them would be cut off.
-    Bins must be equal, because a policy gives their numbers. How queries begin, ranges and starts may differ.
+    Limits of continuous actions must lie within the environment's, because actions beyond them would be clipped. Bins
+    must be equal, because a policy outputs their numbers. Access, ranges and starts may differ.
 
     Args:
-        trained: specification that the policy was trained for.
-        own: specification of the environment.
+        trained: the specification that the policy was trained for.
+        own: the specification of the environment.
 
     Raises:
         PolicyMisfit: the environment does not fit.
@@ -68,7 +68,7 @@ def check_policy(trained: EnvironmentSpec, own: EnvironmentSpec) -> None:
 
 
 def action_ranges(spec: EnvironmentSpec) -> list[Range]:
-    """Return the limits of each entry of an action; those of a discrete one are its first and last number."""
+    """Return the limits of each entry of an action; the first and last value of a discrete entry."""
     action = spec.action
     if isinstance(action, BoxAction):
         return list(zip(action.low, action.high, strict=True))
@@ -77,26 +77,27 @@ def action_ranges(spec: EnvironmentSpec) -> list[Range]:
 
 
 def is_within(asked: Range, allowed: Range) -> bool:
-    """Whether a range lies in another one, apart from rounding. A range with NaN lies in none."""
+    """Return whether one range lies in another, apart from rounding. A range with NaN lies in none."""
     slack = ROUNDING * max(map(abs, allowed))
     return allowed[0] - slack <= asked[0] and asked[1] <= allowed[1] + slack
 
 
 def range_in_words(ranges: Sequence[Range]) -> str:
-    """Describe the limits of several entries: "[0, -2] to [1, 2]"."""
+    """Return the limits of several entries in words, such as "[0, -2] to [1, 2]"."""
     low, high = (", ".join(f"{bound:g}" for bound in bounds) for bounds in zip(*ranges, strict=True))
     return f"[{low}] to [{high}]"
 
 
 def shape_in_words(spec: EnvironmentSpec) -> str:
-    """Describe coordinates and action: "coordinates (x, v) and a box action of 1"."""
+    """Return coordinates and action in words, such as "coordinates (x, v) and a box action of 1"."""
     bins = _bins(spec)
     of = "" if bins is None else f" in {', '.join(map(str, bins))} bins"
     return f"coordinates ({', '.join(spec.coordinate_names)}) and a {spec.action.kind} action of {spec.action.size}{of}"
 
 
 def meant_in_words(spec: EnvironmentSpec) -> str:
-    """Describe which environment a policy is for. A program's command is not repeated: a stranger may have noted it."""
+    """Return in words which environment a policy is for. The command of a program is left out, because a stranger may
+    have written it."""
     name = "a program" if is_executable(spec.environment) else spec.environment or "an environment"
     return f"{name} with {shape_in_words(spec)}"
 

@@ -18,7 +18,7 @@ from surrogym_shared.spec.actions import Action
 
 
 def task_for(environment: str, preset: str) -> Task:
-    """The task of a known Gymnasium id, as the preset defines it.
+    """Return the task with this Gymnasium id, in the version of the preset.
 
     Raises:
         KeyError: there is no classic control task with this id.
@@ -29,13 +29,14 @@ def task_for(environment: str, preset: str) -> Task:
 
 
 def opens_task(name: str, spec: EnvironmentSpec | None) -> bool:
-    """Whether a classic control task of this module opens a name: the specification, if any, has the task's own
-    coordinates in their order. A description has others, and a simulator opens those."""
+    """Return whether this module opens an environment of this name: it is a classic control task, and the
+    specification, if any, has the task's own coordinates in their order. A described specification has others, so a
+    simulator opens the environment."""
     return name in TASKS and (spec is None or spec.coordinate_names == TASKS[name].spec().coordinate_names)
 
 
 def shows_the_same(spec: EnvironmentSpec) -> bool:
-    """Whether the specification's observation equals the environment's own, entry by entry."""
+    """Return whether the specification's observation equals the environment's own, entry by entry."""
     return spec.environment in TASKS and TASKS[spec.environment].spec().observation == spec.observation
 
 
@@ -58,7 +59,7 @@ class GymnasiumEnvironment:
         return self._spec
 
     def step_from(self, coordinates: Array, action: Array) -> RealStep:
-        """Set the state to coordinates (C,), and apply action (F,)."""
+        """Set the state to coordinates (C,), and apply an action (F,)."""
         self._task.write(self._env, coordinates)
         return self.act(action)
 
@@ -68,7 +69,7 @@ class GymnasiumEnvironment:
         return wrapped(self._spec, self._task.read(self._env))
 
     def act(self, action: Array) -> RealStep:
-        """Apply action (F,) in the present state."""
+        """Apply an action (F,) in the current state."""
         achieved = wrapped(self._spec, self._task.read(self._env))
         native = native_action(self._spec.action, action)
         observation, reward, terminated, truncated, _ = self._env.step(native)
@@ -83,22 +84,22 @@ class GymnasiumEnvironment:
         )
 
     def save(self) -> bytes:
-        """The state as the task holds it: an angle keeps its turns, a number its precision."""
+        """Return the task's own state as a snapshot; an angle keeps its turns, a number its precision."""
         return packed(np.asarray(self._env.state))
 
     def restore(self, snapshot: bytes) -> Array:
-        """Return to a saved state; its coordinates (C,)."""
+        """Return to a saved state, and return its coordinates (C,)."""
         state = unpacked(snapshot, np.shape(self._env.state))
         self._task.write(self._env, state)
         self._env.state = state
         return wrapped(self._spec, self._task.read(self._env))
 
     def parameters(self) -> dict[str, float]:
-        """The task's physical attributes, by name."""
+        """Return the task's physical attributes, by name."""
         return {name: float(getattr(self._env, name)) for name in self._task.perturbable}
 
     def set_parameters(self, values: Mapping[str, float]) -> None:
-        """Change physical attributes, and those that depend on them."""
+        """Change physical attributes, and recompute those that depend on them."""
         for name, value in values.items():
             setattr(self._env, name, value)
         if self._task.settle is not None:
@@ -109,7 +110,7 @@ class GymnasiumEnvironment:
 
 
 def native_action(space: Action, action: Array) -> Any:
-    """Convert an action (F,) for the environment's own ``step``: to an int, or an array."""
+    """Convert an action (F,) to the form that a Gymnasium environment's ``step`` takes: an int, or an array."""
     if isinstance(space, BoxAction):
         return np.asarray(action, dtype=np.float32)
     numbers = np.asarray(action, dtype=np.int64)
@@ -117,7 +118,7 @@ def native_action(space: Action, action: Array) -> Any:
 
 
 def wrapped(spec: EnvironmentSpec, coordinates: Array) -> Array:
-    """Wrap angles of coordinates (..., C) to [-pi, pi), and clip bounded coordinates to their bounds.
+    """Wrap the angles of coordinates (..., C) to [-pi, pi), and clip bounded coordinates to their bounds.
 
     Environments with a float32 state exceed their own bounds by a rounding error.
     """
@@ -133,22 +134,27 @@ def wrapped(spec: EnvironmentSpec, coordinates: Array) -> Array:
 
 
 def packed(state: NDArray[Any]) -> bytes:
-    """An array as a snapshot, bit for bit."""
+    """Return an array as the bytes of a snapshot, without loss of precision."""
     file = io.BytesIO()
     np.save(file, state, allow_pickle=False)
     return file.getvalue()
 
 
 def unpacked(snapshot: bytes, shape: tuple[int, ...]) -> NDArray[Any]:
-    """The array in a snapshot that ``packed`` made.
+    """Return the array in a snapshot that ``packed`` made.
 
     Raises:
-        StepFailed: the snapshot has another form, or its state another shape.
+        StepFailed: the snapshot can't be read, or its array has another shape.
     """
     try:
         state: NDArray[Any] = np.load(io.BytesIO(snapshot), allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
-        raise StepFailed(f"expected a snapshot of {shape} numbers, got one that can't be read: {error}") from error
+        raise StepFailed(
+            f"expected a snapshot with an array of shape {shape}, got one that can't be read ({error}): delete it"
+        ) from error
     if state.shape != shape:
-        raise StepFailed(f"expected a snapshot of {shape} numbers, got {state.shape}: delete these snapshots")
+        raise StepFailed(
+            f"expected a snapshot with an array of shape {shape}, got {state.shape}: delete the snapshots of this "
+            "environment"
+        )
     return state

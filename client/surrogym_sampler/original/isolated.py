@@ -1,4 +1,4 @@
-"""An original environment in its own process, so that an error or a hang costs a query and not the worker."""
+"""An original environment in its own process, so that an error or a hang fails one query and not the whole worker."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from surrogym_sampler.original.protocol import Array, Environment, Factory, Real
 from surrogym_sampler.original.rollouts import answering
 from surrogym_shared.spec import EnvironmentSpec
 
-START_LIMIT = 120.0  # seconds; importing a simulator may take long
+START_LIMIT = 120.0  # seconds until the environment must be made; importing a simulator may take long
 PARENTS_BUSINESS = (signal.SIGINT, getattr(signal, "SIGHUP", signal.SIGINT))
-CLOSE_LIMIT = 2.0  # seconds, in addition to the limit of a step
+CLOSE_LIMIT = 2.0  # seconds for closing the environment, in addition to the limit of a step
 
 
 class IsolatedEnvironment:
@@ -40,7 +40,7 @@ class IsolatedEnvironment:
     including the end of this process, the running step is finished and the environment is closed.
 
     Args:
-        factory: makes the environment in the child; it must pickle (a module's function, a ``partial``).
+        factory: makes the environment in the child process; it must be picklable (a module's function, a ``partial``).
         step_limit: seconds that one step may take.
 
     Raises (from any method):
@@ -51,7 +51,7 @@ class IsolatedEnvironment:
     def __init__(self, factory: Factory, step_limit: float = 30.0) -> None:
         self._factory = factory
         self._step_limit = step_limit
-        self._number = 0  # of the last request
+        self._number = 0  # number of the last request
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
 
@@ -79,7 +79,8 @@ class IsolatedEnvironment:
         return at
 
     def close(self) -> None:
-        """Let the environment finish its step and close. If that takes too long, or at Ctrl-C, it is killed."""
+        """Let the environment finish its step and close. If that takes too long, or at Ctrl-C, its process
+        is killed."""
         try:
             if self._pipe is not None and self._process is not None and self._process.is_alive():
                 with suppress(StepFailed):
@@ -103,16 +104,18 @@ class IsolatedEnvironment:
             answer = _await_answer(pipe, self._number, limit)
         except (EOFError, OSError) as error:
             code = self._kill()
-            raise EnvironmentDied(f"the environment's process ended with exit code {code} during {method}") from error
+            raise EnvironmentDied(
+                f"the environment's process ended with exit code {code} during {method}: see what it printed"
+            ) from error
         if answer is None:
             self._kill()
-            raise StepTimedOut(f"{method} took longer than {limit:g} s and was killed; {MORE_TIME}")
+            raise StepTimedOut(f"the environment's {method} took longer than {limit:g} s and was killed; {MORE_TIME}")
         ok, value = answer
         if isinstance(value, StepRefused):
             raise value
         if ok is None:
             assert self._process is not None
-            self._process.join(self._step_limit + CLOSE_LIMIT)  # it closes the environment
+            self._process.join(self._step_limit + CLOSE_LIMIT)  # the child closes the environment before it exits
             self._kill()
             raise EnvironmentDied(
                 f"the environment ended its process during {method}: {value}; let it raise an exception"
@@ -133,7 +136,7 @@ class IsolatedEnvironment:
         try:
             self._await_start(self._pipe)
         except KeyboardInterrupt:
-            self._kill()  # nobody read its first message, so ``close`` would read it as an answer
+            self._kill()  # the child's first message is still unread, and `close` would take it for an answer
             raise
         return self._pipe
 
@@ -144,7 +147,9 @@ class IsolatedEnvironment:
                 raise StepTimedOut(f"the environment took longer than {START_LIMIT:g} s to start: make it start faster")
             ok, value = pipe.recv()
         except EOFError as error:
-            raise EnvironmentDied(f"the environment's process ended with exit code {self._kill()}") from error
+            raise EnvironmentDied(
+                f"the environment's process ended with exit code {self._kill()} at its start: see what it printed"
+            ) from error
         if not ok:
             self._kill()
             raise UnknownEnvironment(value)
@@ -164,7 +169,8 @@ class IsolatedEnvironment:
 
 
 def _await_answer(pipe: Connection, number: int, limit: float) -> tuple[bool | None, Any] | None:
-    """The answer (ok, value) to one request; None after ``limit`` seconds. Answers to earlier requests are skipped."""
+    """Return the answer (ok, value) to request ``number``; None after ``limit`` seconds. Answers to earlier requests
+    are skipped."""
     deadline = time.monotonic() + limit
     while pipe.poll(max(0.0, deadline - time.monotonic())):
         answered, ok, value = pipe.recv()
@@ -174,7 +180,7 @@ def _await_answer(pipe: Connection, number: int, limit: float) -> tuple[bool | N
 
 
 class _Ending:
-    """End of the child on SIGTERM, but not in the middle of a step."""
+    """Handler that ends the child process on SIGTERM, but lets a running step finish first."""
 
     def __init__(self) -> None:
         self._working = self._ending = False
@@ -196,9 +202,10 @@ class _Ending:
 
 
 def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
-    """Main function of the child: one answer (ok, value) for the start, then one for every request.
+    """Run the child process: make the environment, and answer requests until the parent closes.
 
-    What the environment prints goes to standard error, because the output of a command may be JSON.
+    The first answer (ok, value) is that of the start; one for each request follows. What the environment prints goes to
+    standard error, because the output of a command may be JSON.
     """
     sys.stdout = sys.stderr
     for number in PARENTS_BUSINESS:
@@ -224,7 +231,8 @@ def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
 
 
 def _serve_one(pipe: Connection, environment: Environment, working: _Ending) -> str:
-    """Answer one request, and return its method. Raises ``SystemExit`` if the environment asked for the end."""
+    """Answer one request, and return its method. Raises ``SystemExit`` if the environment's code called
+    ``sys.exit``."""
     number, method, arguments = pipe.recv()
     with working:
         ok, value = _answer(environment, method, arguments)
@@ -235,8 +243,8 @@ def _serve_one(pipe: Connection, environment: Environment, working: _Ending) -> 
 
 
 def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -> tuple[bool | None, Any]:
-    """The answer (ok, value). ``ok`` is None if the environment asked for the end of its process, as ``sys.exit``
-    does."""
+    """Call a method of the environment, and return the answer (ok, value). ``ok`` is None if the method called
+    ``sys.exit``, False if it raised an error."""
     try:
         value = getattr(environment, method)(*arguments)
         return True, value.model_dump() if isinstance(value, EnvironmentSpec) else value
@@ -249,7 +257,7 @@ def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -
 
 
 def _exit_after_parent(seconds: float) -> None:
-    """Exit some time after the parent has ended, so that the environment can close."""
+    """Wait for the end of the parent process, and exit ``seconds`` later, so that the environment can close."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])

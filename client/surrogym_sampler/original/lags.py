@@ -1,4 +1,4 @@
-"""Coordinates with their lags, from what an environment reads.
+"""Conversion of what an environment reads to coordinates with their lags.
 
 Shapes: C coordinates, of which R are read and the others are lags; F action entries.
 """
@@ -13,13 +13,13 @@ from surrogym_shared.spec import EnvironmentSpec, limits
 
 
 def read_names(spec: EnvironmentSpec) -> tuple[str, ...]:
-    """Names of the coordinates that the environment itself reads, (R,)."""
+    """Return the names of the R coordinates that the environment itself reads; the others are lags."""
     return tuple(c.name for c in spec.coordinates if c.lag is None)
 
 
 def begun(spec: EnvironmentSpec, read: Array) -> Array:
-    """Coordinates (C,) after a reset that read (R,). No step has been taken, and each other lag has the middle of its
-    declared start.
+    """Return the coordinates (C,) after a reset that read the values ``read`` (R,). A lag that counts steps is 0; each
+    other lag has the middle of its declared start.
 
     Examples:
         A policy on a machine observes ``surrogym_shared.terms.observe(spec, begun(spec, read)[None])[0]``.
@@ -29,7 +29,14 @@ def begun(spec: EnvironmentSpec, read: Array) -> Array:
 
 
 def followed(spec: EnvironmentSpec, before: Array, action: Array, read: Array) -> Array:
-    """Coordinates (C,) after a step from coordinates ``before`` (C,) under action (F,) that read (R,)."""
+    """Return the coordinates (C,) after a step.
+
+    Args:
+        spec: the specification.
+        before: coordinates (C,) before the step.
+        action: the action (F,) of the step.
+        read: the values (R,) read after the step.
+    """
     after = placed(spec, read, before)
     names = spec.coordinate_names
     for i, coordinate in enumerate(spec.coordinates):
@@ -47,7 +54,7 @@ def followed(spec: EnvironmentSpec, before: Array, action: Array, read: Array) -
 
 
 def placed(spec: EnvironmentSpec, read: Array, lags: Array) -> Array:
-    """Coordinates (C,) of what was read (R,), and of lags (C,)."""
+    """Return coordinates (C,) with the read values (R,), and with the lags in ``lags`` (C,)."""
     placed = lags.copy()
     placed[[c.lag is None for c in spec.coordinates]] = read
     return wrapped(spec, placed)

@@ -1,4 +1,5 @@
-"""Load an original environment by name: an adapter's, or a user's by ``package.module:factory``."""
+"""Functions that make an original environment from a name: one that an adapter knows, or a user's
+``package.module:factory``."""
 
 from __future__ import annotations
 
@@ -27,12 +28,12 @@ from surrogym_shared.presets import PresetName
 from surrogym_shared.spec import Access, BoxAction, EnvironmentSpec
 
 Choose = Callable[[EnvironmentSpec], EnvironmentSpec]
-ACCESS: dict[Access, dict[str, Any]] = {  # fields of a specification
+ACCESS: dict[Access, dict[str, Any]] = {  # Fields of a specification for each access.
     "any": {"query": "step", "snapshots": False},
     "snapshot": {"query": "rollout", "snapshots": True},
     "reset": {"query": "rollout", "snapshots": False},
 }
-PLACEHOLDER = "YOUR.MODULE:CLASS"  # for an environment whose name nobody noted
+PLACEHOLDER = "YOUR.MODULE:CLASS"  # stands in a suggested command for the name of an environment that is not known
 ATTRIBUTES = (
     *("step_from", "reset", "step", "coordinates", "begin", "act", "save", "restore"),
     *("picture", "close", "parallel"),
@@ -54,17 +55,17 @@ def make(
     max_rollout: int | None = None,
     step_limit: float = 30.0,
 ) -> Environment:
-    """Build an original environment.
+    """Make an original environment.
 
     Args:
         name: a Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL``, ``fmu:PLANT.fmu``, ``exec:COMMAND``, or
             ``package.module:factory``.
         spec: a specification that replaces the adapter's own; most names have none until ``describe`` writes one.
-        preset, budget, initial, target, acquisition, seed: choices of the design; None keeps the specification's.
+        preset, budget, initial, target, acquisition, seed: settings of the design; None keeps the specification's.
         bins: number of discrete values that replace each dimension of a continuous action for policies.
-        access: where a query may begin: ``any`` state, a ``snapshot`` or a reset, or at a ``reset`` only. None keeps
-            the specification's.
-        max_rollout: the longest of them.
+        access: where a query may begin: at ``any`` state, at a ``snapshot`` or a reset, or at a ``reset`` only. None
+            keeps the specification's.
+        max_rollout: largest number of actions in a query that begins at a reset or snapshot.
         step_limit: seconds that one step of ``exec:COMMAND`` or ``fmu:PLANT.fmu`` may take; ``isolated`` limits the
             others.
 
@@ -89,7 +90,7 @@ def make(
 def isolated(
     name: str, step_limit: float, spec: EnvironmentSpec | None = None
 ) -> IsolatedEnvironment | Executable | Simulated:
-    """Build an original environment that runs in a process of its own, where a step has a time limit in seconds."""
+    """Make an original environment in a process of its own, in which a step may take ``step_limit`` seconds."""
     if is_executable(name):
         return open_executable(name, spec, step_limit=step_limit)
     if (adapter := adapter_of(name)) is not None and adapter.separate:
@@ -100,13 +101,13 @@ def isolated(
 
 
 def is_own(name: str) -> bool:
-    """Whether a name is ``package.module:factory`` or ``exec:COMMAND``, and not an adapter's."""
+    """Return whether a name has the form ``package.module:factory`` or ``exec:COMMAND``, and no adapter knows it."""
     return ":" in name and adapter_of(name) is None
 
 
 def is_known(name: str) -> bool:
-    """Whether a name from a server may be opened without further consent: an adapter knows it, and it runs no user's
-    code."""
+    """Return whether a name that came from a server may be opened without consent: an adapter knows it, and it runs no
+    user's code."""
     import gymnasium
 
     entry = gymnasium.registry.get(name)
@@ -115,8 +116,8 @@ def is_known(name: str) -> bool:
 
 
 def env_option(name: str) -> str:
-    """Return the option ``--env`` that a suggested command needs, with a space before it. Empty if the environment may
-    be opened by its name alone.
+    """Return the option ``--env`` that a suggested command needs, with a space before it; empty if the name alone opens
+    the environment.
 
     A program's command is never repeated, because the name may come from a server.
     """
@@ -128,12 +129,12 @@ def env_option(name: str) -> str:
 
 
 def sample_command(surrogate: str, environment: str) -> str:
-    """Return the command that starts a sampler of a surrogate, whose environment has this name."""
+    """Return the command that starts a sampler of a surrogate whose environment has this name."""
     return f"surrogym sample {surrogate}{env_option(environment)}"
 
 
 def has_specification(name: str) -> bool:
-    """Whether an environment has its own specification, built in or from its class."""
+    """Return whether an environment comes with a specification, built in or from its class."""
     return name in TASKS or name in SPECIFICATIONS or adapter_of(name) is None
 
 
@@ -159,13 +160,14 @@ def specification(name: str) -> EnvironmentSpec:
 
 
 def fits(noted: str, name: str) -> bool:
-    """Whether the specification noted for one environment may be used for another that an adapter opens: both are the
-    same, and known or without a specification of its own."""
+    """Return whether the specification of the environment ``noted`` may be used for the environment ``name``, which an
+    adapter opens: both are the same, and the adapter's name is known or has no specification of its own."""
     return is_same(noted, name) and (is_known(name) or not has_specification(name))
 
 
 def own_time_limit(name: str) -> int:
-    """Time limit of a known name in steps, from its registration; ``LONGEST_EPISODE`` if it has none."""
+    """Return the time limit in steps that a known environment was registered with; ``LONGEST_EPISODE`` if
+    it has none."""
     import gymnasium
 
     if name in gymnasium.registry:
@@ -182,10 +184,17 @@ def with_choices(
     access: Access | None = None,
     max_rollout: int | None = None,
 ) -> EnvironmentSpec:
-    """Replace choices of a specification's design, and other options of ``make``, and validate the result.
+    """Return the specification with changed settings of its design and other options of ``make``, validated again.
+
+    Args:
+        spec: the specification.
+        design: settings of the design to replace.
+        bins: number of discrete values for each dimension of a continuous action; None changes nothing.
+        access: where a query may begin; None changes nothing.
+        max_rollout: largest number of actions in a query; None changes nothing.
 
     Raises:
-        ValueError: they contradict the specification.
+        ValueError: the options contradict the specification.
     """
     fields = spec.model_dump()
     fields["design"].update(design)
@@ -201,7 +210,11 @@ def with_choices(
 
 
 def load_factory(name: str) -> Any:
-    """Import the factory ``package.module:attribute``. The working directory is searched too."""
+    """Import the factory ``package.module:attribute``. The working directory is searched too.
+
+    Raises:
+        UnknownEnvironment: the module can't be imported, or has no such callable.
+    """
     module_name, _, attribute = name.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
@@ -212,7 +225,9 @@ def load_factory(name: str) -> Any:
     except SystemExit as error:
         raise UnknownEnvironment(f"{module_name} ended while it was imported: {sentence(error)}") from error
     if not callable(factory):
-        raise UnknownEnvironment(f"expected {name!r} to be callable, got a {type(factory).__name__}")
+        raise UnknownEnvironment(
+            f"expected {name!r} to be callable, got a {type(factory).__name__}: name a class or function"
+        )
     return factory
 
 
@@ -250,7 +265,7 @@ def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str,
 
 
 class Respecified:
-    """A user's environment whose specification was replaced on the command line."""
+    """A user's environment whose specification is replaced by another one."""
 
     def __init__(self, environment: object, spec: EnvironmentSpec) -> None:
         self._spec = spec
@@ -264,7 +279,8 @@ class Respecified:
 
 
 def _made(name: str) -> Any:
-    """Call a user's factory. Raises ``UnknownEnvironment`` if the name has none, or if it ended by ``sys.exit``."""
+    """Make a user's environment by its factory. Raises ``UnknownEnvironment`` if there is no factory, or if it calls
+    ``sys.exit``."""
     factory = load_factory(name)
     try:
         return factory()
@@ -274,7 +290,7 @@ def _made(name: str) -> Any:
 
 def _own(name: str, made: Any, spec: EnvironmentSpec | None, choose: Choose) -> Environment:
     if not callable(getattr(made, "spec", None)):
-        return answering(made)  # its error says what is missing
+        return answering(made)  # raises an error that names the missing method
     own = made.spec()
     given = choose(spec or own)
     require_period(name, given, period_of(made))

@@ -20,7 +20,8 @@ from surrogym_shared.spec import (
 
 
 def inverted_pendulum() -> EnvironmentSpec:
-    """InvertedPendulum-v5. Episodes also terminate at the ends of the rail, beyond which nothing is worth learning."""
+    """Return the specification of InvertedPendulum-v5. Episodes also terminate at the ends of the rail, unlike
+    Gymnasium's, because nothing beyond them is worth learning."""
     sampling = {
         "slider": Uniform(low=-0.95, high=0.95),
         "hinge": Uniform(low=-0.2, high=0.2),
@@ -42,7 +43,8 @@ def inverted_pendulum() -> EnvironmentSpec:
 
 
 def inverted_double_pendulum() -> EnvironmentSpec:
-    """InvertedDoublePendulum-v5. Its constraint force is 0 except at the rail's ends, where episodes terminate."""
+    """Return the specification of InvertedDoublePendulum-v5. Its constraint force is 0 except at the rail's ends, where
+    episodes terminate."""
     sampling = {
         "slider": Uniform(low=-0.9, high=0.9),
         "hinge": Uniform(low=-0.5, high=0.5),
@@ -80,7 +82,8 @@ def inverted_double_pendulum() -> EnvironmentSpec:
 
 
 def reacher() -> EnvironmentSpec:
-    """Reacher-v5. Its targets lie in a disc of radius 0.2; here they are drawn from the square around it."""
+    """Return the specification of Reacher-v5. Gymnasium draws targets from a disc of radius 0.2; here they come from
+    the square around it."""
     square = Uniform(low=-0.2, high=0.2)
     speed = Normal(mean=0, std=6)
     return EnvironmentSpec(

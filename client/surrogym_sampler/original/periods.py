@@ -1,4 +1,4 @@
-"""Sampling period of an environment: the seconds from one step to the next."""
+"""The sampling period of an environment: the seconds from one step to the next."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from math import isclose
 from surrogym_sampler.original.errors import UnknownEnvironment
 from surrogym_shared.spec import EnvironmentSpec
 
-NAMES = ("sampling_period", "dt")  # of attributes, and of entries of ``metadata``
-CLOSE = 1e-3  # relative
+NAMES = ("sampling_period", "dt")  # names of attributes and of entries of `metadata` that contain the period
+CLOSE = 1e-3  # relative difference of periods that count as equal
 
 
 def period_of(environment: object) -> float | None:
-    """Return the period in seconds that an environment has as an attribute or in its ``metadata``, such as MuJoCo's
-    ``dt``; None if it has none."""
+    """Return the period in seconds from an environment's attributes or ``metadata``, such as MuJoCo's ``dt``; None if
+    it has none."""
     metadata = getattr(environment, "metadata", None)
     noted = metadata if isinstance(metadata, dict) else {}
     found = [value for name in NAMES for value in (getattr(environment, name, None), noted.get(name))]
@@ -22,18 +22,19 @@ def period_of(environment: object) -> float | None:
 
 
 def is_other(one: float | None, other: float | None) -> bool:
-    """Whether two periods are known and differ by more than rounding."""
+    """Return whether two periods are both known and differ by more than rounding."""
     return one is not None and other is not None and not isclose(one, other, rel_tol=CLOSE)
 
 
 def require_period(name: str, spec: EnvironmentSpec, own: float | None) -> None:
-    """Check that an environment with its ``own`` period has the one that its specification declares, if both are known.
+    """Check that an environment's own period equals the one that its specification declares, if both are known.
 
     Raises:
-        UnknownEnvironment: they differ.
+        UnknownEnvironment: the periods differ.
     """
     if is_other(own, spec.sampling_period):
         raise UnknownEnvironment(
-            f"expected {name} to take a step every {spec.sampling_period:g} s, as its specification declares by "
-            f"sampling_period, got {own:g} s"
+            f"expected {name} to take a step every {spec.sampling_period:g} s, the sampling_period of its "
+            "specification, "
+            f"got {own:g} s: correct one of them"
         )

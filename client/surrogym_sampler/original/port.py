@@ -1,4 +1,4 @@
-"""The original environment in place of a surrogate, as an oracle for comparisons. Every step is real, and counted."""
+"""The original environment in the place of a surrogate, for comparisons. Every step is real, and counted."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ from surrogym_shared.wire import (
     SubmittedOccupancy,
 )
 
-SEEDS = (2**20, 2**31)  # of resets; far from those of evaluations
+SEEDS = (2**20, 2**31)  # range of the seeds of resets, far from the seeds of evaluations
 
 
 class OriginalPort:
-    """A ``SurrogatePort`` over real episodes, in the autoreset mode of Stable-Baselines3 (same_step).
+    """A ``SurrogatePort`` whose episodes run in the original environment, in the autoreset mode of Stable-Baselines3
+    (same_step).
 
     An environment that runs one instance at a time has one lane, in one session.
 
@@ -41,19 +42,20 @@ class OriginalPort:
     """
 
     def __init__(self, spec: EnvironmentSpec, open_episode: Callable[[], Episode]) -> None:
-        self.steps = 0  # real steps, over all sessions
+        self.steps = 0  # number of real steps in all sessions
         self._spec = spec
         self._open_episode = open_episode
-        self._parallel = True  # until the first instance declares otherwise
+        self._parallel = True  # whether several instances may exist; the first instance corrects this
         self._sessions: dict[str, list[_Lane]] = {}
         self._names = count()
 
     def spec(self) -> EnvironmentSpec:
-        """The specification that it was made with."""
+        """Return the specification of the environment."""
         return self._spec
 
     def open(self, request: OpenSession) -> SessionView:
-        """Open N episodes. Options that concern models only (variant, penalty, ...) are ignored.
+        """Open a session of N lanes (environments that step together). Options that concern models only (variant,
+        penalty, ...) are ignored.
 
         Raises:
             ValueError: another autoreset mode than same_step.
@@ -100,7 +102,7 @@ class OriginalPort:
         )
 
     def reset(self, session: str, *, seed: int | Sequence[int] | None = None, mask: Bools | None = None) -> ResetResult:
-        """Start new episodes in all lanes, or those of the mask (N,)."""
+        """Begin new episodes in all lanes, or only in those of the mask (N,)."""
         lanes = self._lanes(session)
         for i, lane in enumerate(lanes):
             if mask is None or mask[i]:
@@ -117,7 +119,7 @@ class OriginalPort:
         mask: Bools | None = None,
         deviations: bool = False,  # noqa: ARG002  nothing is predicted here
     ) -> StepResult:
-        """Take one real step in all lanes, or in those of the mask (N,). Lanes that end are reset."""
+        """Take one real step in all lanes, or only in those of the mask (N,). Lanes whose episode ends are reset."""
         lanes = self._lanes(session)
         reward, terminated, truncated = np.zeros(len(lanes)), *np.zeros((2, len(lanes)), dtype=np.bool_)
         final: dict[int, Array] = {}
@@ -144,16 +146,16 @@ class OriginalPort:
         )
 
     def rollout(self, session: str, actions: Floats | Ints) -> list[StepResult]:
-        """Step T times with actions (T, N, F)."""
+        """Take T steps in all lanes, with actions (T, N, F)."""
         return [self.step(session, action) for action in actions]
 
     def submit_occupancy(self, session: str, checkpoint: str) -> SubmittedOccupancy:
-        """Ignored, because there is no design here that could use occupancies."""
+        """Ignore the visited states of a policy, because the original environment has no design that could use them."""
         self._lanes(session)
         return SubmittedOccupancy(checkpoint=checkpoint, states=0)
 
     def close(self, session: str) -> None:
-        """End the episodes; closing twice is harmless."""
+        """Close a session and its environments; closing it twice has no effect."""
         for lane in self._sessions.pop(session, []):
             lane.close()
 
@@ -166,12 +168,12 @@ class OriginalPort:
 
     def _lanes(self, session: str) -> list[_Lane]:
         if session not in self._sessions:
-            raise ValueError(f"expected an open session, got {session!r}")
+            raise ValueError(f"expected an open session, got {session!r}, which is closed or unknown: open one")
         return self._sessions[session]
 
 
 class _Lane:
-    """One lane. Its environment is made on first use, because many lanes are never stepped."""
+    """One of the environments that step together. It is made on first use, because many lanes are never stepped."""
 
     def __init__(
         self,
@@ -186,7 +188,7 @@ class _Lane:
         self._start_box = start_box
         self._limit = limit
         self._episode: Episode | None = None
-        self._placed: Array | None = None  # where the next step begins, if not at the end of the last one
+        self._placed: Array | None = None  # coordinates at which the next step begins; None continues the episode
         self._length = 0
         self.observation = np.zeros(len(spec.observation))
         self.seed(seed)
@@ -200,7 +202,8 @@ class _Lane:
         return self._length >= self._limit
 
     def begin(self) -> None:
-        """Start an episode, anywhere in the sampling range or at the environment's own start."""
+        """Begin an episode: with probability ``start_box`` at a random state of the sampling range, else by the
+        environment's reset."""
         self._length, self._placed = 0, None
         if self._rng.random() < self._start_box:
             self._placed = draw(self._spec, self._rng, wide=True)
@@ -223,7 +226,7 @@ class _Lane:
             self._episode.close()
 
     def instance(self) -> Episode:
-        """The lane's environment, made at the first call."""
+        """Return the lane's environment, which the first call makes."""
         if self._episode is None:
             self._episode = self._open_episode()
         return self._episode

@@ -1,4 +1,5 @@
-"""Lines of the protocol between this client and a program. Pure functions: docs/how-to/executables.md has the protocol.
+"""The lines of the protocol between this client and a program, which docs/how-to/executables.md describes. All
+functions are pure.
 
 Shapes: C coordinates, F action entries.
 """
@@ -19,9 +20,9 @@ from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.spec.actions import Action
 
 PROTOCOL = 1
-LONGEST_LINE = 1 << 24  # bytes, without the end of the line
-SHOWN = 80  # characters of a line that an error repeats
-SHOWN_ERROR = 400  # characters of a program's own error
+LONGEST_LINE = 1 << 24  # largest number of bytes of a line, without its end
+SHOWN = 80  # largest number of characters of a line in an error
+SHOWN_ERROR = 400  # largest number of characters of the program's own error in ours
 CHECK = "surrogym conformance --exec COMMAND checks the program"
 
 Reply = dict[str, Any]
@@ -30,15 +31,24 @@ Reply = dict[str, Any]
 def encode(number: int, method: str, **fields: object) -> bytes:
     """Return the line of a request.
 
+    Args:
+        number: the request's id.
+        method: the request's name, such as ``step``.
+        fields: its other entries.
+
     Raises:
         StepFailed: a number is not finite, or the line is too long.
     """
     try:
         line = json.dumps({"id": number, "method": method, **fields}, allow_nan=False).encode()
     except ValueError as error:
-        raise StepFailed(f"expected finite numbers for {method}, got {fields}") from error
+        raise StepFailed(
+            f"expected finite numbers in the request {method}, got {fields}: correct them at their source"
+        ) from error
     if len(line) > LONGEST_LINE:
-        raise StepFailed(f"expected a request of at most {LONGEST_LINE} bytes, got {len(line)}")
+        raise StepFailed(
+            f"expected a request of at most {LONGEST_LINE} bytes, got {method} with {len(line)}: send less"
+        )
     return line + b"\n"
 
 
@@ -47,7 +57,7 @@ def decode(line: bytes, number: int) -> Reply:
 
     Raises:
         RequestRefused: the program answered with an error.
-        StepRefused: its code is "refused".
+        StepRefused: the program answered with an error whose code is "refused".
         StepFailed: the line is not an answer to this request.
     """
     try:
@@ -76,7 +86,7 @@ def decode(line: bytes, number: int) -> Reply:
 
 
 def numbers(reply: Reply, key: str, size: int) -> Array:
-    """Return a list of finite numbers as an array (``size``,).
+    """Return the entry ``key`` of a reply, a list of ``size`` finite numbers, as an array (size,).
 
     Raises:
         StepFailed: the reply has no such list.
@@ -88,10 +98,10 @@ def numbers(reply: Reply, key: str, size: int) -> Array:
 
 
 def number(reply: Reply, key: str) -> float:
-    """Return a finite number.
+    """Return the entry ``key`` of a reply, a finite number.
 
     Raises:
-        StepFailed: the reply has none under this key.
+        StepFailed: the reply has no such number.
     """
     if not _is_number(reply.get(key)):
         raise _wrong("a finite number", reply, key)
@@ -99,10 +109,10 @@ def number(reply: Reply, key: str) -> float:
 
 
 def truth(reply: Reply, key: str) -> bool:
-    """Return true or false.
+    """Return the entry ``key`` of a reply, which is true or false.
 
     Raises:
-        StepFailed: the reply has neither under this key.
+        StepFailed: the reply has no such entry.
     """
     came = reply.get(key)
     if not isinstance(came, bool):
@@ -111,10 +121,10 @@ def truth(reply: Reply, key: str) -> bool:
 
 
 def text(reply: Reply, key: str) -> str:
-    """Return a text.
+    """Return the entry ``key`` of a reply, a text.
 
     Raises:
-        StepFailed: the reply has none under this key.
+        StepFailed: the reply has no such text.
     """
     came = reply.get(key)
     if not isinstance(came, str):
@@ -123,14 +133,14 @@ def text(reply: Reply, key: str) -> str:
 
 
 def action_entries(space: Action, action: Array) -> list[float] | list[int]:
-    """Return an action (F,) as it is sent: whole numbers if the action is discrete."""
+    """Return an action (F,) as the list that a request contains: integers if the action is discrete."""
     if isinstance(space, BoxAction):
         return [float(entry) for entry in np.atleast_1d(action)]
     return [int(entry) for entry in np.atleast_1d(action)]
 
 
 def specification_in(reply: Reply) -> EnvironmentSpec:
-    """Return the specification in the answer to ``spec``.
+    """Return the specification in the answer to the request ``spec``.
 
     Raises:
         UnknownEnvironment: the program has another version of the protocol, or the specification is not valid.
@@ -150,7 +160,7 @@ def specification_in(reply: Reply) -> EnvironmentSpec:
 
 
 def _wrong(expected: str, reply: Reply, key: str) -> StepFailed:
-    """The error for an entry of an answer that is not what was ``expected``."""
+    """Return the error for an entry ``key`` of an answer that is not what was ``expected``."""
     return StepFailed(f"expected {expected} for {key!r} in the program's answer, got {_got(reply, key)}; {CHECK}")
 
 
@@ -162,7 +172,7 @@ def _is_number(value: object) -> bool:
 
 
 class _Twice(ValueError):
-    """A key that an object has twice: which of the values is meant is unknown."""
+    """An object of a program's answer has one key twice, so that its value is ambiguous."""
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -175,7 +185,7 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class _NotFinite(ValueError):
-    """NaN or an infinity, which is not JSON."""
+    """A program's answer contains NaN or an infinity, which is not JSON."""
 
 
 def _not_finite(constant: str) -> NoReturn:
@@ -187,14 +197,14 @@ def _got(reply: Reply, key: str) -> str:
 
 
 def short(value: object) -> str:
-    """Return a line, or another value, as an error repeats it."""
+    """Return a line or another value in the shortened form in which an error shows it."""
     if not isinstance(value, bytes):
         return one_line(repr(value), SHOWN)
     return one_line(value.decode(errors="replace"), SHOWN) or ("no printable character" if value else "an empty line")
 
 
 def one_line(text: str, most: int) -> str:
-    """Return the first printable characters of a text, ``most`` at most, in one line."""
+    """Return the printable characters of a text in one line, shortened to at most ``most``."""
     printable = "".join(c if c.isprintable() else " " for c in text[: 2 * most])
     line = " ".join(printable.split())
     return line if len(line) <= most and len(text) <= 2 * most else f"{line[:most]}…"

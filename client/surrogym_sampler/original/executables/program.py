@@ -1,4 +1,4 @@
-"""One running program: its start, its requests within a time limit, and its end."""
+"""A running program: its start, its requests within a time limit, and its end."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from surrogym_sampler.original.executables.guard import Guard
 from surrogym_sampler.original.executables.messages import LONGEST_LINE, Reply, decode, encode, short
 from surrogym_sampler.original.executables.standard_error import StandardError
 
-GRACE_SECONDS = 30.0  # for a running step, after this process was killed
-END_SECONDS = 2.0  # after the request to close, and again after SIGTERM
-CHUNK = 1 << 16  # bytes
+GRACE_SECONDS = 30.0  # seconds that a running step may still take after this process was killed
+END_SECONDS = 2.0  # seconds to wait after the request to close, and again after SIGTERM
+CHUNK = 1 << 16  # largest number of bytes read at once
 
 
 class Program:
     """A program that is started without a shell, in a session of its own, so that Ctrl-C does not reach it.
 
-    Its standard error is passed on to that of this process. After a time-out, an end or a line that is no answer, the
-    program is ended, and ``start`` starts it anew. If this process is killed, the program sees the end of its standard
+    Its standard error is passed on to that of this process. After a time-out, or a line that is not an answer, the
+    program is killed; ``start`` starts it again. If this process is killed, the program sees the end of its standard
     input, and is killed some time later.
 
     Args:
         command: the program and its arguments, quoted as for a shell.
-        called: what errors call it.
-        grace: seconds that a running step has left after this process was killed.
+        called: the program's name in errors.
+        grace: seconds that a running step may still take after this process was killed.
 
     Raises:
         UnknownEnvironment: the command is empty, or its quotes don't match.
@@ -52,7 +52,9 @@ class Program:
                 f"expected a command such as './plant --port 7', got {command!r}: {error}"
             ) from error
         if not self._words:
-            raise UnknownEnvironment("expected a command such as './plant --port 7', got an empty one")
+            raise UnknownEnvironment(
+                "expected a command such as './plant --port 7', got an empty one: write it behind exec:"
+            )
         if os.name == "nt":
             raise UnknownEnvironment(
                 "expected Linux or macOS to start a program, got Windows: run the sampler there; the server "
@@ -62,7 +64,7 @@ class Program:
         self._guard: Guard | None = None
         self._standard_error: StandardError | None = None
         self._unread = bytearray()
-        self._number = 0  # of the last request
+        self._number = 0  # id of the last request
 
     @property
     def running(self) -> bool:
@@ -70,7 +72,7 @@ class Program:
         return self._process is not None and self._process.poll() is None
 
     def start(self) -> None:
-        """Start the program, and end one that is left.
+        """Start the program; one that still runs is ended first.
 
         Raises:
             UnknownEnvironment: there is no such program, or it can't be executed.
@@ -88,7 +90,8 @@ class Program:
             self._guard = Guard(self._process.pid, self._grace)
         except OSError as error:
             raise UnknownEnvironment(
-                f"expected a program that can be started, got {self._words[0]!r}: {error}"
+                f"expected a program that can be started, got {self._words[0]!r} ({error}): check its path and "
+                "permissions"
             ) from error
         self._unread.clear()
         assert self._process.stdin is not None
@@ -100,13 +103,13 @@ class Program:
         """Send one request, and return the result.
 
         Args:
-            method: what the program shall do.
-            deadline: when the answer must be complete, on the monotonic clock, in seconds.
-            fields: of the request.
+            method: the request's name, such as ``step``.
+            deadline: when the answer must be complete, in seconds on the monotonic clock.
+            fields: the request's other entries.
 
         Raises:
-            RequestRefused, StepRefused: the program answered with an error; it keeps running.
-            StepFailed: it died, hung or sent something else; it was ended.
+            RequestRefused, StepRefused: the program answered with an error, and keeps running.
+            StepFailed: the program died, hung or sent something else than an answer; it was killed.
         """
         self._number += 1
         answer = self.exchange(encode(self._number, method, **fields), method, deadline)
@@ -119,15 +122,15 @@ class Program:
             raise
 
     def exchange(self, line: bytes, what: str, deadline: float) -> bytes:
-        """Send one line, and return the next line that the program prints, without its end.
+        """Send one line, and return the next line that the program prints, without the line's end.
 
         Args:
-            line: with its end.
+            line: the line with its end.
             what: name of the request, for errors.
-            deadline: when the answer must be complete, on the monotonic clock, in seconds.
+            deadline: when the answer must be complete, in seconds on the monotonic clock.
 
         Raises:
-            StepFailed: the program died, hung or printed too long a line; it was ended.
+            StepFailed: the program died, hung or printed too long a line; it was killed.
         """
         try:
             self._write(line, what, deadline)
@@ -137,7 +140,7 @@ class Program:
             raise
 
     def surplus(self, seconds: float) -> bytes:
-        """Wait, and return what the program printed beyond its answers."""
+        """Wait up to ``seconds``, and return what the program printed after its last answer."""
         if self._process is not None and self._process.stdout is not None:
             with selectors.DefaultSelector() as selector:
                 selector.register(self._process.stdout.fileno(), selectors.EVENT_READ)
@@ -152,14 +155,14 @@ class Program:
                 self._process.stdin.close()
 
     def wait(self, seconds: float) -> int | None:
-        """Return the exit code; None if the program still runs after ``seconds``."""
+        """Return the program's exit code; None if it still runs after ``seconds``, or was not started."""
         try:
             return None if self._process is None else self._process.wait(seconds)
         except subprocess.TimeoutExpired:
             return None
 
     def close(self) -> None:
-        """Ask the program to close, and end it if it does not."""
+        """Ask the program to close, and kill it if it does not."""
         process = self._process
         if process is not None and self.running:
             assert process.stdin is not None
@@ -171,7 +174,7 @@ class Program:
         self.end()
 
     def end(self) -> int | None:
-        """End the program, and what it has started, by SIGTERM, then by SIGKILL.
+        """End the program and all processes that it has started, by SIGTERM, then by SIGKILL.
 
         Returns:
             Its exit code; None if there was no program.
@@ -183,7 +186,7 @@ class Program:
             self._guard.dismiss()
         for number in (signal.SIGTERM, signal.SIGKILL):
             with suppress(ProcessLookupError, PermissionError):
-                os.killpg(process.pid, number)  # the group may outlive the program
+                os.killpg(process.pid, number)  # processes that the program started may outlive it
             with suppress(subprocess.TimeoutExpired):
                 process.wait(END_SECONDS)
         for pipe in (process.stdin, process.stdout):
@@ -197,7 +200,7 @@ class Program:
     def _write(self, line: bytes, method: str, deadline: float) -> None:
         process = self._process
         if process is None or process.stdin is None:
-            raise EnvironmentDied(f"expected a running program for {method}, got none")
+            raise EnvironmentDied(f"expected a running program for the request {method}, got none: start it first")
         begun, left = time.monotonic(), memoryview(line)
         with selectors.DefaultSelector() as selector:
             selector.register(process.stdin.fileno(), selectors.EVENT_WRITE)
@@ -242,11 +245,12 @@ class Program:
         return line
 
     def _unfinished(self) -> str:
-        """What an error says of a line that has begun."""
+        """Return the part of an error about a line that the program began and did not end; empty if there is none."""
         return f"; it printed {short(bytes(self._unread))} without an end of the line" if self._unread else ""
 
     def _death(self, method: str, closed: str) -> EnvironmentDied:
-        """The error of a program that closed its ``closed``, input or output. It has a moment to end by itself."""
+        """Return the error for a program that closed its standard ``closed`` (input or output) during a request. The
+        program first gets some time to end by itself."""
         code = self.wait(END_SECONDS)
         printed = self.surplus(0.0)
         after = f", after it printed {short(printed)}" if printed.strip() else ""
@@ -255,13 +259,13 @@ class Program:
         return EnvironmentDied(f"{self._called} {did} during {method}{after}{self._complaint()}")
 
     def _complaint(self) -> str:
-        """What an error says of the program's standard error."""
+        """Return the part of an error about the program's standard error; empty if it wrote nothing."""
         last = "" if self._standard_error is None else self._standard_error.last_line()
         return f"; the last line of its standard error: {last}" if last else ""
 
 
 def _named(code: int) -> str:
-    """An exit code, with the signal's name if a signal ended the program."""
+    """Return an exit code in words, with the signal's name if a signal ended the program."""
     try:
         return f"{code} ({signal.Signals(-code).name})" if code < 0 else str(code)
     except ValueError:  # a real-time signal, which has no name

@@ -1,4 +1,4 @@
-"""What a program writes to its standard error: it is passed on, and the last line is kept for errors."""
+"""The standard error of a program: it is passed on to that of this process, and the last line is kept for errors."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import threading
 from typing import IO
 
 OWN = 2  # file descriptor of this process's standard error
-TAIL = 4096  # bytes that are kept
-SHOWN = 200  # characters of the last line that an error repeats
-PATIENCE = 0.1  # seconds in which this process's standard error has to take a piece
-LAST_SECONDS = 1.0  # until what an ended program wrote is read; a process that it left behind may hold the pipe
+TAIL = 4096  # number of last bytes that are kept
+SHOWN = 200  # largest number of characters of the last line in an error
+PATIENCE = 0.1  # seconds that this process's standard error has to accept a piece
+LAST_SECONDS = 1.0  # seconds to read the output of an ended program; a process that it started may hold the pipe open
 
 
 class StandardError:
     """The standard error of a running program. A thread reads it, so that the program never waits for a reader.
 
-    A piece that this process's own standard error does not take in time is dropped.
+    A piece that this process's own standard error does not accept in time is dropped.
 
     Args:
-        pipe: its end to read from. The thread closes it.
+        pipe: the end of the pipe to read from. The thread closes it.
     """
 
     def __init__(self, pipe: IO[bytes]) -> None:
@@ -30,11 +30,11 @@ class StandardError:
         self._thread.start()
 
     def finish(self) -> None:
-        """Wait until everything is read that an ended program wrote, ``LAST_SECONDS`` at most."""
+        """Wait until the output of an ended program is read, at most ``LAST_SECONDS``."""
         self._thread.join(LAST_SECONDS)
 
     def last_line(self) -> str:
-        """Return the last line that is not empty, with its printable characters alone; "" if there is none."""
+        """Return the printable characters of the last line that is not empty; "" if there is none."""
         lines = self._tail.decode(errors="replace").splitlines()
         printable = ("".join(filter(str.isprintable, line)).strip() for line in reversed(lines))
         last = next(filter(None, printable), "")
@@ -49,10 +49,10 @@ class StandardError:
 
 
 def _write(piece: bytes, seconds: float) -> bool:
-    """Write to this process's standard error; whether it took the piece. A pipe that is ready takes ``PIPE_BUF``
-    bytes without waiting."""
+    """Write to this process's standard error, and return whether it accepted the piece within ``seconds``. A pipe that
+    is ready accepts ``PIPE_BUF`` bytes without waiting."""
     try:
         ready = bool(select.select([], [OWN], [], seconds)[1])
         return ready and os.write(OWN, piece) > 0
-    except OSError:  # closed
+    except OSError:  # this process's standard error is closed
         return False

@@ -1,7 +1,7 @@
-"""Functional Mock-up Units by ``fmu:PLANT.fmu``, or ``fmu:PLANT.json`` that names one and sets something about it.
+"""The adapter for Functional Mock-up Units: ``fmu:PLANT.fmu``, or ``fmu:PLANT.json`` with the FMU's name and settings.
 
-Their native code runs in a process of its own. The state is what can be set before the FMU is initialised: a state is
-set by a new start.
+Their native code runs in a process of its own. The state consists of variables that can be set before the FMU is
+initialised; to set a state, the FMU is initialised again.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from surrogym_sampler.original.simulator import Motion, Simulated, Simulator, Ta
 from surrogym_shared.spec import MAX_DIMENSIONS, BoxAction, EnvironmentSpec
 from surrogym_shared.spec.base import REWARD
 
-UNKNOWN_LIMITS = (-1.0, 1.0)  # of an input that declares none
-SAME = 1e-9  # of a number: the largest error of a value that counts as set
-SHIFT = 0.05  # of a variable's limits, or of 1, by which a start is shifted to see whether it can be set
+UNKNOWN_LIMITS = (-1.0, 1.0)  # assumed limits of an input that declares none
+SAME = 1e-9  # largest relative error of a value that counts as set
+SHIFT = 0.05  # share of a variable's limits, or of 1, by which its start is shifted to test whether it can be set
 MOTIONS: dict[str | None, Motion] = {"rad": "turn", "rad/s": "speed", "m/s": "speed"}
 
 
 def open_simulator(name: str) -> Simulator:
-    """Open an FMU.
+    """Open the FMU with this name.
 
     Raises:
-        UnknownEnvironment: it can't be used here, or what is set about it does not fit.
+        UnknownEnvironment: the FMU can't be used on this machine, or the settings in its JSON file don't fit.
         ImportError: fmpy is not installed.
     """
     path, choices = read_choices(name)
@@ -46,7 +46,7 @@ def open_simulator(name: str) -> Simulator:
 
 
 class Fmu(SavingSimulator):
-    """One FMU for co-simulation. A reset always begins at its start values. Its observation is its outputs."""
+    """One FMU for co-simulation. A reset always begins at its start values. The observation consists of its outputs."""
 
     pays = False
 
@@ -114,7 +114,7 @@ class Fmu(SavingSimulator):
         return np.array(action, dtype=np.float64)
 
     def with_specification(self, spec: EnvironmentSpec, *, shows_own: bool, step_limit: float) -> Simulated:
-        del shows_own  # outputs may depend on the last input, so a policy observes what the specification declares
+        del shows_own  # Outputs may depend on the last input, so a policy observes what the specification declares.
         self._process.step_limit = step_limit
         return FmuEnvironment(self, spec)
 
@@ -124,7 +124,7 @@ class Fmu(SavingSimulator):
         )
 
     def _why_fixed(self) -> str:
-        """Why the state can't be set; empty if a shifted start was read back."""
+        """Return why the state can't be set; empty if a shifted start could be set and read back."""
         if calculated := [v.name for v in self._state if not v.can_start]:
             return f"the FMU calculates {', '.join(calculated)}, which has no start to set, so it can only be reset"
         wanted = np.array([_shifted(v, at) for v, at in zip(self._state, self.rest, strict=True)])
@@ -141,7 +141,7 @@ class Fmu(SavingSimulator):
         return ""
 
     def _named(self) -> list[str]:
-        """Names that a specification can't use, and those that stand for them."""
+        """Return a sentence for each variable whose name a specification can't use, with the name that replaces it."""
         return [
             f"{v.name} is called {ours.name}"
             for v, ours in zip(self._state, self.variables, strict=True)
@@ -150,7 +150,7 @@ class Fmu(SavingSimulator):
 
 
 def _variables(state: Sequence[Declared]) -> tuple[Variable, ...]:
-    """The state's variables, with names that a specification can use."""
+    """Return the state's variables, with names that a specification can use."""
     found: dict[str, Variable] = {}
     for one in state:
         plain = re.sub(r"[^A-Za-z0-9._-]+", "_", one.name).strip("._-")[:60] or "variable"
@@ -170,7 +170,7 @@ def _limits(variable: Declared) -> tuple[float, float] | None:
 
 
 def _shifted(variable: Declared, at: float) -> float:
-    """Another start of a variable, within its limits."""
+    """Return another start of a variable, shifted from ``at`` within its limits."""
     low, high = _limits(variable) or (at - 1.0, at + 1.0)
     shift = SHIFT * (high - low)
     return at + shift if at + shift <= high else at - shift

@@ -1,4 +1,4 @@
-"""What an FMU declares: interface, platform, variables and default experiment. No native code is loaded here.
+"""The declarations in an FMU's file: interface, platform, variables and default experiment. No native code is loaded.
 
 Times are in seconds.
 """
@@ -12,15 +12,16 @@ from typing import Any
 
 from surrogym_sampler.original.errors import UnknownEnvironment
 
-REAL = ("Real", "Float64", "Float32")  # types of numbers that change gradually
+REAL = ("Real", "Float64", "Float32")  # FMI types of real numbers
 DESCRIPTION = "modelDescription.xml"
 MOST_ENTRIES, MOST_BYTES, MOST_XML_BYTES = 20_000, 2**30, 2**26
-SHOWN = 20  # names that an error lists
+SHOWN = 20  # largest number of names in an error
 
 
 @dataclass(frozen=True)
 class Declared:
-    """One scalar variable of an FMU. ``low`` and ``high`` are its declared limits, ``start`` its declared start."""
+    """A scalar variable of an FMU. ``low``, ``high`` and ``start`` are its declared limits and start value; the other
+    fields are those of the model description."""
 
     name: str
     reference: int
@@ -39,7 +40,7 @@ class Declared:
 
     @property
     def can_start(self) -> bool:
-        """Whether a value can be given before the FMU is initialised."""
+        """Whether the variable's value can be set before the FMU is initialised."""
         if self.variability == "constant":
             return False
         return self.causality in ("input", "parameter", "structuralParameter") or self.initial in ("exact", "approx")
@@ -47,21 +48,21 @@ class Declared:
 
 @dataclass(frozen=True)
 class Archive:
-    """An FMU for co-simulation on this platform.
+    """The declarations of an FMU for co-simulation on this platform.
 
     Attributes:
-        path: the file.
-        version: 2 or 3, of FMI.
-        identifier: of the model, and of its native code.
-        token: by which the native code recognises the description.
+        path: the FMU's file.
+        version: main version of FMI, 2 or 3.
+        identifier: identifier of the model and of its native code.
+        token: text by which the native code checks that the description belongs to it.
         library: path of the native code inside the file.
-        variables: its scalar variables.
+        variables: the scalar variables.
         states: names of the continuous states; empty if the file does not declare them.
-        step: default communication step; None without one.
-        stop: default end of a simulation that starts at 0; None without one.
+        step: default communication step in seconds; None if not declared.
+        stop: default end of a simulation that starts at 0, in seconds; None if not declared.
         snapshots: whether its whole state can be saved.
-        serializes: whether a saved state can leave the process.
-        only_once: whether a process may make one instance only.
+        serializes: whether a saved state can be converted to bytes.
+        only_once: whether a process may make only one instance.
     """
 
     path: Path
@@ -78,7 +79,7 @@ class Archive:
     only_once: bool
 
     def named(self, name: str) -> Declared:
-        """The variable of a name.
+        """Return the variable with this name.
 
         Raises:
             UnknownEnvironment: there is none.
@@ -93,15 +94,15 @@ class Archive:
         )
 
     def of_causality(self, causality: str) -> tuple[Declared, ...]:
-        """The continuous variables of a causality, in their order."""
+        """Return the real variables with this causality, such as ``input``, in their order."""
         return tuple(v for v in self.variables if v.causality == causality and v.is_real)
 
 
 def read_archive(path: Path) -> Archive:
-    """Read an FMU.
+    """Read the declarations of an FMU.
 
     Raises:
-        UnknownEnvironment: it is no FMU for co-simulation of FMI 2.0 or 3.0 that can run on this platform.
+        UnknownEnvironment: the file is not an FMU for co-simulation of FMI 2.0 or 3.0 that can run on this platform.
         ImportError: fmpy is not installed.
     """
     from fmpy import read_model_description
@@ -113,7 +114,7 @@ def read_archive(path: Path) -> Archive:
         )
     try:
         described: Any = read_model_description(str(path), validate=False)
-    except Exception as error:  # fmpy raises errors of zipfile, lxml, its own, and TypeErrors
+    except Exception as error:  # fmpy passes on errors of zipfile and lxml, and raises TypeErrors and errors of its own
         words = "it lacks a part" if isinstance(error, AttributeError | TypeError | KeyError) else _first_line(error)
         raise UnknownEnvironment(
             f"the {DESCRIPTION} of {path} can't be read ({words}): export the FMU anew, or check it with "
@@ -124,7 +125,9 @@ def read_archive(path: Path) -> Archive:
 
 def _names_in(path: Path) -> list[str]:
     if not path.is_file():
-        raise UnknownEnvironment(f"expected an FMU, or a JSON file that names one, got no file {path}")
+        raise UnknownEnvironment(
+            f"expected an FMU, or a JSON file that names one, got {path}, which does not exist: check the path"
+        )
     try:
         with zipfile.ZipFile(path) as file:
             _require_bounded(path, file.infolist())
@@ -140,7 +143,7 @@ def _names_in(path: Path) -> list[str]:
 
 
 def _require_bounded(path: Path, entries: list[zipfile.ZipInfo]) -> None:
-    """Refuse an archive that is larger inside than any real FMU, by its directory, before anything is unpacked."""
+    """Refuse an archive that would be larger than any real FMU when unpacked. Only the archive's directory is read."""
     total = sum(entry.file_size for entry in entries)
     xml = max((entry.file_size for entry in entries if entry.filename.lower().endswith(".xml")), default=0)
     for what, size, most in (
@@ -149,13 +152,17 @@ def _require_bounded(path: Path, entries: list[zipfile.ZipInfo]) -> None:
         ("bytes of an XML file", xml, MOST_XML_BYTES),
     ):
         if size > most:
-            raise UnknownEnvironment(f"expected an FMU of at most {most:,} {what}, got {path} with {size:,}")
+            raise UnknownEnvironment(
+                f"expected an FMU of at most {most:,} {what}, got {path} with {size:,}: export a smaller one"
+            )
 
 
 def _archive(path: Path, names: list[str], described: Any) -> Archive:
     version = int(described.fmiVersion.partition(".")[0])
     if version not in (2, 3):
-        raise UnknownEnvironment(f"expected an FMU of FMI 2.0 or 3.0, got {path} of FMI {described.fmiVersion}")
+        raise UnknownEnvironment(
+            f"expected an FMU of FMI 2.0 or 3.0, got {path} of FMI {described.fmiVersion}: export it as one of these"
+        )
     interface = described.coSimulation
     if interface is None:
         other = "model exchange" if described.modelExchange is not None else "scheduled execution"
@@ -183,7 +190,7 @@ def _archive(path: Path, names: list[str], described: Any) -> Archive:
 
 
 def _library(path: Path, names: list[str], version: int, identifier: str) -> str:
-    """Path of the native code for this platform, inside the archive.
+    """Return the path inside the archive of the native code for this platform.
 
     Raises:
         UnknownEnvironment: there is none.
@@ -204,7 +211,7 @@ def _library(path: Path, names: list[str], version: int, identifier: str) -> str
 
 
 def _states(described: Any) -> tuple[str, ...]:
-    """Names of the scalar continuous states, from the declared derivatives."""
+    """Return the names of the scalar continuous states, from the declared derivatives; empty if a state is an array."""
     unknown = [entry.variable for entry in described.derivatives if entry.variable is not None]
     states = [variable.derivative for variable in unknown if variable.derivative is not None]
     if any(state.dimensions for state in states):
@@ -213,7 +220,7 @@ def _states(described: Any) -> tuple[str, ...]:
 
 
 def _declared(variable: Any) -> Declared:
-    shared = variable.declaredType  # limits and unit may stand there instead
+    shared = variable.declaredType  # the type may declare the limits and unit instead of the variable
     low, high, unit = (
         getattr(variable, key) if getattr(variable, key) is not None else getattr(shared, key, None)
         for key in ("min", "max", "unit")
@@ -233,7 +240,7 @@ def _declared(variable: Any) -> Declared:
 
 
 def _number(text: object) -> float | None:
-    """A finite number of the description; None if there is none."""
+    """Return a text of the model description as a finite number; None if it is not one."""
     try:
         number = float(str(text))
     except ValueError:

@@ -1,6 +1,6 @@
-"""What a person sets about an FMU: ``fmu:PLANT.fmu`` sets nothing, ``fmu:PLANT.json`` names the FMU and the rest.
+"""The settings of a person for an FMU: none for ``fmu:PLANT.fmu``, those in the JSON file for ``fmu:PLANT.json``.
 
-Pure but for reading the file. Times are in seconds.
+Only ``read_choices`` reads a file; the other functions are pure. Times are in seconds.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Value = bool | int | float | str
 
 
 class _File(BaseModel):
-    """The JSON file."""
+    """The content of a JSON file that names an FMU, with settings for it."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -36,14 +36,14 @@ class _File(BaseModel):
 
 @dataclass(frozen=True)
 class Choices:
-    """What a person sets. None leaves it to the model description.
+    """The settings of a person for an FMU. None leaves a setting to the model description.
 
     Attributes:
         step: seconds of one action.
-        actions: inputs that a policy drives.
-        limits: of some of them, low and high.
-        coordinates: variables that describe the state.
-        start: values of parameters and other variables before the FMU is initialised.
+        actions: names of the inputs that a policy sets.
+        limits: low and high of inputs, by name.
+        coordinates: names of the variables that describe the state.
+        start: values of parameters and other variables before the FMU is initialised, by name.
     """
 
     step: float | None = None
@@ -54,10 +54,10 @@ class Choices:
 
 
 def read_choices(name: str) -> tuple[Path, Choices]:
-    """The FMU that a name means, and what is set about it.
+    """Return the path of the FMU that a name stands for, and the settings in its JSON file.
 
     Raises:
-        UnknownEnvironment: the name is of another form, or its JSON file can't be used.
+        UnknownEnvironment: the name has neither form, or its JSON file can't be used.
     """
     path = Path(name.removeprefix(PREFIX))
     if path.suffix == ".fmu":
@@ -72,7 +72,7 @@ def read_choices(name: str) -> tuple[Path, Choices]:
             f"{path}: {wrong}; expected fmu, and optionally step, actions, coordinates and start"
         ) from error
     except ValueError as error:
-        raise UnknownEnvironment(f"{path} is not JSON: {error}; correct it there") from error
+        raise UnknownEnvironment(f"{path} is not JSON: {error}; correct the file at this position") from error
     return path.parent / given.fmu, _choices(path, given)
 
 
@@ -80,19 +80,21 @@ def _choices(path: Path, given: _File) -> Choices:
     limits = given.actions if isinstance(given.actions, dict) else {}
     for action, (low, high) in limits.items():
         if not low < high:
-            raise UnknownEnvironment(f"{path}: action {action!r}: expected low < high, got [{low:g}, {high:g}]")
+            raise UnknownEnvironment(
+                f"{path}: action {action!r}: expected low < high, got [{low:g}, {high:g}]: swap or correct them"
+            )
     actions = None if given.actions is None else tuple(given.actions)
     for key, names in (("actions", actions), ("coordinates", given.coordinates)):
         if names and (twice := next((name for name in names if names.count(name) > 1), None)) is not None:
-            raise UnknownEnvironment(f"{path}: {key}: expected each variable once, got {twice!r} twice")
+            raise UnknownEnvironment(f"{path}: {key}: expected each variable once, got {twice!r} twice: remove one")
     return Choices(given.step, actions, limits, given.coordinates, given.start)
 
 
 def driven(archive: Archive, choices: Choices) -> tuple[Declared, ...]:
-    """The inputs that a policy drives: those chosen, or all continuous ones.
+    """Return the inputs that an action sets: the chosen ones, or all real inputs.
 
     Raises:
-        UnknownEnvironment: there are none, or a chosen variable is no continuous input.
+        UnknownEnvironment: there are none, or a chosen variable is not a real input.
     """
     inputs = archive.of_causality("input")
     if choices.actions is None:
@@ -107,28 +109,28 @@ def driven(archive: Archive, choices: Choices) -> tuple[Declared, ...]:
     chosen = tuple(archive.named(name) for name in choices.actions)
     if not chosen or (wrong := [v.name for v in chosen if v not in inputs]):
         raise UnknownEnvironment(
-            f"actions: expected some of the continuous inputs of {archive.path}, {_listed(inputs)}, got "
-            f"{', '.join(wrong) if chosen else 'none'}"
+            f"actions: expected one or more of the continuous inputs of {archive.path} ({_listed(inputs)}), got "
+            f"{', '.join(wrong) if chosen else 'none'}: correct the JSON file"
         )
     return chosen
 
 
 def described_by(archive: Archive, choices: Choices) -> tuple[Declared, ...]:
-    """The variables whose values are the state.
+    """Return the variables whose values are the state.
 
-    They are those that were chosen; or the continuous states if all of them can be set; or, where none are declared,
-    the outputs and internal variables that can be set; or all outputs, or all states. Two names of one variable count
+    These are the chosen ones; or else the continuous states if all of them can be set; or, if none are declared, the
+    outputs and internal variables that can be set; or all outputs, or all states. A variable with two names counts
     once.
 
     Raises:
-        UnknownEnvironment: there are none, or a chosen variable is not continuous.
+        UnknownEnvironment: there are none, or a chosen variable is not a real number.
     """
     if choices.coordinates is not None:
         chosen = tuple(archive.named(name) for name in choices.coordinates)
         if not chosen or (wrong := [v.name for v in chosen if not v.is_real]):
             raise UnknownEnvironment(
                 f"coordinates: expected continuous variables of {archive.path}, got "
-                f"{_names(wrong) if chosen else 'none'}"
+                f"{_names(wrong) if chosen else 'none'}: correct the JSON file"
             )
         return chosen
     outputs = archive.of_causality("output")
@@ -157,7 +159,7 @@ def _once(variables: tuple[Declared, ...]) -> tuple[Declared, ...]:
 
 
 def start_values(archive: Archive, choices: Choices) -> list[tuple[str, int, Value]]:
-    """Type, reference and value of everything that a person sets before the FMU is initialised.
+    """Return type, reference and value of each variable that a person sets before the FMU is initialised.
 
     Raises:
         UnknownEnvironment: a variable can't be set then, or has another type.
@@ -168,7 +170,7 @@ def start_values(archive: Archive, choices: Choices) -> list[tuple[str, int, Val
         if not variable.can_start:
             raise UnknownEnvironment(
                 f"start: expected a parameter, an input or a variable with a start value, got {name!r} of "
-                f"{archive.path}, which the FMU calculates"
+                f"{archive.path}, which the FMU calculates: remove it"
             )
         found.append((variable.type, variable.reference, _of_type(variable, value)))
     return found
@@ -186,13 +188,13 @@ def _of_type(variable: Declared, value: Value) -> Value:
         wanted, fits = "a whole number", isinstance(value, int) and not isinstance(value, bool)
     if not fits:
         raise UnknownEnvironment(
-            f"start: expected {wanted} for {variable.name!r} of type {variable.type}, got {value!r}"
+            f"start: expected {wanted} for {variable.name!r} of type {variable.type}, got {value!r}: correct the value"
         )
     return float(value) if variable.is_real else value
 
 
 def step_of(archive: Archive, choices: Choices) -> float:
-    """Seconds of one action: the chosen, or the default experiment's.
+    """Return the seconds of one action: the chosen ones, or else those of the FMU's default experiment.
 
     Raises:
         UnknownEnvironment: neither is given.

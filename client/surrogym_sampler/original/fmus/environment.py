@@ -1,5 +1,4 @@
-"""An FMU with a specification. Its reward, its starts and its terminations are those that the specification declares,
-because an FMU has none.
+"""An FMU as an original environment. An FMU has no reward, starts and terminations, so the specification declares them.
 
 Shapes: C coordinates, F action entries.
 """
@@ -21,7 +20,7 @@ from surrogym_shared.terms import terminates
 
 
 class SavingSimulator(Simulator):
-    """A simulator that may have snapshots of its own. ``has_snapshots``: whether this one can make them."""
+    """A simulator that may be able to make snapshots itself; ``has_snapshots`` says whether it can."""
 
     has_snapshots: bool
 
@@ -31,15 +30,15 @@ class SavingSimulator(Simulator):
 
     @abstractmethod
     def snapshot(self) -> bytes:
-        """The whole state, by the simulator's own calls."""
+        """Return the whole state, saved by the simulator itself."""
 
     @abstractmethod
     def go_back(self, snapshot: bytes) -> None:
-        """Return to a state that ``snapshot`` gave."""
+        """Return to the state in a snapshot that ``snapshot`` made."""
 
 
 class FmuEnvironment(Simulated):
-    """An FMU as an original environment. One instance at a time, because each one is a process."""
+    """An FMU as an original environment, with one instance at a time, because each is a process."""
 
     parallel = False
 
@@ -53,21 +52,21 @@ class FmuEnvironment(Simulated):
         if spec.action.kind != "box" or spec.action.size != simulator.action.size:
             raise UnknownEnvironment(
                 f"expected a continuous action of {simulator.action.size} entries, one for each driven input of the "
-                f"FMU, got a {spec.action.kind} one of {spec.action.size}"
+                f"FMU, got a {spec.action.kind} one of {spec.action.size}: correct the specification's action"
             )
         super().__init__(simulator, spec)
         self._saving = simulator
 
     def begin(self, seed: int | None = None) -> Array:
-        """Start where the specification says, if the state can be set, and at the FMU's own start otherwise; the
-        coordinates (C,) there."""
+        """Begin an episode: at a declared start if the state can be set, else at the FMU's own start values. Returns
+        the coordinates (C,)."""
         if self._spec.query == "rollout":
             return super().begin(seed)
         self.place(draw(self._spec, np.random.default_rng(seed), wide=False))
         return self.coordinates()
 
     def act(self, action: Array) -> RealStep:
-        """Apply action (F,) where the FMU stands. The reward is the declared one."""
+        """Apply an action (F,) in the current state. Reward and termination are computed as declared."""
         step = super().act(action)
         before, taken, after = (
             np.atleast_2d(np.asarray(x)) for x in (step.coordinates, step.action, step.next_coordinates)
@@ -77,15 +76,18 @@ class FmuEnvironment(Simulated):
         return replace(step, reward=float(paid[0]), terminated=bool(ended[0]))
 
     def save(self) -> bytes:
-        """The FMU's own state; without one, the state that can be set."""
+        """Return a snapshot: the FMU's own saved state if it can save one, else the coordinates that can be set."""
         if self._saving.has_snapshots:
             return self._saving.snapshot()
         if not self._saving.settable:
-            raise StepFailed("expected an FMU that can save its state or be set to one, got one that can only be reset")
+            raise StepFailed(
+                "expected an FMU that can save its state or be set to one, got one that can only be reset: register it "
+                "with --access reset"
+            )
         return super().save()
 
     def restore(self, snapshot: bytes) -> Array:
-        """Return to a saved state; its coordinates (C,)."""
+        """Return to the state in a snapshot, and return its coordinates (C,)."""
         if not self._saving.has_snapshots:
             return super().restore(snapshot)
         self._saving.go_back(snapshot)

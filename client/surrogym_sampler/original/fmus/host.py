@@ -1,7 +1,7 @@
 """The program that loads an FMU's native code: ``python -m surrogym_sampler.original.fmus.host``.
 
-It answers one line of JSON with one line of JSON, as any program of ``executables`` does, until its input ends. What
-the native code prints goes to standard error.
+It answers each line of JSON with a line of JSON, by the protocol of ``executables``, until its input ends. What the
+native code prints goes to standard error.
 """
 
 from __future__ import annotations
@@ -20,23 +20,24 @@ from typing import Any, TextIO
 
 from surrogym_sampler.original.fmus.instance import Broken, Instance, Refused, Saved, Start, Typed
 
-KEPT = 256  # saved states in memory, if the FMU can't give them as bytes; the oldest goes first
-WATCH_SECONDS = 1.0  # how often this program looks whether its parent still exists
+KEPT = 256  # number of saved states in memory, if the FMU can't give them as bytes; the oldest is dropped
+WATCH_SECONDS = 1.0  # seconds between two checks of whether the parent process still exists
 Fields = dict[str, Any]
 
 
 class Host:
-    """The requests, and what they need between them."""
+    """The methods that answer requests, and the state that they share."""
 
     def __init__(self) -> None:
         self._instance: Instance | None = None
         self._directory = ""
         self._inputs: list[Typed] = []
         self._reads: list[Typed] = []
-        self._names: list[str] = []  # of what is read
+        self._names: list[str] = []  # names of the variables that are read
         self._serializes = False
         self._kept: dict[int, Saved] = {}
-        self._saved = secrets.randbits(60)  # key of the last state; another process's keys don't fit here
+        # key of the last saved state; the first is random, so that keys of another process are not valid here
+        self._saved = secrets.randbits(60)
         self.requests: dict[str, Callable[[Fields], Fields]] = {
             "open": self._open,
             "initialise": self._initialise,
@@ -47,14 +48,14 @@ class Host:
         }
 
     def clear(self) -> None:
-        """Delete what was extracted, if the parent has ended and can't."""
+        """Delete the extracted files, for a parent that has ended without deleting them."""
         if self._directory:
             shutil.rmtree(self._directory, ignore_errors=True)
 
     @property
     def _open_instance(self) -> Instance:
         if self._instance is None:
-            raise Refused("no FMU is open")
+            raise Refused("expected an open FMU, got none: send the request open first")
         return self._instance
 
     def _open(self, fields: Fields) -> Fields:
@@ -103,7 +104,10 @@ class Host:
         instance, key = self._open_instance, fields["key"]
         if key:
             if key not in self._kept:
-                raise Refused("this saved state is no longer in memory, and the FMU can't give it as bytes")
+                raise Refused(
+                    "the saved state was dropped from memory, and the FMU can't give states as bytes: restore a newer "
+                    "one"
+                )
             instance.restore(self._kept[key])
             return self._values()
         saved = instance.from_bytes(Path(fields["file"]).read_bytes(), fields["steps"])
@@ -119,15 +123,17 @@ class Host:
 
     def _values(self) -> Fields:
         values = self._open_instance.read(self._reads)
-        named = dict(zip(self._names, values, strict=True))  # a state that is an output too is read twice
+        named = dict(zip(self._names, values, strict=True))  # a variable that is a state and an output is read twice
         wrong = [f"{name} is {value}" for name, value in named.items() if not math.isfinite(value)]
         if wrong:
-            raise Refused(f"expected finite values of the FMU, but {', '.join(wrong)}")
+            raise Refused(
+                f"expected finite values from the FMU, got {', '.join(wrong)}: narrow the actions or the states"
+            )
         return {"values": values}
 
 
 def serve(host: Host, source: TextIO, answers: TextIO) -> None:
-    """Answer every line until the input ends or the host is asked to close."""
+    """Answer every line of the source until the source ends, a request asks to close, or the native code breaks."""
     for line in source:
         asked = json.loads(line)
         answer: Fields = {"id": asked["id"]}
@@ -153,13 +159,14 @@ def _end_with_parent(host: Host, parent: int) -> None:
 
 
 def main() -> None:
-    """Keep standard output for answers alone, and serve."""
+    """Run the host. The descriptor of standard output is kept for answers; whatever else is printed goes to standard
+    error."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     host = Host()
     threading.Thread(target=_end_with_parent, args=(host, os.getppid()), daemon=True).start()
     serve(host, sys.stdin, answers)
-    os._exit(0)  # without the exit handlers of native code, which may hang
+    os._exit(0)  # skips the exit handlers of the native code, which may hang
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """One instance of an FMU at a time, by fmpy: the calls of FMI 2.0 and 3.0 behind one interface.
 
-This module runs in the host, since a fault of the native code ends the process. Times are in seconds.
+This module runs in the host process, because a fault of the native code ends the process. Times are in seconds.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from fmpy.fmi2 import FMU2Slave, fmi2Discard, fmi2Fatal, fmi2Terminated
 from fmpy.fmi3 import FMU3Slave
 
 Value = bool | int | float | str
-Typed = tuple[str, int]  # a variable's type and reference
-Start = tuple[str, int, Value]  # and the value that it gets before the FMU is initialised
+Typed = tuple[str, int]  # type and reference of a variable
+Start = tuple[str, int, Value]  # type, reference and value of a variable that is set before the FMU is initialised
 STATUS = {2: "discard", 3: "error", 4: "fatal", 5: "pending (it works asynchronously)"}
-SET_AS = {"Enumeration": {2: "Integer", 3: "Int64"}}  # types without calls of their own, by version
+SET_AS = {"Enumeration": {2: "Integer", 3: "Int64"}}  # types that are set by the calls of another type, by FMI version
 
 
 class Broken(Exception):
-    """The native code reported a fatal error: nothing in this process can be used any more."""
+    """The native code reported a fatal error, so nothing in this process can be used any more."""
 
 
 class Refused(Exception):
@@ -32,7 +32,7 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Saved:
-    """A saved state: the FMU's own, and the number of steps since its initialisation."""
+    """A saved state, as the FMU returned it, and the number of steps since the FMU's initialisation."""
 
     state: Any
     steps: int
@@ -42,13 +42,13 @@ class Instance:
     """The native code of an FMU, and at most one instance of it.
 
     Args:
-        version: 2 or 3, of FMI.
-        directory: that the FMU was extracted to.
-        library: path of the native code inside it.
-        identifier: of the model.
-        token: of the model description.
+        version: main version of FMI, 2 or 3.
+        directory: the folder to which the FMU was extracted.
+        library: path of the native code inside that folder.
+        identifier: identifier of the model.
+        token: the token in the model description.
         step: seconds of one step.
-        only_once: whether an instance has to be reset instead of made anew.
+        only_once: whether the instance must be reset instead of being made again.
     """
 
     def __init__(
@@ -63,10 +63,10 @@ class Instance:
             libraryPath=str(Path(directory, library)),
         )
         self._exists = self._initialised = False
-        self._steps = 0  # since the initialisation
+        self._steps = 0  # number of steps since the initialisation
 
     def initialise(self, start: Sequence[Start]) -> None:
-        """Make an instance at time 0, with these values set before it is initialised."""
+        """Make an instance at time 0; ``start`` contains the values to set before its initialisation."""
         self._renew()
         with _words("the start"):
             for kind, reference, value in start:
@@ -87,14 +87,14 @@ class Instance:
         return over
 
     def read(self, variables: Sequence[Typed]) -> list[float]:
-        """The values of variables, in their order."""
+        """Return the values of variables, in the order of ``variables``."""
         with _words("reading"):
             by_kind = {kind: [r for k, r in variables if k == kind] for kind, _ in variables}
             read = {kind: iter(self._get(kind, references)) for kind, references in by_kind.items()}
         return [float(next(read[kind])) for kind, _ in variables]
 
     def save(self) -> Saved:
-        """The FMU's own state."""
+        """Save the FMU's state."""
         with _words("saving"):
             return Saved(self._fmu.getFMUState(), self._steps)
 
@@ -107,19 +107,19 @@ class Instance:
         self._steps = saved.steps
 
     def as_bytes(self, saved: Saved) -> bytes:
-        """A saved state as bytes."""
+        """Convert a saved state to bytes."""
         with _words("serialising"):
             return bytes(self._fmu.serializeFMUState(saved.state))
 
     def from_bytes(self, state: bytes, steps: int) -> Saved:
-        """The saved state in bytes."""
+        """Convert bytes to a saved state; ``steps`` is its number of steps since the initialisation."""
         if not self._initialised:
             self.initialise(())
         with _words("reading a saved state"):
             return Saved(self._fmu.deserializeFMUState(state), steps)
 
     def forget(self, saved: Saved) -> None:
-        """Free a saved state."""
+        """Free the memory of a saved state."""
         with _words("freeing a saved state"):
             self._fmu.freeFMUState(saved.state)
 
@@ -132,7 +132,7 @@ class Instance:
         self._exists = False
 
     def _renew(self) -> None:
-        """A new instance, or the old one as after its making."""
+        """Make a new instance, or reset the only one that may exist."""
         self._terminate()
         if self._exists and self._only_once:
             with _words("the reset"):
@@ -144,7 +144,7 @@ class Instance:
         try:
             self._fmu.instantiate()
         except Exception as error:  # fmpy raises a plain Exception
-            raise Refused("the FMU could not be instantiated; its log may say why") from error
+            raise Refused("the FMU could not be instantiated: see the lines that it printed") from error
         self._exists = True
 
     def _terminate(self) -> None:
@@ -154,7 +154,7 @@ class Instance:
                 self._fmu.terminate()
 
     def _free(self) -> None:
-        """Free the instance, but not the library, as ``freeInstance`` of fmpy would."""
+        """Free the instance but keep the library loaded, unlike fmpy's ``freeInstance``."""
         free = self._fmu.fmi2FreeInstance if self._version == 2 else self._fmu.fmi3FreeInstance
         free(self._fmu.component)
 
@@ -162,7 +162,9 @@ class Instance:
         if self._version == 3:
             _, over, early, _ = self._fmu.doStep(currentCommunicationPoint=time, communicationStepSize=self._step)
             if early and not over:
-                raise Refused("the FMU returned before the end of the step")
+                raise Refused(
+                    'expected the FMU to simulate the whole step, got an early return: set "step" in its JSON file'
+                )
             return bool(over)
         try:
             self._fmu.doStep(currentCommunicationPoint=time, communicationStepSize=self._step)
@@ -189,7 +191,7 @@ class Instance:
 
 
 class _words:
-    """Convert an error of a call to one in words."""
+    """Context manager that converts an error of an FMI call to ``Broken`` or ``Refused``, with a message."""
 
     def __init__(self, during: str) -> None:
         self._during = during

@@ -1,4 +1,4 @@
-"""The host of an FMU as this process sees it: started, asked, ended and started anew.
+"""The process of an FMU's host, seen from this process: it is started, sent requests, ended, and started again.
 
 Shapes: V variables that are read, F inputs.
 """
@@ -31,8 +31,8 @@ from surrogym_sampler.original.fmus.archive import Archive, Declared
 from surrogym_sampler.original.fmus.choices import Value
 from surrogym_sampler.original.protocol import Array
 
-START_LIMIT = 120.0  # seconds until the native code is loaded
-HEADER = struct.Struct("<8s16sqq")  # of a snapshot: form, the FMU's digest, steps since the start, key in memory
+START_LIMIT = 120.0  # seconds until the native code must be loaded
+HEADER = struct.Struct("<8s16sqq")  # header of a snapshot: form, the FMU's digest, steps since the start, key in memory
 FORM = b"SGFMU\x00\x00\x01"
 COMMAND = shlex.join([sys.executable, "-m", "surrogym_sampler.original.fmus.host"])
 
@@ -40,13 +40,13 @@ Start = tuple[str, int, Value]
 
 
 class Process:
-    """One FMU in a process of its own. A crash or a hang ends that process; ``initialise`` and ``restore`` start it
-    anew.
+    """An FMU in a process of its own. A crash or a hang ends that process; ``initialise`` and ``restore`` start it
+    again.
 
     Args:
-        archive: the FMU.
-        inputs: variables that an action sets, F of them.
-        reads: variables that every answer contains, V of them.
+        archive: the FMU's declarations.
+        inputs: the F variables that an action sets.
+        reads: the V variables that every answer contains.
         step: seconds of one action.
         start: values that every initialisation sets first.
 
@@ -80,17 +80,17 @@ class Process:
 
     @property
     def values(self) -> Array:
-        """What the FMU's variables were after the last answer, (V,).
+        """The values (V,) of the FMU's variables after the last answer.
 
         Raises:
-            StepFailed: the process has ended since.
+            StepFailed: the last request failed, so the values are unknown.
         """
         self._check_state()
         assert self._values is not None
         return self._values
 
     def initialise(self, start: Sequence[Start] = ()) -> None:
-        """Begin anew at time 0, with these values in addition."""
+        """Start the simulation again at time 0, with the values in ``start`` set in addition to the usual ones."""
         self._revive()
         self._take(self._ask("initialise", start=[*self._start, *start]))
 
@@ -102,7 +102,7 @@ class Process:
         return truth(reply, "over")
 
     def save(self) -> bytes:
-        """The FMU's whole state, as bytes that ``restore`` takes."""
+        """Return the FMU's whole state, as bytes for ``restore``."""
         file = self._directory / "snapshot"
         reply = self._ask("save", file=str(file))
         state = b"" if reply["key"] else file.read_bytes()
@@ -115,12 +115,16 @@ class Process:
             StepFailed: another FMU made the snapshot, or this process can't use it.
         """
         if len(snapshot) < HEADER.size or not snapshot.startswith(FORM):
-            raise StepFailed(f"expected a snapshot of {self._archive.path.name}, got {len(snapshot)} other bytes")
+            raise StepFailed(
+                f"expected a snapshot of {self._archive.path.name}, got {len(snapshot)} other bytes: delete the "
+                "snapshot"
+            )
         _, digest, steps, key = HEADER.unpack_from(snapshot)
         if digest != self._digest:
             raise StepFailed(
-                f"expected a snapshot of {self._archive.path.name} as it is now, got one of another file, step or "
-                "start: delete the snapshot, or go back to what it was made with"
+                f"expected a snapshot of {self._archive.path.name} as it is now, got one that was made with another "
+                "file, "
+                "step or start: delete the snapshot, or restore the former file and settings"
             )
         self._revive()
         file = self._directory / "snapshot"
@@ -128,13 +132,16 @@ class Process:
         self._take(self._ask("restore", file=str(file), steps=steps, key=key))
 
     def close(self) -> None:
-        """End the process, and delete what was extracted."""
+        """End the process, and delete the extracted files."""
         self._program.close()
         shutil.rmtree(self._directory, ignore_errors=True)
 
     def _check_state(self) -> None:
         if self._values is None:
-            raise StepFailed(f"expected {self._archive.path.name} at a state, got none: its last request failed")
+            raise StepFailed(
+                f"expected {self._archive.path.name} to have a state, got none, because its last request failed: reset "
+                "it"
+            )
 
     def _open(self) -> None:
         self._program.start()
@@ -181,12 +188,12 @@ class Process:
 
 
 def _extract(archive: Archive, directory: Path, others: Sequence[object]) -> bytes:
-    """Extract the FMU. Returns a digest of its file and of everything else that a snapshot depends on, 16 bytes."""
+    """Extract the FMU, and return a digest (16 bytes) of its file and of ``others``, all that a snapshot depends on."""
     from fmpy import extract
 
     try:
         extract(str(archive.path), str(directory))
-    except Exception as error:  # fmpy refuses paths by a plain Exception
+    except Exception as error:  # fmpy refuses unsafe paths in an archive by a plain Exception
         raise UnknownEnvironment(f"{archive.path} can't be extracted: {error}") from error
     digest = hashlib.sha256(archive.path.read_bytes())
     digest.update(repr(others).encode())
