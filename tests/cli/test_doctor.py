@@ -96,7 +96,7 @@ def test_an_environment_that_can_not_be_stepped_or_made(on_server, tmp_path):
     said = on_server("doctor", "--env", "broken:Pendulum", "--quiet")
     assert said.code == 1
     assert list(lines(said)) == ["step"]
-    assert "expected the shape (2,) for next_coordinates of a step, got (1,)" in lines(said)["step"][1]
+    assert "expected the shape (2,) for next_coordinates of a real step, got (1,)" in lines(said)["step"][1]
     missing = on_server("doctor", "--env", "Nowhere-v1", "--quiet")
     assert "Nowhere-v1 can't be made: Environment `Nowhere` doesn't exist" in lines(missing)["environment"][1]
 

@@ -154,7 +154,7 @@ def test_a_snapshot_of_something_else_is_refused(tanks: Path, tmp_path: Path) ->
     one = opened(f"fmu:{tanks}")
     other = opened(mapping(tmp_path, fmu=str(tanks), start={"flow": 1e-4}))
     try:
-        with pytest.raises(StepFailed, match="as it is now, .* another file, step or start: delete"):
+        with pytest.raises(StepFailed, match=r"as it is now, .* another file, step or start: delete"):
             other.go_back(one.snapshot())
         with pytest.raises(StepFailed, match=r"expected a snapshot of TwoTanks.fmu, got 5 other bytes"):
             other.go_back(b"hello")

@@ -217,7 +217,7 @@ def test_the_older_one_of_the_nearest_two_is_least_useful():
 @pytest.mark.parametrize(
     ("environment", "sentence"),
     [
-        (GivesNoBytes, "a state is not kept, so no query will begin there: expected bytes from save, got a str"),
+        (GivesNoBytes, "a state is not kept, so no query will begin there: expected save to return bytes, got a str"),
         (RaisesInSave, "a state is not kept, so no query will begin there: RuntimeError: no licence"),
         (SavesMuch, "expected a snapshot of at most 4000 bytes, which all snapshots together"),
         (ReturnsElsewhere, "restore leads to another state than was saved"),

@@ -1,5 +1,6 @@
-"""Interface between the sampler and an original environment: its specification and real steps. A step starts from any
-state, or, if the state can't be set, follows others after a reset.
+"""The interface between the sampler and an original environment: its specification and real steps.
+
+A step starts from any state, or, if the state can't be set, follows others after a reset.
 
 Shapes: C coordinates, F action entries, D observation entries.
 """
@@ -17,134 +18,121 @@ from surrogym_shared.spec import EnvironmentSpec
 
 Array = NDArray[np.float64]
 
-LONGEST_EPISODE = 1_000  # steps, if there is no time limit
+LONGEST_EPISODE = 1_000  # largest number of steps in an episode without a time limit
 
 
 @runtime_checkable
 class OriginalEnvironment(Protocol):
-    """An environment that can be set to given coordinates. Any class with these three methods will do. An attribute
-    ``parallel = True`` says that several instances may be open at once; without it there is one at a time.
+    """An environment that can be set to given coordinates. Any class with these three methods is one.
+
+    With an attribute ``parallel = True``, several instances may be open at once; without it, only one.
 
     Examples:
         A cart on a rail that is pushed::
 
-            class Cart:
-                def spec(self):
+            class Cart: def spec(self):
                     return EnvironmentSpec.model_validate_json(Path("cart.json").read_text())
 
-                def step_from(self, coordinates, action):
-                    self.rail.move_to(*coordinates)
-                    self.rail.push(action[0])
-                    achieved = self.rail.read()
-                    return RealStep(coordinates, action, achieved, reward=-abs(achieved[0]))
+                def step_from(self, coordinates, action): self.rail.move_to(*coordinates) self.rail.push(action[0])
+                    achieved = self.rail.read() return RealStep(coordinates, action, achieved, reward=-abs(achieved[0]))
 
-                def close(self):
-                    self.rail.park()
+                def close(self): self.rail.park()
     """
 
     def spec(self) -> EnvironmentSpec:
-        """Return the specification, known before the first query."""
+        """Return the specification, which is known before the first query."""
         ...
 
     def step_from(self, coordinates: Array, action: Array) -> RealStep:
-        """Set the environment to coordinates (C,), apply action (F,), and return the real step."""
+        """Set the environment to coordinates (C,), apply an action (F,), and return the real step."""
         ...
 
     def close(self) -> None:
-        """Release what the environment holds."""
+        """Release the environment's resources."""
         ...
 
 
 @runtime_checkable
 class ResettableEnvironment(Protocol):
-    """An environment that can only be reset and acted on. Any class with these five methods will do; ``reset`` and
-    ``step`` are Gymnasium's, so that a Gymnasium environment needs the other three alone. Its specification says
-    ``query="rollout"``.
+    """An environment that can only be reset and acted on. Any class with these five methods is one.
+
+    ``reset`` and ``step`` are Gymnasium's, so a Gymnasium environment lacks only the other three. The specification
+    must declare ``query="rollout"``.
 
     Examples:
         A cart that finds its own way back::
 
-            class Cart:
-                def spec(self):
+            class Cart: def spec(self):
                     return EnvironmentSpec.model_validate_json(Path("cart.json").read_text())
 
-                def reset(self, *, seed=None):
-                    self.rail.home()
-                    return self.rail.read(), {}
+                def reset(self, *, seed=None): self.rail.home() return self.rail.read(), {}
 
-                def step(self, action):
-                    self.rail.push(action[0])
-                    observation = self.rail.read()
-                    return observation, -abs(observation[0]), False, False, {}
+                def step(self, action): self.rail.push(action[0]) observation = self.rail.read() return observation,
+                    -abs(observation[0]), False, False, {}
 
-                def coordinates(self, observation):
-                    return observation
+                def coordinates(self, observation): return observation
 
-                def close(self):
-                    self.rail.park()
+                def close(self): self.rail.park()
     """
 
     def spec(self) -> EnvironmentSpec:
-        """Return the specification, known before the first query."""
+        """Return the specification, which is known before the first query."""
         ...
 
     def reset(self, *, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode; observation and info. What can't be seeded leaves the seed alone."""
+        """Begin an episode, and return observation and info. An environment that can't be seeded ignores the seed."""
         ...
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Apply an action; observation, reward, terminated, truncated and info."""
+        """Apply an action, and return observation, reward, terminated, truncated and info."""
         ...
 
     def coordinates(self, observation: Any) -> ArrayLike:
-        """The coordinates (C,) that an observation tells of, without lags."""
+        """Return the coordinates, without lags, that an observation shows."""
         ...
 
     def close(self) -> None:
-        """Release what the environment holds."""
+        """Release the environment's resources."""
         ...
 
 
 @runtime_checkable
 class RolloutEnvironment(Protocol):
-    """Environment that answers rollout queries: ``FromReset`` makes one of a ``ResettableEnvironment``."""
+    """An environment that answers rollout queries; ``FromReset`` makes one from a ``ResettableEnvironment``."""
 
     def spec(self) -> EnvironmentSpec:
-        """Return the specification, known before the first query."""
+        """Return the specification, which is known before the first query."""
         ...
 
     def begin(self, seed: int | None = None) -> Array:
-        """Reset the environment; the coordinates (C,) it starts at."""
+        """Reset the environment, and return the start coordinates (C,)."""
         ...
 
     def act(self, action: Array) -> RealStep:
-        """Apply action (F,) where the last step, or the reset, has led to."""
+        """Apply an action (F,) in the current state, and return the real step."""
         ...
 
     def close(self) -> None:
-        """Release what the environment holds."""
+        """Release the environment's resources."""
         ...
 
 
 @runtime_checkable
 class SnapshotEnvironment(Protocol):
-    """The two methods of an environment that can return to a state it was in. Its specification says
+    """The two methods of an environment that can return to a state it was in. The specification must declare
     ``snapshots=True``.
 
     Examples:
         A simulator whose whole state is one number::
 
-            class SavedCart(Cart):
-                def save(self):
+            class SavedCart(Cart): def save(self):
                     return struct.pack("<d", self.rail.x)
 
-                def restore(self, snapshot):
-                    (self.rail.x,) = struct.unpack("<d", snapshot)
-                    return self.rail.read()
+                def restore(self, snapshot): (self.rail.x,) = struct.unpack("<d", snapshot) return self.rail.read()
     """
 
     def save(self) -> bytes:
-        """The whole state, in a form of the environment's own. The environment stays as it is."""
+        """Return the whole state as bytes, in a form of the environment's own. The state does not change."""
         ...
 
     def restore(self, snapshot: bytes) -> ArrayLike:
@@ -154,13 +142,13 @@ class SnapshotEnvironment(Protocol):
 
 
 def runs_in_parallel(environment: object) -> bool:
-    """Whether several instances of an environment may be open at once: its attribute ``parallel``, False without one.
+    """Return whether several instances of an environment may be open at once: its attribute ``parallel``, False without
+    one.
 
     Examples:
         A simulator sets the attribute; a machine leaves it out::
 
-            class SimulatedCart(Cart):
-                parallel = True
+            class SimulatedCart(Cart): parallel = True
     """
     return bool(getattr(environment, "parallel", False))
 

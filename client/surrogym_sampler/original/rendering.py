@@ -1,4 +1,4 @@
-"""The original environment's own renderer, shown a state it has not reached itself.
+"""Pictures of given states, drawn by the original environment's own renderer.
 
 Shapes: C coordinates; a picture is (height, width, 3) uint8.
 """
@@ -23,29 +23,30 @@ FRAMES_PER_SECOND = 30
 
 @runtime_checkable
 class Drawable(Protocol):
-    """The additional method of a user's environment that can be rendered."""
+    """A user's environment that can be rendered: it has the additional method ``picture``."""
 
     def picture(self, coordinates: Array) -> Picture:
-        """The state at coordinates (C,)."""
+        """Return the picture of the state with coordinates (C,)."""
         ...
 
 
 def renderer_of(spec: EnvironmentSpec, original: str | None = None) -> Renderer:
-    """The renderer of a specification's environment.
+    """Return the renderer of a specification's environment.
 
     Args:
-        spec: the environment; its word is taken for ids with a built-in adapter alone, never for a module.
-        original: ``package.module:factory`` of one's own environment, which has a method ``picture``.
+        spec: the specification. Its environment's name is used only if it is that of a built-in adapter, never to
+            import a module.
+        original: ``package.module:factory`` of a user's environment, which has a method ``picture``.
 
     Raises:
-        NotRenderable: it has none, or what that needs is not installed.
+        NotRenderable: the environment has no renderer, or a package that the renderer needs is not installed.
     """
     if original is not None and _is_class(original):
         return _Own(original)
     name = original or spec.environment
     if not is_drawn_by_gymnasium(name):
         raise NotRenderable(
-            f"expected original='package.module:factory' of the environment to show, got none (its name: {name!r})"
+            f"expected original='package.module:factory' to render the environment {name!r}, got none: give it"
         )
     return _Native(name, spec)
 
@@ -58,14 +59,18 @@ class _Own:
     def __init__(self, name: str) -> None:
         made = load_factory(name)()
         if not isinstance(made, Drawable):
-            raise NotRenderable(f"expected {name} to have a method picture(coordinates), got a {type(made).__name__}")
+            raise NotRenderable(
+                f"expected {name} to have a method picture(coordinates), got a {type(made).__name__} without: add it"
+            )
         self._environment = made
         self.frames_per_second = int(getattr(made, "frames_per_second", FRAMES_PER_SECOND))
 
     def draw(self, coordinates: Array) -> Picture:
         picture = np.asarray(self._environment.picture(coordinates))
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
-            raise NotRenderable(f"expected a picture (h, w, 3) of uint8, got {picture.shape} of {picture.dtype}")
+            raise NotRenderable(
+                f"expected picture() to return (height, width, 3) of uint8, got {picture.shape} of {picture.dtype}"
+            )
         return picture
 
     def close(self) -> None:
@@ -73,7 +78,7 @@ class _Own:
 
 
 class _Native:
-    """A Gymnasium environment that is written to and asked for its picture; it is never stepped."""
+    """A Gymnasium environment that is set to states and rendered, but never stepped."""
 
     def __init__(self, name: str, spec: EnvironmentSpec) -> None:
         import gymnasium
@@ -94,7 +99,7 @@ class _Native:
             self._simulator.place(self._simulator.columns(self._spec.coordinate_names), coordinates)
         try:
             frame: Any = self._env.render()
-        except Exception as error:  # a display, a driver or a library is missing: each says so by an error of its own
+        except Exception as error:  # a missing display, driver or library each raises an error of its own
             raise self._unavailable(error) from error
         return np.asarray(frame, dtype=np.uint8)
 

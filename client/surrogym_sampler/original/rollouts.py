@@ -1,4 +1,4 @@
-"""Environments that can only be reset and acted on, as the sampler uses them."""
+"""Adaptation of environments that can only be reset and acted on to the interface that the sampler uses."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ from surrogym_sampler.original.protocol import (
 )
 from surrogym_shared.spec import EnvironmentSpec
 
-KINDS = (("spec", "step_from", "close"), ("spec", "reset", "step", "coordinates", "close"))  # methods that each needs
+# Methods that each of the two kinds of environment needs.
+KINDS = (("spec", "step_from", "close"), ("spec", "reset", "step", "coordinates", "close"))
 
 
 class FromReset:
-    """A ``ResettableEnvironment`` as a ``RolloutEnvironment``: each step begins where the one before ended.
+    """A ``ResettableEnvironment`` as a ``RolloutEnvironment``: each step begins where the previous one ended.
 
     The environment reads R coordinates; the others are lags of these and of the actions.
     """
@@ -35,33 +36,38 @@ class FromReset:
         self._spec = environment.spec()
         self._at: Array | None = None
         size = len(self._spec.coordinates)
-        self._prefix = 8 * size if size > len(read_names(self._spec)) else 0  # bytes of coordinates in a snapshot
+        # number of bytes in a snapshot for the coordinates, which contain the lags
+        self._prefix = 8 * size if size > len(read_names(self._spec)) else 0
         self.parallel = runs_in_parallel(environment)
 
     def spec(self) -> EnvironmentSpec:
         return self._spec
 
     def begin(self, seed: int | None = None) -> Array:
-        """Reset the environment; the coordinates (C,) it starts at.
+        """Reset the environment, and return the start coordinates (C,).
 
         Raises:
-            StepFailed: ``reset`` gives no pair, or ``coordinates`` no (R,).
+            StepFailed: ``reset`` does not return a pair, or ``coordinates`` an array (R,).
         """
         self._at = None
         first: Any = self._environment.reset(seed=seed)
         if not isinstance(first, tuple) or len(first) != 2:
-            raise StepFailed(f"expected (observation, info) of reset, got a {type(first).__name__}")
+            raise StepFailed(
+                f"expected reset to return (observation, info), got a {type(first).__name__}: correct the environment"
+            )
         self._at = begun(self._spec, self._read(first[0]))
         return self._at
 
     def act(self, action: Array) -> RealStep:
-        """Apply action (F,).
+        """Apply an action (F,), and return the real step.
 
         Raises:
-            StepFailed: no episode is running, or ``coordinates`` gives no (R,).
+            StepFailed: no episode is running, or ``coordinates`` does not return an array (R,).
         """
         if self._at is None:
-            raise StepFailed("expected an action in a running episode, got one after its end or before a reset")
+            raise StepFailed(
+                "expected an action in a running episode, got one after its end or before a reset: reset first"
+            )
         before, self._at = self._at, None
         native = native_action(self._spec.action, action)
         observation, reward, terminated, truncated, _ = self._environment.step(native)
@@ -79,14 +85,15 @@ class FromReset:
         )
 
     def save(self) -> bytes:
-        """The whole state, in the environment's own form. With lags, which it does not know, coordinates come first.
+        """Return a snapshot of the whole state: the environment's own bytes, after the coordinates if some of them are
+        lags.
 
         Raises:
-            StepFailed: the environment's form is not bytes, or with lags no episode is running.
+            StepFailed: the environment's ``save`` does not return bytes, or there are lags and no episode is running.
         """
         snapshot: Any = _saving(self._environment).save()
         if not isinstance(snapshot, bytes):
-            raise StepFailed(f"expected bytes from save, got a {type(snapshot).__name__}")
+            raise StepFailed(f"expected save to return bytes, got a {type(snapshot).__name__}: correct the environment")
         if not self._prefix:
             return snapshot
         if self._at is None:
@@ -97,16 +104,16 @@ class FromReset:
         return self._at.astype("<f8").tobytes() + snapshot
 
     def restore(self, snapshot: bytes) -> Array:
-        """Return to the state of a snapshot; the coordinates (C,) there.
+        """Return to the state of a snapshot, and return the coordinates (C,) there.
 
         Raises:
-            StepFailed: the snapshot is too short for its lags, or ``coordinates`` gives no (R,).
+            StepFailed: the snapshot is too short for its lags, or ``coordinates`` does not return an array (R,).
         """
         self._at = None
         if len(snapshot) < self._prefix:
             raise StepFailed(
-                f"expected a snapshot of at least {self._prefix} bytes, which its earlier states take, got "
-                f"{len(snapshot)}"
+                f"expected a snapshot of at least {self._prefix} bytes, the size of its coordinates with lags, got "
+                f"{len(snapshot)}: delete the snapshots of this environment"
             )
         read = self._read(_saving(self._environment).restore(snapshot[self._prefix :]))
         before = np.frombuffer(snapshot[: self._prefix], dtype="<f8") if self._prefix else np.zeros(len(read))
@@ -120,14 +127,18 @@ class FromReset:
         read = np.asarray(self._environment.coordinates(observation), dtype=np.float64)
         names = read_names(self._spec)
         if read.shape != (len(names),):
-            raise StepFailed(f"expected coordinates ({', '.join(names)}), got an array of shape {read.shape}")
+            raise StepFailed(
+                f"expected coordinates() to return ({', '.join(names)}), got an array of shape {read.shape}"
+            )
         return read
 
 
 def _saving(environment: object) -> SnapshotEnvironment:
     """Return the environment if it has ``save`` and ``restore``. Raises ``StepFailed`` otherwise."""
     if not isinstance(environment, SnapshotEnvironment):
-        raise StepFailed("expected the methods save and restore for snapshots, got an environment without them")
+        raise StepFailed(
+            "expected the methods save and restore for snapshots, got an environment without them: add them"
+        )
     return environment
 
 
@@ -138,7 +149,11 @@ def _only_resets(environment: object) -> TypeGuard[ResettableEnvironment]:
 
 
 def answering(environment: object) -> Environment:
-    """Adapt an environment to the kind of query that its specification declares."""
+    """Return an environment with the interface for the kind of query that its specification declares.
+
+    Raises:
+        UnknownEnvironment: the object lacks methods that its kind of query, or its snapshots, need.
+    """
     _check_snapshots(environment)
     if _only_resets(environment):
         environment = FromReset(environment)
@@ -156,14 +171,15 @@ def answering(environment: object) -> Environment:
     if not isinstance(environment, needed):
         other = '; for an environment that can only be reset, declare query="rollout"' if query == "step" else ""
         raise UnknownEnvironment(
-            f"its specification declares query={query!r}, which needs {methods}: add those that are missing{other}"
+            f"the environment's specification declares query={query!r}, which needs {methods}: add those that are "
+            f"missing{other}"
         )
     return environment
 
 
 def _missing(environment: object) -> str:
-    """Name the methods that an object lacks of the kind of environment to which it is nearest: the one of which it
-    lacks fewest, and of two such the one of which it has more."""
+    """Return the names of the methods that an object lacks to be an environment of either kind. The kind of which
+    fewest methods are missing is taken; of two such kinds, the one with more methods."""
     lacking = [[name for name in names if not callable(getattr(environment, name, None))] for names in KINDS]
     nearest = min(range(len(KINDS)), key=lambda kind: (len(lacking[kind]), -len(KINDS[kind])))
     return " and ".join(lacking[nearest])
@@ -173,5 +189,6 @@ def _check_snapshots(environment: object) -> None:
     declared = callable(getattr(environment, "spec", None)) and environment.spec().snapshots  # type: ignore[attr-defined]
     if declared and not isinstance(environment, SnapshotEnvironment):
         raise UnknownEnvironment(
-            "its specification declares snapshots, which need the methods save and restore: add those that are missing"
+            "the environment's specification declares snapshots, which need the methods save and restore: add those "
+            "that are missing"
         )

@@ -1,4 +1,5 @@
-"""The interface of an adapter to a simulator, and the original environment made from it with a specification."""
+"""The interface of an adapter to a simulator, and the original environment made from a simulator and a
+specification."""
 
 from __future__ import annotations
 
@@ -16,12 +17,12 @@ from surrogym_sampler.original.protocol import Array, RealStep
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.spec.actions import Action
 
-SMALLEST_FACTOR = 0.05  # a mass or a length stays positive, however large the perturbation
+SMALLEST_FACTOR = 0.05  # smallest factor on a mass or a length, so that it stays positive under any perturbation
 Motion = Literal["slide", "turn", "speed", "held", "other"]
 
 
 def random_factor(rng: np.random.Generator, sigma: float) -> float:
-    """A factor around 1 for a mass or a length, with standard deviation ``sigma``."""
+    """Draw a factor for a mass or a length, with mean 1 and standard deviation ``sigma``."""
     return max(SMALLEST_FACTOR, 1.0 + sigma * float(rng.standard_normal()))
 
 
@@ -29,8 +30,13 @@ def random_factor(rng: np.random.Generator, sigma: float) -> float:
 class Variable:
     """One number of a simulator's state.
 
-    ``motion``: ``slide`` along a line, ``turn`` about an axis, ``speed``, ``held`` through an episode (a goal, a
-    setpoint), or ``other``. ``low`` and ``high`` are the simulator's own limits, None where it has none.
+    Attributes:
+        name: the variable's name.
+        motion: ``slide`` along a line, ``turn`` about an axis, ``speed``, ``held`` through an episode (a goal, a
+            setpoint), or ``other``.
+        low: the simulator's own lower limit; None if it has none.
+        high: the simulator's own upper limit; None if it has none.
+        driven: whether an actuator acts on the joint itself.
     """
 
     name: str
@@ -46,7 +52,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Taken:
-    """Results of one step of a simulator; ``observation`` is its own, (D,)."""
+    """The results of one step of a simulator; ``observation`` is the simulator's own (D,)."""
 
     observation: Array
     reward: float
@@ -58,20 +64,21 @@ class Simulator(ABC):
     """One open simulator, after a first reset.
 
     Attributes:
-        settable: whether its state can be written.
-        fixed: why it can't, and what follows; a part of a sentence.
-        shows: whether ``observe`` reads the state as it is, and not what the last step or reset gave.
-        pays: whether steps have a reward; without one, the specification has to declare it.
-        action: what can be done.
-        variables: the state's numbers, (V,).
-        rest: the state (V,) that a variable has where no coordinate says otherwise.
-        time_limit: steps of an episode; None without a limit.
-        period: seconds from one step to the next; None if it does not tell.
-        scheduled: variables that a schedule sets, such as setpoints, with their lowest and highest value in it. They
-            are coordinates, also where a few steps show one value alone.
-        shown_limits: declared limits (D, 2) of the entries of its observation, infinite where it has none.
-        notes: findings that a description repeats, one sentence each.
-        questions: to a person who reads a description, one sentence each.
+        settable: whether the state can be set.
+        fixed: part of a sentence: why the state can't be set, and what follows from that.
+        shows: whether ``observe`` computes the observation of the current state, instead of returning that of the last
+            step.
+        pays: whether steps have a reward; otherwise the specification has to declare it.
+        action: the action space.
+        variables: the V variables of the state.
+        rest: values (V,) of the variables that are not coordinates when a state is set.
+        time_limit: largest number of steps in an episode; None if there is no limit.
+        period: seconds from one step to the next; None if unknown.
+        scheduled: variables that a schedule sets, such as setpoints, with their smallest and largest value in it. They
+            are coordinates, even if a few steps show only one value.
+        shown_limits: declared limits (D, 2) of the entries of the observation, infinite where none are declared.
+        notes: findings for a description, one sentence each.
+        questions: questions to a person who reads a description, one sentence each.
     """
 
     settable = True
@@ -90,39 +97,40 @@ class Simulator(ABC):
 
     @property
     def saves(self) -> bool:
-        """Whether it can return to a saved state."""
+        """Whether the simulator can return to a saved state."""
         return self.settable
 
     @abstractmethod
     def reset(self, seed: int | None) -> Array:
-        """Begin an episode; the observation (D,)."""
+        """Begin an episode, and return the observation (D,)."""
 
     @abstractmethod
     def step(self, action: Array) -> Taken:
-        """Apply action (F,)."""
+        """Apply an action (F,), and return the results of the step."""
 
     @abstractmethod
     def read(self) -> Array:
-        """The state (V,)."""
+        """Return the state (V,)."""
 
     @abstractmethod
     def write(self, state: Array) -> None:
-        """Set the state (V,) and forget everything else of earlier steps."""
+        """Set the state (V,), and clear all other memory of earlier steps."""
 
     def save(self) -> Array:
-        """All that decides what happens next, as numbers (K,): more than ``read`` where a solver remembers."""
+        """Return as numbers (K,) everything that the next step depends on: more than ``read`` returns if a solver
+        remembers something."""
         return self.read()
 
     def restore(self, saved: Array) -> None:
-        """Return to what ``save`` gave, (K,)."""
+        """Return to the state whose numbers (K,) ``save`` returned."""
         self.write(saved)
 
     @abstractmethod
     def observe(self) -> Array:
-        """The observation (D,) of the state as it is, without a step."""
+        """Return the observation (D,) of the current state, without a step."""
 
     def touches(self) -> bool:
-        """Whether bodies touch in the state as it is; False where the simulator knows of none."""
+        """Return whether bodies touch each other in the current state; False if the simulator has no contacts."""
         return False
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
@@ -133,45 +141,59 @@ class Simulator(ABC):
         """
         del rng, sigma
         raise NotPerturbable(
-            "only MuJoCo models, and classic control with its built-in specification, can be perturbed: write "
-            "a changed class, and name it by --env"
+            "expected a MuJoCo model, or classic control with its built-in specification, for a perturbation, got "
+            "another environment: write a class with changed physics, and give it with --env"
         )
 
     @abstractmethod
     def close(self) -> None:
-        """Release what the simulator holds."""
+        """Release the simulator's resources."""
 
     def columns(self, names: Sequence[str]) -> list[int]:
-        """Index into the state of each name.
+        """Return the index into the state for each name.
 
         Raises:
-            UnknownEnvironment: a name is no variable of the simulator.
+            UnknownEnvironment: a name is not a variable of the simulator.
         """
         known = [variable.name for variable in self.variables]
         if unknown := [name for name in names if name not in known]:
-            raise UnknownEnvironment(f"coordinates {unknown} are not variables of the state: expected some of {known}")
+            raise UnknownEnvironment(
+                f"expected coordinates that are variables of the state, {known}, got {unknown}: correct the "
+                "specification"
+            )
         return [known.index(name) for name in names]
 
     def action_taken(self, action: Array) -> Array:
-        """The action (F,) as the simulator gets it: rounded to its own numbers."""
+        """Return the action (F,) as the simulator receives it, rounded to the simulator's type of numbers."""
         return np.atleast_1d(np.asarray(native_action(self.action, action), dtype=np.float64))
 
     def place(self, columns: list[int], coordinates: Array) -> None:
-        """Set some variables to coordinates (C,), the others to rest."""
+        """Set the variables at the indices ``columns`` to coordinates (C,), and the others to their values at rest."""
         state = self.rest.copy()
         state[columns] = coordinates
         self.write(state)
 
     def with_specification(self, spec: EnvironmentSpec, *, shows_own: bool, step_limit: float) -> Simulated:
-        """The original environment made from this simulator. ``step_limit`` (s) is for simulators with a process of
-        their own."""
+        """Make the original environment from this simulator and a specification.
+
+        Args:
+            spec: the specification.
+            shows_own: whether the specification's observation is the simulator's own.
+            step_limit: seconds that one step may take, for simulators with a process of their own.
+        """
         del step_limit
         return Simulated(self, spec, shows_own=shows_own)
 
 
 class Simulated:
-    """A simulator with a specification, whose coordinates are variables of the state by name. It can be set to given
-    coordinates, and reset. ``shows_own``: whether the specification's observation is the simulator's own."""
+    """An original environment made from a simulator and a specification, whose coordinates are variables of the state,
+    by name. It can be set to given coordinates, and reset.
+
+    Args:
+        simulator: the simulator.
+        spec: the specification.
+        shows_own: whether the specification's observation is the simulator's own.
+    """
 
     parallel = True
 
@@ -191,7 +213,7 @@ class Simulated:
         return self._spec
 
     def step_from(self, coordinates: Array, action: Array) -> RealStep:
-        """Set the state to coordinates (C,), apply action (F,)."""
+        """Set the state to coordinates (C,), and apply an action (F,)."""
         self.place(coordinates)
         return self.act(action)
 
@@ -200,12 +222,12 @@ class Simulated:
         self.simulator.place(self._columns, coordinates)
 
     def begin(self, seed: int | None = None) -> Array:
-        """Reset the simulator; the coordinates (C,) it starts at."""
+        """Reset the simulator, and return the start coordinates (C,)."""
         self.simulator.reset(seed)
         return self.coordinates()
 
     def act(self, action: Array) -> RealStep:
-        """Apply action (F,) where the simulator stands."""
+        """Apply an action (F,) in the current state."""
         achieved = self.coordinates()
         taken = self.simulator.step(action)
         return RealStep(
@@ -219,18 +241,23 @@ class Simulated:
         )
 
     def save(self) -> bytes:
-        """The simulator's whole state, bit for bit. Raises ``StepFailed`` if it can't return to a state."""
+        """Return the simulator's whole state as a snapshot. Raises ``StepFailed`` if the simulator can't return to a
+        state."""
         if not self.simulator.saves:
-            raise StepFailed("expected a simulator that can return to a saved state, got one that can only be reset")
+            raise StepFailed(
+                "expected a simulator that can return to a saved state, got one that can only be reset: register it "
+                "with "
+                "--access reset"
+            )
         return packed(self.simulator.save())
 
     def restore(self, snapshot: bytes) -> Array:
-        """Return to a saved state; its coordinates (C,)."""
+        """Return to a saved state, and return its coordinates (C,)."""
         self.simulator.restore(unpacked(snapshot, self.simulator.save().shape))
         return self.coordinates()
 
     def coordinates(self) -> Array:
-        """Present coordinates of the simulator, (C,)."""
+        """Return the simulator's current coordinates (C,)."""
         return wrapped(self._spec, self.simulator.read()[self._columns])
 
     def close(self) -> None:

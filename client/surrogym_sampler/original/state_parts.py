@@ -1,4 +1,5 @@
-"""Parts of a simulator's state: MuJoCo's, the values of an attribute, and what a reset draws into the model."""
+"""The parts of a simulator's state: MuJoCo's own state, the numbers in an attribute, and what a reset draws into the
+model."""
 
 from __future__ import annotations
 
@@ -13,30 +14,31 @@ from surrogym_sampler.original.simulator import Motion, Variable
 VELOCITY = "_velocity"
 AXES = ("x", "y", "z")
 QUATERNION = ("qw", "qx", "qy", "qz")
-FREE, BALL, SLIDE, HINGE = range(4)  # mjtJoint
-RESETS = 4  # that are compared for what they draw into a model
-DRAWN = ("body_pos", "geom_pos", "geom_size", "site_pos")  # of a model: what tasks draw at a reset
+FREE, BALL, SLIDE, HINGE = range(4)  # numbers of MuJoCo's joint types (mjtJoint)
+RESETS = 4  # number of resets that are compared to find what they draw into a model
+# fields of a MuJoCo model that tasks draw at random at a reset
+DRAWN = ("body_pos", "geom_pos", "geom_size", "site_pos")
 
 
 class StatePart(Protocol):
-    """Some of the numbers of a state."""
+    """A part of a simulator's state: some of its variables, which are read and written together."""
 
     variables: tuple[Variable, ...]
 
     def read(self) -> Array:
-        """Values (n,) of the variables."""
+        """Return the values (n,) of the part's variables."""
         ...
 
     def write(self, values: Array) -> None:
-        """Set them to values (n,)."""
+        """Set the part's variables to values (n,)."""
         ...
 
     def save(self) -> Array:
-        """All that decides what happens next, (k,)."""
+        """Return as numbers (k,) everything in this part that the next step depends on."""
         return self.read()
 
     def restore(self, saved: Array) -> None:
-        """Return to what ``save`` gave, (k,)."""
+        """Return to the state whose numbers (k,) ``save`` returned."""
         self.write(saved)
 
 
@@ -58,7 +60,7 @@ class MujocoState(StatePart):
         self.variables = (*self._positions(), *self._velocities(), *self._activations(), *self._mocap())
 
     def rest_here(self) -> None:
-        """Take the state as it is for rest, without what the solver remembers."""
+        """Record the current state, which ``write`` restores before it sets values."""
         self._mujoco.mj_getState(self._model, self._data, self._rest, self._kept)
 
     def read(self) -> Array:
@@ -85,7 +87,8 @@ class MujocoState(StatePart):
     def restore(self, saved: Array) -> None:
         self._mujoco.mj_setState(self._model, self._data, saved, self._kept)
         self._mujoco.mj_forward(self._model, self._data)
-        self._mujoco.mj_setState(self._model, self._data, saved, self._kept)  # the line above moved the warm start
+        # mj_forward changed the solver's warm start, so restore once more
+        self._mujoco.mj_setState(self._model, self._data, saved, self._kept)
 
     def _positions(self) -> list[Variable]:
         return [variable for joint in self._joints for variable in joint.positions]
@@ -109,7 +112,7 @@ class MujocoState(StatePart):
 
 
 class _Joint:
-    """The variables of one joint."""
+    """The position and velocity variables of one joint."""
 
     def __init__(self, model: Native, index: int) -> None:
         name, kind = model.joint(index).name or f"joint{index}", int(model.jnt_type[index])
@@ -129,16 +132,16 @@ class _Joint:
 
 
 def _is_driven(model: Native, joint: int) -> bool:
-    """Whether an actuator acts on a joint itself."""
+    """Return whether an actuator acts on the joint itself."""
     on_joints = model.actuator_trntype == 0  # mjTRN_JOINT
     return bool((on_joints & (model.actuator_trnid[:, 0] == joint)).any())
 
 
 def _can_touch(model: Native, body: int) -> bool:
-    """Whether gravity, or another body, can move a body: what is only shown, such as a target, neither falls nor
-    touches."""
+    """Return whether gravity or another body can move a body. A body that is only displayed, such as a target, neither
+    falls nor touches."""
     inside = {body}
-    for child in range(body + 1, model.nbody):  # children come behind their parents
+    for child in range(body + 1, model.nbody):  # MuJoCo numbers children after their parents
         if int(model.body_parentid[child]) in inside:
             inside.add(child)
     geoms = [i for i in range(model.ngeom) if int(model.geom_bodyid[i]) in inside]
@@ -166,18 +169,19 @@ class Attribute(StatePart):
         else:
             numbers = [_like(old, new) for old, new in zip(before, values.tolist(), strict=True)]
             made = type(before)(*numbers) if hasattr(before, "_fields") else type(before)(numbers)
-            setattr(self._owner, self._attribute, made)  # an array may be a tuple by now
+            # assigned as a whole, because a tuple can't be changed in place
+            setattr(self._owner, self._attribute, made)
 
 
 def _like(old: Any, new: float) -> Any:
-    """A number of the type that it had: a whole one may be an index."""
+    """Return a number in the type of the old one: a bool, an int if it is whole (such as an index), or a float."""
     if isinstance(old, bool | np.bool_):
         return new >= 0.5
     return int(new) if isinstance(old, int | np.integer) and new == int(new) else new
 
 
 def holds_numbers(owner: Any, attribute: str) -> bool:
-    """Whether an attribute holds a state that can be written: an array, or a list or a tuple, of finite numbers."""
+    """Return whether an attribute contains a state that can be written: an array, list or tuple of finite numbers."""
     value = getattr(owner, attribute, None)
     flat = isinstance(value, list | tuple) and all(np.ndim(entry) == 0 for entry in value)
     if not (flat or isinstance(value, np.ndarray)):
@@ -190,17 +194,17 @@ def holds_numbers(owner: Any, attribute: str) -> bool:
 
 
 def _can_be_written(owner: Any, attribute: str) -> bool:
-    """Whether an attribute takes back what it holds. A property may not."""
+    """Return whether an attribute can be set to its present value. A property may refuse it."""
     part = Attribute(owner, attribute)
     try:
         part.write(part.read())
-    except Exception:  # whatever an environment raises: then it can only be reset
+    except Exception:  # an environment may raise any exception; then it can only be reset
         return False
     return True
 
 
 class DrawnIntoModel(StatePart):
-    """Entries of a MuJoCo model that a task draws anew at each reset, such as the place of a target."""
+    """Entries of a MuJoCo model that a task draws at random at each reset, such as the position of a target."""
 
     def __init__(self, model: Native, places: Sequence[tuple[str, int, int]]) -> None:
         self._model, self._places = model, places
@@ -215,7 +219,8 @@ class DrawnIntoModel(StatePart):
 
 
 def mujoco_parts(model: Native, data: Native, reset: Callable[[int], object]) -> list[StatePart]:
-    """MuJoCo's state, and what ``reset`` with a seed draws into the model, if anything."""
+    """Return the parts of a MuJoCo environment's state: MuJoCo's own, and the entries that ``reset`` with a seed draws
+    into the model, if any."""
     seen = []
     for seed in range(RESETS):
         reset(seed)
@@ -227,12 +232,12 @@ def mujoco_parts(model: Native, data: Native, reset: Callable[[int], object]) ->
 
 
 def drawable(model: Native) -> dict[str, Array]:
-    """A copy of all that a task may draw into a model."""
+    """Return copies of the fields of a model into which a task may draw random values."""
     return {field: np.array(getattr(model, field)) for field in DRAWN}
 
 
 def drawn_between(seen: Sequence[dict[str, Array]]) -> list[tuple[str, int, int]]:
-    """Field, row and column of the entries that differ between copies of a model."""
+    """Return field, row and column of the entries that differ between copies of a model."""
     return [
         (field, int(i), int(k))
         for field in DRAWN

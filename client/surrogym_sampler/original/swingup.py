@@ -1,4 +1,4 @@
-"""Cart-pole swing-up as PILCO states it: a pole hangs from a cart and is to be balanced above it.
+"""Cart-pole swing-up as in PILCO: a pole hangs from a cart and has to be balanced above it.
 
 Physics and the narrow reward: M. P. Deisenroth, C. E. Rasmussen, "PILCO: A Model-Based and Data-Efficient Approach to
 Policy Search", ICML 2011; equations of motion: M. P. Deisenroth, "Efficient Reinforcement Learning using Gaussian
@@ -31,26 +31,30 @@ from surrogym_shared.spec import (
 )
 
 MAX_FORCE = 10.0
-START = 0.1  # half the width of the start distribution, in each coordinate
+START = 0.1  # half the width of the start distribution, for each coordinate
 STEP_SECONDS = 0.1
 SUBSTEPS = 10
 GRAVITY = 9.82
 LENGTH = 0.6
 PIXELS_PER_METRE = 120
 
-# How far from its target the pole's tip may be (m) before the reward falls to exp(-1/2). Hanging, it is 1.2 away:
-# that pays 0.14 under the smooth reward and 1e-5 under PILCO's.
+# Distance (m) of the pole's tip from its target at which the reward falls to exp(-1/2). A hanging pole is 1.2 m away,
+# which earns 0.14 under the smooth reward and 1e-5 under PILCO's narrow one.
 WIDTH = {"smooth": 0.6, "narrow": 0.25}
 
 State = tuple[float, float, float, float]
 
 
 class CartPoleSwingUp(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """State: position, velocity, angle (0 hangs, counter-clockwise), angular velocity. Action: force / N. Observed
-    are the angle's cosine and sine, and the horizontal position of the pole's tip as well.
+    """The swing-up task as a Gymnasium environment.
 
-    Reward of the state after the step: exp(-d^2 / (2 width^2)), d from the pole's tip to where it is when the pole
-    stands above the origin. No state ends an episode. The picture has a mark there.
+    State: position, velocity, angle (0 if the pole hangs, counter-clockwise), angular velocity. Action: force in N.
+    Observation:
+    position, velocity, cosine and sine of the angle, angular velocity, and the horizontal position of the pole's tip.
+
+    The reward depends on the state after the step: exp(-d^2 / (2 width^2)), where d is the distance of the pole's tip
+    from its target, the position when the pole stands above the origin. No state ends an episode. Pictures mark the
+    target.
     """
 
     dt = STEP_SECONDS
@@ -58,9 +62,9 @@ class CartPoleSwingUp(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def __init__(self, reward: Literal["smooth", "narrow"] = "smooth", render_mode: str | None = None) -> None:
         if reward not in WIDTH:
-            raise ValueError(f"reward: expected one of {', '.join(WIDTH)}, got {reward!r}")
+            raise ValueError(f"argument reward: expected one of {', '.join(WIDTH)}, got {reward!r}")
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode: expected None or rgb_array, got {render_mode!r}")
+            raise ValueError(f"argument render_mode: expected None or rgb_array, got {render_mode!r}")
         self.render_mode = render_mode
         self.masscart, self.masspole, self.length, self.friction = 0.5, 0.5, LENGTH, 0.1
         self.width = WIDTH[reward]
@@ -86,7 +90,7 @@ class CartPoleSwingUp(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._observation(), self._reward(), False, False, {}
 
     def render(self) -> Any:
-        """The picture (300, 600, 3) of the state, in 5 m by 2.5 m; None without a render mode."""
+        """Return the picture (300, 600, 3) of the state, which shows 5 m by 2.5 m; None without a render mode."""
         if self.render_mode is None:
             return None
         x, _, angle, _ = map(float, self.state)
@@ -107,7 +111,8 @@ class CartPoleSwingUp(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return _ahead(state, (slope[0], slope[1], slope[2], slope[3]), h)
 
     def _derivative(self, state: State, force: float) -> State:
-        """Equations of motion of a uniform rod on a cart with viscous friction."""
+        """Return the time derivative of the state, by the equations of motion of a uniform rod on a cart with viscous
+        friction."""
         _, velocity, angle, omega = state
         m, length, total = self.masspole, self.length, self.masscart + self.masspole
         sin, cos = math.sin(angle), math.cos(angle)
@@ -129,7 +134,7 @@ class CartPoleSwingUp(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return np.array(shown, dtype=np.float32)
 
     def _tip(self, x: float, angle: float) -> float:
-        """Horizontal position of the pole's tip."""
+        """Return the horizontal position of the pole's tip."""
         return x + self.length * math.sin(angle)
 
 
@@ -139,12 +144,12 @@ def _ahead(state: State, slope: State, h: float) -> State:
 
 
 def swing_up() -> EnvironmentSpec:
-    """Cart-pole swing-up with a reward that is felt from everywhere."""
+    """Return the specification of the swing-up with a smooth reward, which is noticeable from every state."""
     return _specification(SWING_UP)
 
 
 def swing_up_narrow() -> EnvironmentSpec:
-    """Cart-pole swing-up with PILCO's reward: nothing but at the goal."""
+    """Return the specification of the swing-up with PILCO's reward, which is almost 0 except near the target."""
     return _specification(SWING_UP_NARROW)
 
 

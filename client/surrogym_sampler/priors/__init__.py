@@ -1,1 +1,2 @@
-"""Priors: what is known of a plant before its first real step, as a simulator whose parameters real steps correct."""
+"""Priors: knowledge about a plant before its first real step, in the form of a simulator whose parameters are fitted to
+real steps."""

@@ -1,9 +1,9 @@
-"""Calibration: the values of a simulator's parameters with which it repeats real steps, and how uncertain they are.
+"""Calibration: estimation of a simulator's parameters from real steps, with their uncertainty.
 
 Weighted least squares of the errors of single steps, by the trust region reflective method of SciPy (Branch, Coleman
 and Li, 1999). The uncertainty is Laplace's approximation: the inverse of the Gauss-Newton matrix at the optimum.
 
-Shapes: n steps, C coordinates, F action entries, P parameters.
+Shapes: n steps, C coordinates, M of them that change, F action entries, P parameters.
 """
 
 from __future__ import annotations
@@ -20,30 +20,31 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_sampler.priors.parameters import Parameter
 from surrogym_shared.spec import EnvironmentSpec
 
-FEWEST = 2  # real steps
-STARTS = 5  # starting points at most; the first one is the simulator's own values
-EXPECTED = 1e-3  # of the changes: with smaller errors no further starting point is tried
-EDGE = 0.01  # of a range: least distance of a starting point from its ends
-SMALLEST = 1e-9  # of the changes: an error below this share counts as rounding
-FAR = 1e3  # error, in standard deviations of the changes, of a step that the simulator can't take
-CONFIDENCE = 0.9  # of the interval of each parameter
-NUDGE = 1e-5  # of a parameter's range, for its derivatives
-WITHIN = 0.29  # of a range: the standard deviation of a parameter of which only its range is known
-FINEST = 1e-7  # of a range: smallest standard deviation of a parameter, as the fit itself is no finer
-ROUNDING = 1e-14  # of the largest eigenvalue: a direction below it says nothing
+FEWEST = 2  # smallest number of real steps
+STARTS = 5  # largest number of starting points; the first is the simulator's own values
+EXPECTED = 1e-3  # share of the changes; with a smaller error no further starting point is tried
+EDGE = 0.01  # share of a range: smallest distance of a starting point from the range's ends
+SMALLEST = 1e-9  # share of the changes; a smaller error counts as rounding
+FAR = 1e3  # error of a step that the simulator can't take, in standard deviations of the changes
+CONFIDENCE = 0.9  # probability of each parameter's interval
+NUDGE = 1e-5  # share of a parameter's range: step size of numerical derivatives
+WITHIN = 0.29  # standard deviation of a uniform distribution, as a share of its range: nothing but the range is known
+FINEST = 1e-7  # smallest standard deviation of a parameter, as a share of its range; the fit is no more precise
+ROUNDING = 1e-14  # share of the largest eigenvalue, below which a direction counts as undetermined
 FIT: dict[str, Any] = {"bounds": (0.0, 1.0), "x_scale": 0.3, "ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-12}
-LEAST_SHARE = 1e-3  # of the largest error: a coordinate with a smaller one counts no more
+LEAST_SHARE = 1e-3  # share of the largest error; a coordinate with a smaller error gets no larger weight
 
-Step = Callable[[Array, Array, Array], Array]  # parameters (P,), coordinates (C,), action (F,): next coordinates (C,)
+# One step of a simulator: parameters (P,), coordinates (C,) and action (F,) to next coordinates (C,).
+Step = Callable[[Array, Array, Array], Array]
 
 
 class NotCalibrated(OriginalError):
-    """The parameters can't be calibrated. The message says why, and what to do."""
+    """The parameters can't be calibrated; the message says why, and what to do."""
 
 
 @dataclass(frozen=True)
 class RealTransitions:
-    """Real steps from coordinates (n, C) under actions (n, F) to next coordinates (n, C)."""
+    """Real steps: coordinates (n, C), actions (n, F) and next coordinates (n, C)."""
 
     coordinates: Array
     action: Array
@@ -55,8 +56,15 @@ class RealTransitions:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """One parameter: its value, and the ends of its 90 % interval. ``determined`` is False if the steps say little more
-    of it than its range does."""
+    """One calibrated parameter.
+
+    Attributes:
+        name: the parameter's name.
+        value: its most probable value.
+        low: lower end of its 90 % interval.
+        high: upper end of its 90 % interval.
+        determined: False if the steps say little more about it than its range does.
+    """
 
     name: str
     value: float
@@ -67,13 +75,13 @@ class Calibrated:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Result of a calibration. Errors are root mean squares over steps and coordinates, as shares of the standard
+    """The result of a calibration. Errors are root mean squares over steps and coordinates, as shares of the standard
     deviation of each coordinate's changes."""
 
     parameters: tuple[Calibrated, ...]
     steps: int
-    error_before: float  # with the simulator's own values
-    error: float  # with the calibrated values
+    error_before: float  # error with the simulator's own values
+    error: float  # error with the calibrated values
 
     @property
     def values(self) -> dict[str, float]:
@@ -87,18 +95,18 @@ def calibrate(
     """Calibrate the parameters of a simulator on real steps.
 
     Args:
-        spec: coordinates of both, of which some are angles.
+        spec: the specification, which says which coordinates are angles.
         real: the real steps, at least two.
-        parameters: the parameters and their ranges, (P,). Without any the error alone is computed.
+        parameters: the parameters and their ranges, (P,). If there are none, only the error is computed.
         own: the simulator's own values, (P,).
-        step: one step of the simulator; an error of it counts as a step far off.
+        step: takes one step of the simulator; if it raises, the step counts as very wrong.
 
     Raises:
-        NotCalibrated: fewer numbers were measured than there are parameters; or the simulator can't take half of the
-            steps with its own values.
+        NotCalibrated: there are fewer measured numbers than parameters, or the simulator can't take half of the steps
+            with its own values.
     """
     if len(real) < FEWEST:
-        raise NotCalibrated(f"expected at least {FEWEST} real steps, got {len(real)}")
+        raise NotCalibrated(f"expected at least {FEWEST} real steps for a calibration, got {len(real)}: take some more")
     errors = _Errors(spec, real, step)
     if errors.measured <= len(parameters):
         raise NotCalibrated(
@@ -121,7 +129,8 @@ def calibrate(
 
 
 class _Errors:
-    """Errors (n, M) of a simulator's steps, in standard deviations of the M coordinates that change."""
+    """The errors (n, M) of a simulator's steps for given parameters, in standard deviations of the M coordinates that
+    change."""
 
     def __init__(self, spec: EnvironmentSpec, real: RealTransitions, step: Step) -> None:
         self._real, self._step = real, step
@@ -135,7 +144,7 @@ class _Errors:
 
     @property
     def measured(self) -> int:
-        """Number of measured changes."""
+        """Number of measured numbers: real steps times coordinates that change."""
         return len(self._real) * int(self._moves.sum())
 
     def __call__(self, values: Array) -> Array:
@@ -146,7 +155,7 @@ class _Errors:
     def _one(self, values: Array, coordinates: Array, action: Array) -> Array:
         try:
             return np.asarray(self._step(values, coordinates, action), dtype=np.float64)
-        except Exception as error:  # any code of a user: a step that can't be taken is one far off
+        except Exception as error:  # a user's code may raise anything; then the step counts as very wrong
             self.failure = f" ({type(error).__name__}: {str(error)[:80]})"
             return np.full(len(coordinates), np.nan)
 
@@ -158,7 +167,8 @@ class _Errors:
 
 @dataclass(frozen=True)
 class _Scaling:
-    """Parameters as numbers x in [0, 1] (P,): the logarithm of those that are positive in their whole range."""
+    """Scaling of parameters to numbers x in [0, 1] (P,); parameters that are positive in their whole range are scaled
+    logarithmically."""
 
     low: Array
     high: Array
@@ -174,21 +184,21 @@ class _Scaling:
         )
 
     def values(self, x: Array) -> Array:
-        """Values of x (P,)."""
+        """Return the parameters' values for x (P,)."""
         at = self.low + x * (self.high - self.low)
         return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, at, 0.0)), at)
 
     def numbers(self, values: Array) -> Array:
-        """The x of values (P,)."""
+        """Return x (P,) for the parameters' values (P,)."""
         at = np.where(self.logarithmic, np.log(np.where(self.logarithmic, values, 1.0)), values)
         return np.asarray((at - self.low) / (self.high - self.low))
 
 
 def _best(errors: _Errors, scaling: _Scaling, own: Array) -> Array:
-    """Numbers x (P,) of the parameters with the smallest weighted errors, from several starting points.
+    """Return the scaled parameters x (P,) with the smallest weighted errors, found from several starting points.
 
-    A parameter that the steps say nothing of keeps the simulator's own value, because the distance from it, in standard
-    deviations of its range, counts as one more error.
+    The distance of each parameter from the simulator's own value, in standard deviations of its range, counts as one
+    more error. So a parameter that the steps don't determine keeps that value.
     """
     from scipy.optimize import least_squares
     from scipy.stats import qmc
@@ -213,7 +223,8 @@ def _best(errors: _Errors, scaling: _Scaling, own: Array) -> Array:
 
 
 def _weights(errors: Array) -> Array:
-    """Weight (M,) of each coordinate: a coordinate with noise, or that the simulator repeats badly, counts less."""
+    """Return the weight (M,) of each coordinate: one with noise, or that the simulator predicts badly, gets a smaller
+    weight."""
     sizes = np.sqrt((errors**2).mean(0))
     return np.asarray(1.0 / np.maximum(sizes, max(SMALLEST, LEAST_SHARE * sizes.max())))
 
@@ -226,7 +237,8 @@ def _with_intervals(
     off = errors(scaling.values(x))
     weights, rows = _weights(off), len(off)
     jacobian = np.stack([((_moved(errors, scaling, x, i) - off) * weights / NUDGE).ravel() for i in range(len(x))], 1)
-    left = max(1.0, rows - len(parameters) / errors.moving)  # the weights are of the same steps
+    # degrees of freedom for each coordinate; the weights come from the same steps
+    left = max(1.0, rows - len(parameters) / errors.moving)
     variance = float(((off * weights) ** 2).sum()) / errors.moving / left
     size, axes = np.linalg.eigh(jacobian.T @ jacobian)
     size = np.where(size > ROUNDING * size.max(), size, 0.0) / max(variance, np.finfo(float).tiny)
@@ -238,7 +250,7 @@ def _with_intervals(
 
 
 def _moved(errors: _Errors, scaling: _Scaling, x: Array, index: int) -> Array:
-    """Errors with one parameter moved a little."""
+    """Return the errors after the parameter ``index`` was moved by ``NUDGE``."""
     at = x.copy()
     at[index] += NUDGE
     return errors(scaling.values(at))

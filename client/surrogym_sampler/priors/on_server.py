@@ -1,4 +1,4 @@
-"""A simulator as a prior of a surrogate on a server, which also learns the simulator's model."""
+"""A simulator as the prior of a surrogate on a server, which also learns a model of the simulator."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import SurrogateFile
 from surrogym_shared.wire import SurrogateView
 
-BATCH = 64  # queries of one claim
-LONGEST_FIT = 1_800.0  # seconds
-MARK = ".simulator-"  # in the name of the surrogate that the server learns the simulator's model in
-TOKEN = 8  # hexadecimal digits behind it
+BATCH = 64  # number of queries in one claim
+LONGEST_FIT = 1_800.0  # largest number of seconds for fitting the simulator's model
+MARK = ".simulator-"  # in the name of the temporary surrogate with which the server learns the simulator's model
+TOKEN = 8  # number of random hexadecimal digits at the end of that name
 MOST_OF_NAME = 64 - len(MARK) - TOKEN
 
 
 class ServerPrior(SimulatorPrior):
-    """A simulator whose model a server learns, in a surrogate of its own that is removed afterwards.
+    """A simulator whose model a server learns, in a temporary surrogate that is deleted afterwards.
 
     Args:
-        api: the server; the token needs the role admin.
+        api: the connection to the server; the token needs the role admin.
         name: name of the surrogate that gets the prior.
-        simulator, spec, parameters, steps: those of ``SimulatorPrior``, whose errors it raises.
+        simulator, spec, parameters, steps: as for ``SimulatorPrior``, with its errors.
     """
 
     def __init__(
@@ -48,7 +48,12 @@ class ServerPrior(SimulatorPrior):
         self._name = f"{name[:MOST_OF_NAME]}{MARK}{uuid4().hex[:TOKEN]}"
 
     def learn(self, say: Progress) -> SurrogateFile:
-        """Learn the model as ``SimulatorPrior.learn`` says. Raises ``SurrogymClientError`` as every request."""
+        """Let the server learn a model of the simulator from ``steps`` of its steps, and return the model. Progress is
+        reported to ``say``.
+
+        Raises:
+            SurrogymClientError: the server can't be reached, or refuses a request.
+        """
         try:
             self._api.create_surrogate(self._name, self.spec)
             taken = 0

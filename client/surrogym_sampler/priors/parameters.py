@@ -1,4 +1,4 @@
-"""Named physical parameters of a simulator: their values, and ranges in which real steps may move them."""
+"""Named physical parameters of a simulator: their values, and the ranges in which a calibration may change them."""
 
 from __future__ import annotations
 
@@ -9,42 +9,39 @@ from typing import Any, Protocol, Self, runtime_checkable
 
 from surrogym_sampler.original.errors import UnknownEnvironment
 
-AROUND = 2.0  # factor of the default range, around the simulator's own value
+AROUND = 2.0  # the default range reaches from the simulator's own value divided by this factor to the value times it
 
 
 @runtime_checkable
 class Adjustable(Protocol):
-    """A simulator whose parameters can be read and changed. Changes hold from the next step on.
+    """A simulator whose parameters can be read and changed. A change takes effect from the next step on.
 
     Examples:
-        A class that computes something from its parameters has the two methods itself::
+        A class that computes something from its parameters defines the two methods itself::
 
-            class Cart:
-                def parameters(self):
+            class Cart: def parameters(self):
                     return {"mass": self.mass}
 
-                def set_parameters(self, values):
-                    self.mass = values["mass"]
-                    self.inverse = 1 / self.mass
+                def set_parameters(self, values): self.mass = values["mass"] self.inverse = 1 / self.mass
     """
 
     def parameters(self) -> Mapping[str, float]:
-        """Return all parameters that can be changed, with their present values."""
+        """Return all parameters that can be changed, with their current values."""
         ...
 
     def set_parameters(self, values: Mapping[str, float]) -> None:
-        """Change some of the parameters."""
+        """Change the given parameters; the others keep their values."""
         ...
 
 
 class Attributes:
-    """The parameters of an object that has no methods for them: its attributes that are numbers."""
+    """The numeric attributes of an object without the methods of ``Adjustable``, as its parameters."""
 
     def __init__(self, plant: object) -> None:
         self._plant = plant
 
     def parameters(self) -> dict[str, float]:
-        """Return the attributes that are numbers, also those of the class."""
+        """Return the attributes that are numbers, including those of the class."""
         names = [name for name in dir(self._plant) if not name.startswith("_")]
         return {name: float(value) for name in names if _is_number(value := getattr(self._plant, name))}
 
@@ -64,19 +61,20 @@ class Parameter:
 
     @classmethod
     def parse(cls, text: str, present: Mapping[str, float]) -> Self:
-        """Read ``NAME`` or ``NAME=LOW..HIGH``. Without a range it is half to twice the simulator's own value.
+        """Read ``NAME`` or ``NAME=LOW..HIGH``. The default range is half to twice the simulator's own value.
 
         Args:
             text: the parameter.
-            present: values of the simulator by name.
+            present: the simulator's own values, by name.
 
         Raises:
-            ValueError: the simulator has no such parameter, or the range is none, or lacks the present value.
+            ValueError: the simulator has no such parameter, or the range is invalid or does not contain the simulator's
+                own value.
         """
         name, equals, span = text.partition("=")
         if name not in present:
             known = ", ".join(sorted(present)) or "none"
-            raise ValueError(f"expected a parameter of the simulator ({known}), got {name!r}")
+            raise ValueError(f"expected the name of a parameter of the simulator ({known}), got {name!r}")
         value = present[name]
         if not equals:
             if value == 0:
@@ -87,41 +85,47 @@ class Parameter:
         except ValueError as error:
             raise ValueError(f"expected NAME=LOW..HIGH, such as mass=0.5..2, got {text!r}") from error
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            raise ValueError(f"{name}: expected two finite numbers, the smaller one first, got {span}")
+            raise ValueError(f"range of {name}: expected two finite numbers, the smaller one first, got {span}")
         if not low <= value <= high:
-            raise ValueError(f"{name}: expected a range with the simulator's own value {value:g}, got {span}")
+            raise ValueError(
+                f"range of {name}: expected one that contains the simulator's own value {value:g}, got {span}: widen it"
+            )
         return cls(name, low, high)
 
 
 def adjustable(simulator: Any) -> Adjustable:
     """Return the parameters of an original environment.
 
-    They are those that it offers by ``parameters`` and ``set_parameters``, or else its attributes that are numbers.
+    These are what its methods ``parameters`` and ``set_parameters`` offer, or else its attributes that are numbers.
 
     Raises:
-        UnknownEnvironment: it runs in another process, so that its parameters are out of reach.
+        UnknownEnvironment: the environment runs in another process, so that its parameters can't be reached.
     """
     for plant in _layers(simulator):
         if isinstance(plant, Adjustable):
             return plant
     if getattr(simulator, "step_from", None) is None:
-        raise UnknownEnvironment("expected a simulator in this process, got one whose parameters are out of reach")
+        raise UnknownEnvironment(
+            "expected a simulator in this process, got one in another, whose parameters can't be reached"
+        )
     return Attributes(_layers(simulator)[-1])
 
 
 def read_parameters(texts: Sequence[str], plant: Adjustable) -> tuple[Parameter, ...]:
-    """Read the parameters to be calibrated, each as ``Parameter.parse``. Raises ``ValueError``, also if one is named
-    twice."""
+    """Read the parameters to be calibrated, each as ``Parameter.parse`` does. Raises ``ValueError`` if one is invalid
+    or given twice."""
     present = plant.parameters()
     read = tuple(Parameter.parse(text, present) for text in texts)
     names = [parameter.name for parameter in read]
     if twice := {name for name in names if names.count(name) > 1}:
-        raise ValueError(f"expected each parameter once, got {', '.join(sorted(twice))} several times")
+        raise ValueError(
+            f"expected each parameter once, got {', '.join(sorted(twice))} several times: remove the repetitions"
+        )
     return read
 
 
 def _layers(simulator: Any) -> list[Any]:
-    """The environment, and what it wraps, from the outside to the inside."""
+    """Return the environment and the ones inside it that it wraps, from the outermost to the innermost."""
     layers = [simulator]
     while (inner := getattr(layers[-1], "wrapped", None) or getattr(layers[-1], "simulator", None)) is not None:
         layers.append(inner)

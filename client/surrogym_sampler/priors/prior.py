@@ -1,4 +1,4 @@
-"""A simulator as a prior: its parameters are calibrated on real steps, and its model is learned without real steps.
+"""A simulator as a prior: its parameters are calibrated on real steps, and its model is learned from simulated steps.
 
 Shapes: n steps, C coordinates, F action entries.
 """
@@ -22,23 +22,23 @@ from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.surrogate_file import SurrogateFile
 from surrogym_shared.wire.priors import CalibratedParameter, PriorAbout
 
-BY_INPUT = 50  # steps of the simulator for each coordinate and action entry
-FEWEST, MOST = 100, 400  # of these steps
-WORSE = 1.5  # ratio of errors on real steps from which values are taken for outdated
-AGAIN = 2  # growth of the number of real steps after which the parameters are calibrated again
-TRIALS = 5  # steps that a simulator is tried with
-RIGHT = 1e-3  # of the changes: an error that is small enough
+BY_INPUT = 50  # number of simulated steps for each coordinate and action entry
+FEWEST, MOST = 100, 400  # smallest and largest number of simulated steps
+WORSE = 1.5  # if the error on the real steps so far exceeds this multiple of the calibration's error, calibrate again
+AGAIN = 2  # factor by which the number of real steps must grow before the parameters are calibrated again
+TRIALS = 5  # number of steps that test whether a simulator works
+RIGHT = 1e-3  # share of the changes: an error of the simulator that is small enough
 
 Progress = Callable[[float | None, str], None]
 
 
 def silent(share: float | None, words: str) -> None:
-    """Show no progress."""
+    """Ignore the progress."""
     del share, words
 
 
 class Careful:
-    """A simulator that refuses a step which it can't take, so that the design goes elsewhere."""
+    """A simulator that refuses each step that it can't take, so that the design chooses another one."""
 
     parallel = True
 
@@ -49,14 +49,15 @@ class Careful:
         return self._simulator.spec()
 
     def step_from(self, coordinates: Array, action: Array) -> RealStep:
-        """Take a step. Raises ``StepRefused`` for any error of the simulator, and for numbers that are not finite."""
+        """Take a step from coordinates (C,) with an action (F,). Raises ``StepRefused`` if the simulator raises any
+        error or returns numbers that are not finite."""
         try:
             step = self._simulator.step_from(coordinates, action)
             numbers = [*np.ravel(step.coordinates), *np.ravel(step.next_coordinates), step.reward]
-        except Exception as error:  # any code of a user
+        except Exception as error:  # a user's code may raise anything
             raise StepRefused(f"{type(error).__name__}: {error}") from error
         if not np.isfinite(numbers).all():
-            raise StepRefused("the simulator gave numbers that are not finite")
+            raise StepRefused("expected finite numbers from the simulator, got some that are not")
         return step
 
     def close(self) -> None:
@@ -64,20 +65,21 @@ class Careful:
 
 
 class SimulatorPrior(ABC):
-    """What is known of a plant beforehand: a simulator that can be set to any state, and ranges of its parameters.
+    """Prior knowledge about a plant: a simulator that can be set to any state, and ranges of its parameters.
 
-    Where its model is learned is up to the subclass.
+    A subclass decides where the simulator's model is learned.
 
     Args:
         simulator: an environment with ``step_from``, or its name as for ``original.make``. ``close`` closes it.
         spec: specification of the plant. The simulator has the same coordinates and actions.
         parameters: parameters to be calibrated, each as ``NAME`` or ``NAME=LOW..HIGH``.
-        steps: steps of the simulator that its model is learned from. None chooses 100 to 400 by the number of inputs.
+        steps: number of simulated steps from which the model is learned. None chooses 100 to 400 by the number of
+            inputs.
 
     Raises:
         UnknownEnvironment: the simulator can't be opened, or can't be set to a state; or the plant's coordinates have
             lags.
-        ValueError: the simulator has no such parameter, or a range is none.
+        ValueError: the simulator has no such parameter, or a range is invalid.
     """
 
     def __init__(
@@ -89,7 +91,9 @@ class SimulatorPrior(ABC):
         steps: int | None = None,
     ) -> None:
         if any(coordinate.lag is not None for coordinate in spec.coordinates):
-            raise UnknownEnvironment("expected a plant without lags, because a simulator can't be set to a past")
+            raise UnknownEnvironment(
+                "expected a plant without lags, because a simulator can't be set to earlier states, got one with lags"
+            )
         size = len(spec.coordinates) + spec.action.size
         self.steps = min(MOST, max(FEWEST, BY_INPUT * size)) if steps is None else steps
         self.source = simulator if isinstance(simulator, str) else type(simulator).__name__
@@ -100,28 +104,29 @@ class SimulatorPrior(ABC):
         self._set, present = plant.set_parameters, plant.parameters()
         self._own = np.array([present[parameter.name] for parameter in self.parameters])
         self.calibration: Calibration | None = None
-        self._calibrated_on = 0  # real steps
+        self._calibrated_on = 0  # number of real steps in the last calibration
         self.file: SurrogateFile | None = None
 
     @abstractmethod
     def learn(self, say: Progress) -> SurrogateFile:
-        """Learn a model of the simulator, with its parameters as they are, from ``steps`` of its steps.
+        """Learn a model of the simulator with its current parameters, from ``steps`` of its steps, and return it.
 
-        ``say`` is called with the share that is done, and a few words.
+        ``say`` is called with the share of the work that is done, and a few words.
         """
 
     def update(self, real: Sequence[RealStep], progress: Progress = silent) -> bool:
-        """Calibrate the parameters on all real steps so far, and learn the simulator's model again if they moved it.
+        """Calibrate the parameters on all real steps so far, and learn the simulator's model again if their values
+        changed.
 
         Args:
             real: the real steps, at least two.
-            progress: called with the share that is done, and a few words.
+            progress: called with the share of the work that is done, and a few words.
 
         Returns:
-            Whether ``file`` is new.
+            Whether there is a new model in ``file``.
 
         Raises:
-            NotCalibrated: too few real steps for the parameters, or the simulator can't take most of them.
+            NotCalibrated: there are too few real steps for the parameters, or the simulator can't take most of them.
             InvalidInput, NumericalFailure: the simulator's model can't be learned.
         """
         steps = _transitions(real)
@@ -142,7 +147,7 @@ class SimulatorPrior(ABC):
         return True
 
     def close(self) -> None:
-        """Release the simulator."""
+        """Close the simulator."""
         self.simulator.close()
 
     def __enter__(self) -> Self:
@@ -156,7 +161,7 @@ class SimulatorPrior(ABC):
         return np.asarray(self.simulator.step_from(coordinates, action).next_coordinates, dtype=np.float64)
 
     def _error(self, steps: RealTransitions, by: Calibration) -> float:
-        """Error of the simulator with calibrated values on real steps."""
+        """Return the error on real steps of the simulator with the values of the calibration ``by``."""
         values = np.array([by.values[parameter.name] for parameter in self.parameters])
         return calibrate(self.spec, steps, (), values, self._step).error
 
@@ -172,17 +177,20 @@ class SimulatorPrior(ABC):
 
 
 def _opened(simulator: str | OriginalEnvironment, spec: EnvironmentSpec) -> OriginalEnvironment:
-    """Open a simulator, and take a few steps of it.
+    """Open a simulator, and test it with a few steps.
 
     Raises:
-        UnknownEnvironment: it has other coordinates, units or actions than the plant, or can't take any of these steps.
+        UnknownEnvironment: the simulator has other coordinates, units or actions than the plant, or can't take any of
+            these steps.
     """
     opened: Any = make(simulator) if isinstance(simulator, str) and is_own(simulator) else simulator
     try:
         if not isinstance(opened, str):
             _require_alike(spec, opened.spec())
             if not callable(getattr(opened, "step_from", None)):
-                raise UnknownEnvironment("expected a simulator with step_from, which sets it to a state, got none")
+                raise UnknownEnvironment(
+                    "expected a simulator with a method step_from, which sets it to a state, got one without: add it"
+                )
         environment: OriginalEnvironment = _respecified(simulator, opened, spec)
         _require_steps(environment, spec)
     except BaseException:
@@ -193,7 +201,8 @@ def _opened(simulator: str | OriginalEnvironment, spec: EnvironmentSpec) -> Orig
 
 
 def _respecified(simulator: str | OriginalEnvironment, opened: Any, spec: EnvironmentSpec) -> Any:
-    """The simulator with the plant's specification. A name of an adapter has none of its own, and is opened here."""
+    """Return the simulator with the plant's specification. A simulator that is given by an adapter's name is opened
+    here, because it has no specification of its own."""
     if isinstance(simulator, str) and not is_own(simulator):
         return make(simulator, spec=spec.model_copy(update={"environment": simulator}))
     return Respecified(opened, spec)
@@ -205,16 +214,18 @@ def _require_alike(spec: EnvironmentSpec, own: EnvironmentSpec) -> None:
         ("action", *(one.action.model_dump(exclude={"bins"}) for one in (spec, own))),
     ):
         if expected != got:
-            raise UnknownEnvironment(f"expected a simulator with the plant's {what}, {expected}, got {got}")
+            raise UnknownEnvironment(
+                f"expected a simulator with the plant's {what}, {expected}, got {got}: give the simulator the same"
+            )
 
 
 def _coordinates(spec: EnvironmentSpec) -> list[str]:
-    """Name, kind and unit of each coordinate, in words."""
+    """Return name, kind and unit of each coordinate, in words."""
     return [" ".join([one.name, f"({one.kind})", one.unit or ""]).strip() for one in spec.coordinates]
 
 
 def _require_steps(environment: OriginalEnvironment, spec: EnvironmentSpec) -> None:
-    """Check that the simulator takes one of a few steps from states drawn from their ranges."""
+    """Check that the simulator can take at least one of a few steps from random states of the sampling ranges."""
     rng, why = np.random.default_rng(0), ""
     for _ in range(TRIALS):
         start = draw(spec, rng, wide=True)
@@ -223,7 +234,7 @@ def _require_steps(environment: OriginalEnvironment, spec: EnvironmentSpec) -> N
             if reached.shape == start.shape and np.isfinite(reached).all():
                 return
             why = f"it gave {reached.tolist()}"
-        except Exception as error:  # any code of a user
+        except Exception as error:  # a user's code may raise anything
             why = f"{type(error).__name__}: {str(error)[:200]}"
     raise UnknownEnvironment(
         f"expected a simulator that steps from its sampling range to {len(spec.coordinates)} finite coordinates, "
@@ -232,7 +243,7 @@ def _require_steps(environment: OriginalEnvironment, spec: EnvironmentSpec) -> N
 
 
 def _middle(spec: EnvironmentSpec) -> Array:
-    """The action (F,) in the middle of its bounds, or the first discrete one."""
+    """Return the action (F,) in the middle of its bounds; zeros if the actions are discrete."""
     if isinstance(spec.action, BoxAction):
         return np.asarray(np.mean([spec.action.low, spec.action.high], axis=0))
     return np.zeros(spec.action.size)

@@ -1,5 +1,5 @@
-"""Tell failures of the machine from failures of queries, so that one broken machine does not use up every query's
-attempts."""
+"""Distinction between a broken machine and single failing queries, so that a broken machine does not use up the
+attempts of every query."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from surrogym_sampler.original.errors import MachineFails
 
 FIRST_FEW = 4  # different failed queries after which a machine that has never answered counts as broken
 MANY = 8  # different failed queries in a row after which a machine that has answered before counts as broken
-FIRST_DELAY, LONGEST_DELAY = 1.0, 30.0  # seconds
+FIRST_DELAY, LONGEST_DELAY = 1.0, 30.0  # seconds to wait after a failure, doubled with each further one
 
 
 class Failures:
-    """Failures of one sampler since its last answer.
+    """The failures of one sampler since its last answer.
 
     A query that the machine can't reach fails again and again, while others succeed. A broken machine fails at every
     query.
     """
 
     def __init__(self) -> None:
-        self._queries: set[int] = set()  # ids
-        self._later = 0  # failures since the FIRST_FEW-th different query failed; each lengthens the delay
-        self._answered = False  # whether any query was ever answered
+        self._queries: set[int] = set()  # ids of the failed queries
+        self._later = 0  # number of failures after FIRST_FEW different queries failed; each lengthens the delay
+        self._answered = False  # whether any query was answered since the sampler started
         self._last = ""
 
     def answered(self) -> None:
@@ -34,15 +34,18 @@ class Failures:
         self._later += len(self._queries) >= FIRST_FEW
 
     def delay(self) -> float:
-        """Seconds to wait before the next query, so that a short fault of the machine can pass."""
+        """Return the seconds to wait before the next query, so that a short fault of the machine can pass."""
         return min(FIRST_DELAY * 2 ** (self._later - 1), LONGEST_DELAY) if self._later else 0.0
 
     def check(self, waiting: Iterable[int]) -> None:
-        """Check that the machine is not broken, before queries with the given ids begin.
+        """Raise an error if the machine seems broken, before further queries begin.
+
+        Args:
+            waiting: ids of the queries that could begin.
 
         Raises:
-            MachineFails: it failed at too many different queries, or it never answered and failed at all queries there
-                are.
+            MachineFails: the machine failed at too many different queries in a row; or it never answered, and failed at
+                all queries that there are.
         """
         failed = len(self._queries)
         only_these = failed > 1 and self._queries.issuperset(waiting)

@@ -1,4 +1,4 @@
-"""Leases of the queries that a sampler holds: the remaining time of each, and their renewal."""
+"""The leases of the queries that a sampler has claimed: their remaining time, and their renewal."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from surrogym_client.transport.connection import Retries
 from surrogym_shared.wire import Query
 
 AWAY = (ServerUnreachable, Unavailable)
-ONE_ATTEMPT = Retries(seconds=0)  # for requests that are repeated anyway
+ONE_ATTEMPT = Retries(seconds=0)  # no retries, for requests that are repeated anyway
 NEARLY_OVER = 0.1  # remaining share of a lease that counts as nearly over
 
 
 class LeaseEnded(Exception):
-    """The lease has ended, so no real step may begin: another sampler may have answered the query."""
+    """A query's lease has ended, so no real step may begin: another sampler may have answered the query."""
 
 
 def seconds_awake_or_asleep() -> float:
-    """Return the seconds of a clock that is never set. If the system has such a clock, it includes suspended time."""
+    """Return the seconds of a monotonic clock, which includes the time that the machine was suspended if the system has
+    such a clock."""
     if not hasattr(time, "clock_gettime"):
         return time.monotonic()
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
@@ -32,17 +33,17 @@ def seconds_awake_or_asleep() -> float:
 
 @dataclass
 class _Held:
-    """A query that the sampler holds, with its lease."""
+    """A query that the sampler has claimed, and the end of its lease."""
 
     query: Query
-    ends: float  # by the local clock; on the server's clock it ends no earlier
+    ends: float  # end of the lease by the local clock; by the server's clock it ends no earlier
 
 
 class Leases:
-    """Leases that a sampler holds. A thread renews them after each third of their length.
+    """The leases of a sampler's queries. A thread renews them each time a third of their length has passed.
 
     Args:
-        api: the server.
+        api: the connection to the server.
         surrogate: name of the surrogate.
         lease_seconds: length of every lease.
         clock: returns the time in seconds.
@@ -71,7 +72,7 @@ class Leases:
         self._thread.join(timeout=5.0)
 
     def hold(self, queries: Sequence[Query], since: float) -> None:
-        """Add the leases of queries that were claimed no earlier than ``since``, by the clock."""
+        """Add the leases of queries that were claimed no earlier than the time ``since``."""
         with self._lock:
             self._held.update({query.id: _Held(query, since + self._lease_seconds) for query in queries})
 
@@ -80,8 +81,8 @@ class Leases:
             self._held.pop(query.id, None)
 
     def check(self, query: Query) -> None:
-        """Check the lease before each real step of a query. The server is contacted only if the lease is over or nearly
-        over.
+        """Check a query's lease before each of its real steps. The server is contacted only if the lease is over or
+        nearly over.
 
         Raises:
             LeaseEnded: the lease is over, or the server could not confirm it.
@@ -89,7 +90,7 @@ class Leases:
         if self._left(query) <= NEARLY_OVER * self._lease_seconds:
             self._renew(query)
         if self._left(query) <= 0:
-            raise LeaseEnded("its lease has ended, so another sampler may have answered it")
+            raise LeaseEnded("the query's lease has ended, so another sampler may have answered it")
 
     def _left(self, query: Query) -> float:
         with self._lock:
@@ -115,4 +116,4 @@ class Leases:
         except AWAY:
             return  # the next renewal tries again
         except SurrogymClientError:
-            self.release(query)  # the running step is finished, because a late sample is still a true observation
+            self.release(query)  # The running step continues, because a late sample is still a true observation.

@@ -1,4 +1,4 @@
-"""Samplers as actors of a Ray cluster. Ray starts an actor again when its process or machine dies."""
+"""Samplers as actors of a Ray cluster. Ray starts an actor again if its process or machine dies."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from surrogym_sampler.queries.worker import Sampler
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import Query
 
-IDLE_SECONDS = 5.0  # of one claim: a sampler that is to stop ends after it
-LOOK_SECONDS = 1.0  # between two looks at the samplers
-STOP_SECONDS = 15.0  # in addition to the limit of a step, for samplers that were told to stop
+IDLE_SECONDS = 5.0  # longest wait of one claim, after which a sampler can stop
+LOOK_SECONDS = 1.0  # seconds between two checks of the samplers
+STOP_SECONDS = 15.0  # seconds, in addition to the limit of a step, in which stopped samplers have to end
 NO_MODULE = "No module named "
 WITHOUT_CODE = (
     "; install it on each machine of the cluster, or bring it by --runtime-env FILE, a YAML file with working_dir: ."
@@ -33,10 +33,17 @@ NOTHING = SamplerReport(answered=0, failed=0, dropped=0, refused=0, impossible=0
 
 @dataclass(frozen=True)
 class SamplerPlan:
-    """What each sampler of a cluster works on. It is sent to the machines of the cluster.
+    """What a sampler in a cluster needs to work; it is sent to the machines of the cluster.
 
-    ``environment``: a name that ``isolated`` opens; its modules have to be importable there. ``spec`` replaces the
-    environment's own. ``step_limit``: seconds of one real step.
+    Attributes:
+        url: the server's address.
+        token: the server's access token.
+        surrogate: name of the surrogate.
+        environment: a name that ``isolated`` can open; its modules must be importable on the machines.
+        spec: a specification that replaces the environment's own; None keeps that.
+        step_limit: seconds that one real step may take.
+        settings: settings of the sampler.
+        version: version of surrogym, which must be the same on all machines.
     """
 
     url: str
@@ -51,7 +58,7 @@ class SamplerPlan:
 
 @dataclass(frozen=True)
 class Line:
-    """One answered or failed query, in words."""
+    """A line of output about one answered or failed query."""
 
     text: str
     is_error: bool
@@ -59,7 +66,15 @@ class Line:
 
 @dataclass(frozen=True)
 class Look:
-    """How far a sampler is. ``start`` differs after each start; ``lines`` are those since the last look."""
+    """The state of a running sampler.
+
+    Attributes:
+        start: an id that differs after each start of the process.
+        host: name of the machine.
+        process: id of the process.
+        report: counts since the start.
+        lines: lines of output since the last look.
+    """
 
     start: str
     host: str
@@ -70,20 +85,20 @@ class Look:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a sampler ended: by itself or by ``stop``, or with an error."""
+    """The last state of a sampler that has ended; ``error`` is None unless an error ended it."""
 
     look: Look
     error: str | None = None
 
 
 def line_of(query: Query, outcome: Outcome, error: str) -> str:
-    """Return what happened to a query, as one line."""
+    """Return a line of output about the outcome of a query; ``error`` is empty if there was none."""
     asked = f", {len(query.actions)} steps" if query.kind == "rollout" else ""
     return f"query {query.id} ({query.purpose}{asked}) {outcome}{': ' if error else ''}{error}"
 
 
 class SamplerActor:
-    """One sampler, in a process of the cluster. ``look`` and ``stop`` are called while ``run`` runs."""
+    """One sampler in a process of the cluster. ``look`` and ``stop`` may be called while ``run`` runs."""
 
     def __init__(self, plan: SamplerPlan) -> None:
         self._plan = plan
@@ -93,7 +108,7 @@ class SamplerActor:
         self._stopped = False
 
     def run(self) -> Ended:
-        """Answer queries until the plan's settings end it, or ``stop`` is called."""
+        """Answer queries until the plan's settings end the sampler, or ``stop`` is called."""
         plan = self._plan
         if (here := version("surrogym")) != plan.version:
             wrong = f"expected surrogym {plan.version} on every machine of the cluster, got {here} on {platform.node()}"
@@ -117,7 +132,7 @@ class SamplerActor:
         return Look(self._start, platform.node(), os.getpid(), report, tuple(lines))
 
     def stop(self) -> None:
-        """End ``run`` after the running step, or after a claim that waits."""
+        """Let ``run`` end after the running step, or after a claim that waits for queries."""
         self._stopped = True
         if self._sampler is not None:
             self._sampler.stop()
@@ -128,30 +143,32 @@ class SamplerActor:
 
 @dataclass
 class _Member:
-    """One sampler as this process knows it."""
+    """One sampler of the cluster, with what this process knows about it."""
 
     name: str
     actor: Any
-    run: Any  # reference of its end
-    asked: Any  # reference of the look that it owes
-    reports: dict[str, SamplerReport] = field(default_factory=dict)  # of each start, the last one known
+    run: Any  # Ray's reference to the result of its run
+    asked: Any  # Ray's reference to the look that was requested and not received yet
+    reports: dict[str, SamplerReport] = field(default_factory=dict)  # the last known report of each start
 
 
 @dataclass(frozen=True)
 class News:
-    """What a look at the samplers has found."""
+    """What is new since the last look at the samplers."""
 
     lines: tuple[Line, ...]
-    over: bool  # no sampler is left
+    over: bool  # whether all samplers have ended
 
 
 class RaySamplers:
-    """Samplers in the cluster that this process is connected to. They end when this process ends, however it ends.
+    """Samplers in the Ray cluster to which this process is connected. They end when this process ends, for whatever
+    reason.
 
     Args:
-        plan: what each of them does. The number of the sampler is added to ``settings.name``.
+        plan: what each sampler needs to work. The number of the sampler is added to ``settings.name``.
         count: number of samplers.
-        resources: what each takes of the cluster, by Ray's names: ``CPU``, ``GPU``, ``memory`` or a name of one's own.
+        resources: what each sampler takes of the cluster, by Ray's names: ``CPU``, ``GPU``, ``memory`` or a custom
+            name.
 
     Raises:
         ValueError: Ray refuses the resources.
@@ -179,7 +196,7 @@ class RaySamplers:
 
     @property
     def running(self) -> int:
-        """Number of samplers that have not ended, with those that wait for free resources."""
+        """Number of samplers that have not ended, including those that wait for free resources."""
         return len(self._running)
 
     @property
@@ -188,17 +205,17 @@ class RaySamplers:
         return sum(not member.reports for member in self._running)
 
     def lacking(self) -> dict[str, float]:
-        """Return what the cluster has free of each resource that it has too little of for one sampler."""
+        """Return the free amount of each resource of which the cluster has too little for one sampler."""
         free: dict[str, float] = self._ray.available_resources()
         return {name: free.get(name, 0.0) for name, amount in self._needs.items() if free.get(name, 0.0) < amount}
 
     @property
     def restarts(self) -> int:
-        """How often a sampler was started again."""
+        """Number of times that a sampler was started again."""
         return sum(max(0, len(member.reports) - 1) for member in self._members)
 
     def look(self, seconds: float = LOOK_SECONDS) -> News:
-        """Wait until a sampler has ended, ``seconds`` at most, and return what is new."""
+        """Wait up to ``seconds`` for a sampler to end, and return what is new."""
         lines: list[Line] = []
         ended, _ = self._ray.wait([member.run for member in self._running], timeout=seconds, fetch_local=False)
         for member in self._running:
@@ -210,7 +227,7 @@ class RaySamplers:
         return News(tuple(lines), not self._running)
 
     def stop(self) -> None:
-        """Let each sampler finish its running step and give its other queries back. End those that do not."""
+        """Let each sampler finish its running step and return its other queries; kill those that take too long."""
         for member in self._running:
             member.actor.stop.remote()
         deadline = time.monotonic() + self._step_limit + STOP_SECONDS
@@ -221,13 +238,13 @@ class RaySamplers:
             self.end()
 
     def end(self) -> None:
-        """End all samplers at once."""
+        """Kill all samplers at once."""
         for member in self._members:
             self._ray.kill(member.actor, no_restart=True)
         self._running = []
 
     def report(self) -> SamplerReport:
-        """Return the sum of all reports. Of a process that died, its last second may be missing."""
+        """Return the sum of all samplers' reports. The last second of a process that died may be missing."""
         all_reports = [report for member in self._members for report in member.reports.values()]
         phases = [report.phase for report in all_reports if report.phase is not None]
         return SamplerReport(
@@ -243,7 +260,7 @@ class RaySamplers:
 
     def _heard(self, member: _Member) -> Sequence[Line]:
         owed, member.asked = member.asked, member.actor.look.remote()
-        with suppress(self._ray.exceptions.RayError):  # one that has died owes no look
+        with suppress(self._ray.exceptions.RayError):  # a sampler that died can't answer
             return _noted(member, self._ray.get(owed))
         return ()
 
@@ -263,7 +280,8 @@ class RaySamplers:
 
 
 def _noted(member: _Member, look: Look) -> list[Line]:
-    """Keep the report of a look, and return its lines. The first look at a process also says where it runs."""
+    """Store the report of a look, and return its lines. The first look at a process adds a line that says on which
+    machine it runs."""
     lines = list(look.lines)
     if look.start not in member.reports:
         again = bool(member.reports)
@@ -274,12 +292,12 @@ def _noted(member: _Member, look: Look) -> list[Line]:
 
 
 def amounts(resources: Mapping[str, float]) -> str:
-    """Return resources in the form of ``--ray-resources``."""
+    """Return resources as text in the form of the option ``--ray-resources``."""
     return ", ".join(f"{name}={amount:g}" for name, amount in resources.items())
 
 
 def _options(resources: Mapping[str, float]) -> dict[str, Any]:
-    """Options of an actor: Ray has names of its own for some resources."""
+    """Return resources as options of a Ray actor, which has arguments of its own for CPU, GPU and memory."""
     own = {"CPU": "num_cpus", "GPU": "num_gpus", "memory": "memory"}
     options: dict[str, Any] = {own[name]: amount for name, amount in resources.items() if name in own}
     return {"num_cpus": 1, **options, "resources": {name: resources[name] for name in resources if name not in own}}

@@ -1,5 +1,4 @@
-"""What a sampler asks of the server while the environment steps: it sends the answer before, and claims the queries
-after."""
+"""Requests to the server while the environment steps: the previous answer is sent, and the next queries are claimed."""
 
 from __future__ import annotations
 
@@ -13,15 +12,16 @@ from typing import Generic, TypeVar
 from surrogym_client.errors import SurrogymClientError
 from surrogym_shared.wire import ClaimedQueries
 
-HELD_SECONDS = 1.0  # longest wait of a query that was claimed ahead for the end of the running step
-LEAD = 3.0  # a claim ahead begins this many durations of the last answer before the expected end of the step
+HELD_SECONDS = 1.0  # longest time in seconds that a query claimed ahead waits for the end of the running step
+LEAD = 3.0  # a claim ahead starts this multiple of an answer's duration before the expected end of the step
 
 S = TypeVar("S")
 T = TypeVar("T")
 
 
 def beside(call: Callable[[], T]) -> Future[T]:
-    """Call in a thread of its own, which does not keep the process alive."""
+    """Call a function in a thread of its own, which does not keep the process alive, and return the future of its
+    result."""
     future: Future[T] = Future()
 
     def run() -> None:
@@ -35,9 +35,9 @@ def beside(call: Callable[[], T]) -> Future[T]:
 
 
 class ClaimAhead:
-    """Claims queries shortly before the running step ends, so that the next step need not wait for them.
+    """A claim of queries shortly before the running step ends, so that the next step need not wait for it.
 
-    Other samplers may wait for these queries. If the step takes longer than expected, they go back to the queue.
+    Other samplers may wait for these queries. If the step takes longer than expected, they are returned to the queue.
 
     Args:
         claim: claims queries, without waiting for any.
@@ -53,14 +53,16 @@ class ClaimAhead:
         self._future = beside(self._run)
 
     def take(self) -> ClaimedQueries | None:
-        """Return the claimed queries, once the step is over. None: there are none, or it is too early or too late."""
+        """Return the claimed queries, once the step is over; None if there are none, or the step ended too early or too
+        late."""
         self._over.set()
         return self._future.result()
 
     def _run(self) -> ClaimedQueries | None:
         if self._over.wait(self._after):
             return None
-        with suppress(SurrogymClientError):  # of a claim, which is repeated after the step; or the leases end
+        # a failed claim is repeated after the step; queries whose return fails come back when their leases end
+        with suppress(SurrogymClientError):
             claimed = self._claim()
             if claimed.queries and self._over.wait(HELD_SECONDS):
                 return claimed
@@ -69,15 +71,15 @@ class ClaimAhead:
 
 
 class Pipeline(Generic[T]):
-    """At most one answer under way and one claim ahead, beside the running step of a sampler.
+    """At most one answer being sent and one claim ahead, during the running step of a sampler.
 
-    It flows from an accepted answer until the next one that is not accepted. Otherwise each request waits for the one
-    before it, so that no further step begins after a fault of the machine or of an answer.
+    They run beside the step as long as each answer is accepted. After an answer that is not accepted, each request
+    waits for the one before it, so that no further step begins after a fault of the machine or of an answer.
 
     Args:
-        settle: is called with the result of each answer, in order, by the thread that owns the pipeline. Returns
-            whether the answer was accepted.
-        give_back: as of ``ClaimAhead``.
+        settle: called with the result of each answer, in order, by the thread that owns the pipeline. Returns whether
+            the answer was accepted.
+        give_back: returns claimed queries that were not begun.
     """
 
     def __init__(self, settle: Callable[[T], bool], give_back: Callable[[ClaimedQueries], None]) -> None:
@@ -86,7 +88,7 @@ class Pipeline(Generic[T]):
         self._answer: Future[T] | None = None
         self._ahead: ClaimAhead | None = None
         self._held: ClaimedQueries | None = None
-        self._step_seconds = self._answer_seconds = 0.0  # of the last one
+        self._step_seconds = self._answer_seconds = 0.0  # durations of the last step and the last answer
 
     @property
     def under_way(self) -> int:
@@ -94,7 +96,8 @@ class Pipeline(Generic[T]):
         return int(self._answer is not None)
 
     def step(self, step: Callable[[], S], claim: Callable[[], ClaimedQueries] | None) -> S:
-        """Take the real steps of a query. If the pipeline flows, ``claim`` is called shortly before their end."""
+        """Take the real steps of a query. If the last answer was accepted, ``claim`` is called shortly before the
+        expected end of the steps."""
         if claim is not None and self._flows:
             after = max(0.0, self._step_seconds - LEAD * self._answer_seconds)
             self._ahead = ClaimAhead(claim, self._give_back, after)
@@ -104,12 +107,13 @@ class Pipeline(Generic[T]):
         return taken
 
     def send(self, answer: Callable[[], T], *, clean: bool, last: bool) -> None:
-        """Send an answer. It is acknowledged when this returns, unless the pipeline flows and holds another query.
+        """Send an answer. When this returns, it is acknowledged, unless the last answer was accepted and another query
+        is at hand.
 
         Args:
-            answer: sends it.
-            clean: the server is likely to accept it.
-            last: of the queries that were claimed before. One that was claimed ahead may follow.
+            answer: sends the answer.
+            clean: whether the server is likely to accept it.
+            last: whether it answers the last of the claimed queries. One that was claimed ahead may follow.
         """
         self.settle()
         if not (clean and self._flows):
@@ -123,20 +127,21 @@ class Pipeline(Generic[T]):
                 self.settle()
 
     def next(self) -> ClaimedQueries | None:
-        """Return the queries that were claimed ahead. The caller holds them from now on."""
+        """Return the queries that were claimed ahead; the caller becomes responsible for them."""
         held, self._held = self._held, None
         return held
 
     def settle(self) -> None:
-        """Wait until the answer under way is acknowledged. Raises what sending it raised."""
+        """Wait until the answer that is being sent is acknowledged. Raises the error of sending it."""
         if self._answer is not None:
-            wait([self._answer])  # Ctrl-C ends this wait, and leaves the answer under way
+            wait([self._answer])  # Ctrl-C ends this wait, while the answer continues to be sent
             answer, self._answer = self._answer, None
             self._flows = False
             self._flows = self._settle(answer.result())
 
     def close(self) -> None:
-        """Leave nothing claimed ahead and no answer under way. Raises like ``settle``."""
+        """Return queries that were claimed ahead, and wait for the answer that is being sent. Raises the error of
+        sending it."""
         try:
             self.give_back()
         finally:

@@ -1,4 +1,4 @@
-"""Check the server's queries against the limits of the original environment's own specification."""
+"""Checks of the server's queries against the original environment's own specification."""
 
 from __future__ import annotations
 
@@ -15,7 +15,12 @@ IN_WORDS: dict[Access, str] = {"any": "any state", "snapshot": "snapshots", "res
 
 
 def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSpec) -> None:
-    """Check that an environment fits a surrogate: coordinates, action, kind of query, and ranges within its own.
+    """Check that an environment fits a surrogate: coordinates, action, access, and ranges within the environment's own.
+
+    Args:
+        surrogate: name of the surrogate, for messages.
+        asked: the surrogate's specification.
+        own: the environment's specification.
 
     Raises:
         UnknownEnvironment: the environment does not fit.
@@ -43,14 +48,18 @@ def check_query(own: EnvironmentSpec, query: Query) -> None:
         QueryRefused: the environment does not allow the query.
     """
     if query.kind != own.query:
-        raise QueryRefused(f"expected a {own.query} query, got a {query.kind} query")
+        raise QueryRefused(
+            f"expected a {own.query} query, which the environment's specification declares, got a {query.kind} query"
+        )
     if isinstance(query, StepQuery):
         names = [f"coordinate {name!r}" for name in own.coordinate_names]
         _check_values("coordinates", names, query.coordinates, _coordinate_ranges(own))
         _check_action(own, query.action)
         return
     if query.snapshot is not None and not own.snapshots:
-        raise QueryRefused("expected a query that begins at a reset, got one that begins at a snapshot")
+        raise QueryRefused(
+            "expected a query that begins at a reset, as the environment has no snapshots, got one at a snapshot"
+        )
     longest = own.max_rollout or own.time_limit or MAX_ROLLOUT_QUERY
     if not 1 <= len(query.actions) <= longest:
         raise QueryRefused(f"expected a rollout of 1 to {longest} actions, got {len(query.actions)}")
@@ -71,7 +80,9 @@ def _check_values(what: str, names: Sequence[str], values: Sequence[float], rang
         raise QueryRefused(f"{what}: expected {len(ranges)} numbers, got {len(values)}")
     for name, value, allowed in zip(names, values, ranges, strict=True):
         if not is_within((value, value), allowed):
-            raise QueryRefused(f"{name}: expected a value in [{allowed[0]:g}, {allowed[1]:g}], got {value:g}")
+            raise QueryRefused(
+                f"{name}: expected a value in the environment's range [{allowed[0]:g}, {allowed[1]:g}], got {value:g}"
+            )
 
 
 def _check_ranges(what: str, asked: Sequence[Range], own: Sequence[Range]) -> None:

@@ -1,4 +1,4 @@
-"""Saves the states of an environment, and returns to them."""
+"""Saving of an environment's states as snapshots, and return to them."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from surrogym_sampler.queries.snapshots import SnapshotFolder
 from surrogym_shared.spec import EnvironmentSpec, limits
 
 SKIPPED = "the design takes another state, and surrogym doctor --env ENVIRONMENT checks save and restore"
-MOST_HANGS = 2  # of ``save`` in a row; one may be the machine's fault
-ELSEWHERE = 0.01  # share of a sampling range by which a return may miss the coordinates that were saved, unmentioned
+MOST_HANGS = 2  # number of time-outs of `save` in a row after which no state is saved; a single one may be chance
+ELSEWHERE = 0.01  # share of a sampling range; a restored state that differs by more is reported
 
 
 @runtime_checkable
 class Resettable(SnapshotEnvironment, Protocol):
-    """An environment that can also be reset."""
+    """An environment that can be reset and can return to snapshots."""
 
     def begin(self, seed: int | None = None) -> Array: ...
 
@@ -42,12 +42,12 @@ class Returning:
 
     Args:
         environment: saves and restores its state.
-        spec: of the environment.
-        folder: keeps the snapshots.
+        spec: the environment's specification.
+        folder: stores the snapshots.
         known: names of the snapshots that the server knows.
 
     Attributes:
-        gone: names of snapshots that the server has yet to forget.
+        gone: names of snapshots that no longer exist, which the server has not been told yet.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Returning:
         self._environment, self._spec, self._folder = environment, spec, folder
         self.gone = sorted(set(known) - set(folder.names()))
         self._hung_saves = 0
-        self._remarks: dict[str, str] = {}  # first remark of each kind; "" after it was told
+        self._remarks: dict[str, str] = {}  # first remark of each kind; "" after it was reported
         if self.gone:
             self._remark(
                 "start",
@@ -72,7 +72,7 @@ class Returning:
         """Return to a snapshot.
 
         Raises:
-            SnapshotGone: it can't be used, or the environment died or hung at it twice; it is dropped.
+            SnapshotGone: the snapshot can't be used, or the environment died or hung at it twice; it is deleted.
             StepTimedOut, EnvironmentDied: the environment hung or died, and can't be reset either.
         """
         try:
@@ -80,7 +80,7 @@ class Returning:
                 self._restore(name)
             except (StepTimedOut, EnvironmentDied):
                 if not self._resets():
-                    raise  # the fault is the machine's
+                    raise  # the environment itself is at fault, not the snapshot
                 self._restore_again(name)
         except SnapshotGone:
             self._folder.drop(name)
@@ -88,7 +88,7 @@ class Returning:
             raise
 
     def save(self, coordinates: Sequence[float]) -> str | None:
-        """Save the present state, which has the coordinates (C,). Returns its name; None if it can't be saved.
+        """Save the current state, which has the coordinates (C,), and return its name; None if it can't be saved.
 
         Raises:
             StepTimedOut, EnvironmentDied: the environment hung or died, so no step can follow.
@@ -110,12 +110,13 @@ class Returning:
         return name
 
     def handed_in(self, names: Iterable[str]) -> None:
-        """Notice which of these snapshots, of which the server has just learned, are gone already: another sampler has
-        dropped them, or this one has while their samples were on the way."""
+        """Add to ``gone`` those of these snapshots, which the server has just learned of, that no longer exist: another
+        sampler has deleted them, or this one has while their samples were being sent."""
         self.gone += [name for name in names if name not in self._folder and name not in self.gone]
 
     def remarks(self) -> str:
-        """What went wrong without harm to a query, and was not told yet: once for each kind."""
+        """Return remarks about faults that harmed no query and were not reported yet, each kind once; empty if there
+        are none."""
         untold = "; ".join(filter(None, self._remarks.values()))
         self._remarks = dict.fromkeys(self._remarks, "")
         return untold
@@ -128,7 +129,7 @@ class Returning:
             state: Any = self._environment.save()
         except StepFailed:
             raise
-        except Exception as error:  # an environment that is not isolated may raise anything
+        except Exception as error:  # an environment that runs in this process may raise anything
             raise SnapshotNotKept(sentence(error)) from error
         if not isinstance(state, bytes):
             raise SnapshotNotKept(
@@ -141,28 +142,30 @@ class Returning:
         try:
             reached: Any = self._environment.restore(state)
         except (StepTimedOut, EnvironmentDied):
-            raise  # the fault may be the snapshot's or the machine's
-        except Exception as error:  # an environment that is not isolated may raise anything
+            raise  # either the snapshot or the environment may be at fault
+        except Exception as error:  # an environment that runs in this process may raise anything
             raise SnapshotGone(f"snapshot {name} can't be restored: {sentence(error)}; {SKIPPED}") from error
         self._compare(name, np.array(saved), reached)
 
     def _restore_again(self, name: str) -> None:
-        """Return to a snapshot at which the environment died or hung, although it can be reset."""
+        """Return to a snapshot at which the environment died or hung, although it can be reset. Raises ``SnapshotGone``
+        if that happens again."""
         try:
             self._restore(name)
         except (StepTimedOut, EnvironmentDied) as error:
             raise SnapshotGone(f"snapshot {name} can't be restored: {error}, twice; {SKIPPED}") from error
 
     def _resets(self) -> bool:
-        """Whether the environment, started anew, can be reset."""
+        """Return whether the environment, started again, can be reset."""
         try:
             self._environment.begin()
-        except Exception:  # an environment that is not isolated may raise anything
+        except Exception:  # an environment that runs in this process may raise anything
             return False
         return True
 
     def _compare(self, name: str, saved: NDArray[np.float64], reached: Any) -> None:
-        """Check that a return led to coordinates (C,), and remark if they are others than were saved."""
+        """Check the coordinates (C,) that a return to a snapshot reached, and add a remark if they differ from the
+        saved ones."""
         try:
             at = np.asarray(reached, dtype=np.float64)
         except (TypeError, ValueError):
@@ -188,18 +191,19 @@ class Returning:
 def snapshots_of(
     api: Api, surrogate: str, environment: Environment, spec: EnvironmentSpec, settings: SamplerSettings
 ) -> Iterator[Returning | None]:
-    """Open the folder of a surrogate's snapshots. None: no query begins at a snapshot.
+    """Open the folder of a surrogate's snapshots; None if the environment has no snapshots.
 
     Raises:
-        UnusableFolder: it can't be made, or not written to.
+        UnusableFolder: the folder can't be made or written to.
     """
     if not spec.snapshots:
         yield None
         return
-    assert isinstance(environment, Resettable)  # see check_environment
+    assert isinstance(environment, Resettable)  # check_environment has checked that save and restore exist
     with tempfile.TemporaryDirectory(prefix="surrogym-snapshots-") as ended:
         kept = SnapshotFolder((settings.snapshots or Path(ended)) / surrogate, spec, settings.bounds)
-        before = kept.names()  # what is written from now on may be of a sample that is on its way to the server
+        # a snapshot written after this line may belong to a sample that the server has not received yet
+        before = kept.names()
         known = {one.name for one in api.snapshots(surrogate)}
         kept.drop_first(set(before) - known)
         yield Returning(environment, spec, kept, known)

@@ -1,4 +1,4 @@
-"""Convert a real step to the sample that answers a query."""
+"""Conversion of a real step to the sample that answers a query."""
 
 from __future__ import annotations
 
@@ -14,17 +14,22 @@ from surrogym_shared.wire import NewSample, Query, StepQuery
 
 
 def reset_seed(query: Query, design_seed: int) -> int:
-    """Seed of a rollout's reset. Each attempt has its own; it is the same on any server for the same query and
-    design."""
+    """Return the seed of a rollout's reset. It differs between attempts, and is the same on any server for the same
+    query and design."""
     return int(np.random.SeedSequence([design_seed, query.number, query.attempt]).generate_state(1)[0])
 
 
 def sample_of(query: Query, step: RealStep, size: int, number: int = 0) -> NewSample:
-    """Return the sample of a query's step. ``number`` counts the steps of an action sequence from 0; ``size`` is the
-    number of coordinates.
+    """Return the sample of one step of a query.
+
+    Args:
+        query: the query.
+        step: the real step.
+        size: number of coordinates.
+        number: number of the step in the query's action sequence, from 0.
 
     Raises:
-        StepFailed: the step has numbers that are not finite, or of the wrong shape.
+        StepFailed: the step has numbers that are not finite, or arrays of the wrong shape.
     """
     try:
         return NewSample(
@@ -42,7 +47,7 @@ def sample_of(query: Query, step: RealStep, size: int, number: int = 0) -> NewSa
         )
     except (ValidationError, TypeError) as error:
         raise StepFailed(
-            f"expected a step that can be used as a sample, got one with an error: {_first(error)}"
+            f"expected a real step with finite numbers, got one with an error: {_first(error)}; correct the environment"
         ) from error
 
 
@@ -54,7 +59,9 @@ def _requested_actions(query: Query) -> list[list[float]]:
 def _numbers(values: Any, size: int, what: str) -> list[float]:
     array = np.asarray(values, dtype=np.float64)
     if array.shape != (size,):
-        raise StepFailed(f"expected the shape ({size},) for {what} of a step, got {array.shape}")
+        raise StepFailed(
+            f"expected the shape ({size},) for {what} of a real step, got {array.shape}: correct the environment"
+        )
     numbers: list[float] = array.tolist()
     return numbers
 

@@ -1,4 +1,4 @@
-"""Settings of a sampler, and what its run came to."""
+"""The settings of a sampler, and the report of its run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Outcome = Literal["answered", "failed", "dropped", "refused", "impossible"]
 
 
 def worker_name() -> str:
-    """Return a name that distinguishes this sampler from others in the ledger."""
+    """Return a name for this sampler, made of host and process id, that distinguishes it from others."""
     return f"{socket.gethostname()}-{os.getpid()}"[:128]
 
 
@@ -23,10 +23,17 @@ def worker_name() -> str:
 class SamplerSettings:
     """Settings of a sampler.
 
-    ``batch``: queries to claim at once. ``until_done``: stop when the design is ready or over its budget. ``once``:
-    stop after the first claim that returns queries. ``max_queries`` and ``time_limit`` (seconds): begin no query beyond
-    either of them. ``snapshots``: folder that keeps the surrogate's snapshots; None: they end with the sampler.
-    ``bounds``: of their number and size.
+    Attributes:
+        name: name of the sampler, which its samples are stored with.
+        batch: number of queries to claim at once.
+        wait_seconds: seconds that a claim waits for queries.
+        lease_seconds: seconds for which a claimed query is reserved for this sampler.
+        once: whether to stop after the first claim that returns queries.
+        until_done: whether to stop when the design is ready or over its budget.
+        max_queries: number of queries after which no further one begins.
+        time_limit: seconds after which no further query begins.
+        snapshots: folder that stores the surrogate's snapshots; None uses a temporary one.
+        bounds: largest number and size of the snapshots.
     """
 
     name: str = field(default_factory=worker_name)
@@ -43,11 +50,17 @@ class SamplerSettings:
 
 @dataclass(frozen=True)
 class SamplerReport:
-    """Result of a sampler's run.
+    """The result of a sampler's run.
 
-    ``dropped`` counts queries whose lease ended before a real step, ``refused`` those that the environment's own
-    specification does not allow, ``impossible`` those whose snapshot can't be used. ``phase`` is the
-    design's last known phase.
+    Attributes:
+        answered: number of queries answered with samples.
+        failed: number of queries whose step failed.
+        dropped: number of queries whose lease ended before a real step.
+        refused: number of queries that the environment's own specification does not allow.
+        impossible: number of queries whose snapshot can't be used.
+        steps: number of real steps that were sent.
+        seconds: duration of the run.
+        phase: the design's last known phase; None if unknown.
     """
 
     answered: int
@@ -55,6 +68,6 @@ class SamplerReport:
     dropped: int
     refused: int
     impossible: int
-    steps: int  # real steps that were sent
+    steps: int
     seconds: float
     phase: Phase | None

@@ -1,4 +1,4 @@
-"""Snapshots that a sampler keeps: files in a folder, bounded in number and in bytes."""
+"""Storage of snapshots by a sampler: files in a folder, limited in number and in bytes."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from surrogym_sampler.original.errors import SnapshotGone, SnapshotNotKept, UnusableFolder
 from surrogym_shared.spec import EnvironmentSpec, limits
 
-FORM = 1  # of the files
+FORM = 1  # version of the files' form
 ENDING = ".snapshot"
 UNFINISHED = ".part"
-ABANDONED_SECONDS = 60.0  # without a change, after which an unfinished file has no writer any more
-LONGEST_HEAD = 1 << 16  # bytes of a file's first line
+ABANDONED_SECONDS = 60.0  # seconds without a change after which an unfinished file counts as abandoned by its writer
+LONGEST_HEAD = 1 << 16  # largest number of bytes of a file's first line
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Largest number of snapshots, and largest size of their files together, in bytes."""
+    """The largest number of snapshots, and the largest size of their files together, in bytes."""
 
     count: int = 1_000
     size: int = 1 << 30
@@ -36,26 +36,26 @@ class Bounds:
 
 @dataclass(frozen=True)
 class _Kept:
-    """What is known of a file without reading its state."""
+    """What is known about a snapshot's file without reading its state."""
 
     coordinates: tuple[float, ...]  # (C,)
     size: int  # bytes
-    made: int  # time of the file, in nanoseconds
+    made: int  # time at which the file was written, in nanoseconds
 
 
 class SnapshotFolder:
-    """Snapshots in a folder. Several samplers of one surrogate may share it, so any file may be gone at any moment.
+    """Snapshots in a folder. Several samplers of one surrogate may share it, so any file may disappear at any moment.
 
-    A file has a line of JSON about the snapshot, and then the environment's bytes. It is written under another name
-    first.
+    A file has a line of JSON about the snapshot, followed by the environment's bytes. It is written under another name
+    first, and then renamed.
 
     Args:
-        folder: is made if it is not there.
-        spec: of the environment. Snapshots of another environment are not used.
-        bounds: beyond them, the snapshot that is nearest to another one is dropped.
+        folder: the folder, which is made if it does not exist.
+        spec: the environment's specification. Snapshots of another environment are not used.
+        bounds: limits beyond which the snapshot that is nearest to another one is deleted.
 
     Raises:
-        UnusableFolder: it can't be made, or not written to.
+        UnusableFolder: the folder can't be made or written to.
     """
 
     def __init__(self, folder: Path, spec: EnvironmentSpec, bounds: Bounds | None = None) -> None:
@@ -63,12 +63,12 @@ class SnapshotFolder:
         self._environment, self._names = spec.environment, list(spec.coordinate_names)
         self._angles = np.array([c.kind == "angle" for c in spec.coordinates])
         self._widths = np.array([np.ptp(limits(c.sampling)) for c in spec.coordinates])
-        self._kept: dict[str, _Kept | None] = {}  # None: can't be used
+        self._kept: dict[str, _Kept | None] = {}  # by name; None if the snapshot can't be used
         self._unknown: Collection[str] = ()
         self._require_room()
 
     def names(self) -> list[str]:
-        """The names of all snapshots that are there and can be used, oldest first."""
+        """Return the names of all snapshots in the folder that can be used, oldest first."""
         there = {path.name.removesuffix(ENDING): path for path in self._folder.glob(f"*{ENDING}")}
         for name in self._kept.keys() - there.keys():
             del self._kept[name]
@@ -84,14 +84,16 @@ class SnapshotFolder:
         return sorted(usable, key=lambda name: usable[name].made)
 
     def drop_first(self, unknown: Collection[str]) -> None:
-        """Drop these before all others, once there is no room left: the server does not know them."""
+        """Set the names of snapshots that the server does not know, so that they are deleted first when space is
+        needed."""
         self._unknown = unknown
 
     def __contains__(self, name: str) -> bool:
         return self._path(name).exists()
 
     def add(self, state: bytes, coordinates: Sequence[float]) -> tuple[str, list[str]]:
-        """Keep a state with its coordinates (C,). Returns its name, and the names of those that were dropped for it.
+        """Store a state with its coordinates (C,). Returns its name, and the names of the snapshots that were deleted
+        to make room.
 
         Raises:
             SnapshotNotKept: it can't be written, or is larger than all snapshots together may be.
@@ -113,10 +115,10 @@ class SnapshotFolder:
         return name, self._make_room(name)
 
     def read(self, name: str) -> tuple[tuple[float, ...], bytes]:
-        """The coordinates (C,) with which a snapshot was saved, and its bytes.
+        """Return the coordinates (C,) with which a snapshot was saved, and the environment's bytes.
 
         Raises:
-            SnapshotGone: it is not there, damaged, or of another environment or version.
+            SnapshotGone: the snapshot does not exist, is damaged, or is of another environment or version.
         """
         try:
             with self._path(name).open("rb") as file:
@@ -125,8 +127,8 @@ class SnapshotFolder:
             coordinates, digest = head["coordinates"], head["digest"]
         except FileNotFoundError as error:
             raise SnapshotGone(
-                f"snapshot {name} is not in {self._folder}: it was dropped, or is another's; give all "
-                "samplers one --snapshots folder"
+                f"snapshot {name} is not in {self._folder}: it was deleted, or another sampler has it; give all "
+                "samplers the same --snapshots folder"
             ) from error
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise SnapshotGone(f"snapshot {name} can't be read: {error}; the design takes another state") from error
@@ -142,7 +144,7 @@ class SnapshotFolder:
         return tuple(map(float, coordinates.values())), state
 
     def drop(self, name: str) -> None:
-        """Remove a snapshot; harmless if it is not there, or can't be removed."""
+        """Delete a snapshot, if it exists and can be deleted."""
         with suppress(OSError):
             self._path(name).unlink()
         self._kept.pop(name, None)
@@ -158,18 +160,17 @@ class SnapshotFolder:
                 raise
         except OSError as error:
             raise SnapshotNotKept(
-                f"expected to write a snapshot to {self._folder}: {error.strerror or error}; free space, or "
-                "name another folder "
-                "by --snapshots"
+                f"the snapshot can't be written to {self._folder}: {error.strerror or error}; free space, or give "
+                "another folder with --snapshots"
             ) from error
 
     def _require_room(self) -> None:
-        """Make the folder, try to write to it, and remove what killed samplers left unfinished."""
+        """Make the folder, try to write to it, and delete unfinished files of samplers that were killed."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             probe = self._folder / f"{secrets.token_hex(8)}{UNFINISHED}"
             probe.write_bytes(b"")
-            now = probe.stat().st_mtime  # by the clock of the folder's machine
+            now = probe.stat().st_mtime  # the time by the clock of the folder's file system
             probe.unlink()
         except OSError as error:
             raise UnusableFolder(
@@ -183,7 +184,7 @@ class SnapshotFolder:
                     path.unlink()
 
     def _make_room(self, newest: str) -> list[str]:
-        """Drop snapshots until the others are within the bounds. Returns their names."""
+        """Delete snapshots until the others are within the bounds, and return the names of the deleted ones."""
         dropped: list[str] = []
         names = self.names()
         kept = {name: one for name in names if (one := self._kept[name]) is not None}
@@ -198,13 +199,14 @@ class SnapshotFolder:
         return len(kept) > self._bounds.count or sum(one.size for one in kept) > self._bounds.size
 
     def _nearest(self, kept: Mapping[str, _Kept], newest: str) -> str:
-        """The snapshot that is nearest to another one. Never the newest, which another sampler may have dropped."""
+        """Return the name of the snapshot that is nearest to another one; never the newest."""
         names = list(kept)
         points = self._scaled([one.coordinates for one in kept.values()])
         return names[least_useful(points, keep=names.index(newest) if newest in kept else None)]
 
     def _scaled(self, coordinates: Sequence[Sequence[float]]) -> Array:
-        """Coordinates (n, C) in widths of the sampling ranges, and angles as points on a circle of circumference 1."""
+        """Return coordinates (n, C) as shares of the sampling ranges, with angles as points on a circle of
+        circumference 1."""
         q = np.array(coordinates)
         turned = q[:, self._angles]
         circle = np.concatenate([np.cos(turned), np.sin(turned)], 1) / (2 * np.pi)
@@ -215,9 +217,10 @@ class SnapshotFolder:
 
 
 def least_useful(points: Array, keep: int | None = None) -> int:
-    """Number of the older one of the two nearest points (n, K), oldest first, and never ``keep``."""
+    """Return the index of the older of the two nearest points (n, K), which are ordered from old to new; ``keep`` is
+    never returned."""
     nearest = np.full(len(points), np.inf)
-    for number, point in enumerate(points):  # all distances at once would fill gigabytes if there are many points
+    for number, point in enumerate(points):  # the matrix of all distances would need gigabytes if there are many points
         if number != keep:
             apart = np.square(points - point).sum(1)
             apart[number] = np.inf
