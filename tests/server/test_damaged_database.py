@@ -81,14 +81,14 @@ def until(happened: Callable[[], bool]) -> None:
         time.sleep(0.1)
 
 
-def test_a_saved_session_that_is_damaged_is_named_and_the_server_starts(server: ServerProcess, client: httpx.Client):
+def test_the_server_starts_despite_a_damaged_saved_session_and_names_it(server: ServerProcess, client: httpx.Client):
     assert "the saved session" in server.log
     assert "is lost: expected a saved session" in server.log
     assert client.get("/readyz").json() == {"status": "ready", "storage": "ok"}
 
 
 @pytest.mark.parametrize(("column", "value"), [("spec", '{"coordinates'), ("spec", "{}"), ("phase", "reaxy")])
-def test_a_broken_row_is_an_error_that_names_it_and_others_are_served(
+def test_a_damaged_row_gives_an_error_naming_it_and_others_are_served(
     server: ServerProcess, client: httpx.Client, column: str, value: str
 ):
     with changed(server.folder / "surrogym.db", column, value):
@@ -102,7 +102,7 @@ def test_a_broken_row_is_an_error_that_names_it_and_others_are_served(
     assert "Traceback" not in server.log
 
 
-def test_a_missing_table_is_an_error_that_names_it_and_the_server_is_not_ready(
+def test_a_missing_table_gives_an_error_naming_it_and_the_server_is_not_ready(
     server: ServerProcess, client: httpx.Client
 ):
     file = server.folder / "surrogym.db"
@@ -116,7 +116,7 @@ def test_a_missing_table_is_an_error_that_names_it_and_the_server_is_not_ready(
     assert "Traceback" not in server.log
 
 
-def test_the_version_before_replaces_a_model_with_a_flipped_bit(server: ServerProcess, client: httpx.Client):
+def test_the_previous_model_is_served_if_the_newest_has_a_flipped_bit(server: ServerProcess, client: httpx.Client):
     view = client.get(f"/v1/surrogates/{NAME}").json()
     newest, said = view["model_version"], {"coordinates": [[0.3, -0.2]], "action": [[0.7]]}
     flip(server.folder / "surrogym.db", "models", "blob")
@@ -129,7 +129,7 @@ def test_the_version_before_replaces_a_model_with_a_flipped_bit(server: ServerPr
     assert f"ERROR surrogym_server.services.models: model {newest} of {NAME} is set aside" in server.log
 
 
-def test_broken_pages_end_the_start_with_one_sentence_and_the_way_out(database: Path, tmp_path: Path):
+def test_damaged_database_pages_end_the_start_with_repair_instructions(database: Path, tmp_path: Path):
     file = Path(shutil.copy(database, tmp_path))
     content = bytearray(file.read_bytes())
     content[4096:8192] = bytes(4096)

@@ -21,7 +21,7 @@ def started(folder: Path, **options: object) -> None:
     keep_private(read_settings({}, database=str(folder / "surrogym.db"), **options))
 
 
-def test_a_served_database_and_what_lies_beside_it_are_private(tmp_path: Path):
+def test_a_new_database_and_its_side_files_are_readable_by_their_owner_only(tmp_path: Path):
     tokens = tmp_path / "tokens"
     tokens.write_text("train:a-long-token\n")
     tokens.chmod(0o644)
@@ -38,7 +38,7 @@ def test_a_served_database_and_what_lies_beside_it_are_private(tmp_path: Path):
 
 
 @pytest.mark.parametrize("permissions", [0o644, 0o640, 0o604])
-def test_a_database_that_others_may_read_is_named_and_left(tmp_path: Path, caplog, permissions: int):
+def test_a_database_readable_by_others_is_warned_about_and_not_changed(tmp_path: Path, caplog, permissions: int):
     (tmp_path / "surrogym.db").touch()
     (tmp_path / "surrogym.db").chmod(permissions)
     started(tmp_path)
@@ -48,7 +48,7 @@ def test_a_database_that_others_may_read_is_named_and_left(tmp_path: Path, caplo
 
 
 @pytest.mark.parametrize("field", ["token_file", "tls_key"])
-def test_other_secret_files_that_others_may_read_are_named(tmp_path: Path, caplog, field: str):
+def test_other_secret_files_readable_by_others_are_warned_about(tmp_path: Path, caplog, field: str):
     secret, certificate = tmp_path / "secret", tmp_path / "certificate"
     secret.write_text("a-long-token")
     certificate.touch()
@@ -62,13 +62,13 @@ def test_other_secret_files_that_others_may_read_are_named(tmp_path: Path, caplo
 
 
 @pytest.mark.parametrize("database", ["postgresql://user@host/name", "sqlite:///:memory:", "no://thing", "://"])
-def test_other_databases_are_left_alone(database: str, tmp_path: Path, monkeypatch, caplog):
+def test_no_file_is_created_for_databases_other_than_sqlite_files(database: str, tmp_path: Path, monkeypatch, caplog):
     monkeypatch.chdir(tmp_path)
     keep_private(read_settings({}, database=database))
     assert list(tmp_path.iterdir()) == []
     assert not caplog.records
 
 
-def test_a_database_in_a_new_folder_is_private(tmp_path: Path):
+def test_a_database_in_a_new_folder_is_readable_by_its_owner_only(tmp_path: Path):
     keep_private(read_settings({}, database=f"sqlite:///{tmp_path}/a/b/surrogym.db"))
     assert mode(tmp_path / "a" / "b" / "surrogym.db") == 0o600

@@ -12,13 +12,13 @@ from surrogym_server.settings import read_settings
 TOKEN = "a-long-token"
 
 
-def test_defaults_listen_on_loopback_alone():
+def test_the_default_server_listens_on_loopback_only():
     settings = read_settings({})
     assert (settings.host, settings.port, settings.tokens, settings.loopback) == ("127.0.0.1", 8000, {}, True)
     assert settings.database_url == "sqlite:///surrogym.db"
 
 
-def test_a_commit_waits_for_the_disk_unless_a_setting_says_otherwise():
+def test_sqlite_commits_sync_to_disk_unless_set_otherwise():
     assert read_settings({}).synchronous == "full"
     assert read_settings({"SURROGYM_SYNCHRONOUS": "normal"}).synchronous == "normal"
     with pytest.raises(InvalidInput, match="synchronous"):
@@ -26,7 +26,7 @@ def test_a_commit_waits_for_the_disk_unless_a_setting_says_otherwise():
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "robot.example"])
-def test_another_address_needs_a_token(host: str):
+def test_listening_on_a_non_loopback_address_requires_a_token(host: str):
     with pytest.raises(InvalidInput, match=rf"^host {host} is not loopback: expected a token"):
         read_settings({}, host=host)
     assert read_settings({"SURROGYM_TOKEN": TOKEN}, host=host).tokens == {TOKEN: "admin"}
@@ -34,17 +34,17 @@ def test_another_address_needs_a_token(host: str):
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "::1", "localhost"])
-def test_loopback_needs_none(host: str):
+def test_listening_on_loopback_requires_no_token(host: str):
     assert read_settings({}, host=host).loopback
 
 
-def test_options_overrule_the_environment():
+def test_command_line_options_override_environment_variables():
     environment = {"SURROGYM_PORT": "9000", "SURROGYM_THREADS": "3"}
     settings = read_settings(environment, port=0, threads=None)
     assert (settings.port, settings.threads) == (0, 3)
 
 
-def test_tokens_come_with_roles(tmp_path: Path):
+def test_tokens_are_read_from_the_environment_with_their_roles(tmp_path: Path):
     file = tmp_path / "tokens"
     file.write_text("train:train-token\n\nplain-admin-token\n")
     environment = {"SURROGYM_TOKENS": "read:read-token,sample:sample-token"}
@@ -74,18 +74,18 @@ def test_tokens_come_with_roles(tmp_path: Path):
         ({"SURROGYM_LOG_LEVEL": "loud"}, "setting log_level: .*'info'"),
     ],
 )
-def test_an_invalid_setting_is_named(environment: dict[str, str], message: str):
+def test_the_error_for_an_invalid_server_setting_names_it(environment: dict[str, str], message: str):
     with pytest.raises(InvalidInput, match=message):
         read_settings(environment)
 
 
-def test_a_refusal_does_not_print_the_token():
+def test_the_error_for_an_invalid_token_does_not_print_it():
     with pytest.raises(InvalidInput) as refusal:
         read_settings({"SURROGYM_TOKEN": "secret", "SURROGYM_PORT": "-1"})
     assert "secret" not in str(refusal.value)
 
 
-def test_a_token_with_a_colon_that_is_taken_for_a_role_is_not_printed():
+def test_the_error_for_a_token_containing_a_colon_does_not_print_it():
     with pytest.raises(InvalidInput) as refusal:
         read_settings({"SURROGYM_TOKENS": "secret-half:other-half"})
     assert "half" not in str(refusal.value)

@@ -65,7 +65,7 @@ def fits(client: httpx.Client) -> float:
     return next(s.value for f in families for s in f.samples if s.name == "surrogym_fit_seconds_count")
 
 
-def test_each_fit_is_done_once_and_seen_by_both(clients: list[httpx.Client]):
+def test_two_servers_on_one_database_do_each_fit_once_and_both_see_it(clients: list[httpx.Client]):
     first, second = clients
     view = pendulum.teach(first, "shared")
     sessions = [opened(client, "shared") for client in clients]
@@ -81,7 +81,7 @@ def test_each_fit_is_done_once_and_seen_by_both(clients: list[httpx.Client]):
     assert sum(fits(client) for client in clients) == after["model_version"]
 
 
-def test_a_surrogate_deleted_and_made_anew_elsewhere_is_another_one(clients: list[httpx.Client]):
+def test_a_session_ends_if_another_server_deletes_and_recreates_its_surrogate(clients: list[httpx.Client]):
     first, second = clients
     pendulum.teach(first, "renewed")
     session = opened(second, "renewed")
@@ -96,7 +96,7 @@ def test_a_surrogate_deleted_and_made_anew_elsewhere_is_another_one(clients: lis
     assert version(second, opened(second, "renewed")) >= 1
 
 
-def test_a_claim_that_waits_at_one_server_wakes_for_a_query_of_another(
+def test_a_claim_waiting_at_one_server_gets_a_query_added_at_another(
     postgresql: Postgresql, monkeypatch: pytest.MonkeyPatch
 ):
     """By an announcement alone: the look from time to time is put off."""

@@ -29,30 +29,30 @@ def tensor(*values: float) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def test_confidence_index_with_a_tolerance_and_as_the_paper_has_it():
+def test_the_confidence_index_equals_its_formula_and_that_of_the_paper():
     made = confidence(tensor(0.1, 0.05, 0.2), 0.1, None)
     assert made.confidence_index == pytest.approx((0.8413447461 + 0.9772498681 + 0.6914624613) / 3, abs=1e-9)
     assert made.confidence_index_paper == pytest.approx((1 + 1 + 0.9999997133) / 3, abs=1e-9)
     assert made.coverage == pytest.approx(2 / 3)
 
 
-def test_confidence_of_the_papers_tolerance_is_the_papers():
+def test_with_tolerance_1_the_confidence_index_equals_that_of_the_paper():
     made = confidence(tensor(1.0, 2.0), 1.0, None)
     assert made.confidence_index == made.confidence_index_paper == pytest.approx((0.8413447461 + 0.6914624613) / 2)
 
 
-def test_nothing_known_is_a_half_and_no_std_is_certain():
+def test_certainty_is_one_half_at_infinite_deviation_and_one_at_zero():
     torch.testing.assert_close(certainty(tensor(1e12, 0.0), 0.1), tensor(0.5, 1.0))
     assert log_model_uncertainty(tensor(0.0), 0.1).exp().item() == 0
     assert math.isfinite(log_model_uncertainty(tensor(0.0), 0.1).item()), "as JSON has no infinity"
 
 
-def test_model_uncertainty_is_what_certainty_leaves():
+def test_model_uncertainty_is_one_minus_certainty():
     log_u = log_model_uncertainty(tensor(0.1, 0.05), 0.1)
     torch.testing.assert_close(log_u.exp(), tensor(1 - 0.8413447461, 1 - 0.9772498681), rtol=1e-8, atol=0)
 
 
-def test_small_uncertainties_stay_ordered_where_one_minus_phi_is_zero():
+def test_tiny_model_uncertainties_stay_ordered_in_the_logarithm():
     std = tensor(1 / 9, 1 / 10, 1 / 20, 1 / 100)
     assert torch.all(1 - certainty(std, 1.0) == 0)
     log_u = log_model_uncertainty(std, 1.0)
@@ -60,7 +60,7 @@ def test_small_uncertainties_stay_ordered_where_one_minus_phi_is_zero():
     np.testing.assert_allclose(log_u.numpy(), norm.logsf([9, 10, 20, 100]), rtol=1e-9)
 
 
-def test_query_uncertainty_says_all_of_it(model, points, unseen):
+def test_query_uncertainty_returns_mean_deviation_probability_and_index_of_each_output(model, points, unseen):
     q, u = (t.numpy() for t in points)
     tolerances = np.array([0.01, 0.02, 0.1])
     made = query_uncertainty(model, q, u, tolerances)
@@ -75,7 +75,7 @@ def test_query_uncertainty_says_all_of_it(model, points, unseen):
     np.testing.assert_allclose(np.exp(visited.log_uncertainty_index), index, rtol=1e-9)
 
 
-def test_confidence_where_a_policy_goes_is_the_worst_outputs_over_its_states(model):
+def test_the_confidence_over_visited_states_is_that_of_the_worst_output(model):
     states = np.array([[0.0, 1.0], [1.0, -2.0], [0.5, 0.5]])
     alone = [visited_confidence(model, states, [t if i == j else 1e9 for j in range(3)]) for i, t in enumerate(TIGHT)]
     assert visited_confidence(model, states, TIGHT) == min(alone)
@@ -84,7 +84,7 @@ def test_confidence_where_a_policy_goes_is_the_worst_outputs_over_its_states(mod
     assert visited_confidence(model, states, [1e-15] * 3) == pytest.approx(0.5)
 
 
-def test_a_policy_that_runs_out_of_the_sampling_range_goes_where_nothing_is_known(definition, few, unseen):
+def test_visited_states_outside_the_sampling_range_lower_the_confidence(definition, few, unseen):
     more = replace(unseen, **{n: getattr(unseen, n)[:10] for n in unseen.__dataclass_fields__})
     model, within = learn(definition, join(few, more)).model, np.array([[0.5, 0.5]])
     known = visited_confidence(model, within, [1e-2] * 3)

@@ -36,19 +36,19 @@ def drawn(definition: EnvironmentDefinition, count: int, share: float) -> tuple[
     return q, least + (most - least) * rng.random((count, len(least)))
 
 
-def test_a_log_from_everywhere_covers_all(definition: EnvironmentDefinition, asked):
+def test_a_log_over_the_whole_range_replaces_all_initial_queries(definition: EnvironmentDefinition, asked):
     assert covered(definition, *asked, *drawn(definition, 3_000, share=1.0)).all()
 
 
-def test_a_log_from_a_corner_leaves_the_rest_of_the_range(definition: EnvironmentDefinition, asked):
+def test_a_log_of_a_part_of_the_range_replaces_only_initial_queries_there(definition: EnvironmentDefinition, asked):
     found = covered(definition, *asked, *drawn(definition, 3_000, share=0.2))
     assert 0 < found.sum() < QUERIES / 2
 
 
-def test_an_angle_beyond_the_cut_is_near(definition: EnvironmentDefinition):
+def test_logged_angles_cover_queries_across_the_wrap_at_pi(definition: EnvironmentDefinition):
     q, u = np.array([[3.1, 0.0], [0.0, 0.0]]), np.zeros((2, 1))
     assert covered(definition, q, u, np.array([[-3.1, 0.0]]), np.zeros((1, 1))).tolist() == [True, False]
 
 
-def test_no_log_covers_nothing(definition: EnvironmentDefinition, asked):
+def test_an_empty_log_replaces_no_initial_query(definition: EnvironmentDefinition, asked):
     assert not covered(definition, *asked, np.zeros((0, 2)), np.zeros((0, 1))).any()

@@ -70,7 +70,7 @@ def design(spec: EnvironmentSpec, budget: int, state: DesignState | None = None)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_real_pendulum_is_known_within_twenty_steps(seed, unseen):
+def test_the_design_learns_the_pendulum_within_twenty_real_steps(seed, unseen):
     finished = design(designed(seed=seed), budget=20)
     last = finished.decisions[-1]
     assert last.verdict == "ready"
@@ -86,7 +86,7 @@ def test_a_real_pendulum_is_known_within_twenty_steps(seed, unseen):
     assert torch.all(error.square().mean(0).sqrt() < tolerances)
 
 
-def test_tolerances_are_frozen_after_the_first_round_and_rounds_are_counted(definition, few):
+def test_default_tolerances_are_frozen_after_the_first_design_round(definition, few):
     one = advance(definition, first(few, 4), DesignState(), request()).state
     spread = torch.tensor([float(few.reward[:4].std(correction=0))])
     assert one.defaults.values[2] == pytest.approx(0.05 * float(spread))
@@ -96,7 +96,7 @@ def test_tolerances_are_frozen_after_the_first_round_and_rounds_are_counted(defi
     assert set(one.warm) <= set(two.warm)
 
 
-def test_a_state_survives_json(definition, few):
+def test_a_design_state_survives_json(definition, few):
     state = advance(definition, few, DesignState(), request()).state
     again = DesignState.from_json(json.loads(json.dumps(state.to_json())))
     assert (again.round, again.defaults) == (state.round, state.defaults)
@@ -104,7 +104,7 @@ def test_a_state_survives_json(definition, few):
     assert DesignState.from_json({}) == DesignState()
 
 
-def test_the_budget_is_spent_and_never_overspent():
+def test_the_design_uses_its_whole_budget_and_never_more():
     spec = designed(monte_carlo=64)
     finished = design(spec, budget=7, state=NEVER)
     assert finished.decisions[-1].verdict == "over_budget"
@@ -112,21 +112,21 @@ def test_the_budget_is_spent_and_never_overspent():
     assert len(initial_queries(definition_from_spec(spec), 3)) == 3
 
 
-def test_pending_queries_count_against_the_budget(definition, few, unseen):
+def test_pending_queries_count_against_the_design_budget(definition, few, unseen):
     chosen = [
         len(advance(definition, few, NEVER, request(len(few) + 2, first(unseen, p))).queries) for p in (0, 1, 2, 3)
     ]
     assert chosen == [2, 1, 0, 0]
 
 
-def test_pending_queries_are_not_chosen_again(definition, few):
+def test_the_design_does_not_choose_pending_queries_again(definition, few):
     asked = advance(definition, few, NEVER, request()).queries
     again = advance(definition, few, NEVER, replace(request(), pending=asked)).queries
     assert len(again) == 3
     assert not near(definition, Points.of(definition, again), Points.of(definition, asked)).any()
 
 
-def test_one_round_asks_once_for_each_unsure_output_and_never_twice_the_same(definition, few):
+def test_a_design_round_chooses_one_distinct_query_per_uncertain_output(definition, few):
     made = advance(definition, few, NEVER, request())
     asked = Points.of(definition, made.queries)
     assert len(asked) == 3
@@ -136,12 +136,12 @@ def test_one_round_asks_once_for_each_unsure_output_and_never_twice_the_same(def
     assert not near(definition, asked, Points(few.q, few.u)).any()
 
 
-def test_certain_outputs_get_no_queries(definition, few):
+def test_the_design_chooses_no_queries_for_certain_outputs(definition, few):
     generous = DesignState(1, DefaultTolerances((1e3, 1e3, 1e-12)))
     assert len(advance(definition, few, generous, request()).queries) == 1
 
 
-def test_where_nothing_distinct_is_left_to_ask_the_design_ends():
+def test_the_design_ends_unsure_if_no_distinct_query_is_left():
     spec = designed(monte_carlo=16)
     definition = definition_from_spec(spec)
     samples = answer(spec, *monte_carlo(definition))
@@ -151,14 +151,14 @@ def test_where_nothing_distinct_is_left_to_ask_the_design_ends():
 
 
 @pytest.mark.parametrize(("budget", "verdict"), [(20, "ready"), (4, "ready")])
-def test_extra_queries_are_chosen_whatever_the_verdict(definition, few, unseen, budget, verdict):
+def test_requested_extra_queries_are_chosen_even_if_the_design_has_ended(definition, few, unseen, budget, verdict):
     generous = DesignState(1, DefaultTolerances((1e3,) * 3))
     made = advance(definition, join(few, first(unseen, 4)), generous, request(budget, extra=5))
     assert made.verdict == verdict
     assert len(made.queries) == 5
 
 
-def test_the_reward_of_an_ending_is_queried_first():
+def test_the_design_first_queries_a_step_that_terminates_the_episode():
     spec = cartpole()
     definition = definition_from_spec(spec)
     steps = random_steps(spec, 60, seed=0)
@@ -170,19 +170,19 @@ def test_the_reward_of_an_ending_is_queried_first():
     assert not bool(definition.terminated(q)[0])
 
 
-def test_the_same_round_asks_the_same(definition, few, monkeypatch):
+def test_a_design_round_repeated_on_equal_data_chooses_equal_queries(definition, few, monkeypatch):
     monkeypatch.setattr("surrogym_server.sampling.design.learn", learn)
     one, two = (advance(definition, few, DesignState(), request()) for _ in range(2))
     assert one.queries == two.queries
 
 
-def test_another_seed_is_another_design():
+def test_another_design_seed_gives_other_initial_queries():
     one, same, other = (initial_queries(definition_from_spec(designed(seed=s)), 20) for s in (0, 0, 1))
     assert one == same
     assert one != other
 
 
-def test_the_paper_starts_with_ten_points_a_dimension_and_tolerance_one():
+def test_preset_paper_has_ten_initial_queries_per_dimension_and_tolerance_one():
     definition = definition_from_spec(designed(preset="paper"))
     q, u = arrays(initial_queries(definition, 125))
     assert len(q) == len(u) == 10 * (3 + 1)
@@ -192,7 +192,7 @@ def test_the_paper_starts_with_ten_points_a_dimension_and_tolerance_one():
     assert [c.confidence_index for c in made.confidences] == [c.confidence_index_paper for c in made.confidences]
 
 
-def test_the_papers_tolerance_can_be_relative_to_what_its_outputs_do():
+def test_preset_paper_can_use_tolerances_relative_to_the_output_deviation():
     definition = definition_from_spec(designed(preset="paper", tolerance="relative"))
     samples = random_steps(pendulum(), 40, seed=0)
     change = definition.observe(samples.q_next) - definition.observe(samples.q)
@@ -202,19 +202,19 @@ def test_the_papers_tolerance_can_be_relative_to_what_its_outputs_do():
     assert defaults_of(default, samples) == (1.0,) * 3
 
 
-def test_a_latin_hypercube_design_asks_for_its_whole_budget_at_once():
+def test_a_latin_hypercube_design_asks_its_whole_budget_as_initial_queries():
     definition = definition_from_spec(designed(acquisition="latin_hypercube"))
     assert len(initial_queries(definition, 17)) == 17
 
 
-def test_a_large_design_compares_no_pairs():
+def test_30000_initial_queries_are_made_without_comparing_all_pairs():
     """A spec may ask for 100,000 initial queries; the distances of all pairs would take 40 GB."""
     q, u = arrays(initial_queries(definition_from_spec(designed(initial=30_000)), 30_000))
     assert q.shape == (30_000, 2)
     assert u.shape == (30_000, 1)
 
 
-def test_more_extra_queries_than_there_are_distinct_points_end_soon(definition, few, monkeypatch):
+def test_choosing_extra_queries_stops_once_no_distinct_candidate_is_left(definition, few, monkeypatch):
     """Once nothing distinct is left, nothing more is computed for the rest of an ``improve`` of thousands."""
     calls = []
 
@@ -229,7 +229,7 @@ def test_more_extra_queries_than_there_are_distinct_points_end_soon(definition, 
     assert len(decision.queries) <= len(calls) <= 64
 
 
-def test_declared_tolerances_hold(few):
+def test_tolerances_of_the_specification_replace_the_defaults(few):
     definition = definition_from_spec(pendulum().model_copy(update={"tolerances": {"speed": 0.5}}))
     defaults = defaults_of(definition, few)
     assert definition.tolerances_or(defaults) == (defaults[0], 0.5, defaults[2])
@@ -237,12 +237,12 @@ def test_declared_tolerances_hold(few):
     assert advance(definition, few, DesignState(), request()).tolerances == definition.tolerances_or(defaults)
 
 
-def test_an_output_that_never_varied_has_the_size_of_its_mean(definition, few):
+def test_the_default_tolerance_of_a_constant_output_is_relative_to_its_mean(definition, few):
     still = replace(few, reward=torch.ones_like(few.reward))
     assert defaults_of(definition, still)[2] == pytest.approx(0.05)
 
 
-def test_a_tolerance_set_later_takes_the_place_of_the_frozen_one_until_it_is_taken_back(definition, few):
+def test_a_tolerance_set_later_overrides_the_frozen_one_until_it_is_removed(definition, few):
     frozen = DesignState(1, DefaultTolerances((0.5, 0.5, 0.5)))
     made = advance(definition.with_tolerances({"speed": 1e-12}), few, frozen, request())
     assert made.tolerances == (0.5, 1e-12, 0.5)
@@ -252,7 +252,7 @@ def test_a_tolerance_set_later_takes_the_place_of_the_frozen_one_until_it_is_tak
     assert back.confidences[1].confidence_index > 0.999
 
 
-def test_a_tolerance_is_declared_for_what_the_preset_learns():
+def test_tolerances_in_the_specification_must_name_outputs_of_the_preset():
     """Preset ``paper`` moves the observation: it has no error in an angle to compare with a tolerance."""
     design = Design(preset="paper", initial=10)
     spec = EnvironmentSpec.model_validate(pendulum().model_dump() | {"tolerances": {"cos": 0.02}, "design": design})
@@ -263,7 +263,7 @@ def test_a_tolerance_is_declared_for_what_the_preset_learns():
 
 
 @pytest.mark.parametrize("outputs", ["all of it", "its reward"])
-def test_what_never_changes_is_known(outputs):
+def test_a_design_whose_outputs_never_vary_becomes_ready(outputs):
     """An output that never varied has no deviation to choose queries by; the design is ready all the same."""
     spec = designed(initial=4, monte_carlo=64)
     definition = definition_from_spec(spec)
@@ -306,14 +306,14 @@ UNTESTED = replace(SURE, leave_one_out_error=None)
         ("paper", (SURE, UNSURE, SURE), 21, "over_budget"),
     ],
 )
-def test_verdicts(preset, confidences, samples, verdict):
+def test_the_design_verdict_follows_from_confidences_samples_and_budget(preset, confidences, samples, verdict):
     definition = definition_from_spec(designed(preset=preset, initial=10))
     assert math.ceil(1.5 * 10) == 15
     assert judge(definition, confidences, (1.0,) * 3, samples, request(20)) == verdict
 
 
 @pytest.mark.parametrize("acquisition", ["uncertainty_index", "integrated_variance"])
-def test_queries_go_where_policies_went(acquisition):
+def test_the_design_prefers_queries_near_states_visited_by_policies(acquisition):
     """Or where those would have gone that are their mirror images, which tells as much."""
     spec = designed(seed=0, initial=5, acquisition=acquisition)
     definition = definition_from_spec(spec)
@@ -330,7 +330,7 @@ def test_queries_go_where_policies_went(acquisition):
     assert int((anywhere < 1).sum()) == 0
 
 
-def test_an_ended_design_adds_no_queries_after_an_audit(definition, few):
+def test_an_ended_design_chooses_no_queries_after_an_audit(definition, few):
     first = advance(definition, few, DesignState(), request(budget=len(few)))
     assert first.verdict == "over_budget"
     state = DesignState.from_json(first.state.to_json())
@@ -372,23 +372,23 @@ def after_audit(before: Decision, errors: float, budget: int = 100) -> Decision:
     return after
 
 
-def test_a_design_that_was_ready_stays_ready_after_steps_that_agree():
+def test_a_ready_design_stays_ready_after_audit_steps_within_tolerance():
     after = after_audit(ready(), errors=0.9)
     assert (after.verdict, len(after.queries), after.state.ended_as) == ("ready", 0, "ready")
 
 
-def test_a_design_that_was_ready_is_unsure_after_steps_that_differ():
+def test_a_ready_design_becomes_unsure_after_audit_steps_beyond_tolerance():
     after = after_audit(ready(), errors=2.0)
     assert (after.verdict, len(after.queries)) == ("unsure", 0), "92 steps of its budget are left"
 
 
-def test_a_design_that_was_ready_is_judged_anew_once_more_is_asked():
+def test_a_ready_design_continues_if_its_budget_is_raised():
     after = after_audit(ready(), errors=0.9, budget=101)
     assert after.verdict == "continue"
     assert after.queries
 
 
-def test_refused_queries_leave_the_budget_and_are_not_asked_again(definition, few, unseen):
+def test_queries_refused_by_the_environment_cost_no_budget_and_are_not_repeated(definition, few, unseen):
     refused = Points(unseen.q[:3], unseen.u[:3])
     budget = len(few) + 2
     made = advance(definition, few, NEVER, request(budget, refused=refused.queries))
@@ -396,7 +396,7 @@ def test_refused_queries_leave_the_budget_and_are_not_asked_again(definition, fe
     assert not near(definition, Points.of(definition, made.queries), refused).any()
 
 
-def test_a_design_ends_unsure_where_the_environment_refuses_everything(definition, few):
+def test_the_design_ends_unsure_if_the_environment_refuses_too_many_queries(definition, few):
     def verdict(refusals: int) -> str:
         refused = random_steps(pendulum(), refusals, seed=3)
         return advance(definition, few, NEVER, request(10, refused=Points(refused.q, refused.u).queries)).verdict
@@ -404,7 +404,7 @@ def test_a_design_ends_unsure_where_the_environment_refuses_everything(definitio
     assert (verdict(10 + len(few)), verdict(9 + len(few))) == ("unsure", "continue")
 
 
-def test_a_design_with_open_queries_has_not_ended(definition, few, unseen):
+def test_a_design_with_open_queries_continues(definition, few, unseen):
     """A log may come while the rest of the budget is being answered."""
     made = advance(definition, few, NEVER, request(len(few) + 2, first(unseen, 2), open=2))
     assert (made.verdict, len(made.queries)) == ("continue", 0)

@@ -27,7 +27,7 @@ def part(samples: Samples, chosen: torch.Tensor) -> Samples:
     return Samples(*(getattr(samples, name)[chosen] for name in samples.__dataclass_fields__))
 
 
-def test_before_any_seen_ending_the_farthest_points_are_queried(steps):
+def test_without_terminated_samples_queries_far_from_the_samples_are_reserved(steps):
     near = part(steps, steps.q_next.abs().amax(1) < 1)
     assert not bool(near.terminated.any())
     model = learn(definition_from_spec(LEARNED), near).model
@@ -37,7 +37,7 @@ def test_before_any_seen_ending_the_farthest_points_are_queried(steps):
     assert ending(model, near, Points(0 * steps.q, steps.u)) is None
 
 
-def test_an_uncertain_boundary_is_queried(steps):
+def test_queries_at_an_uncertain_termination_boundary_are_reserved(steps):
     some = part(steps, torch.arange(len(steps)) % 2 == 0)
     assert bool(some.terminated.any())
     model = learn(definition_from_spec(LEARNED), some).model
@@ -47,12 +47,12 @@ def test_an_uncertain_boundary_is_queried(steps):
     assert float(doubt[reserved].min()) >= 0.5 * float(doubt.max()) > 0
 
 
-def test_a_declared_end_is_never_in_doubt(steps):
+def test_a_declared_termination_boundary_is_never_uncertain(steps):
     model = learn(definition_from_spec(cartpole()), steps).model
     assert float(in_doubt(model, steps.q_next).max()) == 0
 
 
-def test_an_uncertain_edge_of_the_reward_is_queried():
+def test_queries_at_an_uncertain_reward_jump_are_reserved():
     seen = drifting(lambda q, _: (q[:, 0] > 0.5).double(), 12)
     model = learn(definition_from_spec(plane()), seen).model
     (jump,) = model.jumps
@@ -67,7 +67,7 @@ def test_an_uncertain_edge_of_the_reward_is_queried():
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_design_finds_where_episodes_end(seed):
+def test_the_design_learns_an_undeclared_termination_of_cart_pole_in_30_steps(seed):
     """At most 30 real steps, the ends of CartPole not declared: better than calling no step an end."""
     spec = LEARNED.model_copy(update={"design": cartpole().design.model_copy(update={"seed": seed, "budget": 30})})
     definition, state = definition_from_spec(spec), DesignState()

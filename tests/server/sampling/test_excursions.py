@@ -51,7 +51,7 @@ def away(model: GaussianProcessModel, start: torch.Tensor, actions: torch.Tensor
     return distances(model.definition, *still).amin(1)
 
 
-def test_an_excursion_ends_at_the_first_state_far_from_all_samples(model: GaussianProcessModel):
+def test_an_excursion_rollout_stops_at_the_first_state_far_from_all_samples(model: GaussianProcessModel):
     known = torch.zeros(1, 2, dtype=torch.float64)
     found = excursion(model, known, {"top": (0.0, 0.0)}, 16, rng())
     gone = away(model, known[0], torch.tensor(found.actions, dtype=torch.float64), known)
@@ -61,14 +61,14 @@ def test_an_excursion_ends_at_the_first_state_far_from_all_samples(model: Gaussi
     assert all(away(model, known[0], actions, known).amax() < FAR for actions in shorter)
 
 
-def test_an_excursion_that_cannot_get_far_goes_as_far_as_it_can(model: GaussianProcessModel):
+def test_an_excursion_rollout_that_stays_near_the_samples_goes_as_far_as_possible(model: GaussianProcessModel):
     known = torch.zeros(1, 2, dtype=torch.float64)
     found = excursion(model, known, {"still": (0.0, 0.0), "moving": (0.0, 0.4)}, 2, rng())
     assert found.snapshot == "moving", "it moves away already"
     assert np.abs(found.actions) == pytest.approx(np.full((2, 1), 2.0)), "all the torque that there is"
 
 
-def test_without_a_snapshot_an_excursion_begins_at_a_reset(model: GaussianProcessModel, samples: Samples):
+def test_an_excursion_rollout_without_snapshots_starts_at_a_reset(model: GaussianProcessModel, samples: Samples):
     assert excursion(model, samples.q, {}, 4, rng()).snapshot is None
 
 
@@ -77,7 +77,7 @@ def request(samples: Samples, budget: int = 60) -> Request:
     return Request(budget=budget, target=0.9, snapshots=snapshots)
 
 
-def test_a_sure_design_with_snapshots_is_ready_once_an_excursion_was_answered(samples: Samples):
+def test_a_confident_design_with_snapshots_is_ready_only_after_an_excursion_rollout(samples: Samples):
     first = advance(DEFINITION, samples, DesignState(), request(samples))
     assert first.verdict == "continue"
     (rollout,) = first.queries
@@ -89,7 +89,7 @@ def test_a_sure_design_with_snapshots_is_ready_once_an_excursion_was_answered(sa
     assert advance(DEFINITION, answered, state, request(answered)).verdict == "ready"
 
 
-def test_a_sure_design_without_room_for_an_excursion_is_not_ready(samples: Samples):
+def test_a_confident_design_without_budget_for_an_excursion_rollout_is_not_ready(samples: Samples):
     decision = advance(DEFINITION, samples, DesignState(), request(samples, len(samples)))
     assert decision.verdict == "over_budget"
     assert not decision.queries
@@ -97,7 +97,7 @@ def test_a_sure_design_without_room_for_an_excursion_is_not_ready(samples: Sampl
     assert len(raised.queries) == 1, "once there is room, the excursion is due"
 
 
-def test_with_resets_alone_and_in_preset_paper_no_excursion_is_needed(samples: Samples):
+def test_without_snapshots_or_in_preset_paper_no_excursion_rollout_is_needed(samples: Samples):
     plain = replace(DEFINITION, snapshots=False)
     assert advance(plain, samples, DesignState(), request(samples)).verdict == "ready"
     paper = replace(DEFINITION, design=replace(DEFINITION.design, stopping="confidence"))

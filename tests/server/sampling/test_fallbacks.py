@@ -32,13 +32,13 @@ def candidates(points) -> Points:
     return Points(*points)
 
 
-def test_leave_one_out_errors_are_unknown(plain, candidates):
+def test_a_model_without_leave_one_out_reports_no_such_errors(plain, candidates):
     assert offers(plain, LeaveOneOut) is None
     judged = confidences_of(plain, candidates, stds(plain, candidates.q, candidates.u), TOLERANCES)
     assert {(j.leave_one_out_error, j.leave_one_out_within_one) for j in judged} == {(None, None)}
 
 
-def test_an_answer_is_worth_what_lies_near_it(plain, candidates):
+def test_for_a_model_without_outlook_a_query_lowers_uncertainty_nearby(plain, candidates):
     reference = candidates[30:]
     outlook = outlook_of(plain, candidates, reference, candidates[:0])[2]
     torch.testing.assert_close(outlook.std, 0.1 * candidates.q[:, 1].abs())
@@ -53,14 +53,14 @@ def test_an_answer_is_worth_what_lies_near_it(plain, candidates):
     assert float(after.reduction(here).max()) == 0
 
 
-def test_queries_assumed_and_observed_do_the_same(plain, candidates):
+def test_for_a_model_without_outlook_assumed_and_observed_queries_are_equivalent(plain, candidates):
     observed = [o.observe(4).observe(9) for o in outlook_of(plain, candidates, candidates, candidates[:0])]
     assumed = outlook_of(plain, candidates, candidates, candidates[[4, 9]])
     for one, other in zip(observed, assumed, strict=True):
         torch.testing.assert_close(one.std, other.std)
 
 
-def test_a_batch_spreads(plain, candidates):
+def test_for_a_model_without_outlook_a_batch_of_queries_is_spread_out(plain, candidates):
     made = Candidates(candidates, torch.zeros(60), candidates, torch.full((60,), 1 / 60, dtype=torch.float64))
     nothing = candidates[:0]
     picks = choose(plain, made, nothing, nothing, [0, 0, 0, 0], TOLERANCES)
@@ -69,7 +69,7 @@ def test_a_batch_spreads(plain, candidates):
     assert float(apart[~torch.eye(4, dtype=torch.bool)].min()) > 1
 
 
-def test_steps_of_a_path_count_one_by_one(plain, candidates):
+def test_for_a_model_without_joint_covariance_path_information_adds_per_step(plain, candidates):
     steps = PredictedSteps(*(t.reshape(2, 30, -1) for t in (candidates.q, candidates.u, candidates.q)))
     along = path_outlook(plain, steps, 0)
     weight = torch.ones(2, 30, dtype=torch.float64)
@@ -78,11 +78,11 @@ def test_steps_of_a_path_count_one_by_one(plain, candidates):
     assert as_if_answered(plain, steps) is plain
 
 
-def test_rollouts_are_planned_all_the_same(plain):
+def test_rollouts_are_planned_for_a_model_without_optional_abilities(plain):
     aim = Aim([0, 1], TOLERANCES, longest=5)
     rollouts = plan_round(plain, aim, 8, [Query.rollout([[0.0]] * 3)], np.random.default_rng(0))
     assert sum(query.steps for query in rollouts) == 8
 
 
-def test_no_edge_is_in_doubt(plain, candidates):
+def test_a_model_without_reward_jumps_has_no_uncertain_boundary(plain, candidates):
     assert float(edge_in_doubt(plain, candidates.q, candidates.q).max()) == 0

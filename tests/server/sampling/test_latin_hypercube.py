@@ -62,7 +62,7 @@ def assert_stratified(p: np.ndarray) -> None:
     seed=st.integers(0, 2**32 - 1),
     tries=st.sampled_from([1, 4]),
 )
-def test_stratification(distributions, action, count, seed, tries):
+def test_a_latin_hypercube_has_one_point_per_stratum_of_each_dimension(distributions, action, count, seed, tries):
     definition = replace(PENDULUM, coordinates=tuple(map(coordinate, distributions)), action=action)
     q, u = latin_hypercube(definition, count, np.random.default_rng(seed), tries)
     assert q.shape == (count, len(distributions))
@@ -77,7 +77,7 @@ def test_stratification(distributions, action, count, seed, tries):
         assert counts.max() - counts.min() <= (count % n > 0)
 
 
-def test_points_within_a_stratum_are_random_and_dimensions_are_shuffled():
+def test_latin_hypercube_points_are_random_within_strata_and_uncorrelated():
     q, u = latin_hypercube(PENDULUM, 200, np.random.default_rng(0))
     joint = torch.cat([q, u], 1)
     assert torch.corrcoef(joint.T).fill_diagonal_(0).abs().max() < 0.2
@@ -86,7 +86,7 @@ def test_points_within_a_stratum_are_random_and_dimensions_are_shuffled():
     assert within.std() > 0.2
 
 
-def test_of_several_designs_the_one_of_the_farthest_closest_pair_is_taken():
+def test_of_several_latin_hypercubes_the_one_with_the_largest_minimum_distance_is_taken():
     def closest(tries: int) -> float:
         q, u = latin_hypercube(PENDULUM, 10, np.random.default_rng(1), tries)
         unit = np.concatenate([q.numpy() / [2 * np.pi, 16], u.numpy() / 4], 1)
@@ -106,7 +106,7 @@ def test_random_points_follow_the_sampling_distributions():
     assert 1.9 < float(u.max()) <= 2
 
 
-def test_no_point_is_where_an_episode_is_over_and_the_others_stay():
+def test_points_in_terminal_states_are_redrawn_and_the_others_kept():
     definition = definition_from_spec(acrobot())
     rng = np.random.default_rng(0)
     q, u = random_points(definition, 400, rng)
@@ -118,7 +118,7 @@ def test_no_point_is_where_an_episode_is_over_and_the_others_stay():
     assert torch.equal(kept_u[~over], u[~over])
 
 
-def test_a_range_that_is_all_termination_stays():
+def test_points_are_kept_if_the_whole_sampling_range_is_terminal():
     definition = definition_from_spec(acrobot())
     everywhere = replace(definition.termination_groups[0][0], value=-10.0)
     definition = replace(definition, termination_groups=((everywhere,),))

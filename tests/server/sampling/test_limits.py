@@ -27,7 +27,9 @@ def samples(*speeds: float) -> Samples:
     return Samples(after * 0, torch.zeros(count, 1), after, torch.zeros(count), torch.zeros(count, dtype=torch.bool))
 
 
-def test_limits_have_side_value_and_share_and_the_most_frequent_comes_first(definition: EnvironmentDefinition) -> None:
+def test_coordinate_limits_reached_by_many_samples_are_listed_most_frequent_first(
+    definition: EnvironmentDefinition,
+) -> None:
     found = reached_limits(definition, samples(8, 8, 8, -8, -8, 0, 1, 2))
     assert [(one.coordinate, one.side, one.value, one.share) for one in found] == [
         (definition.coordinates[1].name, "upper", 8.0, 0.375),
@@ -35,12 +37,12 @@ def test_limits_have_side_value_and_share_and_the_most_frequent_comes_first(defi
     ]
 
 
-def test_few_samples_at_a_limit_are_usual(definition: EnvironmentDefinition) -> None:
+def test_a_limit_reached_by_few_samples_is_not_reported(definition: EnvironmentDefinition) -> None:
     assert MANY > 0.1
     assert reached_limits(definition, samples(8, *[0.0] * 9)) == reached_limits(definition, samples()) == ()
 
 
-def test_a_coordinate_without_limits_reaches_none() -> None:
+def test_a_coordinate_without_limits_is_never_reported_at_a_limit() -> None:
     whole = exact_pendulum().definition
     free = tuple(replace(one, low=-float("inf"), high=float("inf")) for one in whole.coordinates)
     assert reached_limits(replace(whole, coordinates=free), samples(1e9, -1e9)) == ()

@@ -56,7 +56,7 @@ def samples(model: ExactModel, again: int, noise: float = 0.0, count: int = 12, 
     return Samples(q, u, q_next, model.pay(q, u), torch.zeros(len(q), dtype=torch.bool))
 
 
-def test_stds_of_repeated_steps_are_pooled(model: ClaimsNoise):
+def test_the_noise_estimate_pools_the_deviations_of_repeated_steps(model: ClaimsNoise):
     taken = samples(model, again=400, noise=0.3)
     found = repeats(model, taken)
     assert found.degrees == 400
@@ -64,7 +64,7 @@ def test_stds_of_repeated_steps_are_pooled(model: ClaimsNoise):
     assert repeats(model, samples(model, again=0)).degrees == 0
 
 
-def test_noise_counts_once_repeats_confirm_it(model: ClaimsNoise):
+def test_noise_is_established_only_after_enough_repeated_steps(model: ClaimsNoise):
     assert established_noise(model, samples(model, again=ENOUGH - 1, noise=0.2), TOLERANCES).tolist() == [0, 0, 0]
     assert established_noise(model, samples(model, again=8, noise=0.2), TOLERANCES).tolist() == [0.2, 0, 0]
 
@@ -78,7 +78,7 @@ def repeated(model: ClaimsNoise, noise: float, seed: int) -> tuple[float, int]:
 
 
 @pytest.mark.parametrize("claimed", [0.2, 0.015])
-def test_negligible_noise_is_seldom_established(model: ClaimsNoise, claimed: float):
+def test_negligible_noise_is_rarely_established(model: ClaimsNoise, claimed: float):
     """The model claims misfit of 20 tolerances as noise, or three times the noise that there is."""
     tests, designs = sum(stage >= ENOUGH for stage in STAGES), 100
     claims = replace(model, noise=(claimed, 0.0, 0.0))
@@ -87,24 +87,24 @@ def test_negligible_noise_is_seldom_established(model: ClaimsNoise, claimed: flo
 
 
 @pytest.mark.parametrize(("noise", "share"), [(0.04, 0.95), (0.02, 0.85)])
-def test_noise_beyond_the_tolerance_is_established(model: ClaimsNoise, noise: float, share: float):
+def test_noise_above_the_tolerance_is_established_with_few_repeats(model: ClaimsNoise, noise: float, share: float):
     claims = replace(model, noise=(noise, 0.0, 0.0))
     found = [repeated(claims, noise, seed) for seed in range(50)]
     assert sum(established > 0 for established, _ in found) >= share * len(found)
     assert np.mean([again for _, again in found]) < STAGES[2], "few repeats suffice"
 
 
-def test_misfit_of_a_deterministic_environment_is_no_noise(model: ClaimsNoise):
+def test_model_misfit_in_a_deterministic_environment_is_not_taken_for_noise(model: ClaimsNoise):
     assert established_noise(model, samples(model, again=8), TOLERANCES).tolist() == [0, 0, 0]
 
 
-def test_noise_that_repeats_do_not_explain_is_bounded(model: ClaimsNoise):
+def test_the_models_noise_estimate_is_capped_by_the_repeated_steps(model: ClaimsNoise):
     louder = replace(model, noise=(50.0, 0.0, 0.0))
     found = float(established_noise(louder, samples(model, again=50, noise=0.2), TOLERANCES)[0])
     assert found == pytest.approx(0.6, rel=0.3)
 
 
-def test_one_repeat_comes_first_and_more_only_where_it_differs(model: ClaimsNoise):
+def test_more_repeats_are_asked_only_if_the_first_repeat_differs(model: ClaimsNoise):
     first = to_repeat(model, samples(model, again=0), TOLERANCES)
     assert first is not None
     assert len(first) == 1
@@ -115,23 +115,23 @@ def test_one_repeat_comes_first_and_more_only_where_it_differs(model: ClaimsNois
     assert to_repeat(model, samples(model, again=ENOUGH, noise=0.2), TOLERANCES) is None
 
 
-def test_noise_below_the_tolerance_is_ignored(model: ClaimsNoise):
+def test_noise_below_the_tolerance_is_not_tested_by_repeats(model: ClaimsNoise):
     quiet = replace(model, noise=(0.005, 0.0, 0.0))
     assert to_repeat(quiet, samples(model, again=0), TOLERANCES) is None
     assert established_noise(quiet, samples(model, again=9, noise=0.005), TOLERANCES).tolist() == [0, 0, 0]
 
 
-def test_a_family_that_learns_no_noise_repeats_nothing(model: ClaimsNoise):
+def test_no_repeats_are_asked_for_a_model_that_learns_no_noise(model: ClaimsNoise):
     plain = exact_pendulum()
     assert to_repeat(plain, samples(model, again=0), TOLERANCES) is None
     assert established_noise(plain, samples(model, again=9, noise=0.2), TOLERANCES).tolist() == [0, 0, 0]
 
 
-def test_tolerances_without_noise_stay_to_the_last_bit():
+def test_tolerances_are_widened_by_noise_and_unchanged_without_it():
     assert widened_by(torch.tensor([0.0, 0.4], dtype=torch.float64), (0.1, 0.3)) == (0.1, 0.5)
 
 
-def test_a_noisy_design_repeats_steps_and_comes_to_be_ready(model: ClaimsNoise):
+def test_a_design_in_a_noisy_environment_repeats_steps_and_becomes_ready(model: ClaimsNoise):
     rng, spread = np.random.default_rng(1), torch.tensor([0.0628, 0.16], dtype=torch.float64)  # 1 % of the ranges
 
     def real(points: Points) -> Samples:

@@ -18,7 +18,7 @@ def visited(angle: float, count: int = 50) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("angle", [0.0, math.pi])
-def test_the_density_integrates_to_one(definition, angle):
+def test_the_density_of_visited_states_integrates_to_one(definition, angle):
     side = (torch.arange(120, dtype=torch.float64) + 0.5) / 60 - 1
     grid = torch.cartesian_prod(math.pi * side, 8 * side)
     ratio = log_occupancy(definition, visited(angle), grid).exp()
@@ -26,7 +26,7 @@ def test_the_density_integrates_to_one(definition, angle):
     assert float(ratio.min()) >= FLOOR - 1e-12
 
 
-def test_against_independent_densities(definition):
+def test_the_density_of_visited_states_equals_von_mises_and_normal_kernels(definition):
     states = torch.tensor([[3.0, -1.0], [-3.0, 1.0], [2.8, 0.5]], dtype=torch.float64)
     at = torch.tensor([[math.pi, 0.0], [1.0, 2.0]], dtype=torch.float64)
     h = 3 ** (-1 / 6)
@@ -40,7 +40,7 @@ def test_against_independent_densities(definition):
     np.testing.assert_allclose(log_occupancy(definition, states, at).exp().numpy(), expected, rtol=1e-9)
 
 
-def test_angles_are_periodic(definition):
+def test_the_density_of_visited_states_is_periodic_in_angles(definition):
     q = torch.tensor([[math.pi - 0.05, 0.0], [0.05 - math.pi, 0.0]], dtype=torch.float64)
     states = torch.tensor([[math.pi - 0.3, 0.5], [0.3 - math.pi, -0.5]], dtype=torch.float64)
     near, across = log_occupancy(definition, states, q).tolist()
@@ -48,12 +48,12 @@ def test_angles_are_periodic(definition):
     assert near > 0, "more likely than under the uniform density"
 
 
-def test_far_from_all_that_was_visited_the_floor_is_left(definition):
+def test_the_density_far_from_all_visited_states_equals_its_floor(definition):
     far = log_occupancy(definition, visited(0.0), torch.tensor([[3.1, -8.0]], dtype=torch.float64))
     assert float(far) == pytest.approx(math.log(0.1), abs=1e-6)
 
 
-def test_one_state_visited_again_and_again_is_still_a_density(definition):
+def test_the_density_stays_finite_if_one_state_is_visited_repeatedly(definition):
     states = torch.tensor([[0.5, 1.0]], dtype=torch.float64).repeat(30, 1)
     at = torch.tensor([[0.5, 1.0], [-2.0, -5.0]], dtype=torch.float64)
     here, far = log_occupancy(definition, states, at).tolist()
@@ -61,7 +61,7 @@ def test_one_state_visited_again_and_again_is_still_a_density(definition):
     assert here > far == pytest.approx(math.log(0.1))
 
 
-def test_blocks_change_nothing(definition, monkeypatch):
+def test_the_density_of_visited_states_does_not_depend_on_the_block_size(definition, monkeypatch):
     q = visited(1.0)
     whole = log_occupancy(definition, visited(0.0), q)
     monkeypatch.setattr("surrogym_server.sampling.occupancy.BLOCK", 7)

@@ -43,13 +43,13 @@ def answered(model: GaussianProcessModel, query: Points) -> GaussianProcessModel
     return replace(model, transitions=tuple(map(extended, model.transitions)), reward=extended(model.reward))
 
 
-def test_it_begins_with_the_stds_of_the_model(model, candidates):
+def test_an_outlook_starts_with_the_predictive_deviations_of_the_model(model, candidates):
     outlook = outlook_of(model, candidates, candidates[NOTHING], candidates[NOTHING])
     said = torch.stack([output.std for output in outlook], -1)
     torch.testing.assert_close(said, stds(model, candidates.q, candidates.u), rtol=1e-6, atol=1e-9)
 
 
-def test_the_reduction_is_what_the_answer_brings(model, candidates, reference):
+def test_the_predicted_variance_reduction_equals_that_after_the_answer(model, candidates, reference):
     weights = torch.arange(1.0, 26.0, dtype=torch.float64) / 325
     outlook = outlook_of(model, candidates, reference, candidates[NOTHING])
     before = stds(model, reference.q, reference.u).square()
@@ -60,7 +60,7 @@ def test_the_reduction_is_what_the_answer_brings(model, candidates, reference):
         torch.testing.assert_close(said, brought, rtol=1e-4, atol=1e-10)
 
 
-def test_queries_assumed_and_candidates_observed_do_the_same(model, candidates, reference):
+def test_assuming_pending_queries_equals_observing_them_in_an_outlook(model, candidates, reference):
     weights = torch.full((25,), 1 / 25, dtype=torch.float64)
     observed = [o.observe(4).observe(9) for o in outlook_of(model, candidates, reference, candidates[NOTHING])]
     assumed = outlook_of(model, candidates, reference, candidates[[4, 9]])
@@ -69,7 +69,7 @@ def test_queries_assumed_and_candidates_observed_do_the_same(model, candidates, 
         torch.testing.assert_close(one.reduction(weights), other.reduction(weights), rtol=1e-5, atol=1e-12)
 
 
-def test_an_answer_at_a_bound_teaches_the_dynamics_nothing(model):
+def test_a_query_predicted_to_end_at_a_bound_does_not_reduce_dynamics_variance(model):
     """It is left out of the processes, so asking for it would not lower their deviations."""
     q = torch.tensor([[1.5, 7.9], [1.5, 0.0]], dtype=torch.float64)
     points = Points(q, torch.full((2, 1), 2.0, dtype=torch.float64))
@@ -81,14 +81,14 @@ def test_an_answer_at_a_bound_teaches_the_dynamics_nothing(model):
     assert theta.learns.tolist() == [model.transitions[0].feature_map.lead, True]
 
 
-def test_an_output_that_never_varied_has_no_outlook():
+def test_a_constant_output_has_no_outlook():
     steps = random_steps(cartpole(), 12, seed=0)
     model = learn(definition_from_spec(cartpole()), steps).model
     points = Points(steps.q, steps.u)
     assert outlook_of(model, points, points, points)[-1] is None
 
 
-def test_a_reward_after_the_step_is_known_where_the_step_leads(candidates):
+def test_the_outlook_of_a_reward_after_the_step_uses_the_predicted_next_state(candidates):
     spec = pendulum().model_copy(update={"reward": Reward(timing="after")})
     model = learn(definition_from_spec(spec), random_steps(spec, 12, seed=0)).model
     outlook = outlook_of(model, candidates, candidates[NOTHING], candidates[NOTHING])

@@ -85,14 +85,14 @@ def longer_dead_time(s: np.ndarray, u: float, before: float, rng: np.random.Gene
 
 
 @pytest.mark.parametrize("follow", [dead_time, longer_dead_time, hidden_speed])
-def test_what_the_step_before_explains_is_no_noise(follow: Next) -> None:
+def test_residuals_explained_by_the_previous_step_are_not_taken_for_noise(follow: Next) -> None:
     position, reward = judged(follow).confidences
     assert position.past >= EXPLAINED
     assert position.noise == position.sensor_noise == reward.noise == 0
 
 
 @pytest.mark.parametrize("follow", [lag, of_process, of_sensor])
-def test_noise_and_plain_steps_owe_nothing_to_the_past(follow: Next) -> None:
+def test_independent_noise_is_not_attributed_to_the_previous_step(follow: Next) -> None:
     position, _ = judged(follow).confidences
     assert position.past == 0
     assert (position.noise > 0) is (follow is of_sensor)
@@ -110,7 +110,7 @@ def single_steps() -> Samples:
 
 
 @pytest.mark.parametrize(("budget", "longer"), [(60, False), (40, True)])
-def test_a_design_of_single_steps_takes_longer_rollouts_in_its_second_half(budget: int, longer: bool) -> None:
+def test_after_half_its_budget_a_single_step_design_asks_longer_rollouts(budget: int, longer: bool) -> None:
     taken = single_steps()
     lacking = pairs_lacking(DEFINITION, taken)
     assert lacking > 0
@@ -120,7 +120,7 @@ def test_a_design_of_single_steps_takes_longer_rollouts_in_its_second_half(budge
     assert (gained >= min(lacking, (budget - len(taken)) // LONGER * (LONGER - 1))) is longer
 
 
-def test_equal_steps_after_different_ones_are_no_repeats() -> None:
+def test_equal_steps_with_different_previous_steps_are_not_repeats() -> None:
     rows = torch.tensor([[0.0, 1.0, 0.5], [0.5, 1.0, 0.7], [0.2, -1.0, 0.5], [0.5, 1.0, 0.3]], dtype=torch.float64)
     nothing = torch.zeros(4, dtype=torch.float64)
     taken = Samples(rows[:, :1], rows[:, 1:2], rows[:, 2:], nothing, nothing.bool())

@@ -33,7 +33,7 @@ def looked_for(samples, tolerance: float = 0.01) -> Points | None:
     return highest(model, samples, POINTS, tolerance, np.random.default_rng(0))
 
 
-def test_a_hidden_peak_is_queried_before_it_was_reached():
+def test_the_predicted_place_of_an_unreached_reward_peak_is_queried():
     samples = drifting(bump, 12)
     assert float(samples.reward.max()) < 0.01
     found = looked_for(samples)
@@ -42,7 +42,7 @@ def test_a_hidden_peak_is_queried_before_it_was_reached():
     assert float((arrives - PLACE).norm()) < 0.02
 
 
-def test_no_query_starts_in_a_terminated_state():
+def test_the_search_for_a_reward_peak_queries_no_terminal_state():
     """A reward that is highest behind the line at which episodes end."""
     right = Inequality(term=Term.linear(x=1), relation=">", value=0.1)
     definition = definition_from_spec(plane().model_copy(update={"termination": ((right,),)}))
@@ -55,7 +55,7 @@ def test_no_query_starts_in_a_terminated_state():
     assert not bool(definition.terminated(found.q).any())
 
 
-def test_nothing_is_queried_once_the_peak_was_reached():
+def test_the_search_for_a_reward_peak_ends_once_it_was_reached():
     samples = drifting(bump, 12)
     q, u = PLACE[None], torch.zeros(1, 1, dtype=torch.float64)
     met = replace(
@@ -69,7 +69,7 @@ def test_nothing_is_queried_once_the_peak_was_reached():
     assert looked_for(met) is None
 
 
-def test_rewards_that_do_not_hide_are_not_looked_for():
+def test_no_peak_is_searched_for_a_smooth_reward():
     assert looked_for(drifting(lambda q, _: -q.square().sum(-1), 12)) is None
 
 
@@ -77,7 +77,7 @@ def constant(value: float) -> Samples:
     return drifting(lambda q, _: torch.full((len(q),), value, dtype=torch.float64), 12)
 
 
-def test_without_any_reward_the_farthest_place_is_queried():
+def test_if_all_rewards_are_zero_the_point_farthest_from_the_samples_is_queried():
     samples = constant(0.0)
     found = looked_for(samples)
     assert found is not None
@@ -85,12 +85,12 @@ def test_without_any_reward_the_farthest_place_is_queried():
     assert float(torch.cdist(found.q, samples.q).min()) == pytest.approx(float(nearest.max()))
 
 
-def test_constant_reward_is_enough():
+def test_no_peak_is_searched_for_a_constant_nonzero_reward():
     assert looked_for(constant(-1.0)) is None
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_design_meets_a_hidden_bump_in_twenty_steps(seed):
+def test_the_design_finds_a_narrow_reward_peak_within_twenty_steps(seed):
     bump = HiddenBump(seed=seed)
     design, met = Design(bump.spec(), budget=20), []
     while (query := design.ask()) is not None:

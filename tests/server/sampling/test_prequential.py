@@ -38,7 +38,7 @@ def test_the_interval_score_is_the_sum_of_two_quantile_losses():
         np.testing.assert_allclose(scored.numpy(), expected, rtol=1e-12)
 
 
-def test_right_stds_have_the_nominal_coverage_and_the_least_expected_score():
+def test_correct_deviations_give_nominal_coverage_and_the_lowest_interval_score():
     """With sigma = 1 the expected score of the central 90 % interval is 4 / alpha phi(z)."""
     errors = np.random.default_rng(1).normal(size=40_000).tolist()
     right, narrow, wide = (scores_of([Prediction(e, d) for e in errors], 1e-9) for d in (1.0, 0.5, 2.0))
@@ -51,7 +51,7 @@ def test_right_stds_have_the_nominal_coverage_and_the_least_expected_score():
     assert narrow.within_90 < right.within_90 < wide.within_90
 
 
-def test_an_error_within_the_tolerance_is_never_a_fault():
+def test_a_prediction_error_within_the_tolerance_counts_as_covered():
     scores = scores_of([Prediction(0.09, 0.0), Prediction(-0.1, 1e-6)], 0.1)
     assert scores is not None
     assert (scores.within_50, scores.within_80, scores.within_90) == (1, 1, 1)
@@ -61,11 +61,11 @@ def test_an_error_within_the_tolerance_is_never_a_fault():
     assert (missed.within_90, missed.interval_score) == (0, pytest.approx(2 + 20))
 
 
-def test_no_predictions_have_no_scores():
+def test_without_predictions_there_are_no_prequential_scores():
     assert scores_of([], 0.1) is None
 
 
-def test_a_model_predicts_new_samples_with_its_own_std(model, unseen):
+def test_predictions_of_new_samples_use_model_deviation_plus_noise(model, unseen):
     free = unseen.at(~saturated(model.definition, unseen.q_next))
     made = predicted(model, free)
     errors = torch.tensor([[p.error for p in output] for output in made], dtype=torch.float64).T
@@ -78,7 +78,7 @@ def test_a_model_predicts_new_samples_with_its_own_std(model, unseen):
     torch.testing.assert_close(found.T, expected)
 
 
-def test_changes_that_a_limit_cuts_and_rewards_of_the_last_step_are_left_out(model, unseen):
+def test_clipped_increments_and_rewards_of_terminated_steps_are_not_scored(model, unseen):
     cut = saturated(model.definition, unseen.q_next)
     assert 0 < int(cut.sum()) < len(unseen)
     ended = Samples(unseen.q, unseen.u, unseen.q_next, unseen.reward, torch.arange(len(unseen)) < 7)
@@ -86,7 +86,7 @@ def test_changes_that_a_limit_cuts_and_rewards_of_the_last_step_are_left_out(mod
     assert counts == [int((~cut).sum())] * 2 + [len(unseen) - 7]
 
 
-def test_the_uncertainty_of_the_next_state_is_part_of_its_rewards_std():
+def test_the_reward_deviation_includes_the_uncertainty_of_the_next_state():
     """Against draws of the next state, for a declared reward that reads it, which is exact otherwise."""
     term = RewardTerm(shape="square", of=(Quantity(term=Term.linear(omega=1)),))
     reward = DeclaredReward(kind="declared", timing="after", terms=(term,))
@@ -99,7 +99,7 @@ def test_the_uncertainty_of_the_next_state_is_part_of_its_rewards_std():
     np.testing.assert_allclose(np.median(found / drawn.numpy()), 1, atol=0.05)
 
 
-def test_only_the_last_predictions_are_kept_and_survive_as_json():
+def test_only_the_latest_predictions_are_kept_and_survive_json():
     old = (tuple(Prediction(float(i), 1.0) for i in range(LATEST)), ())
     new = ((Prediction(-1.0, 2.0),), (Prediction(0.5, 0.25),))
     kept = latest(old, new)

@@ -34,7 +34,7 @@ def region(doubtful: torch.Tensor):
     ],
     ids=["above", "below", "between", "on both sides", "of an action"],
 )
-def test_the_range_with_the_doubt_is_found(doubtful, name, low, high, outside):
+def test_the_input_range_of_uncertain_predictions_is_found(doubtful, name, low, high, outside):
     found = region(doubtful)
     assert (found.input, found.outside) == (name, outside)
     assert found.share == pytest.approx(1.0)
@@ -42,18 +42,18 @@ def test_the_range_with_the_doubt_is_found(doubtful, name, low, high, outside):
         assert end == (None if expected is None else pytest.approx(expected, abs=0.05))
 
 
-def test_some_doubt_elsewhere_leaves_the_range_as_it_is():
+def test_slight_uncertainty_elsewhere_does_not_change_the_uncertain_range():
     found = region((SPEED > 5).double() + 0.02)
     assert found.low == pytest.approx(5, abs=0.05)
     assert 0.85 < found.share < 0.95
 
 
 @pytest.mark.parametrize("doubt", [torch.zeros(2_000), torch.ones(2_000), torch.rand(2_000, generator=GENERATOR)])
-def test_no_region_without_doubt_or_with_doubt_everywhere(doubt):
+def test_no_uncertain_range_is_reported_if_nothing_or_everything_is_uncertain(doubt):
     assert region(doubt) is None
 
 
-def test_equal_values_of_an_input_stay_together():
+def test_equal_input_values_are_not_split_by_an_uncertain_range():
     steps = Points(POINTS.q, POINTS.u.round())
     (found,) = regions_of(DEFINITION, steps, (steps.u > 0.5).double())
     assert (found.input, found.low) == ("action", 0.5)

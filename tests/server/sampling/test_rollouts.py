@@ -77,26 +77,26 @@ def aim(model: GaussianProcessModel) -> Aim:
     return Aim(ALL, [0.05 * output.scale for output in outputs], longest=12)
 
 
-def test_first_rollouts_are_short_first_and_take_the_steps_they_may(swinging: EnvironmentDefinition):
+def test_initial_rollouts_grow_in_length_and_use_the_given_number_of_steps(swinging: EnvironmentDefinition):
     rollouts = first_rollouts(swinging, 12, rng())
     assert [query.steps for query in rollouts] == [1, 2, 3, 4, 2]
     assert all(len(action) == 1 and abs(action[0]) <= 2 for query in rollouts for action in query.actions)
     assert [query.steps for query in first_rollouts(replace(swinging, max_rollout=2), 7, rng())] == [1, 2, 2, 2]
 
 
-def test_sequences_are_held_for_times_of_their_own(swinging: EnvironmentDefinition):
+def test_random_action_sequences_hold_each_action_for_different_durations(swinging: EnvironmentDefinition):
     sequences = random_sequences(swinging, 64, 16, rng())
     changes = (np.diff(sequences[..., 0], axis=1) != 0).sum(1)
     assert {0, 1, 3, 7} <= set(changes.tolist()), "all of it, a half, a quarter, an eighth"
     assert np.abs(sequences).max() == 2, "limits reach farthest"
 
 
-def test_discrete_actions_stay_numbers_of_actions():
+def test_random_action_sequences_of_discrete_actions_are_valid_action_numbers():
     sequences = random_sequences(definition_from_spec(only_resets(cartpole())), 32, 8, rng())
     assert set(np.unique(sequences)) == {0.0, 1.0}
 
 
-def test_starts_are_the_declared_ones_and_stratified(swinging: EnvironmentDefinition):
+def test_predicted_rollouts_start_stratified_in_the_declared_start_range(swinging: EnvironmentDefinition):
     starts = start_points(swinging, 8, rng())
     assert sorted(((starts[:, 0] + torch.pi) / (2 * torch.pi) * 8).int().tolist()) == list(range(8))
     assert bool((starts[:, 1].abs() <= 1).all())
@@ -110,7 +110,7 @@ def test_a_predicted_path_continues_from_its_last_state(model: GaussianProcessMo
     assert bool((paths.drift.diff(dim=1) >= 0).all())
 
 
-def test_information_is_that_of_points_each_after_those_before_it(model: GaussianProcessModel, aim: Aim):
+def test_path_information_equals_the_chain_rule_over_its_points(model: GaussianProcessModel, aim: Aim):
     """Against the chain rule: 1/2 log(1 + var / tau^2) of each point, given those before with noise tau^2."""
     paths = predict_paths(model, start_points(model.definition, 1, rng()), torch.zeros(1, 6, 1, dtype=torch.float64))
     paths = replace(paths, drift=torch.zeros_like(paths.drift))
@@ -129,7 +129,7 @@ def test_information_is_that_of_points_each_after_those_before_it(model: Gaussia
     torch.testing.assert_close(got[0], torch.tensor(expected, dtype=torch.float64), rtol=1e-6, atol=1e-9)
 
 
-def test_a_point_seen_twice_on_a_path_gives_almost_nothing_the_second_time(model: GaussianProcessModel, aim: Aim):
+def test_a_point_repeated_on_a_path_adds_almost_no_information(model: GaussianProcessModel, aim: Aim):
     paths = predict_paths(model, start_points(model.definition, 1, rng()), torch.ones(1, 4, 1, dtype=torch.float64))
     stuck = {name: getattr(paths, name)[:, :1].expand(-1, 4, -1) for name in ("q", "u", "q_next")}
     gain = path_values(model, aim, replace(paths, **stuck, drift=torch.zeros_like(paths.drift)))[0]
@@ -137,7 +137,9 @@ def test_a_point_seen_twice_on_a_path_gives_almost_nothing_the_second_time(model
     assert max(later) < 0.35 * first
 
 
-def test_what_lies_outside_the_sampling_range_or_after_an_end_counts_nothing(model: GaussianProcessModel, aim: Aim):
+def test_path_steps_outside_the_sampling_range_or_after_termination_add_no_information(
+    model: GaussianProcessModel, aim: Aim
+):
     paths = predict_paths(model, start_points(model.definition, 1, rng()), torch.ones(1, 4, 1, dtype=torch.float64))
     away = torch.tensor([0.0, 30.0], dtype=torch.float64)
     outside = replace(paths, q=torch.cat([paths.q[:, :2], (paths.q + away)[:, 2:]], 1))
@@ -148,20 +150,20 @@ def test_what_lies_outside_the_sampling_range_or_after_an_end_counts_nothing(mod
         torch.testing.assert_close(gain[2:], gain[1].expand(2))
 
 
-def test_a_step_counts_less_the_worse_it_can_be_predicted(model: GaussianProcessModel, aim: Aim):
+def test_path_steps_with_uncertain_states_count_less(model: GaussianProcessModel, aim: Aim):
     paths = predict_paths(model, start_points(model.definition, 3, rng()), torch.ones(3, 4, 1, dtype=torch.float64))
     known, lost = (replace(paths, drift=torch.full_like(paths.drift, d)) for d in (0.0, 20.0))
     assert bool((path_values(model, aim, lost) < 0.01 * path_values(model, aim, known)).all())
 
 
-def test_occupancy_draws_the_plan_to_where_policies_go(model: GaussianProcessModel, aim: Aim):
+def test_planned_rollouts_prefer_states_visited_by_policies(model: GaussianProcessModel, aim: Aim):
     paths = predict_paths(model, start_points(model.definition, 8, rng()), torch.ones(8, 2, 1, dtype=torch.float64))
     near = 0.1 * torch.randn(200, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + paths.q[5, 0]
     plain, drawn = (path_values(model, replace(aim, states=states), paths)[:, 0] for states in (None, near))
     assert int((drawn / plain).argmax()) == 5
 
 
-def test_a_planned_rollout_gives_more_per_step_than_random_ones():
+def test_a_planned_rollout_gives_more_information_than_random_ones():
     """Of Acrobot, from a dozen steps: much is left to learn, and a random swing stays low."""
     spec = only_resets(acrobot())
     definition = definition_from_spec(spec)
@@ -181,11 +183,11 @@ def test_a_planned_rollout_gives_more_per_step_than_random_ones():
     assert worth(actions) > 1.1 * float(np.median(others))
 
 
-def test_the_same_plan_again_for_the_same_seed(model: GaussianProcessModel, aim: Aim):
+def test_planning_a_rollout_is_reproducible_from_its_seed(model: GaussianProcessModel, aim: Aim):
     assert plan_rollout(model, aim, rng(3)) == plan_rollout(model, aim, rng(3))
 
 
-def test_a_rollout_that_is_pending_leaves_less_to_learn(model: GaussianProcessModel, aim: Aim):
+def test_a_pending_rollout_reduces_the_information_of_similar_paths(model: GaussianProcessModel, aim: Aim):
     actions = torch.full((6, 1), 2.0, dtype=torch.float64)
     done = as_if_done(model, Query.rollout(actions.tolist()), {}, rng())
     paths = predict_paths(model, start_points(model.definition, 1, rng()), actions[None])
@@ -197,13 +199,13 @@ def test_a_rollout_that_is_pending_leaves_less_to_learn(model: GaussianProcessMo
     torch.testing.assert_close(done.transition(q, u).q_next, model.transition(q, u).q_next, rtol=0, atol=1e-6)
 
 
-def test_a_round_takes_its_steps_and_no_more(model: GaussianProcessModel, aim: Aim):
+def test_a_round_of_planned_rollouts_uses_exactly_its_number_of_steps(model: GaussianProcessModel, aim: Aim):
     rollouts = plan_round(model, replace(aim, longest=3), 7, [Query.rollout([[1.0]] * 2)], rng())
     assert sum(query.steps for query in rollouts) == 7
     assert max(query.steps for query in rollouts) <= 3
 
 
-def test_an_end_of_the_episode_is_looked_for_until_one_was_seen():
+def test_planned_rollouts_aim_at_termination_until_one_was_sampled():
     """Mirrored samples would tell all of the pole, and what is planned without need pushes it over as well."""
     spec = only_resets(cartpole(), design={"symmetry": "none"})
     definition = definition_from_spec(spec)
@@ -224,7 +226,7 @@ def test_an_end_of_the_episode_is_looked_for_until_one_was_seen():
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_a_rewards_edge_in_doubt_is_driven_to(side: int):
+def test_planned_rollouts_aim_at_an_uncertain_reward_jump(side: int):
     """It pays beyond x = 0.5, or beyond -0.5, which starts around 0 reach by pushing that way for a while."""
     samples = drifting(lambda q, _: (side * q[:, 0] > 0.5).double(), 12)
     spec = only_resets(plane(), start={name: Uniform(low=-0.1, high=0.1) for name in "xy"})
@@ -236,7 +238,7 @@ def test_a_rewards_edge_in_doubt_is_driven_to(side: int):
     assert side * float(driven.mean()) > 0.5
 
 
-def test_a_design_without_teleport_spends_its_budget_in_real_steps(swinging: EnvironmentDefinition, begun: Samples):
+def test_a_rollout_design_counts_its_budget_in_real_steps(swinging: EnvironmentDefinition, begun: Samples):
     complete = replace(swinging, design=replace(swinging.design, initial=len(begun)))
 
     def ask(**options: object) -> list[int]:
@@ -253,7 +255,7 @@ def test_a_design_without_teleport_spends_its_budget_in_real_steps(swinging: Env
     assert ask(budget=len(begun)) == []
 
 
-def test_steps_of_the_initial_design_that_early_ends_left_over_are_taken_in_one_round(
+def test_initial_steps_lost_to_early_termination_are_asked_in_one_round(
     swinging: EnvironmentDefinition, begun: Samples
 ):
     """Each round had a quarter of the samples, so that many small rounds followed, each with a fit."""
@@ -270,18 +272,18 @@ def test_steps_of_the_initial_design_that_early_ends_left_over_are_taken_in_one_
     assert sum(ask(pending=pending)) == 4, "two are missing, which is less than a usual round"
 
 
-def test_the_latin_hypercube_arm_is_random_rollouts_alone():
+def test_a_latin_hypercube_rollout_design_asks_its_whole_budget_as_random_rollouts():
     spec = only_resets(pendulum(), design={"acquisition": "latin_hypercube"})
     assert sum(query.steps for query in initial_queries(definition_from_spec(spec), 30)) == 30
     assert sum(query.steps for query in initial_queries(definition_from_spec(SPEC), 30)) == 12
 
 
-def test_the_budget_is_counted_from_the_dimensions():
+def test_the_default_budget_depends_on_the_number_of_dimensions():
     assert default_budget(SPEC) == 60
     assert default_budget(only_resets(cartpole())) == 100
 
 
-def test_a_rollout_is_no_longer_than_an_episode():
+def test_the_longest_rollout_is_limited_to_the_episode_length():
     assert definition_from_spec(only_resets(pendulum(), max_rollout=300)).max_rollout == 200
     assert definition_from_spec(only_resets(pendulum(), time_limit=None)).max_rollout == 200
     assert definition_from_spec(pendulum()).max_rollout is None
@@ -295,12 +297,12 @@ def counted(spec: EnvironmentSpec, steps: int) -> EnvironmentSpec:
     return EnvironmentSpec.model_validate(fields | {"coordinates": [*fields["coordinates"], count], "start": start})
 
 
-def test_first_rollouts_reach_beyond_steps_with_unknown_lags():
+def test_initial_rollouts_are_longer_than_the_steps_with_unknown_lags():
     definition = definition_from_spec(counted(SPEC, 2))
     assert [query.steps for query in first_rollouts(definition, 14, rng())] == [3, 4, 5]
 
 
-def test_a_plan_reaches_beyond_steps_with_unknown_lags():
+def test_planned_rollouts_are_longer_than_the_steps_with_unknown_lags():
     definition = definition_from_spec(counted(SPEC, 2))
     walked = roll(SPEC, random_sequences_of(8), 0)
     known = torch.full((8, 1), 2.0, dtype=torch.float64)
@@ -318,7 +320,7 @@ def random_sequences_of(length: int) -> torch.Tensor:
     return torch.from_numpy(random_sequences(definition_from_spec(SPEC), 1, length, rng())[0])
 
 
-def test_steps_with_unknown_lags_count_and_are_not_learned_from():
+def test_steps_with_unknown_lags_cost_budget_but_are_not_learned_from():
     definition = definition_from_spec(counted(SPEC, 2))
     walked = roll(SPEC, random_sequences_of(8), 0)
     count = torch.arange(9.0, dtype=torch.float64).clamp_max(2.0)[:, None]
@@ -330,7 +332,7 @@ def test_steps_with_unknown_lags_count_and_are_not_learned_from():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_tolerance_below_the_noise_floor_still_values_plans(model: GaussianProcessModel, aim: Aim, seed: int):
+def test_path_information_stays_finite_for_a_tiny_tolerance(model: GaussianProcessModel, aim: Aim, seed: int):
     """The covariance of a path is rounding there, and its factorization failed: a design ended with ChoiceFailed."""
     actions = torch.from_numpy(random_sequences(model.definition, 48, 12, rng(seed)))
     paths = predict_paths(model, start_points(model.definition, len(actions), rng(seed)), actions)
@@ -339,7 +341,7 @@ def test_a_tolerance_below_the_noise_floor_still_values_plans(model: GaussianPro
     assert (values.diff(dim=1) >= -1e-9).all()
 
 
-def test_a_plan_begins_at_the_snapshot_from_where_it_learns_more(model: GaussianProcessModel, aim: Aim):
+def test_a_planned_rollout_starts_at_the_most_informative_snapshot(model: GaussianProcessModel, aim: Aim):
     """Far from what is known, beside the states that a reset leads to."""
     snapshots = {"one": (0.0, 0.0), "two": (0.0, 0.0), "three": (0.0, 0.0), "fast": (2.0, 7.0)}
     plan = plan_rollout(model, replace(aim, snapshots=snapshots), rng())
@@ -348,20 +350,20 @@ def test_a_plan_begins_at_the_snapshot_from_where_it_learns_more(model: Gaussian
     assert reset.snapshot is None
 
 
-def test_no_snapshot_so_far_means_a_plan_from_a_reset(model: GaussianProcessModel, aim: Aim):
+def test_without_snapshots_a_planned_rollout_starts_at_a_reset(model: GaussianProcessModel, aim: Aim):
     plan = plan_rollout(model, replace(aim, snapshots={}), rng())
     assert plan.snapshot is None
     assert plan == plan_rollout(model, aim, rng())
 
 
-def test_a_pending_query_from_a_snapshot_is_done_there(model: GaussianProcessModel):
+def test_a_pending_rollout_from_a_snapshot_reduces_uncertainty_at_that_state(model: GaussianProcessModel):
     place, actions = torch.tensor([[2.0, 6.0]], dtype=torch.float64), torch.full((1, 1), 2.0, dtype=torch.float64)
     done = as_if_done(model, Query.rollout([[2.0]], "fast"), {"fast": (2.0, 6.0)}, rng())
     before, after = (stds(m, place, actions)[0, 1] for m in (model, done))
     assert after < 0.2 * before
 
 
-def test_a_design_with_snapshots_takes_shorter_rounds_of_known_states():
+def test_a_design_with_snapshots_starts_with_few_steps_and_then_uses_snapshots():
     spec = only_resets(pendulum(), snapshots=True)
     definition = definition_from_spec(spec)
     first = initial_queries(definition, 60)

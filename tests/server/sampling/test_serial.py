@@ -57,7 +57,7 @@ def steps(process: float, sensor: float, seed: int) -> Samples:
     return Samples(q[:, None], u[:, None], q_next[:, None], reward, torch.zeros(COUNT, dtype=torch.bool))
 
 
-def test_the_pattern_is_the_covariance_of_a_sensors_residuals() -> None:
+def test_the_sensor_noise_pattern_equals_the_covariance_of_its_residuals() -> None:
     rng = np.random.default_rng(0)
     many = np.stack([residuals(0.0, 1.0, rng) for _ in range(20_000)])
     pattern = sensor_pattern(torch.full((COUNT,), SLOPE, dtype=torch.float64), follows())
@@ -71,13 +71,13 @@ def told(process: float, sensor: float, seed: int) -> bool:
     return ratio > CRITICAL and share >= MAINLY
 
 
-def test_process_noise_is_seldom_called_the_sensors_and_the_sensors_nearly_always() -> None:
+def test_sensor_noise_is_detected_and_process_noise_rarely_mistaken_for_it() -> None:
     designs = 60
     assert sum(told(1.0, 0.0, seed) for seed in range(designs)) <= scipy.stats.binom.ppf(0.99, designs, 0.01)
     assert sum(told(0.0, 1.0, seed) for seed in range(designs)) >= 0.9 * designs
 
 
-def test_a_step_continues_the_one_that_ended_where_it_starts() -> None:
+def test_the_preceding_step_is_the_one_that_ended_at_the_start_state() -> None:
     taken = steps(0.0, 0.1, seed=0)
     assert torch.equal(preceding(DEFINITION, taken), follows())
     taken.terminated[3] = True
@@ -85,7 +85,7 @@ def test_a_step_continues_the_one_that_ended_where_it_starts() -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_learned_model_tells_the_sensors_noise_and_allows_for_it(seed: int) -> None:
+def test_sensor_noise_is_estimated_from_the_residuals_of_a_learned_model(seed: int) -> None:
     taken = steps(0.0, 0.04, seed)
     model = learn(DEFINITION, taken, {}).model
     defaults = default_tolerances(DEFINITION, model.scales.tolist())
@@ -96,13 +96,13 @@ def test_a_learned_model_tells_the_sensors_noise_and_allows_for_it(seed: int) ->
 
 
 @pytest.mark.parametrize(("process", "sensor"), [(0.0, 0.0), (0.05, 0.0)])
-def test_other_steps_have_no_noise_of_sensors(process: float, sensor: float) -> None:
+def test_steps_without_sensor_noise_give_no_sensor_noise_estimate(process: float, sensor: float) -> None:
     taken = steps(process, sensor, seed=1)
     model = learn(DEFINITION, taken, {}).model
     assert sensor_noise(model, taken, default_tolerances(DEFINITION, model.scales.tolist())) == (None, None)
 
 
-def test_single_steps_cannot_tell() -> None:
+def test_single_steps_give_no_sensor_noise_estimate() -> None:
     taken = steps(0.0, 0.04, seed=0).at(torch.arange(0, COUNT, 2))
     model = learn(DEFINITION, taken, {}).model
     assert sensor_noise(model, taken, default_tolerances(DEFINITION, model.scales.tolist())) == (None, None)

@@ -36,43 +36,43 @@ def test_a_tolerance_without_rewards_is_recomputed_at_the_first_reward():
     assert second.values[:-1] == first.values[:-1]
 
 
-def test_tolerance_that_fits_is_frozen():
+def test_a_default_tolerance_from_varied_rewards_stays_frozen():
     first = frozen(PAID)
     paid_more = replace(PAID, reward=100 * PAID.reward)
     assert frozen(paid_more, first) == first
 
 
-def test_tolerance_of_a_constant_reward_is_taken_again_once_it_varies():
+def test_the_tolerance_of_a_constant_reward_is_recomputed_once_it_varies():
     constant = replace(PAID, reward=torch.ones(6, dtype=torch.float64))
     first = frozen(constant)
     assert first.values[-1] == TOLERANCE
     assert frozen(replace(PAID, reward=1 + 1e-3 * PAID.reward), first).values[-1] < 1e-4
 
 
-def test_reward_of_an_ending_does_not_change_a_tolerance():
+def test_a_terminal_reward_does_not_change_the_reward_tolerance():
     first = frozen(NOTHING_MET)
     ended = replace(NOTHING_MET, reward=NOTHING_MET.reward.clone(), terminated=NOTHING_MET.terminated.clone())
     ended.reward[0], ended.terminated[0] = 1.0, True
     assert frozen(ended, first) == first
 
 
-def test_state_without_ranges_keeps_its_tolerances():
+def test_a_design_state_stored_without_ranges_keeps_its_tolerances():
     assert frozen(PAID, DefaultTolerances((1e-12,) * 3)) == DefaultTolerances((1e-12,) * 3)
 
 
-def test_the_tolerance_of_increments_that_are_rounding_is_a_floor_of_the_range():
+def test_the_tolerance_of_increments_of_rounding_size_has_a_lower_limit():
     still = replace(PAID, q_next=PAID.q * (1 + 3e-16))
     tolerance = default_tolerances(DEFINITION, sizes_of(DEFINITION, still))
     assert min(tolerance[:2]) == pytest.approx(TOLERANCE * FLOOR / 3**0.5)
 
 
-def test_raw_tolerances_are_one_whatever_was_met():
+def test_raw_tolerances_are_one_for_any_samples():
     raw = definition_from_spec(plane().model_copy(update={"design": Design(tolerance="raw")}))
     first = frozen_tolerances(raw, NOTHING_MET, DefaultTolerances())
     assert frozen_tolerances(raw, PAID, first).values == (1.0, 1.0, 1.0)
 
 
-def test_tolerance_of_a_design_with_snapshots_grows_with_the_samples_and_never_shrinks():
+def test_tolerances_of_a_design_with_snapshots_can_only_grow():
     """Its first samples lie near the resets, so their deviation is far below that over the sampling range."""
     definition = definition_from_spec(plane().model_copy(update={"query": "rollout", "snapshots": True}))
     first = frozen_tolerances(definition, PAID, DefaultTolerances())

@@ -12,7 +12,7 @@ class Clock:
         return self.now
 
 
-def test_a_sampler_that_falls_silent_is_gone():
+def test_a_sampler_that_sends_nothing_for_a_while_is_no_longer_listed():
     clock = Clock()
     samplers = Samplers(clock)
     samplers.heard("a", "one")
@@ -24,7 +24,7 @@ def test_a_sampler_that_falls_silent_is_gone():
     assert samplers.by_surrogate()["a"] == ["two"]
 
 
-def test_flood_of_names_is_bounded_and_ends_with_its_silence():
+def test_the_number_of_listed_sampler_names_is_limited():
     clock = Clock()
     samplers = Samplers(clock)
     samplers.heard("a", "honest")

@@ -110,13 +110,13 @@ def fit_all(designer: Callable[[], Designer]) -> None:
     asyncio.run(run())
 
 
-def test_nothing_is_fitted_while_queries_are_open(storage: Storage, designer, runner: Runner):
+def test_no_fit_starts_while_initial_queries_are_open(storage: Storage, designer, runner: Runner):
     fit_all(designer)
     assert runner.jobs == []
     assert storage.surrogates.get(NAME).phase == "collecting"
 
 
-def test_a_fit_leaves_a_model_and_the_next_queries(answered: Storage, designer, cache: ModelCache):
+def test_a_fit_stores_a_model_and_the_next_queries(answered: Storage, designer, cache: ModelCache):
     fit_all(designer)
     record = answered.surrogates.get(NAME)
     assert (record.phase, record.round, record.state["round"]) == ("sampling", 1, 1)
@@ -127,7 +127,7 @@ def test_a_fit_leaves_a_model_and_the_next_queries(answered: Storage, designer, 
     assert answered.models.get(NAME).samples == pendulum.INITIAL
 
 
-def test_the_job_has_what_the_design_knows(answered: Storage, designer, runner: Runner):
+def test_a_fit_job_contains_samples_budget_and_visited_states(answered: Storage, designer, runner: Runner):
     answered.occupancy.put(NAME, "visited", np.ones((3, 2)))
     answered.designs.improve(NAME, 2, checkpoint="visited")
     fit_all(designer)
@@ -137,7 +137,7 @@ def test_the_job_has_what_the_design_knows(answered: Storage, designer, runner: 
     assert (job.previous, job.samples.purpose) == (None, ("initial",) * pendulum.INITIAL)
 
 
-def test_answers_are_scored_before_they_are_learned_and_the_scores_are_stored(
+def test_new_samples_are_scored_by_the_previous_model_and_scores_are_stored(
     answered: Storage, designer, runner: Runner
 ):
     fit_all(designer)
@@ -150,7 +150,7 @@ def test_answers_are_scored_before_they_are_learned_and_the_scores_are_stored(
     assert len(answered.surrogates.get(NAME).state["predictions"]) == len(stored)
 
 
-def test_a_budget_lowered_after_a_request_for_queries_holds(answered: Storage, designer, runner: Runner):
+def test_a_budget_lowered_after_improve_limits_its_extra_queries(answered: Storage, designer, runner: Runner):
     """What was promised within the old budget is not asked beyond the new one."""
     answered.designs.improve(NAME, 2)
     answered.surrogates.change(NAME, budget=pendulum.INITIAL + 1)
@@ -159,13 +159,13 @@ def test_a_budget_lowered_after_a_request_for_queries_holds(answered: Storage, d
     assert len(answered.queries.list(NAME)) <= pendulum.INITIAL + 1
 
 
-def test_occupancy_has_no_effect_unless_requested(answered: Storage, designer, runner: Runner):
+def test_stored_visited_states_are_ignored_unless_improve_names_them(answered: Storage, designer, runner: Runner):
     answered.occupancy.put(NAME, "visited", np.ones((3, 2)))
     fit_all(designer)
     assert runner.jobs[0].occupancy is None
 
 
-def test_a_fit_that_fails_says_why_and_is_tried_again_with_new_samples(answered: Storage, designer, runner: Runner):
+def test_a_failed_fit_stores_its_error_and_is_retried_only_after_a_change(answered: Storage, designer, runner: Runner):
     runner.function = refuse(NumericalFailure("no jitter repairs it"))
     for _ in range(3):
         fit_all(designer)
@@ -179,20 +179,20 @@ def test_a_fit_that_fails_says_why_and_is_tried_again_with_new_samples(answered:
     assert (answered.surrogates.get(NAME).phase, answered.surrogates.get(NAME).error) == ("sampling", None)
 
 
-def test_an_unexpected_error_fails_the_design_but_not_the_designer(answered: Storage, designer, runner: Runner):
+def test_an_unexpected_fit_error_fails_only_that_surrogates_design(answered: Storage, designer, runner: Runner):
     runner.function = refuse(ZeroDivisionError("surprise"))
     fit_all(designer)
     assert answered.surrogates.get(NAME).error == "the fit failed: ZeroDivisionError: surprise"
 
 
-def test_an_acquisition_that_fails_is_named_and_not_the_fit(answered: Storage, designer, runner: Runner):
+def test_the_error_of_a_failing_acquisition_names_the_acquisition(answered: Storage, designer, runner: Runner):
     said = "the choice of the next queries failed: acquisition focused: ValueError: x not in tuple"
     runner.function = refuse(ChoiceFailed(said))
     fit_all(designer)
     assert answered.surrogates.get(NAME).error == said
 
 
-def test_a_fit_whose_process_is_killed_is_tried_again(answered: Storage, designer, runner: Runner):
+def test_a_fit_whose_process_was_killed_is_repeated(answered: Storage, designer, runner: Runner):
     made = designer_of(designer)
     runner.function = refuse(Unavailable("the process that fits died twice"))
     made(ATTEMPTS - 1)
@@ -204,7 +204,7 @@ def test_a_fit_whose_process_is_killed_is_tried_again(answered: Storage, designe
     assert len(runner.jobs) == ATTEMPTS
 
 
-def test_a_fit_that_is_always_killed_ends_with_its_error(answered: Storage, designer, runner: Runner):
+def test_a_fit_whose_process_is_always_killed_fails_after_some_attempts(answered: Storage, designer, runner: Runner):
     made = designer_of(designer)
     runner.function = refuse(Unavailable("the process that fits died twice"))
     made(ATTEMPTS + 3)
@@ -216,7 +216,7 @@ def test_a_fit_that_is_always_killed_ends_with_its_error(answered: Storage, desi
     assert (answered.surrogates.get(NAME).phase, len(runner.jobs)) == ("collecting", ATTEMPTS + 1), "it counts anew"
 
 
-def test_a_storage_that_is_away_when_a_fit_is_done_has_it_done_again(answered: Storage, designer, runner, monkeypatch):
+def test_a_fit_that_cannot_be_stored_is_repeated(answered: Storage, designer, runner, monkeypatch):
     def away(*_: object) -> int:
         raise Unavailable("the database can't be used now")
 
@@ -229,7 +229,7 @@ def test_a_storage_that_is_away_when_a_fit_is_done_has_it_done_again(answered: S
     assert answered.surrogates.get(NAME).phase == "sampling"
 
 
-def test_a_fit_that_a_shutdown_cuts_short_stays_due(answered: Storage, designer, runner: Runner):
+def test_a_fit_interrupted_by_a_shutdown_stays_due(answered: Storage, designer, runner: Runner):
     runner.hang = True
 
     async def run() -> None:
@@ -246,7 +246,7 @@ def test_a_fit_that_a_shutdown_cuts_short_stays_due(answered: Storage, designer,
     assert answered.surrogates.get(NAME).phase != "failed"
 
 
-def test_a_surrogate_deleted_during_its_fit_is_no_failure(answered: Storage, designer, runner: Runner):
+def test_deleting_a_surrogate_during_its_fit_raises_no_error(answered: Storage, designer, runner: Runner):
     def delete(job: DesignJob) -> DesignResult:
         answered.surrogates.delete(NAME)
         return run_design_job(job)
@@ -265,7 +265,9 @@ def watchful(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("surrogym_server.services.designer.PASSED_SECONDS", 0.1)
 
 
-def test_a_fit_that_takes_too_long_is_ended_and_named(answered: Storage, designer, runner: Runner):
+def test_a_fit_beyond_the_time_limit_is_stopped_with_an_error_naming_the_option(
+    answered: Storage, designer, runner: Runner
+):
     runner.hang = True
 
     async def run() -> None:
@@ -282,7 +284,7 @@ def test_a_fit_that_takes_too_long_is_ended_and_named(answered: Storage, designe
 
 
 @pytest.mark.usefixtures("watchful")
-def test_a_fit_whose_surrogate_is_deleted_is_ended(answered: Storage, designer, runner: Runner):
+def test_deleting_a_surrogate_stops_its_running_fit(answered: Storage, designer, runner: Runner):
     runner.hang = True
 
     async def run() -> None:
@@ -298,7 +300,7 @@ def test_a_fit_whose_surrogate_is_deleted_is_ended(answered: Storage, designer, 
 
 
 @pytest.mark.usefixtures("watchful")
-def test_a_long_fit_is_logged_and_passed_by_others(answered: Storage, designer, runner: Runner, caplog):
+def test_a_long_fit_is_logged_and_does_not_delay_other_fits(answered: Storage, designer, runner: Runner, caplog):
     teach_another(answered, budget=29)
     runner.hang_at_budget = pendulum.BUDGET
 
@@ -317,7 +319,9 @@ def test_a_long_fit_is_logged_and_passed_by_others(answered: Storage, designer, 
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_as_many_fits_run_at_once_as_are_allowed(answered: Storage, designer, runner: Runner, workers: int):
+def test_the_number_of_concurrent_fits_is_the_number_of_fit_workers(
+    answered: Storage, designer, runner: Runner, workers: int
+):
     teach_another(answered, budget=29)
     runner.hang = True
 
@@ -335,7 +339,7 @@ def test_as_many_fits_run_at_once_as_are_allowed(answered: Storage, designer, ru
     assert runner.ended == workers
 
 
-def test_a_surrogate_that_becomes_due_during_a_fit_is_fitted_beside_it(answered: Storage, designer, runner: Runner):
+def test_a_surrogate_due_during_another_fit_is_fitted_concurrently(answered: Storage, designer, runner: Runner):
     runner.hang_at_budget = pendulum.BUDGET
 
     async def run() -> None:
@@ -363,7 +367,7 @@ def teach_another(storage: Storage, budget: int) -> None:
         storage.samples.add("another", "tester", [NewSample(**step, query_id=query.id, lease_token=query.token)])
 
 
-def test_a_budget_that_comes_later_gets_initial_queries(answered: Storage, designer):
+def test_a_surrogate_without_budget_gets_initial_queries_once_it_has_one(answered: Storage, designer):
     spec = pendulum.spec()
     answered.surrogates.create(NewSurrogate("late", spec, 0, 0.999))
     fit_all(designer)
@@ -374,7 +378,9 @@ def test_a_budget_that_comes_later_gets_initial_queries(answered: Storage, desig
 
 
 @pytest.mark.parametrize("error", [CancelledError(), RuntimeError("line 1\n  line 2")])
-def test_whatever_comes_of_one_fit_the_next_one_follows(answered: Storage, designer, runner: Runner, error: Exception):
+def test_an_error_in_one_fit_does_not_prevent_the_next_fit(
+    answered: Storage, designer, runner: Runner, error: Exception
+):
     teach_another(answered, budget=29)
 
     def function(job: DesignJob) -> DesignResult:
@@ -389,7 +395,7 @@ def test_whatever_comes_of_one_fit_the_next_one_follows(answered: Storage, desig
     assert answered.surrogates.get("another").phase == "sampling"
 
 
-def test_a_surrogate_whose_row_is_broken_keeps_no_other_from_its_fit(answered: Storage, designer, tmp_path: Path):
+def test_a_surrogate_with_a_damaged_row_does_not_prevent_other_fits(answered: Storage, designer, tmp_path: Path):
     answered.surrogates.create(NewSurrogate("broken", {}, 30, 0.999))
     with closing(sqlite3.connect(tmp_path / "surrogym.db")) as file:
         file.execute("UPDATE surrogates SET state = '{' WHERE name = 'broken'")
@@ -398,7 +404,7 @@ def test_a_surrogate_whose_row_is_broken_keeps_no_other_from_its_fit(answered: S
     assert answered.surrogates.get(NAME).phase == "sampling"
 
 
-def test_a_damaged_model_is_named_and_fitted_anew(
+def test_a_damaged_stored_model_is_logged_and_fitted_again(
     answered: Storage, designer, cache: ModelCache, definitions: Definitions, tmp_path: Path, caplog
 ):
     fit_all(designer)
@@ -416,7 +422,7 @@ def test_a_damaged_model_is_named_and_fitted_anew(
     assert restarted.latest(surrogate) == 2
 
 
-def test_the_designer_wakes_by_itself(answered: Storage, designer):
+def test_the_designer_starts_a_due_fit_by_itself(answered: Storage, designer):
     async def run() -> None:
         task = asyncio.create_task(designer().run())
         async with asyncio.timeout(60):
@@ -427,7 +433,7 @@ def test_the_designer_wakes_by_itself(answered: Storage, designer):
     asyncio.run(run())
 
 
-def test_improve_takes_the_latest_occupancy_unless_one_is_named(answered: Storage, designer):
+def test_improve_uses_the_latest_visited_states_unless_a_checkpoint_is_named(answered: Storage, designer):
     async def run() -> None:
         def improve(name: str, queries: int, checkpoint: str | None, key: str | None) -> SurrogateRecord:
             return made.improve(name, queries, checkpoint, key, raise_budget=True).record
@@ -455,14 +461,18 @@ def test_improve_takes_the_latest_occupancy_unless_one_is_named(answered: Storag
         ("unsure", 0, "unsure"),
     ],
 )
-def test_the_phase_after_a_fit(answered: Storage, designer, runner: Runner, verdict: str, queries: int, phase: str):
+def test_the_phase_after_a_fit_follows_from_verdict_and_queries(
+    answered: Storage, designer, runner: Runner, verdict: str, queries: int, phase: str
+):
     fit_all(designer)
     result = run_design_job(runner.jobs[0])
     changed = replace(result, verdict=verdict, queries=(Query.step((0.0, 0.0), (0.0,)),) * queries)
     assert changed.phase == phase
 
 
-def test_a_surrogate_deleted_under_its_eyes_does_not_end_the_designer(answered: Storage, designer, runner, monkeypatch):
+def test_the_designer_continues_if_a_surrogate_is_deleted_between_two_reads(
+    answered: Storage, designer, runner, monkeypatch
+):
     monkeypatch.setattr(answered.designs, "hopeless", lambda: ["gone"])
     fit_all(designer)
     assert len(runner.jobs) == 1

@@ -22,7 +22,9 @@ async def until(holds: Callable[[], bool]) -> None:
 
 
 @pytest.mark.parametrize("streams", [1, 100])
-def test_waiting_streams_share_each_read(storage: Storage, monkeypatch: pytest.MonkeyPatch, streams: int):
+def test_event_streams_of_one_surrogate_share_each_database_read(
+    storage: Storage, monkeypatch: pytest.MonkeyPatch, streams: int
+):
     reads = []
     stored = storage.events.list
 

@@ -39,7 +39,7 @@ def run(test: Callable[[Shop, Notices, Callable[..., Awaitable[int | str]]], Awa
 
 
 @pytest.mark.parametrize("waiting", [10, MANY])
-def test_the_number_of_questions_does_not_grow_with_those_who_wait(waiting: int):
+def test_the_number_of_database_reads_does_not_grow_with_waiting_claims(waiting: int):
     async def test(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
         claims = [claim() for _ in range(waiting)]
         await asyncio.sleep(0.2)
@@ -54,7 +54,7 @@ def test_the_number_of_questions_does_not_grow_with_those_who_wait(waiting: int)
     run(test)
 
 
-def test_all_work_of_one_notice_is_handed_out_along_the_line():
+def test_all_new_queries_of_one_notice_are_handed_to_the_waiting_claims():
     async def test(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
         claims = [claim() for _ in range(MANY)]
         await asyncio.sleep(0.1)
@@ -65,7 +65,7 @@ def test_all_work_of_one_notice_is_handed_out_along_the_line():
     run(test)
 
 
-def test_a_claim_that_does_not_wait_gets_work_past_a_line_that_knows_of_none():
+def test_a_claim_without_waiting_gets_new_queries_despite_waiting_claims():
     async def test(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
         claims = [claim(1.0) for _ in range(FIRST)]
         await asyncio.sleep(0.1)
@@ -78,7 +78,7 @@ def test_a_claim_that_does_not_wait_gets_work_past_a_line_that_knows_of_none():
     run(test)
 
 
-def test_a_claim_whose_caller_has_gone_asks_for_nothing():
+def test_a_waiting_claim_whose_caller_disconnected_takes_no_query():
     async def test(shop: Shop, notices: Notices, _: object) -> None:
         async def present() -> None:
             raise ConnectionError

@@ -77,7 +77,9 @@ def alone(storage: Storage, definitions: Definitions) -> str:
     return "alone"
 
 
-def test_a_log_alone_gives_a_model(storage: Storage, definitions: Definitions, service: SampleService, fit):
+def test_a_model_is_learned_from_a_log_without_any_queries(
+    storage: Storage, definitions: Definitions, service: SampleService, fit
+):
     name = alone(storage, definitions)
     service.add(name, "log", logged(30), None, log=LogPart())
     fit()
@@ -87,7 +89,7 @@ def test_a_log_alone_gives_a_model(storage: Storage, definitions: Definitions, s
     assert storage.queries.list(name) == []
 
 
-def test_a_log_over_the_range_leaves_the_budget_to_adaptive_queries(storage: Storage, service: SampleService, fit):
+def test_a_log_covering_the_whole_range_replaces_the_initial_queries(storage: Storage, service: SampleService, fit):
     service.add(NAME, "log", logged(60), None, log=LogPart())
     assert storage.queries.list(NAME) == [], "all initial queries are covered"
     fit()
@@ -96,7 +98,7 @@ def test_a_log_over_the_range_leaves_the_budget_to_adaptive_queries(storage: Sto
     assert storage.ledger.read(NAME) == LedgerRecord(logged=60)
 
 
-def test_a_log_of_a_corner_leaves_initial_queries(storage: Storage, service: SampleService):
+def test_a_log_of_a_part_of_the_range_leaves_some_initial_queries(storage: Storage, service: SampleService):
     service.add(NAME, "log", logged(60, speed=0.5), None, log=LogPart())
     assert 0 < len(storage.queries.list(NAME, ("pending",))) < pendulum.INITIAL
 
@@ -109,7 +111,9 @@ def test_a_log_of_a_corner_leaves_initial_queries(storage: Storage, service: Sam
         ({"coordinates": (0.0,)}, r"samples\.2\.coordinates: expected \(n, 2\)"),
     ],
 )
-def test_a_bad_row_is_named_by_index_and_reason(storage: Storage, service: SampleService, change, reason: str):
+def test_a_log_with_an_invalid_row_is_refused_with_index_and_reason(
+    storage: Storage, service: SampleService, change, reason: str
+):
     rows = logged(4)
     rows[2] = replace(rows[2], **change)
     with pytest.raises(InvalidInput, match=reason):

@@ -12,7 +12,7 @@ from surrogym_server.storage.announcements import Announcements, Hear
 PATIENCE = 60.0
 
 
-def test_a_notice_before_the_wait_is_remembered():
+def test_a_notice_posted_before_the_wait_still_wakes_the_listener():
     async def run() -> None:
         notices = Notices()
         with notices.listen("a") as listener:
@@ -22,7 +22,7 @@ def test_a_notice_before_the_wait_is_remembered():
     asyncio.run(run())
 
 
-def test_only_listeners_are_woken():
+def test_a_notice_wakes_only_listeners_of_its_surrogate():
     async def run() -> list[bool]:
         notices = Notices()
         with notices.listen("a") as a, notices.listen("b") as b, notices.listen() as everything:
@@ -36,7 +36,7 @@ def test_only_listeners_are_woken():
     assert asyncio.run(run()) == [True, False, True]
 
 
-def test_a_wait_ends_by_its_time():
+def test_a_wait_for_a_notice_ends_at_its_timeout():
     async def run() -> None:
         with Notices().listen("a") as listener:
             await listener.wait(0.01)
@@ -45,7 +45,7 @@ def test_a_wait_ends_by_its_time():
     asyncio.run(run())
 
 
-def test_a_wait_that_is_woken_and_cancelled_at_once_is_cancelled():
+def test_a_wait_woken_and_cancelled_at_once_raises_cancelled():
     async def run() -> None:
         notices = Notices()
         with notices.listen("a") as listener:
@@ -59,7 +59,7 @@ def test_a_wait_that_is_woken_and_cancelled_at_once_is_cancelled():
     asyncio.run(run())
 
 
-def test_a_notice_after_the_end_of_the_loop_is_harmless():
+def test_a_notice_posted_after_the_event_loop_ended_is_harmless():
     async def make() -> Notices:
         return Notices()
 
@@ -83,7 +83,7 @@ class Told(Announcements):
         pass
 
 
-def test_an_announcement_of_another_server_wakes_without_an_echo():
+def test_an_announcement_of_another_server_wakes_listeners_and_is_not_repeated():
     async def run() -> None:
         told = Told()
         notices = Notices(told)

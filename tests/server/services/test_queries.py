@@ -37,7 +37,7 @@ def emptied(storage: Storage) -> Storage:
     return storage
 
 
-def test_a_claim_returns_at_once_if_queries_are_open(storage: Storage, definitions: Definitions):
+def test_a_claim_returns_at_once_if_queries_are_pending(storage: Storage, definitions: Definitions):
     async def run() -> Claim:
         return await QueryService(storage, definitions, Notices()).claim(NAME, "tester", 2, 60, PATIENCE)
 
@@ -45,7 +45,9 @@ def test_a_claim_returns_at_once_if_queries_are_open(storage: Storage, definitio
     assert (len(claim.queries), claim.phase, claim.paused) == (2, "collecting", False)
 
 
-def test_without_waiting_nothing_is_an_answer(emptied: Storage, definitions: Definitions):
+def test_a_claim_with_zero_waiting_time_returns_no_queries_if_none_are_pending(
+    emptied: Storage, definitions: Definitions
+):
     async def run() -> Claim:
         return await QueryService(emptied, definitions, Notices()).claim(NAME, "tester", 2, 60, 0)
 
@@ -97,7 +99,7 @@ def test_two_waiting_samplers_share_new_queries(emptied: Storage, definitions: D
     assert len(set(ids)) == len(ids) == 2
 
 
-def test_a_deleted_surrogate_ends_the_wait(emptied: Storage, definitions: Definitions):
+def test_deleting_a_surrogate_ends_waiting_claims_with_an_error(emptied: Storage, definitions: Definitions):
     async def run() -> None:
         notices = Notices()
 

@@ -24,7 +24,7 @@ class NoSessions:
         return SimpleNamespace(sessions={})
 
 
-def test_a_failure_between_two_reads_is_never_shown_without_its_error(
+def test_a_status_read_while_the_design_fails_contains_the_error(
     storage: Storage, definitions: Definitions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read = storage.surrogates.get
@@ -40,7 +40,7 @@ def test_a_failure_between_two_reads_is_never_shown_without_its_error(
 
 
 @pytest.mark.parametrize("changes", [1, READS - 1])
-def test_a_status_is_of_one_moment(
+def test_a_status_read_during_changes_is_consistent(
     storage: Storage, definitions: Definitions, monkeypatch: pytest.MonkeyPatch, changes: int
 ) -> None:
     """Each of its first reads is followed by a change of the budget, as if another request came in between."""
@@ -73,7 +73,9 @@ def service(storage: Storage, definitions: Definitions) -> SurrogateService:
         ({"x": [{"low": 1}], "y": None, "z": "a" * 500}, "z was created as nothing, got "),
     ],
 )
-def test_another_spec_under_the_same_name_is_refused(other: dict[str, Any], words: str) -> None:
+def test_another_specification_under_the_same_name_is_refused_with_the_difference(
+    other: dict[str, Any], words: str
+) -> None:
     spec = {"x": [{"low": 1}], "y": None}
     check_same("a", spec, spec)
     with pytest.raises(SpecConflict, match=f"^'a' exists with another specification: {words}") as refused:

@@ -18,7 +18,7 @@ from surrogym_server.storage.port import Storage
 NAME = "pendulum"
 
 
-def test_a_sweep_that_fails_is_followed_by_the_next(storage: Storage, monkeypatch: pytest.MonkeyPatch):
+def test_a_failed_sweep_of_expired_leases_is_followed_by_the_next(storage: Storage, monkeypatch: pytest.MonkeyPatch):
     met = [Unavailable("the disk is full"), ZeroDivisionError("surprise"), None]
 
     def sweep_expired() -> int:
@@ -43,7 +43,7 @@ def test_a_sweep_that_fails_is_followed_by_the_next(storage: Storage, monkeypatc
     assert asyncio.run(asyncio.wait_for(run(), 10)) == 3
 
 
-def test_a_change_whose_notice_was_lost_wakes_those_who_wait(storage: Storage):
+def test_the_sweeper_wakes_listeners_of_a_change_whose_notice_was_lost(storage: Storage):
     async def run() -> None:
         notices = Notices()
         models = ModelCache(lambda *_: pytest.fail("nothing is in use"), storage.models.newest)

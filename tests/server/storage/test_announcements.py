@@ -48,7 +48,7 @@ def until_they_listen(storage: Storage, count: int) -> None:
     raise AssertionError("they never listened")
 
 
-def test_sqlite_servers_get_no_announcements_and_lose_nothing(tmp_path) -> None:
+def test_announcements_between_servers_do_nothing_on_sqlite(tmp_path) -> None:
     storage, heard = open_storage(f"sqlite:///{tmp_path}/surrogym.db"), []
     storage.announcements.listen(heard.append)
     storage.announcements.announce("a")
@@ -58,7 +58,7 @@ def test_sqlite_servers_get_no_announcements_and_lose_nothing(tmp_path) -> None:
 
 
 @pytest.mark.postgresql
-def test_each_server_hears_what_others_announce_and_not_itself(other) -> None:
+def test_a_server_receives_announcements_of_others_but_not_its_own(other) -> None:
     (first, heard_by_first), (second, heard_by_second) = other(), other()
     first.announcements.announce("über pendulum")
     assert heard_by_second.get(timeout=PATIENCE) == "über pendulum"
@@ -69,7 +69,7 @@ def test_each_server_hears_what_others_announce_and_not_itself(other) -> None:
 
 
 @pytest.mark.postgresql
-def test_a_server_that_lost_its_connection_hears_that_it_missed_something(other) -> None:
+def test_after_a_lost_connection_a_server_is_told_that_announcements_may_be_missing(other) -> None:
     (first, _), (second, heard) = other(), other()
     with first.announcements._database.write() as connection:
         connection.exec_driver_sql(f"SELECT pg_terminate_backend(pid) {LISTENING}")
@@ -83,7 +83,7 @@ def test_a_server_that_lost_its_connection_hears_that_it_missed_something(other)
 
 
 @pytest.mark.postgresql
-def test_announcements_soon_after_one_another_come_together_and_none_is_lost(other, monkeypatch) -> None:
+def test_announcements_in_quick_succession_are_merged_and_none_is_lost(other, monkeypatch) -> None:
     monkeypatch.setattr(announcements, "GAP_SECONDS", 3_600.0)
     (first, _), (_, heard) = other(), other()
     first.announcements.announce("a")

@@ -17,7 +17,7 @@ Make = Callable[..., str]
 FOUR = steps(np.zeros((4, 2)), np.zeros((4, 1)))
 
 
-def test_audits_cost_none_of_the_budget(storage: Storage, make: Make, answer: Callable[..., NewSample]) -> None:
+def test_audit_queries_cost_no_budget(storage: Storage, make: Make, answer: Callable[..., NewSample]) -> None:
     name = make(queries=0, budget=3)
     storage.queries.enqueue(name, FOUR, purpose="audit")
     assert storage.designs.left(name) == 3
@@ -30,7 +30,7 @@ def test_audits_cost_none_of_the_budget(storage: Storage, make: Make, answer: Ca
     assert storage.designs.due() == [name], "the model learns from them"
 
 
-def test_all_audits_together_are_bounded(storage: Storage, make: Make) -> None:
+def test_audit_queries_beyond_their_total_limit_are_refused(storage: Storage, make: Make) -> None:
     name = make(queries=0, budget=3)
     many = steps(np.zeros((LEAST_AUDITED, 2)), np.zeros((LEAST_AUDITED, 1)))
     ids = storage.queries.enqueue(name, many, purpose="audit", key="k")
@@ -41,7 +41,7 @@ def test_all_audits_together_are_bounded(storage: Storage, make: Make) -> None:
     storage.queries.enqueue(name, FOUR)
 
 
-def test_the_range_of_rewards_is_that_of_all_samples(
+def test_the_reward_range_is_that_of_all_samples(
     storage: Storage, make: Make, by_hand: Callable[..., NewSample]
 ) -> None:
     name = make(queries=0)

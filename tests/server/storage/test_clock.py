@@ -23,7 +23,7 @@ def seconds_left(storage: Storage, name: str, query: int) -> float:
     return left
 
 
-def test_every_column_of_time_is_set_back_by_these_tests() -> None:
+def test_these_clock_tests_cover_every_time_column_of_the_database() -> None:
     doubles = {column.name for table in metadata.tables.values() for column in table.c if is_double(column)}
     others = {"target", "reward", "seconds", "fit_seconds"}
     assert doubles - others == {"created_at", "begun", "expires", "fit_expires", "finished_at"}
@@ -33,7 +33,7 @@ def is_double(column: sa.Column[object]) -> bool:
     return isinstance(column.type, Checked) and isinstance(column.type.impl, sa.Double)
 
 
-def test_the_lease_of_a_dead_sampler_ends_though_the_clock_was_set_back(
+def test_the_lease_of_a_dead_sampler_expires_although_the_clock_was_set_back(
     storage: Storage, make: Callable[..., str], set_clock_back: SetBack, until: Until
 ) -> None:
     name = make(queries=1)
@@ -44,7 +44,7 @@ def test_the_lease_of_a_dead_sampler_ends_though_the_clock_was_set_back(
     assert again.id == dead.id
 
 
-def test_a_living_sampler_keeps_its_lease_for_as_long_as_it_was_given(
+def test_a_live_sampler_keeps_its_lease_although_the_clock_was_set_back(
     storage: Storage,
     make: Callable[..., str],
     answer: Callable[..., NewSample],
@@ -64,9 +64,7 @@ def test_a_living_sampler_keeps_its_lease_for_as_long_as_it_was_given(
     assert added.duplicates == 0
 
 
-def test_leases_that_are_as_long_as_they_were_given_out_are_left_alone(
-    storage: Storage, make: Callable[..., str]
-) -> None:
+def test_leases_of_plausible_length_are_not_shortened(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=1)
     [leased] = storage.queries.claim(name, "alive", 1, LONG)
     for _ in range(5):
@@ -74,7 +72,7 @@ def test_leases_that_are_as_long_as_they_were_given_out_are_left_alone(
     assert storage.queries.renew(name, leased.id, leased.token, LONG) >= leased.expires
 
 
-def test_the_right_to_fit_of_a_dead_server_passes_on_though_the_clock_was_set_back(
+def test_the_fit_lease_of_a_dead_server_expires_although_the_clock_was_set_back(
     storage: Storage,
     make: Callable[..., str],
     answer_all: Callable[[str], None],
@@ -96,7 +94,7 @@ def test_the_right_to_fit_of_a_dead_server_passes_on_though_the_clock_was_set_ba
     assert storage.designs.commit(heir, design()) == 1
 
 
-def test_a_fit_during_which_the_clock_is_set_back_counts(
+def test_a_fit_can_be_committed_although_the_clock_was_set_back_meanwhile(
     storage: Storage,
     make: Callable[..., str],
     answer_all: Callable[[str], None],
@@ -113,7 +111,7 @@ def test_a_fit_during_which_the_clock_is_set_back_counts(
     assert storage.designs.commit(lease, design()) == 1
 
 
-def test_a_clock_that_is_set_forward_loses_no_answer(
+def test_a_sample_is_kept_as_late_if_the_clock_was_set_forward(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample], set_clock_back: SetBack
 ) -> None:
     name = make(queries=1)

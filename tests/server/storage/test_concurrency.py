@@ -32,7 +32,7 @@ def at_once(work: Callable[[int], T]) -> list[T]:
         return list(threads.map(run, range(THREADS)))
 
 
-def test_no_query_is_claimed_twice(
+def test_concurrent_claims_never_get_the_same_query(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=60)
@@ -50,7 +50,7 @@ def test_no_query_is_claimed_twice(
     assert storage.samples.count(name) == 60
 
 
-def test_one_thread_gets_the_right_to_fit(
+def test_one_of_several_concurrent_threads_gets_the_fit_lease(
     storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None]
 ) -> None:
     name = make()
@@ -59,7 +59,7 @@ def test_one_thread_gets_the_right_to_fit(
     assert sum(lease is not None for lease in leases) == 1
 
 
-def test_one_sample_comes_of_many_identical_reports(
+def test_identical_concurrent_reports_store_one_sample(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=1)
@@ -70,12 +70,12 @@ def test_one_sample_comes_of_many_identical_reports(
     assert storage.samples.count(name) == 1
 
 
-def test_one_surrogate_comes_of_many_identical_requests(storage: Storage) -> None:
+def test_identical_concurrent_requests_create_one_surrogate(storage: Storage) -> None:
     made = at_once(lambda _: storage.surrogates.create(NewSurrogate("a", {"x": 1}, 30, 0.9)))
     assert sum(created for _, created in made) == 1
 
 
-def test_a_reader_of_events_misses_none(
+def test_a_reader_of_events_misses_none_during_concurrent_writes(
     storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
 ) -> None:
     name = make(queries=0)
@@ -100,7 +100,7 @@ def test_a_reader_of_events_misses_none(
 
 @pytest.mark.postgresql
 @pytest.mark.parametrize("url", ["postgresql"], indirect=True)
-def test_several_servers_share_one_postgresql(
+def test_several_servers_can_use_one_postgresql_and_one_gets_the_fit_lease(
     url: str, answer: Callable[..., NewSample], by_hand: Callable[..., NewSample]
 ) -> None:
     with ThreadPoolExecutor(THREADS) as threads, ExitStack() as stack:

@@ -56,7 +56,7 @@ def claim_and_answer(storage: Storage, name: str, answer: Callable[..., NewSampl
     storage.designs.hopeless()
 
 
-def test_a_claim_and_an_answer_take_few_statements_that_were_compiled_before(
+def test_claiming_and_answering_a_query_takes_few_precompiled_sql_statements(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=4)
@@ -67,7 +67,7 @@ def test_a_claim_and_an_answer_take_few_statements_that_were_compiled_before(
     assert len(found.statements) <= 19
 
 
-def test_the_ledger_counts_only_samples_since_it_was_read_last(
+def test_reading_the_ledger_counts_only_samples_added_since_the_last_read(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=4)
@@ -85,7 +85,9 @@ def test_the_ledger_counts_only_samples_since_it_was_read_last(
     assert storage.ledger.read(name).total == storage.samples.count(name) == 2
 
 
-def test_the_standing_is_that_of_the_surrogate(storage: Storage, make: Callable[..., str]) -> None:
+def test_the_cached_standing_equals_phase_and_pause_of_the_surrogate(
+    storage: Storage, make: Callable[..., str]
+) -> None:
     name = make()
     storage.surrogates.change(name, paused=True)
     record = storage.surrogates.get(name)

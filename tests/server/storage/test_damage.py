@@ -92,7 +92,7 @@ def all_read(storage: Storage) -> Iterator[SurrogymError]:
 @pytest.mark.parametrize("url", ["sqlite"], indirect=True)
 @pytest.mark.parametrize("flips", [1, 10, 60])
 @pytest.mark.parametrize("seed", range(5))
-def test_flipped_bytes_are_reported_in_one_sentence(url: str, file: Path, flips: int, seed: int) -> None:
+def test_errors_from_flipped_database_bytes_are_one_line(url: str, file: Path, flips: int, seed: int) -> None:
     content = bytearray(file.read_bytes())
     random = np.random.default_rng(seed)
     for place in random.integers(len(content), size=flips):
@@ -102,7 +102,7 @@ def test_flipped_bytes_are_reported_in_one_sentence(url: str, file: Path, flips:
 
 
 @pytest.mark.parametrize("url", ["sqlite"], indirect=True)
-def test_broken_pages_are_refused_at_opening_with_the_way_out(url: str, file: Path) -> None:
+def test_opening_a_database_with_damaged_pages_is_refused_with_repair_instructions(url: str, file: Path) -> None:
     content = bytearray(file.read_bytes())
     content[4096:8192] = bytes(4096)
     file.write_bytes(content)
@@ -112,21 +112,21 @@ def test_broken_pages_are_refused_at_opening_with_the_way_out(url: str, file: Pa
 
 
 @pytest.mark.parametrize("statement", ["DROP TABLE evaluations", "ALTER TABLE surrogates DROP COLUMN state"])
-def test_a_table_or_column_that_is_missing_is_refused_at_opening(url: str, full: Storage, statement: str) -> None:
+def test_opening_a_database_with_a_missing_table_or_column_is_refused(url: str, full: Storage, statement: str) -> None:
     full.close()
     execute(url, statement)
     with pytest.raises(Damaged, match=r"(evaluations|state).*restore a copy"):
         open_storage(url)
 
 
-def test_a_schema_that_no_program_made_is_refused(url: str, full: Storage) -> None:
+def test_opening_a_database_with_an_unknown_schema_is_refused(url: str, full: Storage) -> None:
     full.close()
     execute(url, "DELETE FROM alembic_version")
     with pytest.raises(Damaged, match="already exists"):
         open_storage(url)
 
 
-def test_a_table_that_is_dropped_under_the_server_is_named(url: str, full: Storage) -> None:
+def test_the_error_for_a_table_dropped_at_run_time_names_the_table(url: str, full: Storage) -> None:
     execute(url, "DROP TABLE evaluations")
     with pytest.raises(Damaged, match="evaluations"):
         full.ledger.read(NAME)
@@ -143,7 +143,7 @@ BROKEN_ROWS = [
 
 
 @pytest.mark.parametrize(("statement", "read", "named"), BROKEN_ROWS)
-def test_a_broken_row_is_named_by_whatever_reads_it(
+def test_every_read_of_a_damaged_row_raises_an_error_that_names_it(
     url: str, full: Storage, statement: str, read: str, named: str
 ) -> None:
     execute(url, statement)
@@ -159,7 +159,9 @@ def test_a_broken_row_is_named_by_whatever_reads_it(
         ("UPDATE queries SET coordinates = x'000102'", "queries"),
     ],
 )
-def test_bytes_that_are_no_value_are_damage(url: str, full: Storage, statement: str, read: str) -> None:
+def test_reading_bytes_that_cannot_be_decoded_raises_a_damage_error(
+    url: str, full: Storage, statement: str, read: str
+) -> None:
     with closing(sqlite3.connect(url.removeprefix("sqlite:///"))) as other:
         other.execute(statement)
         other.commit()
@@ -167,7 +169,9 @@ def test_bytes_that_are_no_value_are_damage(url: str, full: Storage, statement: 
         READS[read](full)
 
 
-def test_the_check_of_a_large_file_is_cut_short(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_page_check_of_a_large_database_stops_at_its_time_limit(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """And then says so, and lets the server start."""
     with closing(sqlite3.connect(tmp_path / "large.db")) as large:
         large.execute("CREATE TABLE a (b BLOB)")
@@ -181,7 +185,7 @@ def test_the_check_of_a_large_file_is_cut_short(tmp_path: Path, caplog: pytest.L
     assert "its check stopped after 0 s" in caplog.text
 
 
-def test_nothing_is_damage_in_a_sound_database(full: Storage) -> None:
+def test_reading_everything_in_a_sound_database_raises_no_damage_error(full: Storage) -> None:
     assert list(all_read(full)) == []
 
 
@@ -195,7 +199,7 @@ def flip(url: str, version: int) -> None:
         connection.execute(sa.update(models).where(own).values(blob=bytes(blob)))
 
 
-def test_a_model_changed_in_storage_is_refused(url: str, full: Storage) -> None:
+def test_a_model_changed_in_the_database_is_refused(url: str, full: Storage) -> None:
     assert full.models.blob(NAME, 1) == b"\0model"
     flip(url, 1)
     for version in (1, None):
@@ -203,7 +207,7 @@ def test_a_model_changed_in_storage_is_refused(url: str, full: Storage) -> None:
             full.models.blob(NAME, version)
 
 
-def test_a_damaged_model_is_set_aside_once_and_the_one_before_it_is_the_newest(
+def test_setting_a_damaged_model_aside_makes_the_previous_one_the_newest(
     full: Storage, design: Callable[..., NewDesign], answer_all: Callable[[str], None]
 ) -> None:
     surrogate = full.surrogates.get(NAME).id
@@ -217,7 +221,7 @@ def test_a_damaged_model_is_set_aside_once_and_the_one_before_it_is_the_newest(
     assert full.models.add(NAME, design().model) == 3, "no number is used twice"
 
 
-def test_a_fit_is_due_when_a_model_is_set_aside(
+def test_setting_a_damaged_model_aside_makes_a_fit_due(
     storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None], design: Callable[..., NewDesign]
 ) -> None:
     name = make()
@@ -233,7 +237,7 @@ def test_a_fit_is_due_when_a_model_is_set_aside(
 
 
 @pytest.mark.parametrize("url", ["sqlite"], indirect=True)
-def test_a_value_of_another_type_is_named_by_whatever_reads_it(file: Path) -> None:
+def test_reading_a_value_of_wrong_type_raises_an_error_that_names_it(file: Path) -> None:
     """SQLite keeps text in a column of numbers, and bytes in a column of text."""
     columns = [column for table in metadata.tables.values() for column in table.columns]
     places = [f"{c.table.name}.{c.name}" for c in columns if isinstance(c.type, Checked) and not c.primary_key]
@@ -259,7 +263,7 @@ def changed_copy(file: Path, place: str) -> Path:
     return copy
 
 
-def test_an_index_that_lost_its_entries_is_found_at_the_start(tmp_path: Path) -> None:
+def test_opening_a_database_with_an_incomplete_index_is_refused(tmp_path: Path) -> None:
     """As after one file was copied over another under a running server; ``quick_check`` does not see it."""
     file = tmp_path / "surrogym.db"
     storage = open_storage(f"sqlite:///{file}")

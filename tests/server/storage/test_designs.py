@@ -43,7 +43,7 @@ def begun(storage: Storage, name: str, seconds: float = LONG) -> FitLease:
     return lease
 
 
-def test_a_fit_is_due_when_all_queries_are_closed(
+def test_a_fit_is_due_when_no_query_is_open(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=2)
@@ -56,7 +56,7 @@ def test_a_fit_is_due_when_all_queries_are_closed(
     assert storage.designs.due() == [name]
 
 
-def test_one_at_a_time_may_fit(storage: Storage, due: str) -> None:
+def test_only_one_server_at_a_time_gets_the_fit_lease(storage: Storage, due: str) -> None:
     lease = begun(storage, due)
     assert storage.surrogates.get(due).phase == "fitting"
     assert storage.designs.begin(due, "another", LONG) is None
@@ -64,7 +64,7 @@ def test_one_at_a_time_may_fit(storage: Storage, due: str) -> None:
     assert storage.designs.renew(lease, 2 * LONG).expires > lease.expires
 
 
-def test_the_right_of_a_dead_server_passes_on(
+def test_the_fit_lease_of_a_dead_server_passes_to_another(
     storage: Storage, due: str, design: Callable[..., NewDesign], until: Wait
 ) -> None:
     dead = begun(storage, due, SHORT)
@@ -78,7 +78,7 @@ def test_the_right_of_a_dead_server_passes_on(
     assert storage.designs.commit(heir, design()) == 1
 
 
-def test_a_slow_fit_that_nobody_took_over_still_counts(
+def test_a_fit_with_an_expired_lease_that_nobody_took_can_be_committed(
     storage: Storage, due: str, design: Callable[..., NewDesign], until: Wait
 ) -> None:
     lease = begun(storage, due, SHORT)
@@ -86,7 +86,7 @@ def test_a_slow_fit_that_nobody_took_over_still_counts(
     assert storage.designs.commit(lease, design()) == 1
 
 
-def test_a_commit_stores_model_state_phase_and_queries_together(
+def test_committing_a_fit_stores_model_state_phase_and_queries_together(
     storage: Storage, due: str, design: Callable[..., NewDesign]
 ) -> None:
     storage.designs.commit(begun(storage, due), design(queries=2, state={"keys": [1, 2]}))
@@ -98,7 +98,7 @@ def test_a_commit_stores_model_state_phase_and_queries_together(
     assert storage.designs.due() == []
 
 
-def test_rounds_continue_until_there_are_no_more_queries(
+def test_design_rounds_continue_until_there_are_no_more_queries(
     storage: Storage, due: str, design: Callable[..., NewDesign], answer_all: Callable[[str], None]
 ) -> None:
     assert storage.designs.commit(begun(storage, due), design(queries=1)) == 1
@@ -109,7 +109,7 @@ def test_rounds_continue_until_there_are_no_more_queries(
     assert (storage.ledger.read(due).initial, storage.ledger.read(due).adaptive) == (3, 1)
 
 
-def test_samples_during_a_fit_make_the_next_one_due(
+def test_samples_added_during_a_fit_make_the_next_fit_due(
     storage: Storage, due: str, design: Callable[..., NewDesign], by_hand: Callable[..., NewSample]
 ) -> None:
     lease = begun(storage, due)
@@ -118,7 +118,9 @@ def test_samples_during_a_fit_make_the_next_one_due(
     assert storage.designs.due() == [due]
 
 
-def test_a_failed_fit_waits_for_something_new(storage: Storage, due: str, by_hand: Callable[..., NewSample]) -> None:
+def test_a_failed_fit_is_due_again_only_after_a_new_sample(
+    storage: Storage, due: str, by_hand: Callable[..., NewSample]
+) -> None:
     storage.designs.abort(begun(storage, due), "singular")
     record = storage.surrogates.get(due)
     assert (record.phase, record.error) == ("failed", "singular")
@@ -133,7 +135,7 @@ def test_a_failed_fit_is_tried_again_when_resumed(storage: Storage, due: str) ->
     assert storage.designs.due() == [due]
 
 
-def test_a_fit_given_up_at_shutdown_stays_due(storage: Storage, due: str) -> None:
+def test_a_fit_aborted_at_shutdown_stays_due(storage: Storage, due: str) -> None:
     lease = begun(storage, due)
     storage.designs.abort(lease, None)
     storage.designs.abort(lease, None)
@@ -142,7 +144,7 @@ def test_a_fit_given_up_at_shutdown_stays_due(storage: Storage, due: str) -> Non
 
 
 @pytest.mark.parametrize("change", [{"budget": 60}, {"target": 0.9}])
-def test_another_budget_or_target_wakes_a_finished_design(
+def test_a_changed_budget_or_target_makes_a_finished_design_due(
     storage: Storage, due: str, design: Callable[..., NewDesign], change: dict[str, float]
 ) -> None:
     storage.designs.commit(begun(storage, due), design(phase="over_budget"))
@@ -156,7 +158,7 @@ ASKED_ANEW = ({"tolerances": {"theta": 0.5}}, {"target": 0.9}, {"budget": 3})
 
 
 @pytest.mark.parametrize("change", ASKED_ANEW)
-def test_queries_for_an_older_target_are_withdrawn_unless_begun(
+def test_changing_the_target_withdraws_queries_that_no_sampler_has_begun(
     storage: Storage, due: str, design: Callable[..., NewDesign], change: dict[str, Any]
 ) -> None:
     """A tolerance typed wrong costs no real step; a step that may have been taken stays in the ledger."""
@@ -173,7 +175,7 @@ def test_queries_for_an_older_target_are_withdrawn_unless_begun(
 
 
 @pytest.mark.parametrize(("change", "again"), [({"tolerances": {"theta": 0.5}}, 2), ({"budget": 7}, 0)])
-def test_requested_queries_are_chosen_again_unless_the_budget_is_smaller(
+def test_withdrawn_extra_queries_are_requested_again_unless_the_budget_shrank(
     storage: Storage, due: str, design: Callable[..., NewDesign], change: dict[str, Any], again: int
 ) -> None:
     storage.designs.commit(begun(storage, due), design(phase="ready"))
@@ -184,7 +186,7 @@ def test_requested_queries_are_chosen_again_unless_the_budget_is_smaller(
     assert storage.surrogates.change(due, **change).extra_queries == again
 
 
-def test_a_smaller_budget_leaves_as_many_initial_queries_as_it_holds(
+def test_lowering_the_budget_withdraws_the_initial_queries_beyond_it(
     storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None]
 ) -> None:
     name = make(queries=6)
@@ -196,7 +198,7 @@ def test_a_smaller_budget_leaves_as_many_initial_queries_as_it_holds(
     assert [query.id for query in storage.queries.list(name)] == first
 
 
-def test_queries_without_a_lease_do_not_delay_a_change(
+def test_a_changed_tolerance_makes_a_fit_due_despite_unleased_queries(
     storage: Storage, due: str, design: Callable[..., NewDesign]
 ) -> None:
     storage.designs.commit(begun(storage, due), design(queries=2))
@@ -205,7 +207,7 @@ def test_queries_without_a_lease_do_not_delay_a_change(
 
 
 @pytest.mark.parametrize("change", ASKED_ANEW)
-def test_a_fit_overtaken_by_a_change_is_repeated(
+def test_a_fit_is_repeated_if_the_settings_changed_meanwhile(
     storage: Storage, due: str, design: Callable[..., NewDesign], change: dict[str, Any]
 ) -> None:
     lease = begun(storage, due)
@@ -222,7 +224,7 @@ def test_a_paused_design_is_not_fitted(storage: Storage, due: str) -> None:
     assert storage.designs.begin(due, "me", LONG) is None
 
 
-def test_the_design_continues_without_queries_that_were_set_aside(
+def test_a_fit_is_due_although_some_queries_were_set_aside(
     storage: Storage, due: str, design: Callable[..., NewDesign]
 ) -> None:
     storage.designs.commit(begun(storage, due), design(queries=1))
@@ -232,7 +234,7 @@ def test_the_design_continues_without_queries_that_were_set_aside(
     assert storage.designs.due() == [due]
 
 
-def test_asking_raises_the_budget_and_reaches_the_next_fit_once(
+def test_improve_raises_the_budget_and_reaches_the_next_fit_once_per_key(
     storage: Storage, due: str, design: Callable[..., NewDesign]
 ) -> None:
     storage.surrogates.change(due, budget=4)
@@ -251,12 +253,12 @@ def test_asking_raises_the_budget_and_reaches_the_next_fit_once(
     assert storage.surrogates.get(due).extra_queries == 2, "asked for after the fit began"
 
 
-def test_a_budget_that_is_large_enough_stays(storage: Storage, due: str) -> None:
+def test_improve_does_not_raise_a_budget_that_is_large_enough(storage: Storage, due: str) -> None:
     granted = storage.designs.improve(due, 5, raise_budget=True)
     assert (granted.record.budget, granted.raised) == (30, 0)
 
 
-def test_without_the_right_to_raise_the_budget_its_rest_is_granted(storage: Storage, due: str) -> None:
+def test_improve_without_the_right_to_raise_the_budget_gets_only_its_rest(storage: Storage, due: str) -> None:
     """The budget is the owner's: steps taken, queries open or set aside, and what was promised before all count."""
     storage.queries.enqueue(due, steps(np.zeros((2, 2)), np.zeros((2, 1))))
     for _ in range(MAX_ATTEMPTS):
@@ -274,7 +276,7 @@ def test_without_the_right_to_raise_the_budget_its_rest_is_granted(storage: Stor
     assert storage.designs.left(due) == 0
 
 
-def test_simultaneous_requests_get_at_most_the_budget_left(storage: Storage, due: str) -> None:
+def test_simultaneous_improve_requests_get_at_most_the_remaining_budget(storage: Storage, due: str) -> None:
     def ask(_: int) -> int:
         try:
             return storage.designs.improve(due, 4).record.extra_queries
@@ -286,7 +288,7 @@ def test_simultaneous_requests_get_at_most_the_budget_left(storage: Storage, due
     assert sorted(granted) == [4, 8, 12, 16, 20, 24], "27 of 30 were left"
 
 
-def test_a_fit_of_a_deleted_surrogate_goes_nowhere(
+def test_committing_a_fit_of_a_deleted_surrogate_is_refused(
     storage: Storage, due: str, design: Callable[..., NewDesign], make: Callable[..., str]
 ) -> None:
     lease = begun(storage, due)
@@ -299,7 +301,7 @@ def test_a_fit_of_a_deleted_surrogate_goes_nowhere(
         storage.designs.commit(lease, design())
 
 
-def test_a_refused_commit_leaves_nothing_behind(storage: Storage, due: str, design: Callable[..., NewDesign]) -> None:
+def test_a_failed_commit_of_a_fit_stores_nothing(storage: Storage, due: str, design: Callable[..., NewDesign]) -> None:
     lease = begun(storage, due)
     whole = design(queries=2)
     wrong = (Query.step((1.0, 1.0), ("no number",)),)  # type: ignore[arg-type]
@@ -310,7 +312,7 @@ def test_a_refused_commit_leaves_nothing_behind(storage: Storage, due: str, desi
     assert storage.designs.commit(lease, whole) == 1
 
 
-def test_models_are_numbered_from_one_in_each_surrogate(
+def test_model_versions_start_at_one_in_each_surrogate(
     storage: Storage, make: Callable[..., str], design: Callable[..., NewDesign]
 ) -> None:
     one, two = make(name="one"), make(name="two")

@@ -16,7 +16,9 @@ Make = Callable[..., str]
 Sample = Callable[..., NewSample]
 
 
-def test_logged_samples_have_their_own_line_and_cost_no_budget(storage: Storage, make: Make, by_hand: Sample) -> None:
+def test_logged_samples_are_counted_separately_in_the_ledger_and_cost_no_budget(
+    storage: Storage, make: Make, by_hand: Sample
+) -> None:
     name = make(queries=0, budget=3)
     storage.samples.add(name, "log", [by_hand(reward=float(i)) for i in range(10)], log=LogPart())
     assert storage.ledger.read(name) == LedgerRecord(logged=10)
@@ -26,7 +28,7 @@ def test_logged_samples_have_their_own_line_and_cost_no_budget(storage: Storage,
     assert set(storage.samples.arrays(name).purpose) == {"logged"}
 
 
-def test_arrays_tell_logged_samples_from_others(storage: Storage, make: Make, by_hand: Sample) -> None:
+def test_sample_arrays_mark_logged_samples_by_their_purpose(storage: Storage, make: Make, by_hand: Sample) -> None:
     name = make(queries=0)
     storage.samples.add(name, "log", [by_hand(reward=1.0)], log=LogPart())
     storage.samples.add(name, "hand", [by_hand(reward=1.0)], key="one")
@@ -34,7 +36,9 @@ def test_arrays_tell_logged_samples_from_others(storage: Storage, make: Make, by
     assert storage.ledger.read(name) == LedgerRecord(manual=1, logged=1)
 
 
-def test_the_same_log_in_other_batches_changes_nothing(storage: Storage, make: Make, by_hand: Sample) -> None:
+def test_sending_the_same_log_again_in_other_batches_stores_nothing(
+    storage: Storage, make: Make, by_hand: Sample
+) -> None:
     name = make(queries=0)
     log = [by_hand(reward=float(i)) for i in range(4)]
     first = storage.samples.add(name, "log", log, log=LogPart())
@@ -45,7 +49,7 @@ def test_the_same_log_in_other_batches_changes_nothing(storage: Storage, make: M
     assert storage.samples.count(name) == 4
 
 
-def test_equal_samples_of_a_log_all_count(storage: Storage, make: Make, by_hand: Sample) -> None:
+def test_equal_rows_within_a_log_are_all_stored(storage: Storage, make: Make, by_hand: Sample) -> None:
     """1,864 of 1,999 steps were dropped because they had the numbers of others."""
     name = make(queries=0)
     for _ in range(2):
@@ -68,7 +72,7 @@ def sent(storage: Storage, name: str, log: list[NewSample], size: int, after: st
 
 
 @pytest.mark.parametrize("size", [2, 100])
-def test_drawn_logs_all_count_once_each_however_they_come(
+def test_random_logs_sent_in_any_pieces_are_each_stored_once(
     storage: Storage, make: Make, by_hand: Sample, size: int
 ) -> None:
     """Logs of few different steps, which begin alike, grow, are interrupted and come again."""
@@ -93,14 +97,14 @@ def _begins(one: list[NewSample], other: list[NewSample]) -> bool:
     return all(a == b for a, b in zip(one, other, strict=False))
 
 
-def test_logs_of_different_origin_both_count(storage: Storage, make: Make, by_hand: Sample) -> None:
+def test_equal_logs_of_different_origin_are_both_stored(storage: Storage, make: Make, by_hand: Sample) -> None:
     """Two days of a plant at rest have the same numbers."""
     name, day = make(queries=0), [by_hand()] * 3
     assert [sent(storage, name, day, 2, origin) for origin in ("monday", "tuesday", "monday")] == [0, 0, 3]
     assert storage.samples.count(name) == 6
 
 
-def test_a_log_is_fitted_while_queries_wait_for_a_sampler(
+def test_a_fit_to_a_log_is_due_although_queries_are_open(
     storage: Storage, make: Make, by_hand: Sample, design: Callable[..., NewDesign]
 ) -> None:
     name = make(queries=3)
@@ -115,7 +119,7 @@ def test_a_log_is_fitted_while_queries_wait_for_a_sampler(
     assert storage.designs.due() == [name]
 
 
-def test_no_fit_is_due_before_the_log_is_complete(storage: Storage, make: Make, by_hand: Sample) -> None:
+def test_no_fit_is_due_before_a_log_in_parts_is_complete(storage: Storage, make: Make, by_hand: Sample) -> None:
     name = make(queries=0)
     storage.samples.add(name, "log", [by_hand()], log=LogPart(complete=False))
     assert storage.designs.due() == []
@@ -123,7 +127,7 @@ def test_no_fit_is_due_before_the_log_is_complete(storage: Storage, make: Make, 
     assert storage.designs.due() == [name]
 
 
-def test_a_repeated_complete_log_makes_no_fit_due(
+def test_sending_a_complete_log_again_makes_no_fit_due(
     storage: Storage, make: Make, by_hand: Sample, design: Callable[..., NewDesign]
 ) -> None:
     name = make(queries=0)
@@ -136,7 +140,7 @@ def test_a_repeated_complete_log_makes_no_fit_due(
     assert storage.surrogates.get(name).phase == "from_log"
 
 
-def test_a_logged_sample_of_a_query_is_refused_by_its_index(
+def test_a_logged_sample_with_a_query_id_is_refused_with_its_index(
     storage: Storage, make: Make, by_hand: Sample, answer: Sample
 ) -> None:
     name = make(queries=1)
@@ -146,7 +150,9 @@ def test_a_logged_sample_of_a_query_is_refused_by_its_index(
     assert storage.samples.count(name) == 0
 
 
-def test_only_queries_without_a_lease_are_withdrawn(storage: Storage, make: Make, answer: Sample) -> None:
+def test_withdrawing_queries_leaves_leased_failed_and_answered_ones(
+    storage: Storage, make: Make, answer: Sample
+) -> None:
     name = make(queries=4)
     ids = [query.id for query in storage.queries.list(name)]
     answered, failed = storage.queries.claim(name, "a", 2, SECONDS)

@@ -15,7 +15,9 @@ from surrogym_server.storage.sql import memory
 from surrogym_server.storage.sql.rows import append_event, hold
 
 
-def test_occupancy_comes_back_by_checkpoint_and_the_latest_is_known(storage: Storage, make: Callable[..., str]) -> None:
+def test_visited_states_are_stored_by_checkpoint_and_the_latest_is_known(
+    storage: Storage, make: Callable[..., str]
+) -> None:
     name = make()
     early, late = np.random.default_rng(0).normal(size=(2, 7, 2))
     assert storage.occupancy.latest(name) is None
@@ -31,7 +33,9 @@ def test_occupancy_comes_back_by_checkpoint_and_the_latest_is_known(storage: Sto
     assert storage.occupancy.get(name, "never") is None
 
 
-def test_the_same_checkpoint_again_replaces_and_is_the_latest(storage: Storage, make: Callable[..., str]) -> None:
+def test_visited_states_stored_under_an_existing_checkpoint_replace_it(
+    storage: Storage, make: Callable[..., str]
+) -> None:
     name = make()
     for checkpoint, value in (("a", 1.0), ("b", 2.0), ("a", 3.0)):
         storage.occupancy.put(name, checkpoint, np.full((1, 2), value))
@@ -40,7 +44,7 @@ def test_the_same_checkpoint_again_replaces_and_is_the_latest(storage: Storage, 
     assert (newest.checkpoint, newest.states.tolist()) == ("a", [[3.0, 3.0]])
 
 
-def test_occupancy_remembers_the_round_it_came_in(
+def test_visited_states_are_stored_with_their_design_round(
     storage: Storage,
     make: Callable[..., str],
     answer_all: Callable[[str], None],
@@ -57,7 +61,7 @@ def test_occupancy_remembers_the_round_it_came_in(
     assert (found.round, found.states.shape) == (1, (0, 2))
 
 
-def test_sessions_are_given_back_once(storage: Storage) -> None:
+def test_saved_sessions_are_returned_once(storage: Storage) -> None:
     storage.sessions.save([])
     storage.sessions.save([SavedSession("s", "p", b"old"), SavedSession("t", "p", b"\0\xff")])
     storage.sessions.save([SavedSession("s", "p", b"new")])
@@ -66,7 +70,7 @@ def test_sessions_are_given_back_once(storage: Storage) -> None:
     assert storage.sessions.take() == []
 
 
-def test_events_tell_the_story_in_order(
+def test_events_of_a_surrogate_are_listed_in_order(
     storage: Storage,
     make: Callable[..., str],
     answer_all: Callable[[str], None],
@@ -91,7 +95,7 @@ def test_events_tell_the_story_in_order(
     assert storage.events.list(name, limit=2) == events[:2]
 
 
-def test_times_are_seconds_since_1970(storage: Storage, make: Callable[..., str]) -> None:
+def test_stored_times_are_seconds_since_1970(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=1)
     created = storage.surrogates.get(name).created_at
     [leased] = storage.queries.claim(name, "a", 1, 60.0)
@@ -99,7 +103,7 @@ def test_times_are_seconds_since_1970(storage: Storage, make: Callable[..., str]
     assert 60.0 <= leased.expires - created < 600.0
 
 
-def test_the_newest_event_takes_one_statement_however_many_there_are(
+def test_finding_the_newest_event_takes_a_constant_number_of_statements(
     storage: Storage, make: Callable[..., str]
 ) -> None:
     name, another = make(), make(name="another")
@@ -113,7 +117,7 @@ def test_the_newest_event_takes_one_statement_however_many_there_are(
     assert asked[0] == asked[1]
 
 
-def test_the_oldest_events_are_removed_in_transactions_of_bounded_size(
+def test_the_oldest_events_are_deleted_in_transactions_of_limited_size(
     storage: Storage, make: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(memory, "BATCH", 20)

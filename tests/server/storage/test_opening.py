@@ -53,7 +53,7 @@ def engine(url: str) -> sa.Engine:
     return sa.create_engine(url.replace("postgresql:", "postgresql+psycopg:"), poolclass=sa.NullPool)
 
 
-def test_migrations_make_the_tables_the_program_uses(url: str) -> None:
+def test_database_migrations_create_the_tables_the_program_uses(url: str) -> None:
     """Besides, there may be tables of features that this program lacks."""
     open_storage(url).close()
 
@@ -65,7 +65,7 @@ def test_migrations_make_the_tables_the_program_uses(url: str) -> None:
         assert compare_metadata(MigrationContext.configure(connection, opts=opts), metadata) == []
 
 
-def test_opening_again_keeps_everything(url: str, storage: Storage, make: Callable[..., str]) -> None:
+def test_reopening_a_database_keeps_everything(url: str, storage: Storage, make: Callable[..., str]) -> None:
     make(name="kept")
     before = storage.surrogates.get("kept")
     storage.close()
@@ -74,7 +74,7 @@ def test_opening_again_keeps_everything(url: str, storage: Storage, make: Callab
     again.close()
 
 
-def test_a_database_of_a_newer_program_is_refused_and_left_alone(url: str) -> None:
+def test_a_database_of_a_newer_version_is_refused_and_left_unchanged(url: str) -> None:
     open_storage(url).close()
     with engine(url).begin() as connection:
         connection.execute(sa.text("UPDATE alembic_version SET version_num = '9999'"))
@@ -84,7 +84,7 @@ def test_a_database_of_a_newer_program_is_refused_and_left_alone(url: str) -> No
         assert connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalar() == "9999"
 
 
-def test_a_database_of_an_unreleased_program_is_refused_and_left_alone(url: str) -> None:
+def test_a_database_of_an_unreleased_version_is_refused_and_left_unchanged(url: str) -> None:
     open_storage(url).close()
     with engine(url).begin() as connection:
         connection.execute(sa.text("UPDATE alembic_version SET version_num = '0011'"))
@@ -94,7 +94,7 @@ def test_a_database_of_an_unreleased_program_is_refused_and_left_alone(url: str)
         assert connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalar() == "0011"
 
 
-def test_the_names_of_the_migrations_are_their_revisions_in_order() -> None:
+def test_migration_file_names_are_their_revision_numbers_in_order() -> None:
     """Opening compares the names with the database, so that Alembic is loaded only where something is missing."""
     scripts = ScriptDirectory(str(SCRIPTS)).walk_revisions()
     assert [f"r{script.revision}" for script in reversed(list(scripts))] == [
@@ -102,7 +102,7 @@ def test_the_names_of_the_migrations_are_their_revisions_in_order() -> None:
     ]
 
 
-def test_a_database_with_today_s_schema_is_opened_without_alembic(url: str) -> None:
+def test_a_database_with_the_current_schema_is_opened_without_alembic(url: str) -> None:
     open_storage(url).close()
     opening = f"from surrogym_server.storage.sql import open_storage; open_storage({url!r}).close(); import sys"
     done = subprocess.run(
@@ -115,7 +115,7 @@ def test_a_database_with_today_s_schema_is_opened_without_alembic(url: str) -> N
 
 
 @pytest.mark.postgresql
-def test_text_is_utf8_in_a_database_that_knows_no_encoding(postgresql: Postgresql) -> None:
+def test_text_is_stored_as_utf8_in_an_sql_ascii_postgresql_database(postgresql: Postgresql) -> None:
     url = postgresql.new_database("TEMPLATE template0 ENCODING 'SQL_ASCII' LC_COLLATE 'C' LC_CTYPE 'C'")
     opened = open_storage(url)
     opened.surrogates.create(NewSurrogate("a", {"environment": "Fräse 3 µm"}, 30, 0.9))
@@ -125,25 +125,25 @@ def test_text_is_utf8_in_a_database_that_knows_no_encoding(postgresql: Postgresq
     again.close()
 
 
-def test_ping_answers_and_closing_twice_is_harmless(storage: Storage) -> None:
+def test_a_database_answers_ping_and_can_be_closed_twice(storage: Storage) -> None:
     storage.ping()
     storage.close()
     storage.close()
 
 
 @pytest.mark.parametrize("url", ["mysql://host/name", "sqlite://", "sqlite:///:memory:", "surrogym.db"])
-def test_other_addresses_are_refused(url: str) -> None:
+def test_unsupported_database_urls_are_refused(url: str) -> None:
     with pytest.raises(InvalidInput, match="expected"):
         open_storage(url)
 
 
-def test_a_refused_address_does_not_print_its_password() -> None:
+def test_the_error_for_a_refused_database_url_hides_its_password() -> None:
     with pytest.raises(InvalidInput) as refused:
         open_storage("mysql://user:secret@host/name")
     assert "secret" not in str(refused.value)
 
 
-def test_a_second_server_on_the_same_file_is_refused(tmp_path: Path) -> None:
+def test_a_second_server_on_the_same_sqlite_file_is_refused(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/surrogym.db"
     first = open_storage(url)
     with pytest.raises(Unavailable, match="only server"):
@@ -179,7 +179,9 @@ OTHER_NAMES = [by_symbolic_link, by_hard_link, after_a_move, without_files_besid
 
 
 @pytest.mark.parametrize("other_name", OTHER_NAMES)
-def test_a_second_server_is_refused_by_any_name_of_the_file(tmp_path: Path, other_name: Callable[[Path], Path]) -> None:
+def test_a_second_server_on_a_link_to_the_same_sqlite_file_is_refused(
+    tmp_path: Path, other_name: Callable[[Path], Path]
+) -> None:
     """In another process, for a lock may be kept by process; and this one's locks outlive the refusals."""
     file = tmp_path / "surrogym.db"
     first = open_storage(f"sqlite:///{file}")
@@ -193,7 +195,7 @@ def test_a_second_server_is_refused_by_any_name_of_the_file(tmp_path: Path, othe
     open_storage(f"sqlite:///{second}").close()
 
 
-def test_where_no_byte_can_be_locked_a_file_beside_refuses_a_second_server(
+def test_without_byte_range_locks_a_lock_file_refuses_a_second_server(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(filelock, "WHOLE_DESCRIPTION", None)
@@ -217,7 +219,7 @@ def replace_by_a_copy(file: Path) -> None:
 
 
 @pytest.mark.parametrize("change", [delete, after_a_move, replace_by_a_copy])
-def test_nothing_is_written_to_a_file_that_is_no_longer_in_its_place(
+def test_writing_is_refused_if_the_database_file_was_moved_replaced_or_deleted(
     tmp_path: Path, change: Callable[[Path], Any]
 ) -> None:
     file = tmp_path / "surrogym.db"
@@ -231,7 +233,9 @@ def test_nothing_is_written_to_a_file_that_is_no_longer_in_its_place(
 
 @pytest.mark.parametrize("suffix", ["-wal", "-shm"])
 @pytest.mark.parametrize("replaced", [False, True])
-def test_deleting_the_write_ahead_log_loses_nothing(tmp_path: Path, suffix: str, replaced: bool) -> None:
+def test_deleting_the_write_ahead_log_at_run_time_loses_no_acknowledged_data(
+    tmp_path: Path, suffix: str, replaced: bool
+) -> None:
     """What was acknowledged before is there after a restart; nothing is acknowledged into a log that nobody finds."""
     file = tmp_path / "surrogym.db"
     storage = open_storage(f"sqlite:///{file}")
@@ -252,7 +256,7 @@ def test_deleting_the_write_ahead_log_loses_nothing(tmp_path: Path, suffix: str,
     again.close()
 
 
-def test_a_replaced_file_is_not_read(tmp_path: Path) -> None:
+def test_reading_is_refused_if_the_database_file_was_replaced(tmp_path: Path) -> None:
     file = tmp_path / "surrogym.db"
     storage = open_storage(f"sqlite:///{file}")
     replace_by_a_copy(file)
@@ -261,39 +265,39 @@ def test_a_replaced_file_is_not_read(tmp_path: Path) -> None:
     storage.close()
 
 
-def test_a_file_that_can_not_be_written_is_refused(tmp_path: Path) -> None:
+def test_a_read_only_database_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "surrogym.db").mkdir()
     with pytest.raises(Unavailable, match=r"expected a file to read and write .*surrogym\.db"):
         open_storage(f"sqlite:///{tmp_path}/surrogym.db")
 
 
-def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
+def test_opening_a_file_that_is_not_a_database_is_refused(tmp_path: Path) -> None:
     (tmp_path / "surrogym.db").write_text("a diary\n" * 1000)
     with pytest.raises(Unavailable, match="not a database"):
         open_storage(f"sqlite:///{tmp_path}/surrogym.db")
 
 
-def test_a_folder_that_can_not_be_made_is_refused(tmp_path: Path) -> None:
+def test_a_database_in_a_folder_that_cannot_be_created_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(Unavailable, match="folder"):
         open_storage(f"sqlite:///{tmp_path}/file/surrogym.db")
 
 
 @pytest.mark.postgresql
-def test_a_postgresql_that_is_not_there_is_unavailable(tmp_path: Path) -> None:
+def test_an_unreachable_postgresql_raises_unavailable(tmp_path: Path) -> None:
     with pytest.raises(Unavailable, match="check that PostgreSQL runs, and the address in --database"):
         open_storage(f"postgresql://postgres@/x?host={tmp_path}")
 
 
 @pytest.mark.postgresql
-def test_a_postgresql_database_that_does_not_exist_comes_with_what_makes_it(postgresql: Postgresql) -> None:
+def test_the_error_for_a_missing_postgresql_database_shows_the_createdb_command(postgresql: Postgresql) -> None:
     missing = sa.make_url(postgresql.new_database()).set(database="nowhere").render_as_string()
     with pytest.raises(Unavailable, match='"nowhere" does not exist; createdb nowhere makes it, or check --database'):
         open_storage(missing)
 
 
 @pytest.mark.parametrize(("options", "synchronous"), [((), 2), (("full",), 2), (("normal",), 1)])
-def test_sqlite_waits_for_the_disk_before_it_acknowledges(tmp_path: Path, options: tuple[Any], synchronous: int):
+def test_sqlite_syncs_to_disk_before_acknowledging_a_commit(tmp_path: Path, options: tuple[Any], synchronous: int):
     opened = connect(f"sqlite:///{tmp_path}/surrogym.db", *options)
     with opened.write() as connection:
         pragmas = {
@@ -304,7 +308,7 @@ def test_sqlite_waits_for_the_disk_before_it_acknowledges(tmp_path: Path, option
     assert pragmas == {"journal_mode": "wal", "synchronous": synchronous, "foreign_keys": 1}
 
 
-def test_a_writer_that_stays_keeps_the_others_waiting_for_a_while_only(
+def test_a_second_writer_gives_up_after_waiting_for_the_first_too_long(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(database, "BUSY_SECONDS", 0.05)
@@ -325,7 +329,7 @@ def test_a_writer_that_stays_keeps_the_others_waiting_for_a_while_only(
     opened.close()
 
 
-def test_a_killed_writer_loses_nothing_it_acknowledged(url: str) -> None:
+def test_a_killed_writer_loses_no_acknowledged_data(url: str) -> None:
     writer = subprocess.Popen([sys.executable, "-c", WRITER, url], stdout=subprocess.PIPE, text=True)
     assert writer.stdout is not None
     acknowledged = [writer.stdout.readline().split() for _ in range(20)]
@@ -341,13 +345,13 @@ def test_a_killed_writer_loses_nothing_it_acknowledged(url: str) -> None:
     assert len(stored) <= len(acknowledged) + 1, "at most the one that was on its way"
 
 
-def test_a_pipe_is_refused_instead_of_waiting_for_its_other_end(tmp_path: Path) -> None:
+def test_a_database_path_that_is_a_pipe_is_refused_without_blocking(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InvalidInput, match=r"expected a file for the database, got .*pipe"):
         open_storage(f"sqlite:///{tmp_path}/pipe")
 
 
-def test_both_databases_refuse_the_same_values_in_the_same_words(storage: Storage) -> None:
+def test_sqlite_and_postgresql_refuse_unstorable_values_with_the_same_error(storage: Storage) -> None:
     said = set()
     for name in ("nul \0", "half \ud800"):
         with pytest.raises(InvalidInput) as refused:

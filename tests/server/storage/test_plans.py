@@ -53,14 +53,14 @@ Read = Callable[[Storage], object]
     ],
     ids=["page", "claim"],
 )
-def test_pages_and_claims_read_their_rows_by_an_index(
+def test_paging_and_claiming_statements_use_a_postgresql_index(
     filled: str, storage: Storage, read: Read, words: tuple[str, ...], indexes: set[tuple[str, str]]
 ):
     [sent] = [sent for sent in statements(storage, read) if all(word in sent[0] for word in words)]
     assert scans(filled, *sent) == indexes
 
 
-def test_a_list_of_surrogates_reads_the_large_tables_by_their_indexes(filled: str, storage: Storage):
+def test_listing_surrogates_reads_the_large_postgresql_tables_by_index(filled: str, storage: Storage):
     """The first list counts the samples for the ledgers. Later ones count those that are new."""
     assert storage.surrogates.summaries()
     found = [scan for sent in statements(storage, lambda s: s.surrogates.summaries()) for scan in scans(filled, *sent)]

@@ -14,7 +14,7 @@ SECONDS = 60.0
 BLOB, ABOUT = bytes(range(256)) * 3, {"source": "textbook", "parameters": [{"name": "mass"}]}
 
 
-def test_a_prior_comes_back_bit_for_bit_and_the_next_one_replaces_it(storage: Storage, make: Callable[..., str]):
+def test_a_stored_prior_is_read_back_unchanged_and_replaced_by_the_next(storage: Storage, make: Callable[..., str]):
     name = make()
     assert storage.priors.get(name) is None
     assert storage.priors.blob(name) is None
@@ -41,14 +41,14 @@ def test_no_fit_is_due_while_a_design_waits_for_its_prior(
     assert name in storage.designs.due()
 
 
-def test_a_design_that_has_a_prior_waits_for_no_other(storage: Storage, make: Callable[..., str]):
+def test_a_design_that_has_a_prior_does_not_wait_for_another(storage: Storage, make: Callable[..., str]):
     name = make()
     storage.priors.put(name, BLOB, ABOUT)
     storage.priors.wait(name)
     assert storage.priors.blob(name) == BLOB
 
 
-def test_a_new_prior_withdraws_what_no_sampler_has_begun(
+def test_storing_a_prior_withdraws_pending_queries_and_makes_a_fit_due(
     storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None], design: Callable[..., NewDesign]
 ):
     name = make()
@@ -62,7 +62,7 @@ def test_a_new_prior_withdraws_what_no_sampler_has_begun(
     assert name in storage.designs.due()
 
 
-def test_a_removed_prior_leaves_a_fit_without_it_due(
+def test_removing_a_prior_makes_a_fit_without_it_due(
     storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None]
 ):
     name = make()
@@ -74,7 +74,7 @@ def test_a_removed_prior_leaves_a_fit_without_it_due(
     assert name in storage.designs.due()
 
 
-def test_a_prior_is_removed_with_its_surrogate(storage: Storage, make: Callable[..., str]):
+def test_deleting_a_surrogate_deletes_its_prior(storage: Storage, make: Callable[..., str]):
     name = make()
     storage.priors.put(name, BLOB, ABOUT)
     storage.surrogates.delete(name)

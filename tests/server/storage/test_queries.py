@@ -16,7 +16,7 @@ LONG = 60.0
 SHORT = 0.02
 
 
-def test_claims_go_out_oldest_first_and_once(storage: Storage, make: Callable[..., str]) -> None:
+def test_each_query_is_handed_out_once_and_the_oldest_first(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=3)
     first = storage.queries.claim(name, "a", 2, LONG)
     second = storage.queries.claim(name, "b", 2, LONG)
@@ -28,14 +28,14 @@ def test_claims_go_out_oldest_first_and_once(storage: Storage, make: Callable[..
     assert storage.queries.counts(name) == QueryCounts(leased=3)
 
 
-def test_a_query_says_who_has_it(storage: Storage, make: Callable[..., str]) -> None:
+def test_a_leased_query_names_its_sampler(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=1)
     [leased] = storage.queries.claim(name, "arm-7", 1, LONG)
     query = storage.queries.get(name, leased.id)
     assert (query.status, query.sampler, query.attempts) == ("leased", "arm-7", 1)
 
 
-def test_a_query_says_how_long_its_lease_lasts(storage: Storage, make: Callable[..., str]) -> None:
+def test_a_leased_query_contains_the_expiry_of_its_lease(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=2)
     [failed] = storage.queries.claim(name, "a", 1, LONG)
     storage.queries.fail(name, failed.id, failed.token, "dropped")
@@ -46,7 +46,7 @@ def test_a_query_says_how_long_its_lease_lasts(storage: Storage, make: Callable[
     assert [seconds for id, seconds in left.items() if id != leased.id] == [None]
 
 
-def test_coordinates_come_back_bit_for_bit(storage: Storage, make: Callable[..., str]) -> None:
+def test_query_coordinates_are_stored_bit_exactly(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=0)
     odd = np.array([[0.1 + 0.2, -0.0], [5e-324, 1.7976931348623157e308]])
     storage.queries.enqueue(name, steps(odd, [[np.pi], [1 / 3]]))
@@ -55,7 +55,7 @@ def test_coordinates_come_back_bit_for_bit(storage: Storage, make: Callable[...,
     assert [query.action for query in claimed] == [(np.pi,), (1 / 3,)]
 
 
-def test_a_paused_surrogate_hands_out_nothing(storage: Storage, make: Callable[..., str]) -> None:
+def test_no_query_of_a_paused_surrogate_is_handed_out(storage: Storage, make: Callable[..., str]) -> None:
     name = make()
     storage.surrogates.change(name, paused=True)
     assert storage.queries.claim(name, "a", 1, LONG) == []
@@ -63,7 +63,7 @@ def test_a_paused_surrogate_hands_out_nothing(storage: Storage, make: Callable[.
     assert len(storage.queries.claim(name, "a", 1, LONG)) == 1
 
 
-def test_the_query_of_a_dead_sampler_goes_to_the_next(
+def test_the_query_of_a_dead_sampler_goes_to_the_next_sampler(
     storage: Storage, make: Callable[..., str], until: Callable[[Callable[[], bool]], None]
 ) -> None:
     name = make(queries=1)
@@ -75,7 +75,7 @@ def test_the_query_of_a_dead_sampler_goes_to_the_next(
     assert storage.ledger.read(name).unresolved == 1
 
 
-def test_a_lease_that_ran_out_counts_as_unresolved_before_anyone_sweeps(
+def test_a_query_with_an_expired_lease_counts_as_unresolved_at_once(
     storage: Storage, make: Callable[..., str], until: Callable[[Callable[[], bool]], None]
 ) -> None:
     name = make(queries=1)
@@ -88,7 +88,7 @@ def test_a_lease_that_ran_out_counts_as_unresolved_before_anyone_sweeps(
     assert storage.ledger.read(name).unresolved == 1
 
 
-def test_renewing_keeps_a_lease_alive(
+def test_renewing_a_query_lease_prevents_its_expiry(
     storage: Storage, make: Callable[..., str], until: Callable[[Callable[[], bool]], None]
 ) -> None:
     name = make(queries=2)
@@ -102,7 +102,7 @@ def test_renewing_keeps_a_lease_alive(
         storage.queries.renew(name, lost.id, lost.token, LONG)
 
 
-def test_a_query_that_keeps_failing_is_set_aside_with_its_error(storage: Storage, make: Callable[..., str]) -> None:
+def test_a_query_that_fails_repeatedly_is_set_aside_with_its_error(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=1)
     statuses = []
     for attempt in range(1, MAX_ATTEMPTS + 1):
@@ -119,7 +119,7 @@ def test_a_query_that_keeps_failing_is_set_aside_with_its_error(storage: Storage
     assert storage.ledger.read(name) == LedgerRecord(unresolved=3, failed=3), "each may have moved the robot"
 
 
-def test_a_query_whose_leases_all_run_out_is_set_aside(
+def test_a_query_whose_leases_expire_repeatedly_is_set_aside(
     storage: Storage, make: Callable[..., str], until: Callable[[Callable[[], bool]], None]
 ) -> None:
     name = make(queries=1)
@@ -135,7 +135,7 @@ def test_a_query_whose_leases_all_run_out_is_set_aside(
     assert storage.ledger.read(name) == LedgerRecord(unresolved=MAX_ATTEMPTS, failed=0)
 
 
-def test_resuming_requeues_queries_that_were_set_aside(storage: Storage, make: Callable[..., str]) -> None:
+def test_resuming_a_surrogate_requeues_queries_that_were_set_aside(storage: Storage, make: Callable[..., str]) -> None:
     """With all attempts, of which giving back unbegun is none, and as often as somebody resumes."""
     name = make(queries=1)
 
@@ -155,7 +155,7 @@ def test_resuming_requeues_queries_that_were_set_aside(storage: Storage, make: C
     assert [body["asked_again"] for body in told] == [1, 1]
 
 
-def test_an_answer_after_a_failure_resolves_it(
+def test_a_sample_for_a_failed_query_answers_it(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=1)
@@ -166,7 +166,7 @@ def test_an_answer_after_a_failure_resolves_it(
     assert storage.ledger.read(name) == LedgerRecord(initial=1)
 
 
-def test_a_query_given_back_unbegun_counts_nowhere(
+def test_a_query_returned_before_it_was_begun_counts_as_no_attempt(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=1)
@@ -186,7 +186,9 @@ def test_a_query_given_back_unbegun_counts_nowhere(
     assert storage.ledger.read(name) == LedgerRecord(initial=1, unresolved=3, failed=3), "it was begun after all"
 
 
-def test_a_refused_query_is_no_attempt_and_leaves_the_budget(storage: Storage, make: Callable[..., str]) -> None:
+def test_a_query_refused_by_the_environment_costs_no_attempt_and_no_budget(
+    storage: Storage, make: Callable[..., str]
+) -> None:
     name = make(queries=1)
     left = storage.designs.left(name)
     [leased] = storage.queries.claim(name, "a", 1, LONG)
@@ -204,7 +206,7 @@ def test_a_refused_query_is_no_attempt_and_leaves_the_budget(storage: Storage, m
     assert storage.queries.counts(name) == QueryCounts(pending=1)
 
 
-def test_failing_twice_under_one_lease_counts_once(storage: Storage, make: Callable[..., str]) -> None:
+def test_a_failure_reported_twice_under_one_lease_counts_once(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=1)
     [leased] = storage.queries.claim(name, "a", 1, LONG)
     first = storage.queries.fail(name, leased.id, leased.token, "x")
@@ -213,7 +215,7 @@ def test_failing_twice_under_one_lease_counts_once(storage: Storage, make: Calla
     assert again.attempt == 2
 
 
-def test_an_answered_query_can_neither_fail_nor_be_renewed(
+def test_an_answered_query_can_no_longer_fail_or_be_renewed(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=1)
@@ -226,7 +228,9 @@ def test_an_answered_query_can_neither_fail_nor_be_renewed(
     assert storage.queries.get(name, leased.id).status == "answered"
 
 
-def test_foreign_tokens_and_unknown_queries_raise_different_errors(storage: Storage, make: Callable[..., str]) -> None:
+def test_a_wrong_lease_token_and_an_unknown_query_raise_different_errors(
+    storage: Storage, make: Callable[..., str]
+) -> None:
     name, other = make(name="one"), make(name="two")
     mine, neighbour = storage.queries.claim(name, "a", 2, LONG)
     [foreign] = storage.queries.claim(other, "a", 1, LONG)
@@ -240,7 +244,9 @@ def test_foreign_tokens_and_unknown_queries_raise_different_errors(storage: Stor
         storage.queries.get(name, foreign.id)
 
 
-def test_asking_by_hand_twice_with_one_key_queues_once(storage: Storage, make: Callable[..., str]) -> None:
+def test_manual_queries_sent_twice_with_one_idempotency_key_are_queued_once(
+    storage: Storage, make: Callable[..., str]
+) -> None:
     name = make(queries=0)
     asked, other = (steps(np.full((2, 2), value), np.ones((2, 1))) for value in (1.0, 2.0))
     ids = storage.queries.enqueue(name, asked, key="k")

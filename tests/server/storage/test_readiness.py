@@ -41,7 +41,7 @@ def _always_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sql_storage, "FRESH_SECONDS", 0.0)
 
 
-def test_a_missing_table_is_not_ready_until_it_is_back(storage: Storage, url: str) -> None:
+def test_a_storage_with_a_missing_table_is_not_ready_until_it_is_restored(storage: Storage, url: str) -> None:
     storage.ping()
     execute(url, "ALTER TABLE evaluations RENAME TO gone")
     assert "evaluations" in (refusal(storage) or "")
@@ -62,7 +62,7 @@ def test_a_database_that_can_only_be_read_is_not_ready(storage: Storage, url: st
     assert "read-only" in (refusal(storage) or "")
 
 
-def test_a_file_that_another_program_keeps_is_not_ready_and_nobody_waits_long_for_that(
+def test_readiness_checks_of_a_locked_database_fail_quickly(
     tmp_path: Path, until: Until, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     storage = open_storage(f"sqlite:///{tmp_path}/surrogym.db")
@@ -77,7 +77,7 @@ def test_a_file_that_another_program_keeps_is_not_ready_and_nobody_waits_long_fo
     storage.close()
 
 
-def test_many_simultaneous_checks_cause_one_write(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simultaneous_readiness_checks_cause_one_write(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sql_storage, "FRESH_SECONDS", 3600.0)
     writes: list[None] = []
     write = sql_storage.Readiness._write
@@ -90,7 +90,7 @@ def test_many_simultaneous_checks_cause_one_write(storage: Storage, monkeypatch:
     assert len(writes) == 1
 
 
-def test_the_probe_is_a_write_and_changes_nothing(tmp_path: Path) -> None:
+def test_the_readiness_check_writes_to_disk_without_changing_data(tmp_path: Path) -> None:
     storage = open_storage(f"sqlite:///{tmp_path}/surrogym.db")
     log = tmp_path / "surrogym.db-wal"
     storage.ping()

@@ -28,14 +28,14 @@ def long(storage: Storage, name: str) -> LeasedQuery:
     return storage.queries.claim(name, "a", 1, LONG)[0]
 
 
-def test_an_action_sequence_comes_back_bit_for_bit(storage: Storage, name: str) -> None:
+def test_the_actions_of_a_rollout_query_are_stored_bit_exactly(storage: Storage, name: str) -> None:
     long, short = storage.queries.claim(name, "a", 2, LONG)
     assert [(q.kind, q.coordinates, q.steps) for q in (long, short)] == [("rollout", (), 3), ("rollout", (), 1)]
     assert [q.actions for q in (long, short)] == [q.actions for q in ROLLOUTS]
     assert storage.queries.get(name, long.id).actions == ROLLOUTS[0].actions
 
 
-def test_rollouts_by_hand_wait_beside_steps(storage: Storage, make: Callable[..., str]) -> None:
+def test_manual_step_and_rollout_queries_can_be_queued_together(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=0)
     by_hand = Query.step((1.0, 1.0), (1.0,))
     step, rollout = storage.queries.enqueue(name, [by_hand, ROLLOUTS[0]], key="k")
@@ -60,14 +60,16 @@ def test_every_step_of_a_rollout_is_a_sample_of_one_trajectory(
     assert storage.ledger.read(name) == LedgerRecord(initial=3)
 
 
-def test_a_step_query_is_no_trajectory(storage: Storage, make: Callable[..., str], answer: Answer) -> None:
+def test_the_sample_of_a_step_query_belongs_to_no_trajectory(
+    storage: Storage, make: Callable[..., str], answer: Answer
+) -> None:
     [query] = storage.queries.claim(make(queries=1), "a", 1, LONG)
     storage.samples.add("pendulum", "a", [answer(query)])
     [sample] = storage.samples.page("pendulum", 0, 1)
     assert (sample.trajectory, sample.step) == (None, 0)
 
 
-def test_an_episode_that_ends_early_answers_its_query_and_gives_the_rest_of_its_steps_back(
+def test_a_rollout_that_terminates_early_returns_its_unused_steps_to_the_budget(
     storage: Storage, name: str, long: LeasedQuery, answer: Answer
 ) -> None:
     raised = storage.designs.improve(name, 30, raise_budget=True).record.budget
@@ -79,7 +81,7 @@ def test_an_episode_that_ends_early_answers_its_query_and_gives_the_rest_of_its_
     assert storage.ledger.read(name).total == 2
 
 
-def test_the_same_answer_again_is_harmless_and_another_refused(
+def test_repeating_a_rollouts_samples_is_harmless_and_changed_ones_are_refused(
     storage: Storage, name: str, long: LeasedQuery, answer: Answer
 ) -> None:
     batch = [answer(long, step=0), answer(long, step=1)]
@@ -94,7 +96,7 @@ def test_the_same_answer_again_is_harmless_and_another_refused(
 
 
 @pytest.mark.parametrize("steps", [(1,), (0, 2), (0, 1, 2, 3)], ids=["no start", "a gap", "too many"])
-def test_an_answer_with_a_gap_or_too_many_steps_is_refused(
+def test_rollout_samples_with_missing_or_too_many_steps_are_refused(
     storage: Storage, name: str, long: LeasedQuery, answer: Answer, steps: tuple[int, ...]
 ) -> None:
     batch = [answer(long, reward=float(i)) for i in steps]
@@ -105,7 +107,7 @@ def test_an_answer_with_a_gap_or_too_many_steps_is_refused(
     assert storage.queries.get(name, long.id).status == "leased"
 
 
-def test_a_sampler_that_dies_in_a_rollout_may_have_taken_all_its_steps(
+def test_all_steps_of_a_rollout_count_as_unresolved_if_its_sampler_dies(
     storage: Storage, name: str, answer: Answer, until: Wait
 ) -> None:
     [lost] = storage.queries.claim(name, "dead", 1, SHORT)
@@ -121,7 +123,7 @@ def test_a_sampler_that_dies_in_a_rollout_may_have_taken_all_its_steps(
     assert {s.trajectory for s in late} != {first.trajectory}
 
 
-def test_a_design_asks_for_rollouts(
+def test_rollout_queries_of_a_design_are_handed_out_as_adaptive(
     storage: Storage, name: str, answer: Answer, design: Callable[..., NewDesign]
 ) -> None:
     for query in storage.queries.claim(name, "a", 2, LONG):

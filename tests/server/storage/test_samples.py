@@ -17,7 +17,7 @@ SHORT = 0.02
 Wait = Callable[[Callable[[], bool]], None]
 
 
-def test_a_sample_answers_its_query_and_takes_its_purpose(
+def test_a_sample_answers_its_query_and_gets_its_purpose(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=1)
@@ -42,7 +42,7 @@ def test_a_sample_without_a_query_is_manual(
     assert storage.ledger.read(name).manual == 2
 
 
-def test_answering_again_is_a_duplicate_with_the_same_id(
+def test_answering_a_query_again_returns_the_same_sample_id(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=2)
@@ -65,7 +65,7 @@ def test_another_answer_under_the_same_lease_is_refused(
     assert storage.samples.page(name, 0, 10)[0].reward == -1.25
 
 
-def test_one_lease_twice_in_a_batch_is_one_sample(
+def test_a_lease_answered_twice_in_one_batch_stores_one_sample(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=1)
@@ -77,7 +77,7 @@ def test_one_lease_twice_in_a_batch_is_one_sample(
     assert added.duplicates == 1
 
 
-def test_a_key_makes_a_repeat_harmless_and_another_body_a_conflict(
+def test_repeating_samples_with_a_key_is_harmless_and_changed_ones_conflict(
     storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
 ) -> None:
     name = make(queries=0)
@@ -90,7 +90,7 @@ def test_a_key_makes_a_repeat_harmless_and_another_body_a_conflict(
     assert storage.samples.count(name) == 2
 
 
-def test_keys_belong_to_one_surrogate(
+def test_idempotency_keys_of_samples_are_separate_for_each_surrogate(
     storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
 ) -> None:
     one, two = make(queries=0, name="one"), make(queries=0, name="two")
@@ -100,7 +100,7 @@ def test_keys_belong_to_one_surrogate(
 
 
 @pytest.mark.parametrize("broken", ["foreign", "missing", "unknown", "conflict"])
-def test_a_batch_is_all_or_nothing(
+def test_a_batch_with_one_invalid_sample_stores_none(
     storage: Storage,
     make: Callable[..., str],
     answer: Callable[..., NewSample],
@@ -125,14 +125,14 @@ def test_a_batch_is_all_or_nothing(
     assert storage.samples.add(name, "a", [by_hand(), answer(good)], key="k").duplicates == 0, "the key is still free"
 
 
-def test_a_token_without_its_query_is_refused(
+def test_a_sample_with_a_lease_token_but_no_query_id_is_refused(
     storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
 ) -> None:
     with pytest.raises(InvalidInput, match="query_id"):
         storage.samples.add(make(), "a", [by_hand(lease_token="t")])
 
 
-def test_a_late_answer_is_kept_once_and_answers_the_waiting_query(
+def test_a_late_sample_is_stored_once_and_answers_the_pending_query(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample], until: Wait
 ) -> None:
     name = make(queries=1)
@@ -147,7 +147,7 @@ def test_a_late_answer_is_kept_once_and_answers_the_waiting_query(
     assert storage.ledger.read(name) == LedgerRecord(initial=1), "it is resolved now"
 
 
-def test_a_late_answer_before_anyone_swept_is_late_all_the_same(
+def test_a_sample_after_lease_expiry_is_late_even_before_the_sweep(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample], until: Wait
 ) -> None:
     name = make(queries=1)
@@ -159,7 +159,7 @@ def test_a_late_answer_before_anyone_swept_is_late_all_the_same(
     assert storage.queries.counts(name) == QueryCounts(answered=1)
 
 
-def test_a_late_answer_leaves_the_query_to_a_live_lease_and_both_are_data(
+def test_a_late_sample_does_not_end_the_lease_of_the_next_sampler(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample], until: Wait
 ) -> None:
     name = make(queries=1)
@@ -177,7 +177,7 @@ def test_a_late_answer_leaves_the_query_to_a_live_lease_and_both_are_data(
     ]
 
 
-def test_sweeping_leaves_a_query_answered_that_was_answered_late(
+def test_the_sweep_leaves_a_query_answered_by_a_late_sample(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample], until: Wait
 ) -> None:
     name = make(queries=1)
@@ -191,7 +191,7 @@ def test_sweeping_leaves_a_query_answered_that_was_answered_late(
     assert storage.ledger.read(name).unresolved == 1
 
 
-def test_a_late_answer_to_an_answered_query_is_kept(
+def test_a_late_sample_for_an_answered_query_is_stored(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample], until: Wait
 ) -> None:
     name = make(queries=1)
@@ -204,7 +204,7 @@ def test_a_late_answer_to_an_answered_query_is_kept(
     assert storage.queries.counts(name) == QueryCounts(answered=1)
 
 
-def test_an_answer_after_a_reported_failure_is_still_an_observation(
+def test_a_sample_after_a_reported_failure_is_stored_as_late(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=1)
@@ -215,7 +215,7 @@ def test_an_answer_after_a_reported_failure_is_still_an_observation(
     assert storage.queries.get(name, leased.id).status == "answered"
 
 
-def test_arrays_hold_all_samples_in_order_and_exactly(
+def test_sample_arrays_contain_all_samples_in_order_bit_exactly(
     storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
 ) -> None:
     name = make(queries=0)
@@ -232,7 +232,7 @@ def test_arrays_hold_all_samples_in_order_and_exactly(
     assert got.terminated.tolist() == (rows[:, 5] > 0).tolist()
 
 
-def test_pages_continue_after_an_id(
+def test_a_page_of_samples_starts_after_the_given_id(
     storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
 ) -> None:
     name = make(queries=0)
@@ -246,7 +246,9 @@ def test_pages_continue_after_an_id(
     assert storage.samples.page(name, ids[-1], 3) == []
 
 
-def test_evaluation_steps_are_counted_once_per_key_and_apart(storage: Storage, make: Callable[..., str]) -> None:
+def test_evaluation_steps_are_counted_once_per_key_and_separately_from_samples(
+    storage: Storage, make: Callable[..., str]
+) -> None:
     name = make()
     storage.ledger.report(name, 200, key="k", episodes=1)
     assert storage.ledger.report(name, 200, key="k", episodes=1).evaluation == 200

@@ -48,19 +48,23 @@ def chosen(storage: Storage, name: str, known: list[NewSample], design: Callable
     return queries
 
 
-def test_a_snapshot_is_known_with_the_state_after_its_step(storage: Storage, name: str, known: list[NewSample]) -> None:
+def test_a_snapshot_is_stored_with_the_state_after_its_step(
+    storage: Storage, name: str, known: list[NewSample]
+) -> None:
     expected = {"one": known[0].next_coordinates, "two": known[1].next_coordinates}
     assert storage.snapshots.all(name) == expected
     storage.samples.add(name, "a", known)
     assert storage.snapshots.all(name) == expected, "a repeat changes nothing"
 
 
-def test_a_query_says_where_it_begins(storage: Storage, name: str, chosen: list[LeasedQuery]) -> None:
+def test_a_rollout_query_names_the_snapshot_it_starts_from(
+    storage: Storage, name: str, chosen: list[LeasedQuery]
+) -> None:
     assert [query.snapshot for query in chosen] == ["one", "two", None]
     assert [query.snapshot for query in storage.queries.list(name)] == [None, "one", "two", None]
 
 
-def test_a_dropped_snapshot_takes_its_queries_along_and_a_fit_is_due(
+def test_dropping_a_snapshot_withdraws_its_queries_and_makes_a_fit_due(
     storage: Storage, name: str, chosen: list[LeasedQuery]
 ) -> None:
     storage.queries.withdraw(name, [query.id for query in chosen[1:]])
@@ -72,7 +76,7 @@ def test_a_dropped_snapshot_takes_its_queries_along_and_a_fit_is_due(
     assert storage.snapshots.drop(name, ["one"]) == 0, "a repeat is harmless"
 
 
-def test_a_repeated_sample_does_not_bring_a_dropped_snapshot_back(
+def test_a_repeated_sample_does_not_restore_a_dropped_snapshot(
     storage: Storage, name: str, known: list[NewSample]
 ) -> None:
     storage.snapshots.drop(name, ["one"])
@@ -80,7 +84,7 @@ def test_a_repeated_sample_does_not_bring_a_dropped_snapshot_back(
     assert list(storage.snapshots.all(name)) == ["two"]
 
 
-def test_a_query_that_was_leased_when_its_snapshot_went_is_not_offered_again(
+def test_a_leased_query_whose_snapshot_was_dropped_is_not_handed_out_again(
     storage: Storage, name: str, chosen: list[LeasedQuery]
 ) -> None:
     first, second, third = storage.queries.claim(name, "a", 3, LONG)
@@ -93,7 +97,9 @@ def test_a_query_that_was_leased_when_its_snapshot_went_is_not_offered_again(
     assert storage.ledger.read(name).unresolved == 0
 
 
-def test_a_query_that_may_have_been_begun_is_set_aside(storage: Storage, name: str, chosen: list[LeasedQuery]) -> None:
+def test_a_possibly_begun_query_is_set_aside_when_its_snapshot_is_dropped(
+    storage: Storage, name: str, chosen: list[LeasedQuery]
+) -> None:
     again = storage.queries.claim(name, "a", 1, LONG)[0]
     storage.queries.fail(name, again.id, again.token, "it shook")
     storage.snapshots.drop(name, ["one"])
@@ -102,7 +108,7 @@ def test_a_query_that_may_have_been_begun_is_set_aside(storage: Storage, name: s
     assert storage.ledger.read(name).unresolved == 2, "its two steps may have been taken"
 
 
-def test_a_deleted_surrogate_takes_its_snapshots_along(storage: Storage, name: str, known: list[NewSample]) -> None:
+def test_deleting_a_surrogate_deletes_its_snapshots(storage: Storage, name: str, known: list[NewSample]) -> None:
     storage.surrogates.delete(name)
     for call in (lambda: storage.snapshots.all(name), lambda: storage.snapshots.drop(name, ["one"])):
         with pytest.raises(UnknownSurrogate):

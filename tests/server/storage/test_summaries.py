@@ -79,14 +79,14 @@ def test_a_summary_equals_the_surrogates_own_fields(storage: Storage, worked: li
     assert (untouched.ledger.total, untouched.queries.pending) == (0, 3)
 
 
-def test_an_index_that_is_no_number_spoils_no_list(storage: Storage, make: Callable[..., str]) -> None:
+def test_a_nan_confidence_index_does_not_break_the_surrogate_list(storage: Storage, make: Callable[..., str]) -> None:
     storage.models.add(make(), judged(float("nan")))
     index = storage.surrogates.summaries()[0].confidence_index
     assert index is not None
     assert index != index
 
 
-def test_pages_follow_one_another(storage: Storage, make: Callable[..., str]) -> None:
+def test_pages_of_surrogate_summaries_cover_all_in_order(storage: Storage, make: Callable[..., str]) -> None:
     names = [make(name=f"s-{number}") for number in range(5)]
     storage.surrogates.delete(names.pop(2))
     seen: list[SurrogateSummary] = []
@@ -107,7 +107,7 @@ def test_pages_follow_one_another(storage: Storage, make: Callable[..., str]) ->
     ],
     ids=["summaries", "designer", "models", "sweeper"],
 )
-def test_many_surrogates_take_no_more_statements_than_a_few(
+def test_summaries_of_many_surrogates_take_as_many_sql_statements_as_of_few(
     storage: Storage, make: Callable[..., str], look: Callable[[Storage], object]
 ) -> None:
     """Ten seconds for a list of a thousand is what several statements for each came to."""
@@ -137,7 +137,7 @@ def test_a_design_without_samples_is_hopeless_once_all_its_queries_are_set_aside
     assert storage.queries.counts(waiting).pending == 1
 
 
-def test_a_design_is_unbegun_while_it_has_a_budget_and_never_had_a_query(
+def test_a_design_with_a_budget_and_no_query_or_sample_is_unbegun(
     storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
 ) -> None:
     late, sampled = (make(queries=0, name=name, budget=0) for name in ("late", "sampled"))
@@ -152,7 +152,7 @@ def test_a_design_is_unbegun_while_it_has_a_budget_and_never_had_a_query(
     assert [storage.queries.counts(name).pending for name in (late, sampled)] == [2, 0]
 
 
-def test_a_second_list_shows_what_came_since_the_first(
+def test_a_second_surrogate_list_shows_every_change_since_the_first(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     """Some numbers are kept in memory. Each kind of change that could leave them behind comes between two lists."""
@@ -181,7 +181,7 @@ def test_a_second_list_shows_what_came_since_the_first(
     require_fresh()
 
 
-def test_a_second_list_counts_no_answers_again(storage: Storage, worked: list[str]) -> None:
+def test_a_second_surrogate_list_does_not_recount_samples(storage: Storage, worked: list[str]) -> None:
     before = storage.surrogates.summaries()
     with statements() as sent:
         assert storage.surrogates.summaries() == before

@@ -32,7 +32,7 @@ def test_a_new_surrogate_is_collecting_with_its_initial_queries(storage: Storage
     assert (first.coordinates, last.coordinates, last.action) == ((0.0, 1.0), (4.0, 5.0), (0.5,))
 
 
-def test_creating_again_with_the_same_spec_changes_nothing(storage: Storage) -> None:
+def test_creating_a_surrogate_again_with_the_same_specification_changes_nothing(storage: Storage) -> None:
     new = NewSurrogate("a", {"x": [1, 2.5], "y": None}, 30, 0.9)
     first, created = storage.surrogates.create(new)
     assert created
@@ -41,13 +41,13 @@ def test_creating_again_with_the_same_spec_changes_nothing(storage: Storage) -> 
     assert storage.queries.counts("a").pending == 0
 
 
-def test_a_name_that_is_taken_keeps_its_spec(storage: Storage) -> None:
+def test_creating_a_surrogate_under_an_existing_name_keeps_its_specification(storage: Storage) -> None:
     first, _ = storage.surrogates.create(NewSurrogate("a", {"x": 1}, 30, 0.9))
     assert storage.surrogates.create(NewSurrogate("a", {"x": 2}, 30, 0.9)) == (first, False)
     assert storage.surrogates.get("a").spec == {"x": 1}
 
 
-def test_a_name_given_anew_is_another_surrogate(
+def test_a_surrogate_recreated_under_a_deleted_name_gets_a_new_id(
     storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None], design: Callable[..., NewDesign]
 ) -> None:
     name = make()
@@ -72,7 +72,7 @@ def test_surrogates_are_listed_in_order_of_creation(storage: Storage, make: Call
     assert [summary.name for summary in storage.surrogates.summaries()] == ["b", "a", "c"]
 
 
-def test_change_touches_what_is_given_and_no_more(storage: Storage, make: Callable[..., str]) -> None:
+def test_changing_a_surrogate_changes_only_the_given_fields(storage: Storage, make: Callable[..., str]) -> None:
     name = make()
     before = storage.surrogates.get(name)
     after = storage.surrogates.change(name, budget=50)
@@ -81,7 +81,7 @@ def test_change_touches_what_is_given_and_no_more(storage: Storage, make: Callab
     assert not storage.surrogates.change(name, paused=False).paused
 
 
-def test_tolerances_are_set_one_by_one(storage: Storage, make: Callable[..., str]) -> None:
+def test_tolerances_of_a_surrogate_can_be_set_one_by_one(storage: Storage, make: Callable[..., str]) -> None:
     name = make()
     assert storage.surrogates.get(name).tolerances == {}
     storage.surrogates.change(name, tolerances={"theta": 0.1, "reward": 2.0})
@@ -91,7 +91,7 @@ def test_tolerances_are_set_one_by_one(storage: Storage, make: Callable[..., str
     assert storage.surrogates.get(name).tolerances == {"theta": 0.01}
 
 
-def test_set_phase_keeps_the_error(storage: Storage, make: Callable[..., str]) -> None:
+def test_setting_phase_failed_stores_its_error(storage: Storage, make: Callable[..., str]) -> None:
     name = make()
     storage.surrogates.set_phase(name, "failed", "it broke")
     record = storage.surrogates.get(name)
@@ -105,7 +105,7 @@ def test_resuming_a_failed_design_clears_its_error(storage: Storage, make: Calla
     assert (record.phase, record.error) == ("collecting", None)
 
 
-def test_deleting_takes_everything_and_frees_the_name(
+def test_deleting_a_surrogate_deletes_everything_and_frees_its_name(
     storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None]
 ) -> None:
     name = make()
@@ -117,7 +117,7 @@ def test_deleting_takes_everything_and_frees_the_name(
     assert not set(old) & {query.id for query in storage.queries.list(name)}, "ids are never used twice"
 
 
-def test_every_operation_refuses_an_unknown_surrogate(storage: Storage, by_hand: Callable[..., object]) -> None:
+def test_every_storage_operation_refuses_an_unknown_surrogate(storage: Storage, by_hand: Callable[..., object]) -> None:
     none = np.zeros((0, 2))
     operations: list[Callable[[], object]] = [
         lambda: storage.surrogates.get("no"),
@@ -153,7 +153,7 @@ def test_every_operation_refuses_an_unknown_surrogate(storage: Storage, by_hand:
             operation()
 
 
-def test_many_initial_queries_are_queued_in_bounded_transactions_and_after_a_crash(
+def test_many_initial_queries_are_stored_in_limited_transactions_even_after_a_crash(
     storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(queries, "BATCH", 10)
@@ -179,7 +179,7 @@ def test_many_initial_queries_are_queued_in_bounded_transactions_and_after_a_cra
     assert storage.designs.due() == [NAME]
 
 
-def test_a_surrogate_is_deleted_in_bounded_transactions_and_after_a_crash(
+def test_a_large_surrogate_is_deleted_in_limited_transactions_even_after_a_crash(
     storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(stored, "BATCH", 10)

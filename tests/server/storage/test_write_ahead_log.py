@@ -85,7 +85,7 @@ def contents(file: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("restore", [move, overwrite])
-def test_the_log_of_a_killed_server_is_not_merged_into_another_database(
+def test_a_write_ahead_log_is_not_merged_into_another_database(
     tmp_path: Path, restore: Callable[[Path, Path], None]
 ) -> None:
     file, other = tmp_path / "a.db", tmp_path / "b.db"
@@ -105,7 +105,7 @@ def test_the_log_of_a_killed_server_is_not_merged_into_another_database(
 
 @pytest.mark.parametrize("restore", [move, overwrite])
 @pytest.mark.parametrize("copied", ["by_backup_of_a_killed_server", "between_two_servers"])
-def test_the_log_of_a_killed_server_is_not_merged_into_an_older_copy(
+def test_a_write_ahead_log_is_not_merged_into_an_older_copy(
     tmp_path: Path, restore: Callable[[Path, Path], None], copied: str
 ) -> None:
     file = tmp_path / "a.db"
@@ -122,7 +122,7 @@ def test_the_log_of_a_killed_server_is_not_merged_into_an_older_copy(
         opened(file)
 
 
-def test_a_copy_of_the_present_log_s_time_is_another_database(tmp_path: Path) -> None:
+def test_a_write_ahead_log_is_not_merged_into_a_copy_that_already_contains_it(tmp_path: Path) -> None:
     file = tmp_path / "a.db"
     serve_and_kill(file, "r")
     beside = {name: content for name, content in contents(file).items() if name != file.name}
@@ -134,7 +134,7 @@ def test_a_copy_of_the_present_log_s_time_is_another_database(tmp_path: Path) ->
         opened(file)
 
 
-def test_a_log_whose_database_is_gone_is_not_thrown_away(tmp_path: Path) -> None:
+def test_a_write_ahead_log_whose_database_is_missing_is_kept(tmp_path: Path) -> None:
     """SQLite deletes the log of an empty database."""
     file = tmp_path / "a.db"
     serve_and_kill(file, "r")
@@ -147,7 +147,9 @@ def test_a_log_whose_database_is_gone_is_not_thrown_away(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("registered", [["r"], MANY])
-def test_a_killed_server_s_own_log_is_merged_without_a_word(tmp_path: Path, registered: list[str]) -> None:
+def test_the_write_ahead_log_of_a_killed_server_is_merged_into_its_database(
+    tmp_path: Path, registered: list[str]
+) -> None:
     """Again and again, whether merging had begun or not, and after a move of all files to other inodes."""
     file = tmp_path / "a.db"
     serve_and_kill(file, *registered)
@@ -160,7 +162,7 @@ def test_a_killed_server_s_own_log_is_merged_without_a_word(tmp_path: Path, regi
 
 
 @pytest.mark.parametrize("cut", [10, 100, 2_000, 6_000])
-def test_a_log_that_a_loss_of_power_cut_short_is_no_foreign_one(tmp_path: Path, cut: int) -> None:
+def test_a_write_ahead_log_truncated_by_power_loss_is_merged(tmp_path: Path, cut: int) -> None:
     file = tmp_path / "a.db"
     register(file, "r")
     serve_and_kill(file, "lost")
@@ -170,7 +172,7 @@ def test_a_log_that_a_loss_of_power_cut_short_is_no_foreign_one(tmp_path: Path, 
     assert served(file) == ["r"]
 
 
-def test_an_older_program_s_log_goes_with_an_older_program_s_database(tmp_path: Path) -> None:
+def test_a_write_ahead_log_of_an_older_version_is_merged_into_its_database(tmp_path: Path) -> None:
     file = tmp_path / "a.db"
     with closing(sqlite3.connect(file)) as old:
         old.execute("PRAGMA journal_mode=WAL")
@@ -183,7 +185,7 @@ def test_an_older_program_s_log_goes_with_an_older_program_s_database(tmp_path: 
 
 
 @pytest.mark.parametrize("copied", ["another", "backup"])
-def test_a_database_overwritten_under_the_server_is_used_no_more(
+def test_a_database_file_overwritten_at_run_time_is_no_longer_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, copied: str
 ) -> None:
     """What was written over it stays as it is, byte for byte, and is what a server finds when the log is put away."""
@@ -210,7 +212,7 @@ def register_in(storage: Storage) -> None:
     storage.surrogates.create(NewSurrogate("later", {}, 30, 0.9))
 
 
-def test_merging_its_own_log_is_no_overwriting(tmp_path: Path) -> None:
+def test_checkpointing_the_write_ahead_log_is_not_mistaken_for_overwriting(tmp_path: Path) -> None:
     """By this server, in the course of many writes, and by another program that has the file open."""
     file = tmp_path / "a.db"
     storage = opened(file)
@@ -225,7 +227,7 @@ def test_merging_its_own_log_is_no_overwriting(tmp_path: Path) -> None:
     assert len(served(file)) == 120
 
 
-def test_pages_that_were_found_broken_keep_the_server_from_being_ready(tmp_path: Path) -> None:
+def test_a_server_that_met_damaged_pages_is_not_ready(tmp_path: Path) -> None:
     file = tmp_path / "a.db"
     register(file, "r")
     storage = opened(file)

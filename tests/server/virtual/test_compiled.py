@@ -107,7 +107,7 @@ def test_compiled_steps_agree_with_torch(model, choice):
 
 
 @needs_numba
-def test_compiled_steps_of_masked_lanes_agree_with_torch(model):
+def test_compiled_steps_with_a_mask_agree_with_torch(model):
     settings, rng = compiled_settings(model, time_limit=2), np.random.default_rng(0)
     lanes, _ = reset(model.definition, settings, create(model.definition, settings, 0))
     for _ in range(STEPS):
@@ -118,14 +118,14 @@ def test_compiled_steps_of_masked_lanes_agree_with_torch(model):
 
 
 @needs_numba
-def test_compiled_steps_refuse_lanes_that_were_never_reset(model):
+def test_compiled_steps_refuse_environments_that_were_never_reset(model):
     settings = compiled_settings(model)
     with pytest.raises(NotReset):
         step(model, settings, create(model.definition, settings, 0), actions(model, np.random.default_rng(0)))
 
 
 @needs_numba
-def test_compiled_steps_change_no_state_that_was_given(model):
+def test_compiled_steps_do_not_modify_their_input_state(model):
     settings = compiled_settings(model, autoreset_mode="same_step", time_limit=1)
     lanes, _ = reset(model.definition, settings, create(model.definition, settings, 0))
     before = {name: array.copy() for name, array in lanes.to_arrays().items()}
@@ -135,7 +135,7 @@ def test_compiled_steps_change_no_state_that_was_given(model):
     assert (after.episode == lanes.episode + 1).all()
 
 
-def test_session_without_numba_steps_by_torch(model, monkeypatch):
+def test_a_session_without_numba_steps_with_torch(model, monkeypatch):
     monkeypatch.setattr(compiled, "available", lambda: False)
     fresh = replace(model)  # what it has compiled is not kept
     settings = VirtualSettings(LANES)
@@ -147,7 +147,7 @@ def test_session_without_numba_steps_by_torch(model, monkeypatch):
         np.testing.assert_array_equal(getattr(ours[1], field.name), getattr(theirs[1], field.name))
 
 
-def test_session_whose_model_fails_to_compile_steps_by_torch(model, monkeypatch, caplog):
+def test_a_session_whose_model_fails_to_compile_steps_with_torch(model, monkeypatch, caplog):
     def fails(_: GaussianProcessModel) -> None:
         raise RuntimeError("no code for this processor")
 
@@ -156,7 +156,7 @@ def test_session_whose_model_fails_to_compile_steps_by_torch(model, monkeypatch,
     assert "torch computes them" in caplog.text
 
 
-def test_stds_of_many_points_are_left_to_torch(monkeypatch):
+def test_deviations_of_a_model_with_many_points_are_computed_with_torch(monkeypatch):
     case = CASES["case: learned reward"]
     model = gaussian_processes(case.definition, case.samples)
     monkeypatch.setattr(gaussian_process_model, "COMPILED_SOLVES", len(case.samples.q) - 1)
@@ -167,7 +167,7 @@ def test_stds_of_many_points_are_left_to_torch(monkeypatch):
 @needs_numba
 @pytest.mark.parametrize("choice", ["mean", "penalty, same step", "drawn functions", "noise, trust, box"])
 @pytest.mark.parametrize("time_limit", [None, 3])
-def test_the_outside_reward_of_compiled_steps_is_that_of_torch(choice, time_limit):
+def test_compiled_steps_agree_with_torch_when_the_sampling_range_is_left(choice, time_limit):
     """Lanes leave the sampling range, or what is trusted, in this step or in a later one."""
     slow = pendulum().model_dump() | {"outside_reward": -7.0}
     slow["coordinates"][1]["sampling"] = {"kind": "uniform", "low": -1.0, "high": 1.0}

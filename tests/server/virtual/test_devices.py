@@ -53,7 +53,7 @@ def run(model: GaussianProcessModel, settings: VirtualSettings) -> tuple[LaneSta
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_steps_agree_with_those_on_the_cpu(model, variant, device):
+def test_virtual_steps_on_every_device_agree_with_those_on_the_cpu(model, variant, device):
     settings = VirtualSettings(LANES, autoreset_mode="same_step", time_limit=3, **VARIANTS[variant])
     here, there = run(model, settings), run(model.on(device), settings)
     assert {getattr(there[0], field.name).device.type for field in fields(LaneState)} == {device.type}
@@ -63,7 +63,7 @@ def test_steps_agree_with_those_on_the_cpu(model, variant, device):
                 np.testing.assert_allclose(getattr(theirs, field.name), expected, rtol=1e-6, atol=1e-6)
 
 
-def test_a_model_moves_whole_and_the_first_stays_where_it_is(model):
+def test_moving_a_model_to_a_device_copies_all_tensors_and_keeps_the_original(model):
     meta = torch.device("meta")
     assert model.on(CPU) is model
     assert model.on(meta).transitions[0].posterior.factor.device == meta
@@ -72,7 +72,7 @@ def test_a_model_moves_whole_and_the_first_stays_where_it_is(model):
 
 @pytest.mark.parametrize("differences", [False, True])
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_nothing_of_a_step_is_made_on_the_cpu(model, variant, differences, monkeypatch):
+def test_a_step_on_another_device_creates_no_tensor_on_the_cpu(model, variant, differences, monkeypatch):
     """Tensors that only pretend to be anywhere: an operation on two devices is refused. ``meta`` is the other one."""
     conditions = iter([True])  # all lanes run; nobody is to be reset
     monkeypatch.setattr(FakeTensor, "__bool__", lambda _: next(conditions, False))

@@ -17,7 +17,7 @@ SPEC = EnvironmentSpec(
 )
 
 
-def test_a_diverging_model_stays_finite():
+def test_steps_of_a_diverging_model_stay_finite():
     rng = np.random.default_rng(0)
     q, u = torch.tensor(rng.uniform(-1, 1, (8, 1))), torch.tensor(rng.uniform(-1, 1, (8, 1)))
     samples = Samples(q, u, 1.3 * q + 0.1 * u, -q[:, 0].square(), torch.zeros(8, dtype=torch.bool))

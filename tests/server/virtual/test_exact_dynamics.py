@@ -21,7 +21,7 @@ MODES = {
 }
 
 
-def test_two_hundred_steps_of_pendulum(pendulum_model, started):
+def test_the_virtual_pendulum_with_exact_dynamics_equals_gymnasiums_for_200_steps(pendulum_model, started):
     settings, lanes = started(pendulum_model, 3, time_limit=200)
     originals = [gymnasium.make("Pendulum-v1") for _ in range(3)]
     for original, q in zip(originals, lanes.q, strict=True):
@@ -65,7 +65,9 @@ def reference(cartpole_model):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_lanes_are_gymnasiums_sync_vector_env(cartpole_model, started, reference, mode):
+def test_virtual_environments_equal_gymnasiums_sync_vector_env_in_every_autoreset_mode(
+    cartpole_model, started, reference, mode
+):
     settings, lanes = started(cartpole_model, LANES, SEED, autoreset_mode=mode, time_limit=TIME_LIMIT)
     envs = reference(mode)
     theirs, _ = envs.reset()
@@ -93,7 +95,7 @@ def test_lanes_are_gymnasiums_sync_vector_env(cartpole_model, started, reference
     assert truncations > 5
 
 
-def test_in_next_step_the_step_after_the_end_only_resets(cartpole_model, started):
+def test_in_autoreset_mode_next_step_the_step_after_an_episode_end_only_resets(cartpole_model, started):
     settings, lanes = started(cartpole_model, 2, time_limit=1)
     lanes, ended = step(cartpole_model, settings, lanes, np.ones((2, 1)))
     assert ended.truncated.all()
@@ -107,7 +109,7 @@ def test_in_next_step_the_step_after_the_end_only_resets(cartpole_model, started
     assert lanes.elapsed.tolist() == [0, 0]
 
 
-def test_a_step_at_the_limit_may_end_both_ways(cartpole_model, started):
+def test_a_step_at_the_time_limit_can_be_terminated_and_truncated(cartpole_model, started):
     settings, lanes = started(cartpole_model, 1, time_limit=1)
     falling = replace(lanes, q=torch.tensor([[0.0, 0.0, 0.2, 2.0]]).double())
     _, made = step(cartpole_model, settings, falling, np.ones((1, 1)))
@@ -126,21 +128,21 @@ def test_a_step_at_the_limit_may_end_both_ways(cartpole_model, started):
         ([0, 0, 0.2, 0.1], False),
     ],
 )
-def test_cartpole_ends_where_it_leaves_its_limits(cartpole_model, started, q, over):
+def test_virtual_cart_pole_terminates_exactly_outside_its_limits(cartpole_model, started, q, over):
     settings, lanes = started(cartpole_model, 1)
     _, made = step(cartpole_model, settings, replace(lanes, q=torch.tensor([q]).double()), np.zeros((1, 1)))
     assert made.terminated.tolist() == [over]
     assert made.truncated.tolist() == [False]
 
 
-def test_without_a_time_limit_nothing_is_truncated(pendulum_model, started):
+def test_without_a_time_limit_virtual_episodes_are_never_truncated(pendulum_model, started):
     settings, lanes = started(pendulum_model, 1, time_limit=None)
     for _ in range(300):
         lanes, made = step(pendulum_model, settings, lanes, np.zeros((1, 1)))
         assert not made.truncated.any()
 
 
-def test_a_mask_steps_some_lanes_and_leaves_the_others(pendulum_model, started):
+def test_a_masked_step_moves_only_the_masked_virtual_environments(pendulum_model, started):
     settings, lanes = started(pendulum_model, 3)
     mask, u = np.array([True, False, True]), np.array([[1.0], [2.0], [-1.0]])
     some, masked = step(pendulum_model, settings, lanes, u, mask)
@@ -155,7 +157,7 @@ def test_a_mask_steps_some_lanes_and_leaves_the_others(pendulum_model, started):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_step_before_the_first_reset_is_refused(pendulum_model, mode):
+def test_a_virtual_step_before_the_first_reset_is_refused(pendulum_model, mode):
     settings = VirtualSettings(2, autoreset_mode=mode)
     lanes = create(pendulum_model.definition, settings, 0)
     with pytest.raises(NotReset, match=r"lanes \[0, 1\]"):
@@ -166,14 +168,14 @@ def test_a_step_before_the_first_reset_is_refused(pendulum_model, mode):
     step(pendulum_model, settings, lanes, np.zeros((2, 1)), np.array([True, False]))
 
 
-def test_a_finished_lane_under_autoreset_disabled_is_refused(pendulum_model, started):
+def test_stepping_a_finished_environment_with_autoreset_disabled_is_refused(pendulum_model, started):
     settings, lanes = started(pendulum_model, 2, autoreset_mode="disabled", time_limit=1)
     lanes, _ = step(pendulum_model, settings, lanes, np.zeros((2, 1)), np.array([False, True]))
     with pytest.raises(NotReset, match=r"lanes \[1\]"):
         step(pendulum_model, settings, lanes, np.zeros((2, 1)))
 
 
-def test_stepping_leaves_the_old_lanes_as_they_were(cartpole_model, started):
+def test_a_virtual_step_does_not_modify_its_input_state(cartpole_model, started):
     settings, lanes = started(cartpole_model, 3, autoreset_mode="same_step", time_limit=2)
     before = {name: array.copy() for name, array in lanes.to_arrays().items()}
     after = lanes
@@ -183,7 +185,7 @@ def test_stepping_leaves_the_old_lanes_as_they_were(cartpole_model, started):
         np.testing.assert_array_equal(array, before[name])
 
 
-def test_lanes_restored_from_arrays_continue_alike(pendulum_model, started):
+def test_virtual_environments_restored_from_arrays_continue_equally(pendulum_model, started):
     settings, lanes = started(pendulum_model, 3, variant="probabilistic", particles=4)
     stored = {name: array.copy() for name, array in lanes.to_arrays().items()}
     loaded = LaneState.from_arrays(stored)
@@ -194,7 +196,7 @@ def test_lanes_restored_from_arrays_continue_alike(pendulum_model, started):
         np.testing.assert_array_equal(a, b)
 
 
-def test_lanes_are_taken_and_put_back_by_index_or_mask(pendulum_model, started):
+def test_states_of_virtual_environments_can_be_selected_and_replaced_by_index_or_mask(pendulum_model, started):
     _, lanes = started(pendulum_model, 4)
     order = np.array([2, 0])
     taken = lanes.take(order)

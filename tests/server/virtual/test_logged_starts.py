@@ -28,19 +28,19 @@ def of_a_log(pendulum_model: ExactModel) -> ExactModel:
     return replace(pendulum_model, definition=definition)
 
 
-def test_episodes_start_at_states_of_the_log(of_a_log, started):
+def test_virtual_episodes_of_a_log_surrogate_start_at_logged_states(of_a_log, started):
     _, lanes = started(of_a_log, 300)
     found = {tuple(row) for row in lanes.q.tolist()}
     assert found == set(STATES)
 
 
-def test_a_share_of_them_still_starts_anywhere(of_a_log, started):
+def test_with_start_box_half_of_the_log_surrogates_episodes_start_anywhere(of_a_log, started):
     _, lanes = started(of_a_log, 300, start_box=0.5)
     elsewhere = sum(tuple(row) not in set(STATES) for row in lanes.q.tolist())
     assert 100 < elsewhere < 200
 
 
-def test_leaving_the_range_ends_an_episode_and_pays_missing_steps(of_a_log, started):
+def test_leaving_the_sampling_range_terminates_and_pays_for_the_remaining_steps(of_a_log, started):
     settings, lanes = started(of_a_log, 2, time_limit=10)
     lanes = replace(lanes, q=torch.tensor([[1.5, 3.9], [0.0, 0.0]], dtype=torch.float64), elapsed=lanes.elapsed + 4)
     _, moved = step(of_a_log, settings, lanes, STILL)
@@ -50,7 +50,7 @@ def test_leaving_the_range_ends_an_episode_and_pays_missing_steps(of_a_log, star
     assert not moved.truncated.any()
 
 
-def test_leaving_the_trusted_range_pays_too(of_a_log, started):
+def test_leaving_the_trusted_range_pays_the_outside_reward(of_a_log, started):
     unsure = replace(of_a_log, std=0.5)
     settings, lanes = started(unsure, 2, time_limit=10, trust=0.4)
     _, moved = step(unsure, settings, lanes, STILL)
@@ -58,7 +58,7 @@ def test_leaving_the_trusted_range_pays_too(of_a_log, started):
     np.testing.assert_array_equal(moved.reward, [10 * OUTSIDE] * 2)
 
 
-def test_without_it_the_range_ends_nothing(of_a_log, started):
+def test_without_an_outside_reward_leaving_the_sampling_range_does_not_terminate(of_a_log, started):
     model = replace(of_a_log, definition=replace(of_a_log.definition, outside_reward=None))
     settings, lanes = started(model, 2)
     lanes = replace(lanes, q=torch.tensor([[1.5, 3.9], [0.0, 0.0]], dtype=torch.float64))

@@ -28,20 +28,20 @@ ONES = 0xFFFFFFFF
         ),
     ],
 )
-def test_the_known_answers_of_random123(counter, key, expected):
+def test_philox_gives_the_known_answers_of_random123(counter, key, expected):
     words = philox(tuple(map(torch.tensor, counter)), tuple(map(torch.tensor, key)))
     assert words.tolist() == list(expected)
 
 
 @pytest.mark.skipif(not compiled.available(), reason="numba is not installed, or switched off")
-def test_compiled_words_are_those_of_torch(lanes, monkeypatch):
+def test_compiled_philox_equals_that_of_torch(lanes, monkeypatch):
     lanes = replace(lanes, seed=torch.tensor([0, 1, 2**31, 2**32, 2**40 + 5, 2**62, 2**63 - 1, ONES]))
     words = noise._words(lanes, Purpose.PROCESS, 5, 9)
     monkeypatch.setattr(compiled, "available", lambda: False)
     assert torch.equal(words, noise._words(lanes, Purpose.PROCESS, 5, 9))
 
 
-def test_uniforms_never_reach_their_ends():
+def test_uniform_noise_never_reaches_0_or_1():
     ends = uniforms(torch.tensor([0, ONES]))
     assert 0 < float(ends[0]) < 1e-9
     assert 1 - 1e-9 < float(ends[1]) < 1
@@ -54,7 +54,7 @@ def lanes(pendulum_model) -> LaneState:
     return replace(made, episode=torch.arange(8) % 3, elapsed=10 * torch.arange(8))
 
 
-def test_normals_are_normal_and_uniforms_uniform(lanes):
+def test_normal_and_uniform_noise_have_their_distributions(lanes):
     normal = normal_noise(lanes, Purpose.TRANSITION, 2_000, 3)
     assert normal.shape == (8, 2_000, 3)
     assert kstest(normal.flatten().numpy(), "norm").pvalue > 0.01
@@ -64,7 +64,7 @@ def test_normals_are_normal_and_uniforms_uniform(lanes):
     assert kstest(uniform.flatten().numpy(), "uniform").pvalue > 0.01
 
 
-def test_the_noise_of_a_lane_is_the_same_whatever_the_number_of_lanes(lanes):
+def test_the_noise_of_an_environment_does_not_depend_on_the_number_of_environments(lanes):
     alone = lanes.take(np.array([3]))
     assert torch.equal(
         normal_noise(lanes, Purpose.TRANSITION, 5, 3)[3:4], normal_noise(alone, Purpose.TRANSITION, 5, 3)
@@ -78,17 +78,17 @@ def test_noise_of_more_particles_extends_that_of_fewer(lanes):
 
 
 @pytest.mark.parametrize("part", ["seed", "lane", "episode", "elapsed"])
-def test_every_part_of_the_key_counts(lanes, part):
+def test_changing_any_part_of_the_noise_key_changes_the_noise(lanes, part):
     changed = replace(lanes, **{part: getattr(lanes, part) + 1})
     one, other = (normal_noise(a, Purpose.TRANSITION, 2, 2) for a in (lanes, changed))
     assert not torch.isclose(one, other).any()
 
 
-def test_high_bits_of_the_seed_count(lanes):
+def test_changing_high_bits_of_the_seed_changes_the_noise(lanes):
     one, other = (uniform_noise(replace(lanes, seed=lanes.seed + s), Purpose.START, 2) for s in (0, 2**33))
     assert not torch.isclose(one, other).any()
 
 
-def test_no_two_purposes_share_a_number(lanes):
+def test_noise_for_different_purposes_shares_no_number(lanes):
     draws = [uniform_noise(lanes, purpose, 4) for purpose in Purpose]
     assert len(torch.stack(draws).unique()) == 4 * 8 * len(Purpose)

@@ -49,7 +49,7 @@ def column(*values: float) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64)[:, None]
 
 
-def test_the_mean_moves_and_the_reward_is_its_lower_confidence_bound(cart):
+def test_the_deterministic_variant_follows_the_mean_with_a_lower_bound_reward(cart):
     moved = move_mean(cart, column(1.0, 2.5), column(0.5, 1.0), penalty=3.0, stds=True)
     assert moved.q[:, 0].tolist() == [1.5, 3.5]
     assert moved.reward_mean.tolist() == [10.0, 25.0]
@@ -58,13 +58,13 @@ def test_the_mean_moves_and_the_reward_is_its_lower_confidence_bound(cart):
     assert moved.std.tolist() == [[0.5, 1.0], [0.5, 2.5]]
 
 
-def test_without_a_penalty_the_reward_is_the_mean(cart):
+def test_without_an_uncertainty_penalty_the_reward_is_the_mean(cart):
     moved = move_mean(cart, column(1.0), column(0.5), penalty=0.0, stds=False)
     assert moved.reward.tolist() == moved.reward_mean.tolist() == [10.0]
     assert moved.std is None
 
 
-def test_particles_are_weighed_by_inverse_variance(cart):
+def test_particle_rewards_are_weighted_by_inverse_variance(cart):
     """Rewards 10, 20, 40 deviate by 1, 2, 4: weights 16 : 4 : 1 of 21."""
     particles = torch.tensor([[[1.0], [2.0], [4.0]]], dtype=torch.float64)
     moved = move_particles(cart, particles, column(0.5), 3.0, None, "inverse_variance")
@@ -75,27 +75,27 @@ def test_particles_are_weighed_by_inverse_variance(cart):
     assert moved.std[0].tolist() == [pytest.approx(0.5), pytest.approx(math.sqrt((1 + 4 + 16) / 3))]
 
 
-def test_or_alike(cart):
+def test_particle_rewards_can_be_weighted_uniformly(cart):
     particles = torch.tensor([[[1.0], [2.0], [4.0]]], dtype=torch.float64)
     moved = move_particles(cart, particles, column(0.5), 3.0, None, "uniform")
     assert float(moved.reward_mean) == pytest.approx((10 + 20 + 40) / 3)
     assert float(moved.reward) == pytest.approx((7 + 14 + 28) / 3)
 
 
-def test_a_certain_particle_takes_all_the_weight_and_stays_finite(cart):
+def test_a_particle_with_zero_reward_variance_gets_all_the_weight(cart):
     particles = torch.tensor([[[0.0], [2.0]]], dtype=torch.float64)
     moved = move_particles(cart, particles, column(0.0), 3.0, None, "inverse_variance")
     assert float(moved.reward) == pytest.approx(0, abs=1e-9)
 
 
-def test_weights_do_not_depend_on_the_rewards_unit(cart):
+def test_particles_with_equally_certain_rewards_get_equal_weights(cart):
     certain = replace(cart, reward_std=lambda q: 0 * q[:, 0])
     particles = torch.tensor([[[1.0], [2.0]]], dtype=torch.float64)
     moved = move_particles(certain, particles, column(0.0), 0.0, None, "inverse_variance")
     assert float(moved.reward) == pytest.approx(15)
 
 
-def test_with_noise_each_particle_moves_by_a_draw(cart):
+def test_with_noise_each_particle_moves_by_its_own_random_draw(cart):
     particles = torch.tensor([[[1.0], [2.0]], [[0.0], [0.0]]], dtype=torch.float64)
     noise = torch.tensor([[[1.0], [-2.0]], [[0.0], [3.0]]], dtype=torch.float64)
     moved = move_particles(cart, particles, column(0.0, 1.0), 0.0, noise, "uniform")
@@ -103,13 +103,13 @@ def test_with_noise_each_particle_moves_by_a_draw(cart):
     assert moved.q[:, 0].tolist() == [1.25, 1.75]
 
 
-def test_an_episode_ends_on_the_output_state_not_on_a_particle(cart):
+def test_termination_depends_on_the_mean_state_and_not_on_single_particles(cart):
     particles = torch.tensor([[[1.0], [4.0]], [[2.5], [4.0]]], dtype=torch.float64)
     moved = move_particles(cart, particles, column(0.0, 0.0), 0.0, None, "uniform")
     assert moved.terminated.tolist() == [False, True]
 
 
-def test_the_mean_of_angles_is_on_the_circle(pendulum_model):
+def test_the_mean_of_particle_angles_is_the_circular_mean(pendulum_model):
     particles = torch.tensor([[[3.0, 1.0], [-3.0, 3.0]], [[0.2, 0.0], [0.4, 1.0]]], dtype=torch.float64)
     mean = mean_state(pendulum_model.definition, particles)
     assert abs(float(mean[0, 0])) == pytest.approx(math.pi)
@@ -117,7 +117,7 @@ def test_the_mean_of_angles_is_on_the_circle(pendulum_model):
     assert mean[:, 1].tolist() == [2.0, 0.5]
 
 
-def test_one_particle_without_spread_moved_by_the_mean_is_aur_d(pendulum_model, started):
+def test_one_particle_with_mean_propagation_equals_the_deterministic_variant(pendulum_model, started):
     particle = {"variant": "probabilistic", "particles": 1, "spread": 0.0, "propagation": "mean"}
     runs = [started(pendulum_model, 3, time_limit=20, **chosen) for chosen in ({}, particle)]
     states = [lanes for _, lanes in runs]
@@ -131,7 +131,7 @@ def test_one_particle_without_spread_moved_by_the_mean_is_aur_d(pendulum_model, 
         np.testing.assert_array_equal(made[0].truncated, made[1].truncated)
 
 
-def test_sampled_steps_differ_between_lanes_and_repeat_with_the_seed(cart, started):
+def test_sampled_particle_steps_differ_between_environments_and_repeat_with_the_seed(cart, started):
     def run(num_envs: int) -> np.ndarray:
         settings, lanes = started(cart, num_envs, 5, variant="probabilistic", particles=3)
         made = []
@@ -146,13 +146,13 @@ def test_sampled_steps_differ_between_lanes_and_repeat_with_the_seed(cart, start
     np.testing.assert_array_equal(four[:, :2], run(2))
 
 
-def test_particles_moved_by_the_mean_keep_their_distance(cart, started):
+def test_particles_with_mean_propagation_keep_their_distance(cart, started):
     settings, lanes = started(cart, 1, variant="probabilistic", particles=5, propagation="mean")
     after, _ = step(cart, settings, lanes, np.full((1, 1), 0.5))
     torch.testing.assert_close(after.particles, lanes.particles + 0.5)
 
 
-def test_a_step_in_which_every_lane_resets_moves_no_particle(cart, started):
+def test_a_step_in_which_every_environment_resets_moves_no_particle(cart, started):
     settings, lanes = started(cart, 2, variant="probabilistic", particles=3, time_limit=1)
     lanes, ended = step(cart, settings, lanes, np.zeros((2, 1)), stds=True)
     lanes, begun = step(cart, settings, lanes, np.zeros((2, 1)), stds=True)
@@ -166,7 +166,7 @@ def bump(q: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
     return (-0.5 * (q / 0.04).square().sum(-1)).exp()
 
 
-def test_compiled_particles_of_a_hidden_reward_agree_with_torch():
+def test_compiled_particles_with_a_log_reward_agree_with_torch():
     model = gaussian_processes(definition_from_spec(plane()), drifting(bump, 12))
     assert model.reward.warp is not None
     steps = model.compiled()
@@ -183,7 +183,7 @@ def test_compiled_particles_of_a_hidden_reward_agree_with_torch():
         torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=2e-5, atol=0.0)
 
 
-def test_rewards_whose_squares_are_no_numbers_weigh_particles_all_the_same():
+def test_particle_weights_stay_finite_for_tiny_rewards_whose_squares_underflow():
     """A hidden reward may have paid 1e-170 at most, and a particle then deviates by as little."""
 
     def faint(q: torch.Tensor, _: torch.Tensor) -> torch.Tensor:

@@ -44,7 +44,7 @@ def moved(model, settings, lanes, *q: float, action: float = 0.5) -> tuple[LaneS
     return after, after.q.numpy()
 
 
-def test_a_place_answers_alike_throughout_an_episode(model, started):
+def test_in_pathwise_mode_a_state_has_the_same_step_throughout_an_episode(model, started):
     settings, lanes = started(model, 3, variant="pathwise")
     lanes, first = moved(model, settings, lanes, 2.0, -6.0)
     lanes, elsewhere = moved(model, settings, lanes, -1.0, 5.0)
@@ -54,7 +54,7 @@ def test_a_place_answers_alike_throughout_an_episode(model, started):
     assert not np.allclose(elsewhere, first)
 
 
-def test_lanes_share_functions_from_different_starts(model, started):
+def test_with_functions_2_pathwise_environments_share_two_drawn_functions(model, started):
     settings, lanes = started(model, 6, variant="pathwise", functions=2)
     assert len(np.unique(lanes.q.numpy(), axis=0)) == 6
     _, there = moved(model, settings, lanes, 2.0, -6.0)
@@ -62,7 +62,7 @@ def test_lanes_share_functions_from_different_starts(model, started):
     np.testing.assert_array_equal(there[:2], there[2:4])
 
 
-def test_the_next_episode_follows_another_function(model, started):
+def test_the_next_pathwise_episode_follows_another_drawn_function(model, started):
     settings, lanes = started(model, 2, variant="pathwise", time_limit=1, autoreset_mode="same_step")
     lanes, _ = moved(model, settings, lanes, 2.0, -6.0)
     assert (lanes.elapsed == 0).all()
@@ -71,7 +71,7 @@ def test_the_next_episode_follows_another_function(model, started):
     assert not np.isclose(before, lanes.path).any(1).all()
 
 
-def test_functions_scatter_as_the_posterior_does(model, started):
+def test_pathwise_environments_vary_with_posterior_mean_and_deviation(model, started):
     """Mean and deviation of 2,000 lanes' steps; the deviation's tolerance has the 256 frequencies' share in it. The
     angle is moved by the speed that was drawn, over a step of 0.05 s, and scatters with it."""
     count, point = 2_000, (0.5, 3.0)
@@ -85,7 +85,7 @@ def test_functions_scatter_as_the_posterior_does(model, started):
     np.testing.assert_allclose(q.std(0), std, rtol=0.25)
 
 
-def test_functions_pass_through_the_samples(model, samples, started):
+def test_pathwise_functions_pass_through_the_samples(model, samples, started):
     settings, lanes = started(model, 4, variant="pathwise")
     for q, u, q_next in zip(samples.q, samples.u, samples.q_next, strict=True):
         if float(q_next[1].abs()) < 8:  # one that ended at the bound is left out of the dynamics
@@ -93,7 +93,7 @@ def test_functions_pass_through_the_samples(model, samples, started):
             np.testing.assert_allclose(reached, q_next.expand(4, -1), atol=1e-2)
 
 
-def test_the_same_seed_gives_the_same_episodes(model, started):
+def test_pathwise_episodes_are_reproducible_from_the_seed(model, started):
     runs = []
     for _ in range(2):
         settings, lanes = started(model, 5, variant="pathwise", time_limit=3)
@@ -107,12 +107,12 @@ def test_the_same_seed_gives_the_same_episodes(model, started):
             np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
 
 
-def test_a_function_does_not_depend_on_how_many_lanes_there_are(model, started):
+def test_a_pathwise_function_does_not_depend_on_the_number_of_environments(model, started):
     few, many = (moved(model, *started(model, n, variant="pathwise"), 2.0, -6.0)[1] for n in (2, 9))
     np.testing.assert_allclose(few, many[:2], rtol=1e-9)
 
 
-def test_lanes_under_models_of_two_sizes_keep_their_functions(model, better, started):
+def test_pathwise_functions_stay_the_same_beside_those_of_a_larger_model(model, better, started):
     """A newer model has more points: its lanes' functions are longer, the others' still the same."""
     settings, lanes = started(model, 4, variant="pathwise")
     old, reached = moved(model, settings, lanes, 2.0, -6.0)
@@ -123,14 +123,14 @@ def test_lanes_under_models_of_two_sizes_keep_their_functions(model, better, sta
     np.testing.assert_allclose(again, reached[[0, 2]], rtol=1e-9)
 
 
-def test_the_reward_follows_a_function_as_well(model, started):
+def test_the_pathwise_reward_follows_a_drawn_function(model, started):
     settings, lanes = started(model, 50, variant="pathwise")
     _, transition = step(model, settings, at(lanes, 2.0, -6.0), np.full((50, 1), 0.5))
     assert transition.reward.std() > 0
     np.testing.assert_array_equal(transition.reward, transition.reward_mean)
 
 
-def test_a_family_that_draws_no_functions_keeps_its_errors_for_the_episode(started):
+def test_without_drawn_functions_pathwise_errors_stay_constant_within_an_episode(started):
     """Each lane lies the same number of deviations from the mean at every step, another in each episode."""
     exact = exact_pendulum()
     model = ExactModel(exact.definition, lambda q, _: q.clone(), exact.pay, std=0.01)

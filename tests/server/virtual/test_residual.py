@@ -24,7 +24,7 @@ def stepped(model, started, chosen: Residual | None, angles=(0.1, 0.1), torque: 
     return step(model, settings, replace(lanes, q=q), np.full((len(angles), 1), torque))
 
 
-def test_each_row_of_lanes_gets_its_own_errors(pendulum_model, started):
+def test_each_environment_gets_its_own_systematic_model_error(pendulum_model, started):
     errors = ((NONE, (0.3, 0, 0, 0, 0), (-2.0, 0, 0, 0, 0)), (NONE, NONE, NONE))
     plain, usual = stepped(pendulum_model, started, None, angles=(0.1, 0.1, 0.1))
     lanes, moved = stepped(pendulum_model, started, residual(*errors), angles=(0.1, 0.1, 0.1))
@@ -33,14 +33,14 @@ def test_each_row_of_lanes_gets_its_own_errors(pendulum_model, started):
     assert (moved.reward - usual.reward).tolist() == pytest.approx([-2, 0, -2])
 
 
-def test_an_error_may_depend_on_state_and_action(pendulum_model, started):
+def test_a_systematic_model_error_can_depend_on_state_and_action(pendulum_model, started):
     by = ((NONE, (0, 0, 1.0, 0, 2.0), NONE),)
     plain, _ = stepped(pendulum_model, started, None)
     lanes, _ = stepped(pendulum_model, started, residual(*by))
     assert (lanes.q - plain.q)[:, 1].tolist() == pytest.approx([np.sin(0.1) + 2 * 0.5] * 2)
 
 
-def test_limits_and_wrapped_angles_hold_after_the_errors(pendulum_model, started):
+def test_states_stay_clipped_and_wrapped_after_systematic_model_errors(pendulum_model, started):
     far = (((4.0, 0, 0, 0, 0), (50.0, 0, 0, 0, 0), NONE),)
     lanes, _ = stepped(pendulum_model, started, residual(*far))
     assert lanes.q[:, 1].tolist() == [8.0, 8.0], "the pendulum's fastest"
@@ -56,6 +56,6 @@ def test_limits_and_wrapped_angles_hold_after_the_errors(pendulum_model, started
     ],
     ids=["inputs", "outputs", "scale"],
 )
-def test_a_residual_that_does_not_fit_is_refused(pendulum_model, wrong: Residual):
+def test_systematic_model_errors_of_wrong_shape_are_refused(pendulum_model, wrong: Residual):
     with pytest.raises(InvalidInput, match="residual: expected"):
         wrong.check(pendulum_model.definition)

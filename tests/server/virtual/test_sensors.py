@@ -33,7 +33,7 @@ def speed_name(model: ExactModel) -> str:
     return model.definition.coordinate_names[1]
 
 
-def test_observations_differ_from_the_state_by_the_sensors_noise_alone(model: Noisy, started) -> None:
+def test_sensor_noise_changes_observations_but_not_the_state(model: Noisy, started) -> None:
     settings, lanes = started(model, LANES, sensor_noise=((speed_name(model), 0.3),))
     exact = replace(settings, sensor_noise=())
     after, seen = step(model, settings, lanes, np.zeros((LANES, 1)))
@@ -49,7 +49,7 @@ def test_observations_differ_from_the_state_by_the_sensors_noise_alone(model: No
 
 
 @pytest.mark.parametrize(("sensor", "left"), [(0.1, 0.0), (0.05, 0.5**0.5 * 0.1), (0.0, 0.1)])
-def test_the_sensors_share_of_the_learned_noise_does_not_drive_the_state(
+def test_process_noise_is_reduced_by_the_sensors_share_of_the_learned_noise(
     model: Noisy, started, sensor: float, left: float
 ) -> None:
     settings, lanes = started(model, LANES, process_noise=True, sensor_noise=((speed_name(model), sensor),))
@@ -60,6 +60,6 @@ def test_the_sensors_share_of_the_learned_noise_does_not_drive_the_state(
     assert float(moved[:, 0].sin().std()) == pytest.approx(0.1, rel=0.1), "the angle's noise is the process's"
 
 
-def test_a_coordinate_that_does_not_exist_is_refused(model: Noisy) -> None:
+def test_sensor_noise_for_an_unknown_coordinate_is_refused(model: Noisy) -> None:
     with pytest.raises(InvalidInput, match="sensor_noise: expected coordinates of"):
         check(model.definition, (("height", 1.0),))

@@ -28,31 +28,31 @@ def starts(definition, count, seed=None, first=0, episodes=1, **chosen):
     return np.stack(made)
 
 
-def test_a_seed_gives_each_lane_a_key_of_its_own(definition):
+def test_one_seed_gives_each_environment_its_own_noise_key(definition):
     three, five = starts(definition, 3, seed=7), starts(definition, 5, seed=7)
     np.testing.assert_array_equal(three[0], five[0][:3])
     assert len(np.unique(five[0][:, 0])) == 5
 
 
-def test_a_list_of_seeds_makes_every_lane_the_first_of_its_own(definition):
+def test_an_environment_with_its_own_seed_starts_as_if_alone(definition):
     listed = starts(definition, 3, seed=[7, 8, 7])[0]
     for lane, seed in enumerate([7, 8, 7]):
         np.testing.assert_array_equal(listed[lane], starts(definition, 1, seed=seed)[0][0])
 
 
-def test_without_a_seed_each_lane_begins_its_next_episode(definition):
+def test_a_reset_without_seed_starts_the_next_episode_of_the_first_seed(definition):
     first = starts(definition, 2, seed=7, episodes=3)
     assert len(np.unique(first[:, :, 0])) == 6
     np.testing.assert_array_equal(first, starts(definition, 2, seed=7, episodes=3))
     np.testing.assert_array_equal(first, starts(definition, 2, seed=None, first=7, episodes=3))
 
 
-def test_seed_zero_is_a_seed(definition):
+def test_resetting_with_seed_zero_differs_from_resetting_without_seed(definition):
     assert not np.array_equal(starts(definition, 2, seed=0, first=3), starts(definition, 2, seed=None, first=3))
     np.testing.assert_array_equal(starts(definition, 2, seed=0, first=3), starts(definition, 2, seed=0, first=4))
 
 
-def test_a_mask_keeps_the_others_as_they_are(definition):
+def test_a_masked_reset_keeps_the_other_environments(definition):
     settings = VirtualSettings(3)
     lanes, before = reset(definition, settings, create(definition, settings, 0))
     lanes, after = reset(definition, settings, lanes, seed=9, mask=np.array([False, True, False]))
@@ -62,7 +62,7 @@ def test_a_mask_keeps_the_others_as_they_are(definition):
     assert lanes.episode.tolist() == [0, 0, 0]
 
 
-def test_an_empty_mask_changes_nothing(definition):
+def test_a_reset_with_an_empty_mask_changes_nothing(definition):
     settings = VirtualSettings(2)
     fresh = create(definition, settings, 0)
     lanes, _ = reset(definition, settings, fresh, mask=np.zeros(2, dtype=bool))
@@ -70,13 +70,13 @@ def test_an_empty_mask_changes_nothing(definition):
 
 
 @pytest.mark.parametrize(("options", "complaint"), [({"mask": np.ones(3, bool)}, "mask"), ({"seed": [1]}, "seed")])
-def test_masks_and_seeds_of_another_length_are_refused(definition, options, complaint):
+def test_reset_masks_and_seeds_of_wrong_length_are_refused(definition, options, complaint):
     settings = VirtualSettings(2)
     with pytest.raises(InvalidInput, match=f"{complaint}: expected"):
         reset(definition, settings, create(definition, settings, 0), **options)
 
 
-def test_starts_follow_the_declared_distribution(definition):
+def test_start_states_follow_the_declared_distribution(definition):
     angle, speed = definition.coordinates
     declared = replace(
         definition,
@@ -90,7 +90,7 @@ def test_starts_follow_the_declared_distribution(definition):
     assert kstest(uniform[:, 2], "uniform", args=(-1, 2)).pvalue > 0.01
 
 
-def test_a_share_of_starts_is_anywhere_in_the_sampling_range(definition):
+def test_with_start_box_a_share_of_episodes_starts_anywhere_in_the_sampling_range(definition):
     assert np.abs(starts(definition, 500)[0][:, 2]).max() <= 1
     fast = np.abs(starts(definition, 4_000, start_box=0.5)[0][:, 2]) > 1
     assert fast.mean() == pytest.approx(0.5 * 7 / 8, abs=0.04)
@@ -98,7 +98,7 @@ def test_a_share_of_starts_is_anywhere_in_the_sampling_range(definition):
     assert kstest(everywhere[:, 2], "uniform", args=(-8, 16)).pvalue > 0.01
 
 
-def test_particles_start_around_the_reset_state_with_a_share_of_each_range(definition):
+def test_particles_start_around_the_reset_state_with_the_given_spread(definition):
     settings = VirtualSettings(2, variant="probabilistic", particles=4_000, spread=0.01)
     lanes, observation = reset(definition, settings, create(definition, settings, 0))
     assert lanes.particles.shape == (2, 4_000, 2)
@@ -109,7 +109,7 @@ def test_particles_start_around_the_reset_state_with_a_share_of_each_range(defin
     torch.testing.assert_close(off.mean(1), torch.zeros(2, 2).double(), rtol=0, atol=0.01)
 
 
-def test_constants_and_bounds_hold_for_particles(definition):
+def test_initial_particles_keep_constant_coordinates_and_stay_within_bounds(definition):
     angle, speed = definition.coordinates
     fixed = replace(
         definition, coordinates=(replace(angle, kind="constant"), replace(speed, start=FixedDefinition(8.0)))

@@ -24,7 +24,7 @@ def stepped(model, started, angles, **chosen):
     return step(model, settings, replace(lanes, q=q), np.zeros((len(angles), 1)))
 
 
-def test_an_episode_ends_where_any_output_leaves_the_range(unsure, started):
+def test_an_episode_is_truncated_where_any_output_leaves_the_trusted_range(unsure, started):
     _, transition = stepped(unsure, started, [0.1, 0.8, -2.0], trust=0.7)
     assert transition.untrusted.tolist() == transition.truncated.tolist() == [False, True, True]
     assert not transition.terminated.any()
@@ -33,7 +33,7 @@ def test_an_episode_ends_where_any_output_leaves_the_range(unsure, started):
     assert transition.untrusted.all(), "the dynamics deviate by 0.5"
 
 
-def test_the_range_is_in_units_of_the_samples_std(unsure, started):
+def test_the_trusted_range_is_relative_to_the_deviation_of_the_samples(unsure, started):
     class Wider(ExactModel):
         @property
         def scales(self) -> torch.Tensor:
@@ -50,19 +50,19 @@ def test_a_session_without_a_trusted_range_reports_none(unsure, started):
     assert not transition.truncated.any()
 
 
-def test_it_ends_episodes_of_particles_too(unsure, started):
+def test_the_trusted_range_truncates_episodes_of_the_particle_variant_too(unsure, started):
     chosen = {"variant": "probabilistic", "particles": 3, "trust": 0.4}
     _, transition = stepped(unsure, started, [0.1, 0.2, 0.3], **chosen)
     assert transition.untrusted.all()
 
 
-def test_a_lane_that_left_begins_anew(unsure, started):
+def test_an_environment_that_left_the_trusted_range_resets(unsure, started):
     lanes, transition = stepped(unsure, started, [0.1, 0.8, -2.0], trust=0.7, autoreset_mode="same_step")
     assert transition.final_lanes.tolist() == [1, 2]
     assert lanes.episode.tolist() == [0, 1, 1]
 
 
-def test_process_noise_moves_the_state_by_its_learned_std(pendulum_model, started):
+def test_process_noise_moves_the_state_with_its_learned_deviation(pendulum_model, started):
     shaken = replace(pendulum_model, process_std=0.02)
     settings, lanes = started(shaken, 2_000, process_noise=True)
     still, _ = step(shaken, replace(settings, process_noise=False), lanes, np.zeros((2_000, 1)))
@@ -74,7 +74,7 @@ def test_process_noise_moves_the_state_by_its_learned_std(pendulum_model, starte
     np.testing.assert_array_equal(again.q, moved.q)
 
 
-def test_each_particle_is_shaken_by_itself(pendulum_model, started):
+def test_process_noise_is_independent_for_each_particle(pendulum_model, started):
     shaken = replace(pendulum_model, process_std=0.02)
     chosen = {"variant": "probabilistic", "particles": 4, "spread": 0.0, "propagation": "mean"}
     settings, lanes = started(shaken, 3, process_noise=True, **chosen)

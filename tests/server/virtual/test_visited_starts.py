@@ -19,21 +19,21 @@ def at_visited(lanes) -> np.ndarray:
     return np.array([tuple(row) in STATES for row in lanes.q.tolist()])
 
 
-def test_a_share_of_episodes_starts_where_real_steps_were_taken(pendulum_model: ExactModel, started):
+def test_the_share_start_visited_of_episodes_starts_at_sampled_states(pendulum_model: ExactModel, started):
     _, lanes = started(pendulum_model, 2_000, start_visited=0.5, visited=VISITED)
     assert at_visited(lanes).mean() == pytest.approx(0.5, abs=0.05)
     assert {tuple(row) for row in lanes.q[at_visited(lanes)].tolist()} == STATES, "each of them"
     assert (lanes.q[~at_visited(lanes), 1].abs() <= 1).all(), "the others start as declared"
 
 
-def test_both_shares_hold_beside_each_other(pendulum_model: ExactModel, started):
+def test_the_start_shares_start_visited_and_start_box_can_be_combined(pendulum_model: ExactModel, started):
     _, lanes = started(pendulum_model, 4_000, start_visited=0.25, start_box=0.5, visited=VISITED)
     anywhere = ~at_visited(lanes) & (lanes.q[:, 1].abs() > 1).numpy()
     assert at_visited(lanes).mean() == pytest.approx(0.25, abs=0.04)
     assert anywhere.mean() == pytest.approx(0.5 * 7 / 8, abs=0.04)
 
 
-def test_without_a_share_starts_are_as_before(pendulum_model: ExactModel, started):
+def test_start_visited_0_leaves_start_states_unchanged(pendulum_model: ExactModel, started):
     for share in (0.0, 0.5):
         plain, beside = (
             started(pendulum_model, 50, start_box=share)[1],
@@ -42,7 +42,7 @@ def test_without_a_share_starts_are_as_before(pendulum_model: ExactModel, starte
         np.testing.assert_array_equal(plain.q, beside.q)
 
 
-def test_doubt_lowers_the_reward_and_not_its_mean(pendulum_model: ExactModel, started):
+def test_the_option_caution_lowers_the_reward_by_the_models_uncertainty(pendulum_model: ExactModel, started):
     """The dynamics deviate by 0.5 and the reward by the angle, in deviations of 1 over the samples."""
     unsure = replace(pendulum_model, std=0.5, reward_std=lambda q: q[:, 0].abs())
     settings, lanes = started(unsure, 3, caution=2.0)
@@ -54,7 +54,7 @@ def test_doubt_lowers_the_reward_and_not_its_mean(pendulum_model: ExactModel, st
     np.testing.assert_array_equal(sure.reward, sure.reward_mean)
 
 
-def test_doubt_is_in_units_of_the_samples_stds(pendulum_model: ExactModel, started):
+def test_the_caution_penalty_is_relative_to_the_deviation_of_the_samples(pendulum_model: ExactModel, started):
     class Wider(ExactModel):
         @property
         def scales(self) -> torch.Tensor:
@@ -66,7 +66,7 @@ def test_doubt_is_in_units_of_the_samples_stds(pendulum_model: ExactModel, start
     np.testing.assert_allclose(transition.reward_mean - transition.reward, 0.5 / 1.0 * 4.0)
 
 
-def test_doubt_lowers_rewards_of_particles_too(pendulum_model: ExactModel, started):
+def test_the_option_caution_lowers_rewards_of_the_particle_variant_too(pendulum_model: ExactModel, started):
     unsure = replace(pendulum_model, std=0.5)
     settings, lanes = started(unsure, 2, caution=2.0, variant="probabilistic", particles=3)
     _, transition = step(unsure, settings, lanes, np.zeros((2, 1)))
