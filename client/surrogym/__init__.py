@@ -92,7 +92,9 @@ __all__ = [
     "with_history",
 ]
 
-_LAZY = {  # name: module, its name there, the extra that brings what the module needs; others are of the specification
+# Module, name in the module, and extra that installs the module's packages, by public name. All other names are from
+# surrogym_shared.spec.
+_LAZY = {
     "Design": ("surrogym.design", "Design", "server"),
     "Query": ("surrogym.design", "Query", "server"),
     "QueriesOpen": ("surrogym.design", "QueriesOpen", "server"),
@@ -111,7 +113,7 @@ _LAZY = {  # name: module, its name there, the extra that brings what the module
 
 
 def __getattr__(name: str) -> Any:
-    """Load a name on first use.
+    """Import a public name of this package on its first use.
 
     Raises:
         ImportError: a package is missing; the message names the extra to install.

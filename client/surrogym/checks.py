@@ -24,14 +24,15 @@ from surrogym_shared.spec import EnvironmentSpec
 
 Floats = NDArray[np.float64]
 
-MOST_STEPS = 100_000  # as in a specification
+MOST_STEPS = 100_000  # largest budget of real steps, the same as in a specification
 MOST_THREADS = 1_024
-FARTHEST = 1e6  # distance from the middle of a sampling range, in its widths; a fit loses all digits beyond
-SHOWN = 80  # characters of the given value in an error message
+FARTHEST = 1e6  # largest distance of a state from its sampling range, in widths of the range; a fit loses digits beyond
+SHOWN = 80  # most characters of a wrong value that an error message shows
 
 
 def require_specification(given: object) -> None:
-    """Raise ``InvalidInput`` for anything but a specification, for example for the environment that gives it."""
+    """Raise ``InvalidInput`` if ``given`` is not a specification, but for example an environment with a method
+    ``spec``."""
     if not isinstance(given, EnvironmentSpec):
         kind = type(given).__name__
         hint = f": give {kind}.spec()" if callable(getattr(given, "spec", None)) else ""
@@ -39,7 +40,8 @@ def require_specification(given: object) -> None:
 
 
 def whole(what: str, value: Any, low: int, high: int, why: str = "") -> int:
-    """Check a whole number within bounds. ``why`` explains the bounds in the error message."""
+    """Return ``value`` as a whole number from ``low`` to ``high``, or raise ``InvalidInput``, with ``why`` in the
+    message."""
     try:
         number = None if isinstance(value, bool | np.bool_) else operator.index(value)
     except TypeError:
@@ -50,14 +52,14 @@ def whole(what: str, value: Any, low: int, high: int, why: str = "") -> int:
 
 
 def share(what: str, value: Any) -> float:
-    """Check a target confidence index."""
+    """Return a target confidence index, above 0.5 and below 1, or raise ``InvalidInput``."""
     if isinstance(value, bool) or not isinstance(value, float | np.floating | int) or not 0.5 < value < 1:
         raise InvalidInput(f"{what}: expected a number above 0.5 and below 1, got {_shown(value)}")
     return float(value)
 
 
 def states(definition: EnvironmentDefinition, what: str, values: Any) -> Floats:
-    """Check states of shape (v, C), with at least one row."""
+    """Return states as an array (v, C) with at least one row, or raise ``InvalidInput``."""
     rows = check_coordinates(definition, what, _numbers(what, values))
     if not len(rows):
         raise InvalidInput(f"{what}: expected at least one state, got none")
@@ -65,7 +67,7 @@ def states(definition: EnvironmentDefinition, what: str, values: Any) -> Floats:
 
 
 def steps_of(given: Any) -> list[RealStep]:
-    """Return one or several real steps as a list."""
+    """Return one real step, or several, as a list. Raises ``InvalidInput`` for anything else."""
     steps = [given] if isinstance(given, RealStep) else list(given) if isinstance(given, Sequence) else [given]
     for step in steps:
         if not isinstance(step, RealStep):
@@ -88,7 +90,8 @@ def real_step(definition: EnvironmentDefinition, step: RealStep) -> RealStep:
 
 
 def _near(definition: EnvironmentDefinition, what: str, rows: Floats) -> Floats:
-    """Check that states (n, C) are finite and not absurdly far from the sampling range."""
+    """Return states (n, C) if they are finite and not absurdly far from the sampling range, or raise
+    ``InvalidInput``."""
     if not np.isfinite(rows).all():
         raise InvalidInput(f"{what}: expected finite numbers, got {_shown(rows.tolist())}")
     for index, coordinate in enumerate(definition.coordinates):

@@ -54,7 +54,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def run(built: Callable[[], typer.Typer], name: str, arguments: Sequence[str] | None = None) -> None:
-    """Build an app, run one of its commands under this program's name, and exit as ``main`` does."""
+    """Build a command-line app, run one of its commands, and exit with the statuses of ``main``.
+
+    Args:
+        built: builds the app.
+        name: name of the program in messages.
+        arguments: arguments of the program; None takes those of this process.
+    """
     try:
         built()(args=None if arguments is None else list(arguments), prog_name=name)
     except KeyboardInterrupt:
@@ -68,7 +74,7 @@ def run(built: Callable[[], typer.Typer], name: str, arguments: Sequence[str] | 
 
 
 def build() -> typer.Typer:
-    """Assemble all commands: the client's own, and those of other packages."""
+    """Build the app with all commands: those of this package, and those of other packages by entry points."""
     app = typer.Typer(
         name="surrogym",
         cls=Commands,
@@ -102,4 +108,4 @@ def _version(
     ),
 ) -> None:
     """Learn a virtual environment from a handful of real steps, serve it, and train on it."""
-    del version  # its callback has acted on it
+    del version  # its callback has printed the version

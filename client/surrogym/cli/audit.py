@@ -110,7 +110,8 @@ def command(
 def _by_episodes(
     subject: Subject, env: str, card: PolicyCard, settings: EvaluationSettings, *, quiet: bool
 ) -> Handover:
-    """Audit by whole episodes in an environment. Their steps are announced, and counted in the ledger in any case."""
+    """Audit a policy by whole episodes in an environment. Their real steps are announced before, and reported to the
+    server even after an error."""
     from surrogym.cli.errors import CommandError
     from surrogym.cli.opening import opener_for_policy
     from surrogym_sampler.original.errors import EvaluationFailed
@@ -140,7 +141,7 @@ def _by_episodes(
 
 
 def _not_made(view: SurrogateView, reason: str) -> str:
-    """Say why no audit in a surrogate was made."""
+    """Return the error message that no audit of a surrogate was made, with the reason and the next command."""
     from surrogym_sampler.original.loading import sample_command
     from surrogym_trainer.training.handover import NO_SAMPLER
 
@@ -149,7 +150,8 @@ def _not_made(view: SurrogateView, reason: str) -> str:
 
 
 def _require_fit(predict: Predict, spec: EnvironmentSpec, misfit: str) -> None:
-    """Raise ``CommandError`` if a network of arrays has other observations or actions than the surrogate."""
+    """Raise ``CommandError`` if a policy network has other observations or actions than the surrogate. The message
+    begins with ``misfit``."""
     from surrogym.cli.errors import CommandError
     from surrogym_shared.network import Network, counts_of
 
@@ -167,14 +169,14 @@ def _require_fit(predict: Predict, spec: EnvironmentSpec, misfit: str) -> None:
 
 
 def _of_another(card: PolicyCard) -> PolicyCard:
-    """Return the card without what holds in the surrogate alone that it names."""
+    """Return a policy's card without the fields that only hold for the surrogate that the policy was trained on."""
     empty = {"server": None, "spec": None, "imagined_return": None, "untrained": None, "visited_confidence": ()}
     return card.model_copy(update={**empty, "settings": {}})
 
 
 def _floor(port: SurrogatePort, seed: int, session: dict[str, object]) -> float:
-    """Return the imagined return without a policy, where no card notes that of an untrained one: a promise means
-    little without the gain over it."""
+    """Return the mean imagined return without a policy, to compare the promised return with. It replaces the return of
+    an untrained policy, if the card has none."""
     from surrogym_trainer.evaluation.imagined import imagined_returns
     from surrogym_trainer.evaluation.uncontrolled import baseline, default_baseline
     from surrogym_trainer.training.settings import CHECK_EPISODES
@@ -185,8 +187,8 @@ def _floor(port: SurrogatePort, seed: int, session: dict[str, object]) -> float:
 
 
 def session_of(card: PolicyCard, view: SurrogateView) -> dict[str, object]:
-    """Return the session options that the policy was compared in, from its card. Noise that was confirmed since then is
-    added."""
+    """Return the options of the session in which the policy was judged, from its card, with noise that the surrogate
+    has confirmed since then."""
     from surrogym_trainer.training.settings import noise_of
 
     judged = card.settings.get("judge") or card.settings.get("session") or {}
@@ -195,7 +197,8 @@ def session_of(card: PolicyCard, view: SurrogateView) -> dict[str, object]:
 
 
 def _actions(known: int | tuple[int, ...]) -> str:
-    """The actions of a network: the number of choices of each discrete action, or the number of continuous ones."""
+    """Describe the actions of a network in words, from the number of continuous actions, or from the number of choices
+    of each discrete action."""
     if isinstance(known, int):
         return f"{known} continuous action{'s' * (known != 1)}"
     return f"discrete actions of {' and '.join(map(str, known))} choices"

@@ -1,4 +1,4 @@
-"""Options of ``surrogym evaluate`` for what runs from the same starts as the policy."""
+"""Options of ``surrogym evaluate`` for controllers that run from the same starts as the policy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Compare = Literal["zero", "random"]
 
 @dataclass(frozen=True)
 class Beside:
-    """A controller that runs from the same starts as the policy."""
+    """Options for controllers that run from the same starts as the policy, to compare them with it."""
 
     compare: Annotated[
         Compare | None,
@@ -44,7 +44,8 @@ class Beside:
     ] = None
 
     def check(self, settings: EvaluationSettings) -> None:
-        """Raise ``CommandError`` if something is to be compared with a policy whose actions are changed at random."""
+        """Raise ``CommandError`` if --compare or --reference is given together with --explore, which changes actions
+        at random."""
         from surrogym.cli.errors import CommandError
 
         if settings.explore and (self.compare or self.reference):
@@ -54,10 +55,16 @@ class Beside:
     def controllers(
         self, policy: Path, card: PolicyCard, reading: PolicyReading, opener: Callable[[], Episode]
     ) -> dict[Controller, Callable[[], Acting]]:
-        """Return loaders of whatever chooses the actions, the policy first.
+        """Return a function that loads each controller, by its kind: the policy first, then those to compare with it.
+
+        Args:
+            policy: file of the policy.
+            card: card of the policy.
+            reading: options for reading policy files.
+            opener: opens the original environment.
 
         Raises:
-            PolicyMisfit: the reference controller is a policy of another environment, which was opened and not reset.
+            PolicyMisfit: the reference controller is a policy that was trained for another environment.
             OriginalError: there is no such reference controller; nothing was run.
         """
         from surrogym_sampler.original.fitting import check_policy
@@ -76,7 +83,8 @@ class Beside:
 
 
 def spec_of_reference(given: str) -> EnvironmentSpec | None:
-    """Return the specification in the card of a reference policy's file; None without one, and for a module's code."""
+    """Return the specification in the card of a reference controller that is a policy file; None if the card has none,
+    or if the controller is code."""
     from surrogym_trainer.policies.card import read_card
 
     return read_card(Path(given)).spec if Path(given).exists() else None
@@ -99,7 +107,7 @@ def reference_of(given: str, reading: PolicyReading) -> Acting:
     """Load a reference controller: a policy file, or ``package.module:name``.
 
     Raises:
-        CommandError, OriginalError, UnusablePolicy: there is none of this name, or it can't be used.
+        CommandError, OriginalError, UnusablePolicy: there is no controller of this name, or it can't be used.
     """
     from surrogym.cli.errors import CommandError
     from surrogym_trainer.evaluation.reference import load_reference

@@ -13,7 +13,7 @@ from surrogym.cli.options import (
     read_tolerances,
 )
 
-USUAL = "=usual"  # returns an output to its default tolerance
+USUAL = "=usual"  # ending of an option that returns an output to its default tolerance
 
 
 def register(app: typer.Typer) -> None:

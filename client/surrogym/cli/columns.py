@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 from textwrap import fill, wrap
 
-ENDLESS = 10_000  # characters in a line, where no terminal limits it
+ENDLESS = 10_000  # characters in a line of output that is not a terminal
 GAP = "  "
 
 
@@ -52,13 +52,14 @@ def fitted(markdown: str, width: int | None = None) -> str:
 
 
 def screen_width() -> int:
-    """Number of characters in a line of standard output; ``ENDLESS`` if it is not a terminal."""
+    """Return the number of characters in a line of standard output; ``ENDLESS`` if it is not a terminal."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else ENDLESS
 
 
 def _widths(heading: Sequence[str], body: Sequence[Sequence[str]], room: int) -> list[int] | None:
-    """Choose the widest columns that fit: whole headings if possible, then whole cells, then widths as even as the
-    words allow.
+    """Return the widths of a table's columns that fit into ``room`` characters; None if no word may be broken.
+
+    Whole headings are preferred, then whole cells, then widths as even as the longest words allow.
     """
     cells = [list(column) for column in zip(*body, strict=True)] or [[] for _ in heading]
     values = [max(map(len, column), default=0) for column in cells]
@@ -76,8 +77,8 @@ def _longest_word(text: str) -> int:
 
 
 def _broken(row: Sequence[str], widths: Sequence[int], *, bottom: bool = False) -> Iterator[str]:
-    """Return the lines of a row whose cells are broken between words. Short cells are aligned to the top, or to the
-    bottom.
+    """Yield the lines of a table's row whose cells are broken between words to their widths. Cells with fewer lines are
+    aligned to the top, or with ``bottom`` to the bottom.
     """
     cells = [wrap(text, width, break_on_hyphens=False) or [""] for text, width in zip(row, widths, strict=True)]
     height = max(map(len, cells))

@@ -18,8 +18,8 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     ),
     "Operate": ("watch", "work", "jobs", "conformance"),
 }
-REST = "More"  # heading of the commands of no group, such as those of other packages
-ADVANCED: Mapping[str, frozenset[str]] = {  # options that a first reader does not need, by command
+REST = "More"  # heading in the help of commands outside all groups, such as those of other packages
+ADVANCED: Mapping[str, frozenset[str]] = {  # options for experts, which the help lists last, by command
     "deploy": frozenset({"--algorithm", "--trust-policy", "--spec", "--episodes"}),
     "evaluate": frozenset(
         {"--wide", "--start-scale", "--perturb", "--explore", "--parallel", "--algorithm", "--where", "--learn"}
@@ -40,10 +40,10 @@ ADVANCED: Mapping[str, frozenset[str]] = {  # options that a first reader does n
 
 
 class Command(TyperCommand):
-    """One command. Its help has the options for experts last, under "Advanced"."""
+    """One command of ``surrogym``. Its help lists the options for experts last, under "Advanced"."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the sections of arguments and options."""
+        """Write the sections of arguments, options and advanced options to the help of a command."""
         sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": [], "Advanced": []}
         advanced = ADVANCED.get(self.name or "", frozenset())
         for parameter in self.get_params(ctx):
@@ -55,10 +55,10 @@ class Command(TyperCommand):
 
 
 class Commands(TyperGroup):
-    """Group of all commands. An unknown option that a command once had is refused with its successor."""
+    """Group of all commands of ``surrogym``. The error about an option that was removed names its replacement."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a section for each group of commands."""
+        """Write a section for each group of commands to the help of ``surrogym``."""
         known = {name: command for name in self.list_commands(ctx) if (command := self.get_command(ctx, name))}
         shown = {name: command for name, command in known.items() if not command.hidden}
         grouped = {name for names in GROUPS.values() for name in names}
@@ -72,11 +72,11 @@ class Commands(TyperGroup):
         _write(formatter, sections)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the named command."""
+        """Run the command, and add the replacement of a removed option to the error about it."""
         try:
             return super().invoke(ctx)
         except Exception as error:
-            option = getattr(error, "option_name", None)  # of NoSuchOption, which newer versions of typer have inside
+            option = getattr(error, "option_name", None)  # typer may hide the class NoSuchOption
             if option is not None and (said := remark(f"option of {ctx.invoked_subcommand}", option)):
                 error.message += said  # type: ignore[attr-defined]
                 error.possibilities = None  # type: ignore[attr-defined]

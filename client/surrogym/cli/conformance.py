@@ -62,7 +62,7 @@ def _of_program(program: str, step_limit: float) -> Iterable[Outcome]:
 
 
 def _show(checked: Iterable[Outcome], output: Output) -> None:
-    """Show each outcome as soon as it is there, then the sum."""
+    """Print the outcome of each check as soon as it is known, then the number of passed checks."""
     from surrogym_shared.words import visible
 
     outcomes = []

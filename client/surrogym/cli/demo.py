@@ -86,7 +86,15 @@ def command(
 def perform(
     settings: S, begin: Begin[S], out: Path | None, json_file: Path | None, *, exit_with_parent: bool, quiet: bool
 ) -> None:
-    """Run a demo, and show its metrics as a table, or write them to ``json_file``.
+    """Run a demo, and show its metrics as a table, or write them to a file.
+
+    Args:
+        settings: settings of the demo.
+        begin: starts the run that learns the policy.
+        out: empty folder for the results; None makes one.
+        json_file: file for the metrics; ``-`` prints them as JSON in place of the table; None writes none.
+        exit_with_parent: whether to end with the process that started this one.
+        quiet: whether progress and table are hidden.
 
     Raises:
         CommandError: the folder of ``json_file`` does not exist; nothing was run.

@@ -22,23 +22,23 @@ S = TypeVar("S", bound=DemoSettings, contravariant=True)
 
 
 class Run(Protocol):
-    """One way to a policy."""
+    """Protocol of one run of the demo: learning a policy, and storing the results."""
 
     def learn(self) -> Learned:
-        """Learn a policy. Returns it with its costs."""
+        """Learn a policy, and return it with the real steps, virtual steps and seconds that it took."""
         ...
 
     def keep(self, judgement: Judgement) -> None:
-        """Enter the real steps of the evaluation into the ledger, and write pictures and data into the run folder."""
+        """Report the real steps of the evaluation to the server, and write pictures and data into the run folder."""
         ...
 
     def linger(self) -> None:
-        """Keep the server running until Ctrl-C, so that a person can look at its page."""
+        """Keep the server running until Ctrl-C, so that a person can view its page."""
         ...
 
 
 class Begin(Protocol[S]):
-    """Begins a run in a folder, with processes that end with it."""
+    """Protocol of a function that starts a run in a folder. Its child processes end with the run."""
 
     def __call__(self, settings: S, folder: Path, children: Children, *, quiet: bool) -> Run: ...
 
@@ -51,17 +51,17 @@ def run_demo(
     *,
     quiet: bool = False,
 ) -> None:
-    """Run the whole loop. Then call ``tell`` with the metrics, which are also in the run folder, and with this folder.
+    """Run a demo: learn a policy, evaluate it, and write metrics and data into the run folder.
 
     Args:
-        settings: of the run.
-        out: an empty folder for its results; None makes one.
-        tell: called at the end.
-        begin: begins the way to a policy.
+        settings: settings of the demo.
+        out: an empty folder for the results; None makes one.
+        tell: called at the end with the metrics and the run folder.
+        begin: starts the run that learns the policy.
         quiet: whether progress is hidden.
 
     Raises:
-        RunFailed: the folder is not empty, or a process failed; the message has its last words and its log.
+        RunFailed: the folder is not empty, or a process failed; the message has its last output and its log file.
         SurrogymClientError: the server refused, or the design failed.
     """
     started, code = time.monotonic(), commit()
@@ -98,7 +98,7 @@ def _empty_folder(folder: Path) -> Path:
 
 
 def _what_stays(folder: Path) -> str:
-    """Name the results that are kept after an interruption."""
+    """Describe the results that remain in the run folder after an interruption."""
     database, policy = _database(folder), folder / "policy.zip"
     kept = [f"the real samples (surrogym serve --database {database})"] if database.exists() else []
     kept += [f"the policy so far ({policy})"] if policy.exists() else []

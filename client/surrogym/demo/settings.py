@@ -1,4 +1,4 @@
-"""Settings of one run, and the specification that follows from them."""
+"""Settings of a demo, and the specification that follows from them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from surrogym_trainer.training.settings import TrainSettings, prolongs
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """Settings of a demo. None takes the task's own."""
+    """Settings of a demo. None takes the default of the task."""
 
     task: str = "pendulum"
     seed: int = 0
-    budget: int | None = None  # real steps
-    steps: int | None = None  # virtual steps, all rounds together
+    budget: int | None = None  # most real steps of the design
+    steps: int | None = None  # virtual steps of all rounds of training together
     episodes: int = 100
     pictures: bool = True
     keep: bool = False
@@ -32,12 +32,12 @@ class DemoSettings:
 
     @property
     def run_name(self) -> str:
-        """Name of the kind of run, for its folder and its table."""
+        """Name of the kind of run, which its folder and its table of results have."""
         return self.task if self.access == "any" else f"{self.task}-{self.access}"
 
     @property
     def labels(self) -> dict[str, str]:
-        """What else tells this kind of run from others, for its metrics."""
+        """Further settings that distinguish this kind of run, as entries of its metrics."""
         return {}
 
     @property
@@ -46,7 +46,8 @@ class DemoSettings:
 
     @property
     def real_steps(self) -> int:
-        """The budget. A task whose states can't be set has the default budget of its specification."""
+        """Budget of real steps. Without a given budget, it is that of the task, or, if its states are not set directly,
+        the default of its specification."""
         if self.budget is not None:
             return self.budget
         if self.access == "any":
@@ -66,7 +67,8 @@ class DemoSettings:
 
     @property
     def prolong(self) -> bool:
-        """Whether a training takes more cycles while it gains: as ``prolongs``, and not if the search can't."""
+        """Whether a training is prolonged while the return still rises: if ``prolongs`` advises it, and the policy
+        search supports it."""
         return SEARCHES.get(self.search).prolongable and prolongs(TrainSettings(total_steps=self.steps), self.spec())
 
     @property
@@ -76,7 +78,7 @@ class DemoSettings:
 
     @property
     def training_options(self) -> list[str]:
-        """Options of ``surrogym train``."""
+        """Options of ``surrogym train`` for the training of this demo."""
         options = [] if self.virtual_steps is None else ["--steps", str(self.virtual_steps)]
         if self.algorithm is not None:
             options += ["--algorithm", self.algorithm]
@@ -87,28 +89,28 @@ class DemoSettings:
 
     @property
     def description_steps(self) -> int:
-        """Real steps that the description of the environment took. The demo's tasks have specifications of their
-        own."""
+        """Number of real steps that were taken to describe the environment; 0, as the demo's tasks have
+        specifications."""
         return 0
 
     def spec(self) -> EnvironmentSpec:
-        """The environment's specification with the design of the demo."""
+        """Return the environment's specification with the budget of this demo."""
         return with_choices(self._usual, {"preset": "default", "budget": design_budget(self.real_steps)})
 
     @cached_property
     def _usual(self) -> EnvironmentSpec:
-        """The specification with the design's default budget."""
+        """Specification of the task's environment with the default budget."""
         return make(self.demo_task.environment, preset="default", seed=self.seed, access=self.access).spec()
 
     def judged_by(self) -> EnvironmentSpec:
-        """The original environment as the policy is judged by it."""
+        """Return the specification of the original environment by which the policy is evaluated."""
         return make(self.demo_task.environment).spec()
 
     def asked(self) -> dict[str, Any]:
-        """Everything that a result depends on and that is known before the run, without the seed; JSON-able."""
+        """Return all settings that a result depends on, except the seed, as values that JSON can represent."""
         spec = self.spec().model_dump(mode="json")
         spec["design"].pop("seed")
-        if not spec["snapshots"]:  # results that are older than snapshots stay valid
+        if not spec["snapshots"]:  # so that older results, whose settings lack this field, stay valid
             del spec["snapshots"]
         names = ["task", "real_steps", "virtual_steps", "prolong", "episodes"]
         search = {} if self.search == REFERENCE else {"algorithm": self.search.lower()}
@@ -116,5 +118,5 @@ class DemoSettings:
 
 
 def fingerprint(content: Any) -> str:
-    """Twelve hexadecimal digits for JSON-able content."""
+    """Return a hash of content that JSON can represent, as twelve hexadecimal digits."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:12]

@@ -8,13 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 MIN_DESIGN = 20
-ROUNDS = 3  # of the closed loop, while the design is not ready
+ROUNDS = 3  # most rounds of the closed loop (train a policy, then query where it goes) while the design is not ready
 
 
 @dataclass(frozen=True)
 class Starts:
-    """Other starts than the environment's own, for a second evaluation: ``wide`` is anywhere in the sampling range,
-    ``scale`` spreads the declared starts so many times as far."""
+    """Starts of a second evaluation: ``wide`` starts anywhere in the sampling range, ``scale`` widens the declared
+    start distribution by this factor."""
 
     words: str
     wide: bool = False
@@ -23,22 +23,22 @@ class Starts:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Results of 100 episodes."""
+    """Results of the 100 episodes of an evaluation: mean and lowest return, and share of successes."""
 
     mean: float
     lowest: float
-    success: float | None  # share of the episodes
+    success: float | None  # share of the episodes that were a success; None without a criterion
 
 
 @dataclass(frozen=True)
 class Target:
-    """Criteria for one run. Every given value must be reached."""
+    """Results that one run of a demo has to reach; None is no requirement."""
 
     words: str
     mean: float | None = None
     lowest: float | None = None
     success: float | None = None
-    also_success: float | None = None  # of the second evaluation
+    also_success: float | None = None  # share of successes in the second evaluation, from other starts
 
     def reached(self, real: Outcome, also: Outcome | None = None) -> bool:
         pairs = [(real.mean, self.mean), (real.lowest, self.lowest), (real.success, self.success)]
@@ -48,7 +48,7 @@ class Target:
 
 @dataclass(frozen=True)
 class DemoTask:
-    """A task of a demo, and its budget of real steps."""
+    """A task of the demo: its environment, its budget of real steps, and the results to reach."""
 
     environment: str
     budget: int
@@ -82,7 +82,7 @@ TASKS = {
 
 
 def design_budget(budget: int) -> int:
-    """Real steps of the design before the first policy: two fifths, with a minimum."""
+    """Return the real steps that the design takes before the first policy: two fifths of the budget, with a minimum."""
     return min(budget, max(MIN_DESIGN, 2 * budget // 5))
 
 

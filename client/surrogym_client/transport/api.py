@@ -22,7 +22,7 @@ R = TypeVar("R", bound=wire.Reply)
 P = TypeVar("P", wire.Uncertainty, wire.Prediction)
 
 _EVENT_SILENCE_SECONDS = 60.0
-_NUMBERS = 2_000  # most numbers in one request: each has up to 25 characters, and the server accepts 64 KiB of JSON
+_NUMBERS = 2_000  # most numbers in a request: each has up to 25 characters, and the server accepts 64 KiB of JSON
 _OF_ALL_POINTS = ("model_version", "outputs")
 _MODEL_FILE = "application/octet-stream"
 _BATCH_BYTES = 96 * 1024  # most bytes of samples in one request; the server accepts 128 KiB of JSON
@@ -76,7 +76,7 @@ class Api:
         self.close()
 
     def close(self) -> None:
-        """Close the sockets; a later call connects anew."""
+        """Close the sockets. A later call opens new ones."""
         self.connection.close()
 
     # Service
@@ -136,7 +136,7 @@ class Api:
         return found
 
     def surrogate(self, name: str) -> wire.SurrogateView:
-        """Return one surrogate with its specification, the fidelity of every output, its ledger and counts of queries.
+        """Return one surrogate: specification, fidelity of every output, and counts of real steps and of queries.
 
         Raises:
             UnknownSurrogate: there is no surrogate of this name.
@@ -180,8 +180,8 @@ class Api:
         lease_seconds: float = wire.LEASE_SECONDS,
         retries: Retries | None = None,
     ) -> wire.ClaimedQueries:
-        """Lease queries for a sampler, and wait up to ``wait_seconds`` until there are some. The list may be empty.
-        ``retries`` replaces the connection's.
+        """Lease up to ``max_queries`` queries for a sampler, and wait up to ``wait_seconds`` for the first one. There
+        may be none. ``retries`` replaces the retry budget of the connection.
 
         A claim whose reply is lost is not sent again. Its leases expire, and the queries return to the queue.
 
@@ -214,7 +214,7 @@ class Api:
         lease_seconds: float = wire.LEASE_SECONDS,
         retries: Retries | None = None,
     ) -> None:
-        """Extend a lease while the original environment works. ``retries`` replaces the connection's.
+        """Extend the lease of a query. ``retries`` replaces the retry budget of the connection.
 
         Raises:
             LeaseExpired: the lease has expired; the sample may still be sent.
@@ -225,8 +225,8 @@ class Api:
     def fail(
         self, name: str, query_id: int, lease_token: str, error: str, *, begun: bool = True, refused: bool = False
     ) -> None:
-        """Return a query with the error it caused. ``begun`` says whether a real step may have been taken, ``refused``
-        whether the original environment refused the query before one."""
+        """Return a query without an answer, with the error it caused. ``begun``: a real step may have been taken.
+        ``refused``: the original environment refused the query before a real step."""
         body = wire.FailQuery(lease_token=lease_token, error=error, begun=begun, refused=refused)
         self._send(f"{routes.surrogate(name)}/queries/{query_id}:fail", body)
 
@@ -269,7 +269,7 @@ class Api:
         return self._get(wire.SnapshotList, f"{routes.surrogate(name)}/snapshots").snapshots
 
     def drop_snapshots(self, name: str, snapshots: Sequence[str]) -> int:
-        """Report snapshots that no sampler holds any more, and return how many were known."""
+        """Report snapshots that no sampler holds any more, and return how many of them the server knew."""
         body = wire.DropSnapshots(snapshots=list(snapshots))
         return self._post(wire.DroppedSnapshots, f"{routes.surrogate(name)}/snapshots:drop", body).dropped
 
@@ -287,10 +287,11 @@ class Api:
     ) -> wire.AddedSamples:
         """Send real steps, and return once the server has stored them.
 
-        ``logged`` steps were recorded before: they don't count towards the budget, and a log that is stored already
-        changes nothing. The call with ``complete`` makes a fit of the log due. A further part of a log comes ``after``
-        the ``digest`` of the reply to the part before. If the reply has a ``restart``, nothing of the log was stored,
-        and it has to be sent from its beginning with this as ``after``; a call without ``after`` does so by itself.
+        Steps of purpose ``logged`` were recorded before: they don't count towards the budget, and storing a log twice
+        changes nothing. A log may be sent in several calls: ``after`` is the ``digest`` of the reply to the part
+        before, and ``complete`` is true for the last part, which starts a fit. If the reply has a ``restart``, nothing
+        of the log was stored, and it has to be sent from its beginning with this as ``after``; a call without ``after``
+        does so by itself.
 
         A batch of up to about 300 samples is stored whole or not at all. A larger one is sent in several requests, so
         an error may leave its first part stored; the same call with the same key then adds the rest. ``stored`` is
@@ -298,7 +299,7 @@ class Api:
         """
         batches = _batches(samples)
         keys: list[str | None] = [None] * len(batches)
-        if idempotency_key or any(sample.query_id is None for sample in samples):  # otherwise leases identify them
+        if idempotency_key or any(sample.query_id is None for sample in samples):  # else leases identify the samples
             key = idempotency_key or new_key()
             keys = [key] if len(batches) == 1 else [f"{key}/{number}" for number in range(len(batches))]
         added: list[wire.AddedSamples] = []
@@ -335,14 +336,14 @@ class Api:
     def report_steps(
         self, name: str, steps: int, *, episodes: int = 0, note: str = "", idempotency_key: str | None = None
     ) -> wire.Ledger:
-        """Enter real steps of an evaluation into the ledger."""
+        """Report the number of real steps of an evaluation, and return the surrogate's counts of real steps."""
         body = wire.ReportSteps(steps=steps, episodes=episodes, note=note, idempotency_key=idempotency_key or new_key())
         return self._post(wire.Ledger, f"{routes.surrogate(name)}/ledger", body)
 
     def improve(
         self, name: str, queries: int, *, checkpoint: str | None = None, idempotency_key: str | None = None
     ) -> wire.ImprovedSurrogate:
-        """Add queries to the design, chosen near the occupancy submitted as ``checkpoint``.
+        """Add queries to the design, chosen near the visited states that were submitted as ``checkpoint``.
 
         Raises:
             BeyondBudget: the budget has too few steps left, and this token may not raise it; a token of role admin may.
@@ -450,7 +451,7 @@ class Api:
                 time.sleep(pause)
 
     def _one_stream(self, name: str, after: int | None) -> Iterator[wire.Event | None]:
-        """Iterate over the events of one connection; None is a keep-alive message. Only an error ends the iteration."""
+        """Yield the events of one connection, and None for a keep-alive message, until an error is raised."""
         path = f"{routes.surrogate(name)}/events"
         headers = {"Accept": "text/event-stream"}
         if after is not None:
@@ -504,7 +505,7 @@ class Api:
 
 
 def _joined(added: Sequence[wire.AddedSamples]) -> wire.AddedSamples:
-    """Return one reply for all requests so far."""
+    """Combine the replies to several requests with samples into one reply."""
     ids = [id for one in added for id in one.sample_ids]
     return added[-1].model_copy(update={"sample_ids": ids, "duplicates": sum(one.duplicates for one in added)})
 

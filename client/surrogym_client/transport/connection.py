@@ -50,14 +50,14 @@ class Timeouts:
     request: float = 30.0
     step: float = 60.0
     rollout: float = 600.0
-    open: float = 150.0  # to open a session: a server that is new on its machine compiles its steps first
+    open: float = 150.0  # time to open a session, because a newly installed server compiles its code first
 
 
 @dataclass(frozen=True)
 class Retries:
-    """How long a request is retried. Pauses grow by ``factor``, and each is drawn from the upper half of its range.
+    """Retry budget of a request: ``seconds`` from the first failure; 0 does not retry.
 
-    ``seconds`` counts from the first failure; 0 does not retry.
+    Pauses grow by ``factor``. Each is drawn at random between half its length and its length.
     """
 
     seconds: float = 30.0
@@ -164,7 +164,7 @@ class Connection:
         timeout: float | None = None,
         media_type: str = JSON,
     ) -> Callable[[], bytes]:
-        """Send a request once, for ``persist``. The arguments are those of ``send``."""
+        """Return a function that sends a request once, for ``persist``. The arguments are those of ``send``."""
 
         def send_once() -> bytes:
             client = self._open_client()
@@ -185,7 +185,7 @@ class Connection:
 
         Args:
             attempt: sends one request.
-            repeatable: whether the server may get the request twice. If not, it is repeated only if it certainly did
+            repeatable: whether the server may get the request twice. If not, it is sent again only if it certainly did
                 not arrive.
             retries: pauses between attempts; None takes the connection's.
 
@@ -198,7 +198,7 @@ class Connection:
             try:
                 return attempt()
             except (httpx.TransportError, OSError, Unavailable) as failure:
-                # A failed request's connection is closed with it, so a late reply answers nobody.
+                # The connection of a failed request is closed, so that a late reply is never taken for another's.
                 delays = (retries or self.retries).delays() if delays is None else delays
                 pause = next(delays, None) if _may_repeat(failure, repeatable) else None
                 if pause is None:
@@ -207,7 +207,7 @@ class Connection:
 
     @property
     def proxied(self) -> bool:
-        """Whether a proxy from the environment variables is in use. Such a proxy only carries HTTP."""
+        """Whether requests pass a proxy from the environment variables, which carries HTTP but no stream."""
         url = httpx.URL(self.url)
         return not _is_loopback(self.url) and url.scheme in getproxies() and not proxy_bypass(url.host)
 
@@ -249,7 +249,7 @@ def token_in(path: Path) -> str:
     Raises:
         UnusableToken: the file can't be read, or does not contain exactly one token.
     """
-    from surrogym_shared.secret_files import tokens_in  # only who has a token in a file needs it
+    from surrogym_shared.secret_files import tokens_in  # only for a token in a file
 
     try:
         tokens = tokens_in(path)
@@ -282,12 +282,12 @@ def _checked(url: str) -> str:
 def _new_client(url: str, token: str | None) -> httpx.Client:
     headers = {"Authorization": f"Bearer {token}"} if token else {}
     limits = httpx.Limits(keepalive_expiry=_KEEPALIVE_SECONDS)
-    trusted = httpx.create_ssl_context()  # SSL_CERT_FILE counts for this machine too, where its proxies don't
+    trusted = httpx.create_ssl_context()  # SSL_CERT_FILE also applies to loopback hosts, unlike proxies
     return httpx.Client(headers=headers, limits=limits, verify=trusted, trust_env=not _is_loopback(url))
 
 
 def _is_loopback(url: str) -> bool:
-    """Whether a host is this machine. A proxy must never stand between two programs of one machine."""
+    """Whether the host of a URL is this machine, to which requests never pass a proxy."""
     host = httpx.URL(url).host
     try:
         return ip_address(host).is_loopback

@@ -28,10 +28,8 @@ from surrogym_shared.spec import EnvironmentSpec
 Transport = Literal["auto", "stream", "binary", "json"]
 T = TypeVar("T")
 
-_RETURNS = 5  # how often a server may go back to a checkpoint during one request
-_UPGRADE_PAUSE_SECONDS = (
-    60.0  # before the next attempt to open a stream, after one was refused or broke without an answer
-)
+_RETURNS = 5  # how often a server may restore an older checkpoint of a session during one request
+_UPGRADE_PAUSE_SECONDS = 60.0  # pause before a stream is tried again, after one was refused or broke without an answer
 
 
 @dataclass
@@ -42,11 +40,11 @@ class _Live:
     shape: Shape
     seq: int
     stream: Stream
-    window: Window | None  # None: the server never goes back
+    window: Window | None  # last requests; None: the server never restores an older checkpoint of the session
 
 
 class HttpSurrogate:
-    """One surrogate on a server. It keeps the invariants of ``SurrogatePort``.
+    """One surrogate on a server, as a ``SurrogatePort`` over HTTP or a WebSocket.
 
     After a lost reply, a time-out or a dropped connection, the same request is sent again with the same sequence
     number, so a step happens once. A session is an id, not a connection: another HttpSurrogate may continue it, and a
@@ -90,8 +88,8 @@ class HttpSurrogate:
         self.transport: Transport = transport
         self._form: Form = JsonForm() if transport == "json" else BinaryForm()
         self._live: dict[str, _Live] = {}
-        self._upgrade_after = math.inf if self.connection.proxied else 0.0  # by time.monotonic
-        self._streamed = False  # whether a stream has ever brought an answer
+        self._upgrade_after = math.inf if self.connection.proxied else 0.0  # time without a stream
+        self._streamed = False  # whether any stream has returned an answer
         self._spec: EnvironmentSpec | None = None
 
     def __repr__(self) -> str:
@@ -181,7 +179,7 @@ class HttpSurrogate:
         return parse(wire.SubmittedOccupancy, self.connection.send("POST", route, body), route)
 
     def close(self, session: str) -> None:
-        """Close the session. The sockets are closed with the last session."""
+        """Close the session. Closing the last session also closes the sockets."""
         self._forget(session)
         try:
             with suppress(SessionLost):
@@ -202,8 +200,8 @@ class HttpSurrogate:
         read: Callable[[bytes, Shape], tuple[int, T]],
         timeout: float,
     ) -> T:
-        """Send a request that changes the session, with the next sequence number. After an error, the number is used
-        again."""
+        """Send a request that changes the session, with the next sequence number. If it fails, the next request has the
+        same number."""
         live = self._live.get(session) or self._look_up(session)
         sent = Sent(live.seq + 1, what, write(live.seq + 1, live.shape), read, timeout)
         result: T
@@ -226,8 +224,8 @@ class HttpSurrogate:
         return result
 
     def _answered(self, live: _Live, sent: Sent) -> tuple[bytes, tuple[int, Any]]:
-        """Send a request until it is answered. If the server has gone back to a checkpoint, send those since then
-        first."""
+        """Send a request until it is answered. If the server has restored an older checkpoint of the session, first
+        send the requests since then again."""
         if live.window is None:
             return self._sent(live, sent)
         window, returns = live.window, 0
@@ -239,11 +237,11 @@ class HttpSurrogate:
                 if behind is None or behind >= sent.seq or returns == _RETURNS:
                     raise
                 returns += 1
-                with suppress(SeqConflict):  # it went back again: the next attempt says how far
+                with suppress(SeqConflict):  # restored once more: the next attempt shows how far
                     self._send_again(live, window, behind)
 
     def _send_again(self, live: _Live, window: Window, behind: int) -> None:
-        """Send the requests from ``behind`` on again. Their answers must be the same, bit for bit."""
+        """Send the requests from number ``behind`` on again. Their answers must be the same as before, bit for bit."""
         if (missing := window.since(behind)) is None:
             raise self._given_up(live, f"went back to request {behind}, which this client no longer keeps")
         for sent in missing:
@@ -269,7 +267,7 @@ class HttpSurrogate:
         return self.connection.persist(once)
 
     def _attempt(self, live: _Live, what: str, content: bytes, timeout: float) -> Callable[[], bytes]:
-        """Return a function that sends the request once. The caller repeats it after a failure."""
+        """Return a function that sends a request once, by the stream or by HTTP. After a failure it is called again."""
         if self.transport == "stream":
             return lambda: live.stream.exchange(content, timeout)
         by_http = self.connection.attempt(
@@ -280,8 +278,8 @@ class HttpSurrogate:
         first = True
 
         def stream_first() -> bytes:
-            """Send by the stream at the first attempt, and by HTTP when repeated. What broke the stream may break it
-            again, and HTTP returns the reason."""
+            """Send a request by the stream, and if it is repeated, by HTTP: the request that broke the stream may break
+            it again, and HTTP returns the reason."""
             nonlocal first
             if not first:
                 return by_http()
@@ -310,7 +308,7 @@ class HttpSurrogate:
         self._upgrade_after = time.monotonic() + seconds
 
     def _look_up(self, session: str) -> _Live:
-        """Look up a session that another client opened."""
+        """Ask the server for a session that another client opened, and start to track it."""
         route = routes.session(session)
         return self._know(parse(wire.SessionView, self.connection.send("GET", route), route))
 

@@ -15,9 +15,9 @@ R = TypeVar("R", bound=wire.Reply)
 
 
 class JobCalls:
-    """Routes of the jobs of trainer workers.
+    """Methods for the routes of jobs: trainings and evaluations that trainer workers run.
 
-    Every method raises as those of ``Api``, and ``UnknownJob`` for a job that does not exist.
+    Every method raises the errors of ``Api``, and ``UnknownJob`` for a job that does not exist.
     """
 
     def __init__(self, connection: Connection) -> None:
@@ -45,7 +45,7 @@ class JobCalls:
         return self._post(wire.JobView, f"{routes.surrogate(surrogate)}/jobs", body, repeatable=bool(idempotency_key))
 
     def cancel(self, surrogate: str, id: int) -> wire.JobView:
-        """Cancel a queued job, or ask the worker of a running one to stop."""
+        """Cancel a queued job, or ask the worker of a running job to stop."""
         route = f"{routes.job(surrogate, id)}:cancel"
         return parse(wire.JobView, self._connection.send("POST", route), route)
 
@@ -84,7 +84,8 @@ class JobCalls:
         lease_seconds: float = wire.LEASE_SECONDS,
         retries: Retries | None = None,
     ) -> bool:
-        """Renew the lease of a job, and store its progress. Returns whether the worker is to stop.
+        """Renew the lease of a job, and store its progress. Returns whether the worker has to stop, because a person
+        cancelled the job.
 
         Raises:
             LeaseExpired: the job has ended, or another worker has it.
@@ -103,7 +104,7 @@ class JobCalls:
         version: int | None = None,
         evaluation: int | None = None,
     ) -> wire.JobView:
-        """End a job. Repeating it is harmless. Raises as ``report``."""
+        """Report that a job has ended. Repeating it is harmless. Raises ``LeaseExpired`` like ``report``."""
         body = wire.FinishJob(
             lease_token=lease_token, status=status, error=error, version=version, evaluation=evaluation
         )

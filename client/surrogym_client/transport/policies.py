@@ -11,13 +11,13 @@ from surrogym_client.transport.replies import parse
 from surrogym_shared import wire
 
 _FILE = "application/octet-stream"
-_SECONDS = 300.0  # enough for the largest file over a slow connection
+_SECONDS = 300.0  # time-out of a file's transfer, enough for the largest file over a slow connection
 
 
 class PolicyCalls:
-    """Routes of the policies that a server stores. A policy is named by its version, an alias, or ``latest``.
+    """Methods for the routes of stored policies. ``which`` is the version of a policy, an alias, or ``latest``.
 
-    Every method raises as those of ``Api``, and ``UnknownPolicy`` for a policy that does not exist.
+    Every method raises the errors of ``Api``, and ``UnknownPolicy`` for a policy that does not exist.
     """
 
     def __init__(self, connection: Connection) -> None:
@@ -41,7 +41,7 @@ class PolicyCalls:
         form: wire.PolicyForm,
         file: bytes,
     ) -> wire.PushedPolicy:
-        """Store a policy with its file. A version never changes: the same file with another card is a new one.
+        """Store a policy with its file. A version never changes: the same file with another card is a new version.
 
         Raises:
             SpecConflict: the policy was made for other observations or actions.
@@ -57,7 +57,8 @@ class PolicyCalls:
         return pushed
 
     def put_file(self, surrogate: str, version: int, form: wire.PolicyForm, file: bytes) -> wire.PolicyView:
-        """Store a further file of a policy. One that is there is never replaced: another of its form is refused."""
+        """Store a further file of a policy. A stored file is never replaced: another file of the same form is an
+        error."""
         route = f"{routes.policy(surrogate, version)}/files/{form}"
         digest = {"digest": _digest(file)}
         reply = self._connection.send("PUT", route, file, params=digest, media_type=_FILE, timeout=_SECONDS)
@@ -68,18 +69,19 @@ class PolicyCalls:
         return self._connection.send("GET", f"{routes.policy(surrogate, which)}/files/{form}", timeout=_SECONDS)
 
     def evaluate(self, surrogate: str, version: int, evaluation: wire.AddEvaluation) -> wire.EvaluationView:
-        """Store real episodes of a policy, once for each idempotency key. This does not change the ledger."""
+        """Store the results of real episodes of a policy, once for each idempotency key. They don't change the
+        surrogate's counts of real steps, see ``Api.report_steps``."""
         route = f"{routes.policy(surrogate, version)}/evaluations"
         reply = self._connection.send("POST", route, evaluation.model_dump_json().encode())
         return parse(wire.EvaluationView, reply, route)
 
     def evaluation(self, surrogate: str, which: str | int, id: int) -> wire.EvaluationDetail:
-        """Return stored real episodes: the return of each, and the traces of some."""
+        """Return the results of a stored evaluation: the return of each real episode, and the traces of some."""
         route = f"{routes.policy(surrogate, which)}/evaluations/{id}"
         return parse(wire.EvaluationDetail, self._connection.send("GET", route), route)
 
     def put_alias(self, surrogate: str, alias: str, version: int) -> wire.PolicyView:
-        """Let an alias name a version. This needs a token of role admin."""
+        """Point an alias to a version of the policies. This needs a token of role admin."""
         route = f"{routes.policy(surrogate, 'aliases')}/{routes.alias(alias)}"
         reply = self._connection.send("PUT", route, wire.PutAlias(version=version).model_dump_json().encode())
         return parse(wire.PolicyView, reply, route)

@@ -9,29 +9,29 @@ from surrogym_shared.wire.priors import PriorView
 
 
 class PriorCalls:
-    """Routes of the prior of a surrogate. Every method raises as those of ``Api``."""
+    """Methods for the routes of the prior of a surrogate. Every method raises the errors of ``Api``."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
 
     def get(self, surrogate: str) -> PriorView:
-        """Return what the prior was made from, and whether the design waits for one."""
+        """Return what the prior was made from, and whether the design waits for a prior."""
         return self._viewed("GET", self._route(surrogate))
 
     def put(self, surrogate: str, data: bytes) -> PriorView:
-        """Set the model in a surrogate's file as the prior.
+        """Set the model in a surrogate's file (``data``) as the prior.
 
         Raises:
-            InvalidRequest: its coordinates, units or actions are others.
+            InvalidInput: the file has other coordinates, units or actions than the surrogate.
         """
         return self._viewed("PUT", self._route(surrogate), data)
 
     def wait(self, surrogate: str) -> PriorView:
-        """Let the design wait after its initial queries until a prior is set."""
+        """Make the design wait, after its initial queries, until a prior is set."""
         return self._viewed("POST", f"{self._route(surrogate)}:await")
 
     def drop(self, surrogate: str) -> None:
-        """Remove the prior, or stop waiting for one."""
+        """Remove the prior, or let the design continue without waiting for one."""
         self._connection.send("DELETE", self._route(surrogate))
 
     def _viewed(self, method: str, route: str, data: bytes | None = None) -> PriorView:

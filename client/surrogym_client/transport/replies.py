@@ -14,25 +14,25 @@ R = TypeVar("R", bound=wire.Reply)
 
 
 def parse(reply: type[R], content: bytes, path: str) -> R:
-    """Parse a reply.
+    """Parse the content of a server's reply from ``path`` into its wire model.
 
     Raises:
-        ProtocolMismatch: the reply is not of this protocol.
+        ProtocolMismatch: the content does not fit the model.
     """
     try:
         return reply.model_validate_json(content)
     except ValidationError as error:
-        from surrogym_shared.faults import first_fault  # only a fault needs it
+        from surrogym_shared.faults import first_fault  # only for an error
 
         raise ProtocolMismatch(f"unexpected answer of {path}: {first_fault(error)}") from error
 
 
 def new_key() -> str:
-    """Return a new idempotency key."""
+    """Return a new idempotency key, by which the server recognises a repeated request."""
     return uuid4().hex
 
 
 def check_protocol(protocol: int, url: str) -> None:
-    """Refuse a server of another protocol version."""
+    """Raise ``ProtocolMismatch`` if the server at ``url`` has another version of the protocol."""
     if protocol != wire.PROTOCOL:
         raise ProtocolMismatch(f"expected protocol {wire.PROTOCOL} at {url}, got {protocol}: upgrade the older side")

@@ -21,8 +21,8 @@ def surrogate(name: str) -> str:
 
 
 def policy(name: str, which: str | int) -> str:
-    """Return the route of a policy by its version, an alias or ``latest``. Raises ``InvalidInput`` for an invalid
-    one."""
+    """Return the route of a policy. ``which`` is its version, an alias or ``latest``; ``InvalidInput`` is raised for
+    any other text."""
     return f"{surrogate(name)}/policies/{_segment(str(which), POLICY, f'policy: expected {IN_WORDS[POLICY]}')}"
 
 
@@ -32,7 +32,7 @@ def job(name: str, id: int) -> str:
 
 
 def alias(name: str) -> str:
-    """Return an alias as the last part of a route. Raises ``InvalidInput`` for an invalid one."""
+    """Return an alias as the last part of a route. Raises ``InvalidInput`` for an invalid alias."""
     return _segment(name, ALIAS, f"alias of a policy: expected {IN_WORDS[ALIAS]}")
 
 

@@ -28,8 +28,8 @@ R = TypeVar("R", frames.ResetReply, frames.StepReply, frames.RolloutReply, frame
 
 
 class Form(Protocol):
-    """Encoding of requests and replies. Its methods that write raise ``InvalidInput`` for values that can't be sent,
-    such as NaN in JSON."""
+    """Encoding of requests and replies. The methods that encode a request raise ``InvalidInput`` for values that can't
+    be sent, such as NaN in JSON."""
 
     media_type: str
 
@@ -51,8 +51,7 @@ class Form(Protocol):
 
 
 class BinaryForm:
-    """Encoding as frames. Arrays travel as they lie in memory, so their sizes are checked here, while they are
-    known."""
+    """Encoding as frames with raw arrays. Shapes are not sent, so they are checked before an array is encoded."""
 
     media_type = frames.MEDIA_TYPE
 
@@ -92,7 +91,7 @@ class BinaryForm:
 
 
 class _ResetBody(msgspec.Struct, forbid_unknown_fields=True):
-    """``wire.ResetReply``, decoded without validating each number again."""
+    """Fields of ``wire.ResetReply``, for fast decoding without a check of each number."""
 
     seq: int
     observation: list[list[float]]
@@ -100,7 +99,7 @@ class _ResetBody(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _StepBody(msgspec.Struct, forbid_unknown_fields=True):
-    """``wire.StepReply``, decoded without validating each number again."""
+    """Fields of ``wire.StepReply``, for fast decoding without a check of each number."""
 
     seq: int
     observation: list[list[float]]
@@ -129,12 +128,12 @@ _ROLLOUT = msgspec.json.Decoder(_RolloutBody)
 
 
 class JsonForm:
-    """Encoding as JSON. A person can read it, but it takes several times as long."""
+    """Encoding as JSON, which a person can read, but which takes several times as long as frames."""
 
     media_type = "application/json"
 
     def reset(self, seq: int, seed: Seeds, mask: Bools | None, shape: Shape) -> bytes:
-        del shape  # the server checks it
+        del shape  # the server checks the shape
         body = {"seq": seq, "seed": _plain(seed), "mask": _listed(mask)}
         return _ENCODER.encode({name: value for name, value in body.items() if value is not None})
 
@@ -198,7 +197,7 @@ def _reply(content: bytes, kind: type[R]) -> R:
 
 
 def _rows(what: str, raw: Array, expected: tuple[int, ...]) -> Array:
-    """Check the shape of actions. The last axis may be missing if it has one entry."""
+    """Return actions as an array of the expected shape. Actions of one entry may lack the last axis."""
     array = np.asarray(raw)
     _require_numbers(array)
     if array.ndim == len(expected) - 1 and expected[-1] == 1:

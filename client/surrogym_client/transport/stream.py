@@ -32,17 +32,17 @@ DEFAULT_PORTS = {"http": 80, "https": 443}
 
 
 class StreamUnavailable(OSError):
-    """No stream could be opened: nothing listens, or the server offers no stream. Nothing was sent."""
+    """No stream could be opened, because nothing listens or the server offers no stream. No message was sent."""
 
 
 class StreamLost(OSError):
-    """The connection ended before the reply. The message may have been carried out."""
+    """The connection ended before the reply. The server may have carried out the request."""
 
 
 class Stream:
-    """One connection, opened by its first message. Any failure closes it, so a late reply is never read.
+    """One WebSocket connection, opened by its first message. Any failure closes it, so a late reply is never read.
 
-    Threads take turns. A pickled copy opens its own connection.
+    Only one thread at a time exchanges a message. A pickled copy opens its own connection.
 
     Args:
         url: address of the stream, beginning with http or https.
@@ -77,7 +77,7 @@ class Stream:
                 if seconds != connected.gettimeout():  # setting a time-out is a system call
                     connected.settimeout(seconds)
                 key = secrets.token_bytes(KEY_BYTES)
-                with suppress(ConnectionError):  # a server that refuses a large message answers, and stops reading it
+                with suppress(ConnectionError):  # a server that refuses a large message stops reading, and answers
                     connected.sendall(b"".join((header(len(message), MASKED), key, apply_mask(message, key))))
                 return self._receive(connected)
             except (WebSocketException, ConnectionError) as error:
@@ -114,7 +114,7 @@ class Stream:
             self._feed(connected)
         if self._protocol.handshake_exc is not None:
             raise self._protocol.handshake_exc
-        self._protocol.events_received()  # the response itself
+        self._protocol.events_received()  # discards the response to the handshake
         self._frames = FrameSplitter()
 
     def _receive(self, connected: socket.socket) -> bytes:
@@ -128,12 +128,12 @@ class Stream:
             for frame, _ in whole:
                 self._protocol.receive_data(frame)
             message = self._gathered(parts)
-            self._flush(connected)  # pongs
+            self._flush(connected)  # sends answers to pings
             if message is not None:
                 return message
 
     def _gathered(self, parts: list[bytes]) -> bytes | None:
-        """Return the complete message that the protocol's events and the earlier parts make up, if there is one."""
+        """Return the message that the earlier ``parts`` and the protocol's events complete; None if it lacks parts."""
         for event in self._protocol.events_received():
             assert isinstance(event, Frame)
             if event.opcode is Opcode.CLOSE:
@@ -176,7 +176,7 @@ class Stream:
 
 
 def _refused(response: Response) -> Exception:
-    """Return the error for a refused handshake: a problem of this session, or no stream at all."""
+    """Return the error for a refused handshake: a problem of this session, or ``StreamUnavailable``."""
     try:
         problem = Problem.model_validate_json(response.body or b"")
     except ValidationError:

@@ -1,4 +1,4 @@
-"""Window: the last requests of a session, which a server asks for again after a session host died."""
+"""Window: the last requests of a session, which are sent again if the server restores an older checkpoint of it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_BYTES = 32 * 2**20
 
 @dataclass(frozen=True)
 class Sent:
-    """A request that was answered, and the digest of its answer."""
+    """A request of a session, and the digest of its answer once it has been answered."""
 
     seq: int
     what: str
@@ -26,7 +26,7 @@ class Sent:
 
 
 class Window:
-    """The last answered requests, in order.
+    """Buffer of the last answered requests of a session, in order.
 
     Args:
         most: number of requests to keep. Their contents take at most 32 MiB together.
