@@ -223,7 +223,7 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path):
     with pytest.raises(NotDeployable, match=r"arm_controller\.c: nothing was written"):
         deploy(controller, "c", tmp_path / "out")
     assert {path: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
-    with pytest.raises(NotDeployable, match=r"expected the target c, arduino, .*got 'plc'"):
+    with pytest.raises(NotDeployable, match=r"expected one of the targets c, arduino, .*got 'plc'"):
         deploy(controller, "plc", tmp_path / "new")
     assert not (tmp_path / "new").exists()
 

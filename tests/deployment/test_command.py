@@ -87,8 +87,8 @@ def test_what_can_not_be_written_or_checked_is_refused_and_nothing_is_written(su
     for arguments, words in [
         ([str(path), *to, "--range", "speed"], "expected NAME=LOW:HIGH"),
         (["nowhere.zip", *to], "no such policy file"),
-        ([str(path), "--target", "plc", "--out", "c"], "expected the target c, arduino"),
-        ([str(path), *to, "--fallback", "3"], "expected a fallback of 1 entries"),
+        ([str(path), "--target", "plc", "--out", "c"], "expected one of the targets c, arduino"),
+        ([str(path), *to, "--fallback", "3"], "--fallback: expected 1 entries"),
         ([str(path), *to, "--check"], "--check needs --env"),
         ([str(path), *to, "--env", "Pendulum-v1"], "--env together with --check"),
         ([str(path), *to, "--check", "--env", "MountainCarContinuous-v0"], "does not fit the environment"),

@@ -175,7 +175,7 @@ def test_choices_that_do_not_fit_are_refused(tmp_path: Path):
         (Choices(timeout=0.0), "a timeout of 1e-06 s"),
         (Choices(ranges={"speed": (0.0, 1.0)}), r"angle, slide, target\), got speed"),
         (Choices(ranges={"slide": (1.0, 1.0)}), "that rises, .* got 1 to 1"),
-        (Choices(ranges={"slide": (0.0, np.inf)}), "a range of slide that rises, within .* got 0 to inf"),
+        (Choices(ranges={"slide": (0.0, np.inf)}), "range of slide: .* got 0 to inf"),
         (Choices(ranges={"slide": (0.0, 1e39)}), r"within -1e\+37 to 1e\+37, got 0 to 1e\+39"),
         (Choices(timeout=1e38), r"a timeout of 1e-06 s to 1e\+37 s, got 1e\+38"),
         (Choices(period=1e-9), r"a period of 1e-06 s"),

@@ -32,12 +32,13 @@ from surrogym_sampler.queries.settings import Outcome, SamplerReport, SamplerSet
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQuery
 
-PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # for a server or a storage that does not answer
-LOOK_SECONDS = 0.1  # how often a waiting sampler checks whether it was stopped
-LAST_SECONDS = 5.0  # how long a stopped sampler retries to send its last real step
-END_SECONDS = 2.0  # longest time until a waiting sampler notices that the design had ended before its claim
-AGAIN_SECONDS = 1.0  # pause after a claim in which no query could begin
-MOST_GONE = 1_000  # snapshots that one request reports as gone
+# Retries of a request while the server or its storage does not answer.
+PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)
+LOOK_SECONDS = 0.1  # seconds between two checks by a waiting sampler of whether it was stopped
+LAST_SECONDS = 5.0  # seconds in which a stopped sampler retries to send its last real step
+END_SECONDS = 2.0  # longest wait of a claim, in seconds, if the sampler has to end with the design
+AGAIN_SECONDS = 1.0  # seconds to wait after a claim with no query that the environment allows
+MOST_GONE = 1_000  # largest number of deleted snapshots in one report to the server
 STOPPED = "the sampler was stopped"
 
 T = TypeVar("T")
@@ -45,8 +46,16 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class _Answer:
-    """The real steps of a query. ``outcome``: if there are none. ``remark``: what went wrong without harm to it.
-    ``for_good``: the environment itself refused it, so no other sampler should try."""
+    """The answer to a query.
+
+    Attributes:
+        query: the query.
+        taken: samples of its real steps.
+        outcome: the outcome if there are no real steps.
+        error: what went wrong; empty if nothing did.
+        remark: a fault that did not harm the answer; empty if there was none.
+        for_good: whether the environment itself refused the query, so that no other sampler should try it.
+    """
 
     query: Query
     taken: list[NewSample]
@@ -63,9 +72,9 @@ class _Answer:
 class Sampler:
     """Answers the queries of one surrogate with real steps.
 
-    While the environment steps, the sampler sends the answer of the query before and claims the one after. So the
-    environment waits for no request, as long as all answers are accepted. At most one query that it has stepped is not
-    acknowledged yet. A query is claimed shortly before the running step ends, and goes back if the step takes longer.
+    While the environment steps, the sampler sends the answer to the previous query and claims the next one. So the
+    environment waits for no request, as long as all answers are accepted. At most one answered query is not
+    acknowledged yet. A query is claimed shortly before the running step ends, and returned if the step takes longer.
 
     If a step fails, its query is returned with the error; in a rollout, the steps before it are the answer. If the
     server does not answer, the sampler waits and keeps its samples.
@@ -76,11 +85,11 @@ class Sampler:
     After failures at several different queries in a row, the sampler waits longer and longer, and then ends. So a fault
     of the machine does not use up the three attempts that each query has.
 
-    The server is not trusted with the environment. Each query is checked against the environment's own specification,
-    and one outside of it is returned as not begun before anything is sent to the environment.
+    The server is not trusted with the environment. Each query is checked against the environment's own specification.
+    One that it does not allow is returned as not begun, and nothing is sent to the environment.
 
     Args:
-        api: the server.
+        api: the connection to the server.
         surrogate: name of the surrogate.
         environment: the original environment; wrap it in ``IsolatedEnvironment`` if it may hang or crash.
         settings: when to stop, and how many queries to claim.
@@ -108,21 +117,21 @@ class Sampler:
         self._report = report
         self._ended = ended
         self._counts: dict[Outcome, int] = dict.fromkeys(get_args(Outcome), 0)
-        self._refused: set[int] = set()  # ids of refused queries, which the server offers again
+        self._refused: set[int] = set()  # ids of refused queries, which the server may offer again
         self._failures = Failures()
         self._steps = 0
-        self._returning: Returning | None = None  # None: no query begins at a snapshot
+        self._returning: Returning | None = None  # the environment's snapshots; None if it has none
         self._phase: Phase | None = None
         self._spec: EnvironmentSpec
         self._own: EnvironmentSpec
         self._leases: Leases
         self._pipeline = Pipeline(self._settle, self._return)
         self._started = time.monotonic()
-        self._broken_off = False  # by an error or Ctrl-C
-        self._stopping = False  # not an Event, because a signal handler that sets one can deadlock
+        self._broken_off = False  # whether an error or Ctrl-C ended the run
+        self._stopping = False  # not an Event, because setting one in a signal handler can deadlock
 
     def stop(self) -> None:
-        """End ``run`` after the running step. Call it from another thread or a signal handler.
+        """Let ``run`` end after the running step. Call this from another thread or a signal handler.
 
         The sampler then no longer waits for a server that does not answer, except for ``LAST_SECONDS`` to send its last
         real step. Retries of a single request by ``api`` add to that.
@@ -130,13 +139,13 @@ class Sampler:
         self._stopping = True
 
     def run(self) -> SamplerReport:
-        """Answer queries until a setting ends it, ``stop`` is called, or Ctrl-C is pressed.
+        """Answer queries until a setting ends the run, ``stop`` is called, or Ctrl-C is pressed.
 
         Raises:
             UnknownSurrogate: there is no surrogate of this name, or it was deleted.
             ServerUnreachable, Unavailable: the server, or its storage, did not answer for too long.
             UnknownEnvironment: the environment can't be made, or does not fit the surrogate.
-            MachineFails: the machine failed at several queries in a row.
+            MachineFails: the environment failed at several queries in a row.
         """
         self._started, self._broken_off = time.monotonic(), False
         self._check()
@@ -147,7 +156,7 @@ class Sampler:
             try:
                 self._answer_all()
             except BaseException:
-                self._broken_off = True  # the answer under way is sent all the same, though not with patience
+                self._broken_off = True  # the answer that is being sent is still finished, but with few retries
                 raise
         return self.summary()
 
@@ -167,7 +176,7 @@ class Sampler:
                 self._pause(AGAIN_SECONDS)
 
     def summary(self) -> SamplerReport:
-        """Return the report of the work so far."""
+        """Return the report of the run so far."""
         seconds = time.monotonic() - self._started
         return SamplerReport(**self._counts, steps=self._steps, seconds=seconds, phase=self._phase)
 
@@ -177,13 +186,13 @@ class Sampler:
             self._ended(phase)
 
     def _check(self) -> None:
-        """Refuse an environment that does not fit the surrogate."""
+        """Raise ``UnknownEnvironment`` if the environment does not fit the surrogate."""
         self._environment = answering(self._environment)
         self._spec, self._own = self._api.surrogate(self._surrogate).spec, self._environment.spec()
         check_environment(self._surrogate, self._spec, self._own)
 
     def _wait_seconds(self) -> float:
-        """Seconds that a claim waits for queries."""
+        """Return the seconds that the next claim waits for queries."""
         s = self._settings
         if s.until_done and (self._phase is None or self._phase in ENDED):
             return 0.0
@@ -220,13 +229,13 @@ class Sampler:
                 self._give_back(query, STOPPED, begun=query is begun)
 
     def _return(self, claimed: ClaimedQueries) -> None:
-        """Return queries to the queue that were not begun."""
+        """Return queries that were not begun to the queue."""
         for query in claimed.queries:
             self._leases.release(query)
             self._give_back(query, STOPPED, begun=False)
 
     def _answer(self, query: Query, *, last: bool) -> None:
-        """Take the real steps of a query, and send them. ``last``: the next query has to be claimed."""
+        """Take the real steps of a query, and send them; ``last`` means that no claimed query is left after it."""
         flows = not self._settings.once
         ahead = self._limit(running=1) if flows and last else 0
         claim = partial(self._claim, ahead, 0.0, ONE_ATTEMPT) if ahead > 0 else None
@@ -236,7 +245,7 @@ class Sampler:
     def _step(self, query: Query) -> _Answer:
         taken: list[NewSample] = []
         error, for_good = "", False
-        outcome: Outcome = "failed"  # if no step was taken
+        outcome: Outcome = "failed"  # the outcome if no step is taken
         try:
             check_query(self._own, query)
             self._take(query, taken)
@@ -251,9 +260,9 @@ class Sampler:
             outcome = "refused"
         except StepFailed as failed:
             error = message_of(failed) or "no reason given"
-        except Exception as raised:  # an environment that is not isolated may raise anything
+        except Exception as raised:  # an environment that runs in this process may raise anything
             error = f"{type(raised).__name__}: {message_of(raised)}"
-        except BaseException:  # Ctrl-C: real steps that were taken are reported all the same
+        except BaseException:  # Ctrl-C: the real steps taken so far are still sent
             self._hand_in(taken)
             self._steps += len(taken)
             raise
@@ -261,14 +270,16 @@ class Sampler:
         return _Answer(query, taken, outcome, error, remark, for_good)
 
     def _deliver(self, answer: _Answer) -> _Answer:
-        """Send the samples of an answer, or return its query. Returns the answer as the server took it."""
+        """Send the samples of an answer, or return its query if there are none. Returns the answer, changed if the
+        server refused the samples."""
         try:
             self._hand_in(answer.taken)
         except InvalidInput as invalid:
             answer = replace(answer, taken=[], outcome="failed", error=str(invalid))
         if not answer.taken:
             if answer.outcome == "impossible":
-                self._report_gone()  # first, or another sampler claims the query and finds its snapshot gone too
+                # report the snapshot before returning the query, or another sampler would claim the query in vain
+                self._report_gone()
             begun = bool(answer.error) and answer.outcome == "failed"
             give_back = partial(
                 self._give_back, answer.query, answer.error or STOPPED, begun=begun, refused=answer.for_good
@@ -277,7 +288,7 @@ class Sampler:
         return answer
 
     def _settle(self, answer: _Answer) -> bool:
-        """Count a query whose answer was acknowledged. Returns whether it has one."""
+        """Count a query whose answer was acknowledged. Returns whether it was answered without an error."""
         self._leases.release(answer.query)
         self._steps += len(answer.taken)
         if self._returning is not None:
@@ -288,7 +299,7 @@ class Sampler:
         return answer.clean
 
     def _take(self, query: Query, taken: list[NewSample]) -> None:
-        """Take the real steps of a query, and append each to ``taken`` as soon as it is done."""
+        """Take the real steps of a query, and append the sample of each to ``taken`` as soon as the step is done."""
         environment, size = self._environment, len(self._spec.coordinates)
         if isinstance(query, StepQuery):
             assert isinstance(environment, OriginalEnvironment)
@@ -301,7 +312,7 @@ class Sampler:
         if query.snapshot is None:
             environment.begin(reset_seed(query, self._spec.design.seed))
         else:
-            assert self._returning is not None  # see check_query
+            assert self._returning is not None  # check_query has refused snapshots of an environment without them
             self._returning.begin(query.snapshot)
         for number, action in enumerate(query.actions):
             if self._stopped():
@@ -316,7 +327,7 @@ class Sampler:
                 taken[-1] = taken[-1].model_copy(update={"snapshot": snapshot})
 
     def _report_gone(self) -> None:
-        """Tell the server which of its snapshots are gone, so that the design chooses other queries."""
+        """Tell the server which of its snapshots no longer exist, so that the design chooses other queries."""
         while self._returning is not None and (some := self._returning.gone[:MOST_GONE]):
             self._patiently(partial(self._api.drop_snapshots, self._surrogate, some), LAST_SECONDS)
             del self._returning.gone[: len(some)]
@@ -326,7 +337,7 @@ class Sampler:
             self._patiently(lambda: self._api.add_samples(self._surrogate, self._settings.name, samples), LAST_SECONDS)
 
     def _patiently(self, request: Callable[[], T], once_stopped: float = 0.0) -> T:
-        """Repeat a request until the server and its storage answer. Every request here is safe to repeat.
+        """Repeat a request until the server and its storage answer. Only requests that are safe to repeat are passed.
 
         Raises:
             ServerUnreachable, Unavailable: no answer for longer than ``PATIENCE``, or than ``once_stopped`` seconds
@@ -360,10 +371,10 @@ class Sampler:
         try:
             self._api.fail(self._surrogate, query.id, query.lease_token, error[:4_000], begun=begun, refused=refused)
         except (LeaseExpired, NotThere):
-            return  # another sampler has the query already
+            return  # the lease has ended, so another sampler may have the query
 
     def _count(self, query: Query, outcome: Outcome, error: str, *, again: bool) -> None:
-        if outcome == "refused" and again:  # the server offers it again, and it counts once
+        if outcome == "refused" and again:  # the server may offer a refused query again, but it is counted once
             if query.id in self._refused:
                 return
             self._refused.add(query.id)
@@ -376,8 +387,11 @@ class Sampler:
             self._report(query, outcome, error)
 
     def _limit(self, running: int = 0) -> int:
-        """Number of queries to claim next; 0 if it is time to stop. Dropped queries don't count, as others answer
-        them. ``running``: number of queries whose steps are taken meanwhile."""
+        """Return the number of queries to claim next; 0 if the sampler has to stop.
+
+        Dropped queries don't count, because other samplers answer them. ``running`` is the number of queries whose
+        steps are being taken.
+        """
         s = self._settings
         if self._out_of_time():
             return 0
@@ -403,5 +417,5 @@ class Sampler:
         return self._settings.until_done and self._none_allowed(claimed) and claimed.phase in ENDED
 
     def _none_allowed(self, claimed: ClaimedQueries) -> bool:
-        """Whether a claim returned nothing, or only queries that the environment does not allow."""
+        """Return whether a claim returned no queries, or only those that the environment does not allow."""
         return all(query.id in self._refused for query in claimed.queries)

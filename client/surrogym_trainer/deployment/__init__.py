@@ -1,1 +1,2 @@
-"""Deployment: a policy as a controller that runs without Python, for a microcontroller, a PLC or another simulator."""
+"""Deployment: conversion of a policy to a controller that runs without Python, on a microcontroller, a PLC or in
+another simulator."""

@@ -1,4 +1,5 @@
-"""What a controller computes, as data: from raw measurements to actions. Every target is written from this.
+"""The computation of a controller, from raw measurements to actions, as data. The files for every target are generated
+from it.
 
 Shapes: C coordinates, R measurements, D observation entries, A outputs of the network, F action entries. A place is the
 index of a coordinate among all C.
@@ -21,16 +22,16 @@ from surrogym_shared.spec.actions import Action
 Array = NDArray[np.float64]
 Activation = Literal["none", "tanh", "relu"]
 
-NOT_FINITE, OUT_OF_RANGE, LATE, NO_ACTION = 1, 2, 4, 8  # bits of a status; 0: the action is the policy's
-PERIODS = 2  # age of a measurement in sampling periods that is no fault: its time varies
-LARGEST = 1e37  # number of a controller: float has it, and sums of a few
-SHORTEST = 1e-6  # s
-MOST_WEIGHTS = 1_000_000  # of a network: 8 MB in double, and about 20 MB of source
-TURNS = 100  # turns of an angle that a sensor may count, as wrapping loses digits
+NOT_FINITE, OUT_OF_RANGE, LATE, NO_ACTION = 1, 2, 4, 8  # bits of a status; 0 means that the action is the policy's
+PERIODS = 2  # default timeout in sampling periods, because the duration of a period varies
+LARGEST = 1e37  # largest number in a controller, so that sums of a few still fit in a C float
+SHORTEST = 1e-6  # smallest period or timeout in seconds
+MOST_WEIGHTS = 1_000_000  # largest number of weights of a network: 8 MB in double, and about 20 MB of source
+TURNS = 100  # default number of turns of an angle that a sensor may count; wrapping more turns loses digits
 
 
 class NotDeployable(SurrogymClientError):
-    """The policy can't become a controller of this target."""
+    """The policy can't be converted to a controller for this target."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +39,12 @@ class Measurement:
     """A coordinate that the caller measures.
 
     Attributes:
-        place: its coordinate.
+        name: the coordinate's name.
+        unit: the coordinate's unit.
+        place: the coordinate's index.
         angle: whether it is wrapped to [-pi, pi).
-        low, high: bounds that it is clipped to; infinite without bounds.
-        lowest, highest: a reading outside of these leads to the fallback.
+        low, high: bounds to which it is clipped; infinite without bounds.
+        lowest, highest: range of valid readings; outside of it, the controller uses its fallback action.
     """
 
     name: str
@@ -56,15 +59,17 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Remembered:
-    """A coordinate that the controller keeps itself: a lag.
+    """A lag: a coordinate that the controller computes from earlier measurements or actions.
 
     Attributes:
-        place: its coordinate.
-        source: place of the coordinate that it repeats; entry of the action for kind ``action``; -1 for ``steps``.
-        angle: whether the source is an angle, so that a change is at most half a turn.
-        of_action: whether it repeats actions. Other lags begin anew after a fault, because a measurement is missing.
-        start: its value when nothing has been measured yet.
-        low, high: bounds that it is clipped to; infinite without bounds.
+        name: the coordinate's name.
+        place: the coordinate's index.
+        kind: what is repeated: an ``action``, an earlier ``value`` or ``change``, or the number of ``steps``.
+        source: index of the repeated coordinate; entry of the action for kind ``action``; -1 for ``steps``.
+        angle: whether the repeated coordinate is an angle, so that a change is at most half a turn.
+        of_action: whether it repeats actions. Other lags start again after a fault, because a measurement is missing.
+        start: its value before anything was measured.
+        low, high: bounds to which it is clipped; infinite without bounds.
     """
 
     name: str
@@ -80,7 +85,8 @@ class Remembered:
 
 @dataclass(frozen=True)
 class Part:
-    """coefficient * phi(sum of weight * q[place]), with phi = 1, the identity, sin or cos."""
+    """One summand of an observation entry: coefficient * phi(sum of weight * q[place]), with phi = 1, the identity, sin
+    or cos."""
 
     function: Function
     coefficient: float
@@ -91,7 +97,8 @@ class Part:
 class Observed:
     """An entry of the observation: the sum of its parts, clipped to [low, high], which are infinite without a clip.
 
-    ``smallest`` and ``largest`` are its limits in the observation space. Nothing is clipped to them.
+    ``smallest`` and ``largest`` are the entry's limits in the observation space. They are only documented; nothing is
+    clipped to them.
     """
 
     name: str
@@ -105,7 +112,7 @@ class Observed:
 
 @dataclass(frozen=True, eq=False)
 class Dense:
-    """A layer: activation(x @ weights + bias)."""
+    """A layer of the network: activation(x @ weights + bias)."""
 
     weights: Array  # (I, O)
     bias: Array  # (O,)
@@ -116,15 +123,16 @@ class Dense:
 class Decision:
     """The policy's network.
 
-    x = clip((o - mean) / deviation, -clip, clip), y = layers(x). A discrete action is the index of the largest output
-    of each group of ``counts``. A continuous one is centre + reach * tanh(y), or without the tanh if not ``squash``.
+    x = clip((o - mean) / deviation, -clip, clip), y = layers(x). For a discrete action, ``counts`` splits y into one
+    group for each entry, and the index of the group's largest output is chosen. A continuous action is centre + reach *
+    tanh(y), or without the tanh if ``squash`` is false.
     """
 
     mean: Array  # (D,)
     deviation: Array  # (D,)
-    clip: float  # infinite without a clip
+    clip: float  # largest absolute value of a standardised entry; infinite without a clip
     layers: tuple[Dense, ...]
-    counts: tuple[int, ...]  # choices of each entry of a discrete action; empty for a continuous one
+    counts: tuple[int, ...]  # number of choices of each entry of a discrete action; empty for a continuous one
     squash: bool
     centre: Array  # (F,); empty for a discrete action
     reach: Array  # (F,); empty for a discrete action
@@ -134,22 +142,24 @@ class Decision:
 class Controller:
     """A policy with everything around it: one call per sampling period, from R measurements to F action entries.
 
-    One decision: judge the measurements; on a fault return ``fallback``. Else place the wrapped and clipped
-    measurements and the lags among the C coordinates, observe, let the network decide, and clip to [low, high]. Index i
-    of n choices becomes low + i * (high - low) / (n - 1), which is i itself for a discrete action.
-    ``surrogym_trainer.deployment.reference`` is this in NumPy.
+    Each call first checks the measurements; on a fault it returns ``fallback``. Otherwise it puts the wrapped and
+    clipped measurements and the lags into the C coordinates, computes the observation, evaluates the network, and clips
+    the action to [low, high]. Index i of n choices becomes low + i * (high - low) / (n - 1), which is i itself for a
+    discrete action. ``surrogym_trainer.deployment.reference`` implements this in NumPy.
 
     Observations, and the actions that lags remember, are rounded to float32, as in training and evaluation.
 
     Attributes:
-        name: of the surrogate; part of file names.
+        name: name of the surrogate; part of file names.
         coordinates: names of all C coordinates.
-        measurements: in the order of the specification.
+        measurements: the measured coordinates, in the order of the specification.
         lags: the other coordinates.
-        low, high: limits (F,) of the action; of a discrete one its first and last number.
+        observation: the D entries of the observation.
+        decision: the policy's network.
+        low, high: limits (F,) of the action; first and last number of a discrete one.
         fallback: action (F,) on a fault.
         timeout: largest age of a measurement in seconds; infinite without one.
-        period: seconds between decisions; None if nobody declared it.
+        period: seconds between decisions; None if it is not declared.
         digests: SHA-256 of policy and specification and, if the card has it, the hash of the model's samples.
     """
 
@@ -172,7 +182,7 @@ class Controller:
 
     @property
     def late(self) -> str:
-        """Which ages of a measurement are faults, in words."""
+        """The ages of a measurement that count as faults, in words."""
         if np.isfinite(self.timeout):
             return f"older than {self.timeout:g} s"
         return "of a negative age (no timeout was given)"
@@ -180,14 +190,14 @@ class Controller:
 
 @dataclass(frozen=True)
 class Choices:
-    """What a person chooses of a controller. None takes the default.
+    """A person's settings for a controller; None takes the default.
 
     Attributes:
         fallback: action (F,) on a fault. Default: the continuous action nearest to 0. A discrete one has no default.
         timeout: largest age of a measurement in seconds. Default: two sampling periods, if the period is declared.
         period: seconds between two decisions. Default: ``sampling_period`` of the specification, which it can't change.
-        ranges: readings that a sensor can give, by measurement. Default: the range of the specification, widened by its
-            own width at each end; 100 turns for an angle.
+        ranges: smallest and largest valid reading, by measurement. Default: the range of the specification, widened by
+            its own width at each end; 100 turns for an angle.
     """
 
     fallback: tuple[float, ...] | None = None
@@ -201,8 +211,15 @@ def controller_from(
 ) -> Controller:
     """Return the controller of a network and the specification that it was trained for.
 
+    Args:
+        spec: the specification.
+        decision: the policy's network.
+        name: name of the surrogate.
+        digests: hashes of policy, specification and samples, by name.
+        choices: a person's settings.
+
     Raises:
-        NotDeployable: they don't fit, a choice does not, or a number is too large for float.
+        NotDeployable: network and specification don't fit, a setting does not, or a number is too large for a C float.
     """
     _require_small(decision)
     low, high = _limits(spec.action)
@@ -233,7 +250,7 @@ def controller_from(
 
 
 def _numbers(controller: Controller) -> Iterator[float]:
-    """Yield the numbers of a controller but for its network; infinite ones are limits that do not exist."""
+    """Yield all numbers of a controller except the network's; infinite ones mean that there is no limit."""
     for measurement in controller.measurements:
         yield from (measurement.low, measurement.high)
     for entry in controller.observation:
@@ -246,7 +263,8 @@ def _numbers(controller: Controller) -> Iterator[float]:
 
 
 def _require_small(decision: Decision) -> None:
-    """Refuse a network that is too large for a controller, or that has numbers which are not finite in float."""
+    """Raise ``NotDeployable`` if a network is too large for a controller, or has numbers that a C float can't
+    represent."""
     layers = [array for layer in decision.layers for array in (layer.weights, layer.bias)]
     size = sum(array.size for array in layers)
     if size > MOST_WEIGHTS:
@@ -254,18 +272,21 @@ def _require_small(decision: Decision) -> None:
             f"expected a network of at most {MOST_WEIGHTS:,} weights, got {size:,}, which need {8 * size // 10**6} MB: "
             "surrogym export-policy writes it for a larger machine"
         )
-    if not (decision.deviation >= 1 / LARGEST).all():  # smaller ones are 0 in float
-        raise NotDeployable("expected standard deviations of the observations above 0 in the policy, got others")
+    if not (decision.deviation >= 1 / LARGEST).all():  # their inverse would be too large for a C float
+        raise NotDeployable(
+            "expected standard deviations of the observations above 0 in the policy, got one that is 0 or almost 0: "
+            "train the policy without the entries that never change"
+        )
     arrays = (decision.mean, decision.deviation, decision.centre, decision.reach, *layers)
     _require_in_float("a policy", *arrays)
 
 
 def _require_in_float(what: str, *arrays: Any) -> None:
-    """Refuse numbers that a controller in float can't have."""
+    """Raise ``NotDeployable`` if arrays contain numbers that are not finite, or too large for a C float."""
     for values in map(np.ravel, arrays):
         if len(wrong := values[~(np.abs(values) <= LARGEST)]):
             raise NotDeployable(
-                f"expected {what} as finite numbers up to {LARGEST:g}, the range of float, got {wrong[0]:g}"
+                f"expected finite numbers up to {LARGEST:g}, the range of a C float, in {what}, got {wrong[0]:g}"
             )
 
 
@@ -282,15 +303,16 @@ def _measurements(spec: EnvironmentSpec, ranges: dict[str, tuple[float, float]])
         lowest, highest = ranges.get(c.name) or _readable(c)
         if not -LARGEST <= lowest < highest <= LARGEST:
             raise NotDeployable(
-                f"expected a range of {c.name} that rises, within {-LARGEST:g} to {LARGEST:g}, got {lowest:g} to "
-                f"{highest:g}"
+                f"--range of {c.name}: expected the smaller number first, both within {-LARGEST:g} to {LARGEST:g}, got "
+                f"{lowest:g} to {highest:g}"
             )
         found.append(Measurement(c.name, c.unit, place, c.kind == "angle", *_bounds(c), lowest, highest))
     return tuple(found)
 
 
 def _readable(coordinate: Coordinate) -> tuple[float, float]:
-    """Readings that a sensor is believed: far more than where the model was learned, as leaving that is no fault."""
+    """Return the default range of valid readings: much wider than the sampling range, because leaving that is not a
+    fault of the sensor."""
     if coordinate.kind == "angle":
         return -2 * np.pi * TURNS, 2 * np.pi * TURNS
     low, high = coordinate.settable
@@ -338,7 +360,7 @@ def _clips(term: Term, entry: Any) -> tuple[tuple[float | None, float | None], .
 
 
 def _unit(spec: EnvironmentSpec, term: Term) -> str:
-    """Unit of a term: that of its coordinate, if it is one coordinate; else none is known."""
+    """Return the unit of a term that is a single coordinate; empty for other terms."""
     if len(term.parts) != 1 or term.parts[0].function != "linear" or len(term.parts[0].weights) != 1:
         return ""
     (name,) = term.parts[0].weights
@@ -370,7 +392,7 @@ def _fallback(action: Action, low: Array, high: Array, chosen: tuple[float, ...]
     whole = isinstance(action, BoxAction) or (given == np.round(given)).all()
     if given.shape != low.shape or not whole or not ((given >= low) & (given <= high)).all():
         raise NotDeployable(
-            f"expected a fallback of {len(low)} entries from {low.tolist()} to {high.tolist()}, got {given.tolist()}"
+            f"--fallback: expected {len(low)} entries from {low.tolist()} to {high.tolist()}, got {given.tolist()}"
         )
     return given
 
@@ -397,4 +419,4 @@ def _timeout(period: float | None, chosen: float | None) -> float:
 
 def _require_seconds(what: str, seconds: float) -> None:
     if not SHORTEST <= seconds <= LARGEST:
-        raise NotDeployable(f"expected a {what} of {SHORTEST:g} s to {LARGEST:g} s, got {seconds:g}")
+        raise NotDeployable(f"--{what}: expected {SHORTEST:g} s to {LARGEST:g} s, got {seconds:g}")

@@ -1,4 +1,4 @@
-"""A controller's network in ONNX, with a description inside: names, order, units, scales and limits.
+"""A controller's network as an ONNX file that contains a description: names, order, units, scales and limits.
 
 Shapes: N rows, D observation entries, A outputs, F action entries.
 """
@@ -22,15 +22,16 @@ from surrogym_trainer.deployment.running import Running
 from surrogym_trainer.policies.onnx_files import INPUT, OUTPUT
 
 OPSET = 17
-IR_VERSION = 9  # onnxruntime 1.20 reads it
-KEY = "surrogym"  # of the metadata
+IR_VERSION = 9  # version of ONNX's file format that onnxruntime 1.20 can read
+KEY = "surrogym"  # key of the description in the file's metadata
 
 
 def write(controller: Controller, folder: Path) -> None:
-    """Write ``NAME.onnx``: observation (N, D) to action (N, F), float32, or int64 for a discrete action.
+    """Write ``NAME.onnx`` into a folder: observation (N, D) to action (N, F), in float32, or int64 for a discrete
+    action.
 
     Raises:
-        ModuleNotFoundError: the extra ``export`` is missing.
+        ModuleNotFoundError: the extra ``export`` is not installed.
     """
     import onnx
 
@@ -40,13 +41,13 @@ def write(controller: Controller, folder: Path) -> None:
 
 
 def description(controller: Controller) -> dict[str, Any]:
-    """Return what a program must know to use the network, as JSON."""
+    """Return everything that a program needs to use the network, as a JSON object."""
     names, decision = controller.coordinates, controller.decision
     choices: tuple[int | None, ...] = decision.counts or (None,) * len(controller.low)
     return {
         "measurements": [
             {"name": m.name, "unit": m.unit, "angle": m.angle, "low": _finite(m.low), "high": _finite(m.high)}
-            | {"sensor": [m.lowest, m.highest]}  # beyond it: a fault
+            | {"sensor": [m.lowest, m.highest]}  # range of valid readings; others are faults
             for m in controller.measurements
         ],
         "lags": [{"name": lag.name, "is": _lag(lag, names), "start": lag.start} for lag in controller.lags],
@@ -71,10 +72,11 @@ def description(controller: Controller) -> dict[str, Any]:
 
 
 class RunningGraph(Running):
-    """The ONNX file in onnxruntime. The reference computes the observation, as the file has the network alone.
+    """The ONNX file in onnxruntime. The reference in NumPy computes the observation, because the file contains only the
+    network.
 
     Args:
-        controller: what the file was made from.
+        controller: the controller that the file was made from.
         act: the network, from observations (N, D) in float32 to actions (N, F).
     """
 
@@ -98,10 +100,10 @@ class RunningGraph(Running):
 
 @contextmanager
 def running(controller: Controller) -> Iterator[RunningGraph]:
-    """Write the file of a controller, and load it in onnxruntime.
+    """Write the ONNX file of a controller, and load it in onnxruntime.
 
     Raises:
-        ModuleNotFoundError: the extra ``export`` is missing.
+        ModuleNotFoundError: the extra ``export`` is not installed.
     """
     from onnxruntime import InferenceSession
 
@@ -145,7 +147,10 @@ def _model(controller: Controller) -> Any:
 
 
 def _chosen(graph: _Graph, scores: str, controller: Controller) -> tuple[str, int]:
-    """Add the choice of each group of outputs. Bins become continuous values, numbers stay."""
+    """Add the nodes that choose the largest output of each group. Returns the name of the result, and its type.
+
+    Bins become continuous values; a discrete action is returned as its number.
+    """
     from onnx import TensorProto
 
     counts, first, chosen = controller.decision.counts, 0, []
@@ -163,14 +168,14 @@ def _chosen(graph: _Graph, scores: str, controller: Controller) -> tuple[str, in
 
 
 class _Graph:
-    """Nodes and arrays of a graph that grows."""
+    """The nodes and arrays of an ONNX graph to which nodes are added."""
 
     def __init__(self) -> None:
         self.nodes: list[Any] = []
         self.arrays: dict[str, NDArray[Any]] = {}
 
     def add(self, operator: str, *inputs: str | NDArray[Any], **attributes: Any) -> str:
-        """Add a node, and return the name of its output. Floats are stored as float32."""
+        """Add a node, and return the name of its output. Real numbers are stored as float32."""
         from onnx import helper
 
         names = [given if isinstance(given, str) else self._array(given) for given in inputs]
@@ -185,7 +190,7 @@ class _Graph:
 
 
 def _term(entry: Observed, names: tuple[str, ...]) -> str:
-    """Return how an entry of the observation is computed, in words: "cos(angle)"."""
+    """Return in words how an entry of the observation is computed, such as "cos(angle)"."""
     parts = []
     for part in entry.parts:
         inner = " + ".join(names[place] if w == 1 else f"{w!r} * {names[place]}" for place, w in part.weights)
@@ -199,7 +204,7 @@ def _term(entry: Observed, names: tuple[str, ...]) -> str:
 
 
 def _lag(lag: Remembered, names: tuple[str, ...]) -> str:
-    """Return what a lag repeats, in words."""
+    """Return in words what a lag repeats."""
     match lag.kind:
         case "action":
             return f"entry {lag.source} of the last action"

@@ -1,4 +1,4 @@
-"""Read a policy file as a controller: networks of arrays, and Stable-Baselines3's policies of one network.
+"""Conversion of a policy file to a controller: networks of arrays, and Stable-Baselines3 policies of one network.
 
 Shapes: D observation entries, A outputs, F action entries.
 """
@@ -35,7 +35,7 @@ from surrogym_trainer.policies.predict import Predict
 if TYPE_CHECKING:
     from torch import nn
 
-CHECKS = 1_000  # random observations on which the controller is compared with the policy
+CHECKS = 1_000  # number of random observations on which the controller is compared with the policy
 TOLERANCE = 1e-4  # largest difference, as a share of an action's range; torch computes in float32
 CAN = (
     "a deterministic feed-forward network can be deployed: a policy of surrogym train, or one of PPO, A2C, SAC, TD3, "
@@ -55,13 +55,13 @@ def controller_of(
 
     Args:
         policy: file from ``surrogym train`` or Stable-Baselines3.
-        spec: specification that it was trained for; None takes its card's.
+        spec: the specification that it was trained for; None takes that of its card.
         algorithm: name of the Stable-Baselines3 class; None takes the card's. A network of arrays needs none.
-        trust: unpickle the policy's objects, which runs any code that is in them.
-        choices: fallback, timeout and ranges.
+        trust: whether to unpickle the policy's objects, which runs any code that is in them.
+        choices: a person's settings, such as fallback, timeout and ranges.
 
     Raises:
-        NotDeployable: the policy has another form or needs ``trust``, no specification is known, or a choice does not
+        NotDeployable: the policy has another form or needs ``trust``, no specification is known, or a setting does not
             fit.
         UnusablePolicy: the file or its card is damaged.
         PolicyMisfit: the card has another specification.
@@ -124,7 +124,7 @@ def _of_learner(policy: Path, algorithm: str, *, trust: bool) -> Decision:
     """Return the network of a Stable-Baselines3 policy.
 
     Raises:
-        NotDeployable: it has parts that are not layers, a clip or a scale.
+        NotDeployable: the policy has parts that are not layers, a clip or a scale.
     """
     from gymnasium import spaces
 
@@ -134,14 +134,14 @@ def _of_learner(policy: Path, algorithm: str, *, trust: bool) -> Decision:
     learner = read_learner(policy, algorithm, trust, {})
     observed, acted = learner.observation_space, learner.action_space
     if not isinstance(observed, spaces.Box) or len(observed.shape) != 1:
-        raise NotDeployable(f"expected a policy of an observation (D,), got one of {observed}; {CAN}")
+        raise NotDeployable(f"expected a policy whose observation is a vector, got one of {observed}; {CAN}")
     modules, squash, bounded = _actor(learner.policy)
     mean, deviation, clip = np.zeros(observed.shape), np.ones(observed.shape), np.inf
     if (extractor := _standardise(learner.policy)) is not None:
         mean, deviation = _doubles(extractor.mean), _doubles(extractor.deviation)
     if is_normalised(learner):
         if extractor is not None:
-            raise NotDeployable(f"expected one normalisation of observations, got two; {CAN}")
+            raise NotDeployable(f"expected a policy with one normalisation of observations, got two; {CAN}")
         statistics = Normalisation(statistics_path(policy))
         clip = float(statistics.clip)
         mean, deviation = (np.broadcast_to(a, observed.shape) for a in (statistics.mean, statistics.spread))
@@ -156,10 +156,10 @@ def _of_learner(policy: Path, algorithm: str, *, trust: bool) -> Decision:
 
 
 def _choices(acted: Any) -> tuple[int, ...]:
-    """Return the numbers of choices of an action space; empty for a continuous one.
+    """Return the number of choices of each entry of an action space; empty for a continuous one.
 
     Raises:
-        NotDeployable: the space is another one.
+        NotDeployable: the space is neither continuous nor discrete from 0.
     """
     from gymnasium import spaces
 
@@ -175,8 +175,14 @@ def _choices(acted: Any) -> tuple[int, ...]:
 
 
 def _actor(policy: Any) -> tuple[list[nn.Module], bool, Any]:
-    """Return the modules from the observation to the outputs, in order; whether a tanh and a scale follow; and the
-    module that has both inside, if there is one."""
+    """Return the modules of the policy from the observation to the outputs.
+
+    Returns:
+        The modules in order; whether a tanh and a scale follow them; and the module that contains both, or None.
+
+    Raises:
+        NotDeployable: the policy is of another class.
+    """
     from stable_baselines3.common.policies import ActorCriticPolicy
     from stable_baselines3.dqn.policies import DQNPolicy
     from stable_baselines3.sac.policies import SACPolicy
@@ -193,7 +199,7 @@ def _actor(policy: Any) -> tuple[list[nn.Module], bool, Any]:
     if kind is SACPolicy:
         return [*_flat(policy.actor.latent_pi), *_flat(policy.actor.mu)], True, None
     if kind is TD3Policy:
-        *modules, _ = _flat(policy.actor.mu)  # the last is the tanh
+        *modules, _ = _flat(policy.actor.mu)  # the last module is the tanh
         return modules, True, None
     if kind is DQNPolicy:
         return list(_flat(policy.q_net.q_net)), False, None
@@ -201,7 +207,7 @@ def _actor(policy: Any) -> tuple[list[nn.Module], bool, Any]:
 
 
 def _standardise(policy: Any) -> Any:
-    """Return the layer that standardises observations; None without one.
+    """Return the layer that standardises observations; None if there is none.
 
     Raises:
         NotDeployable: observations pass through another layer.
@@ -217,7 +223,9 @@ def _standardise(policy: Any) -> Any:
         return extractor
     if isinstance(extractor, FlattenExtractor):
         return None
-    raise NotDeployable(f"expected observations that go into the network, got {type(extractor).__name__}; {CAN}")
+    raise NotDeployable(
+        f"expected a policy whose observations enter the network directly, got {type(extractor).__name__}; {CAN}"
+    )
 
 
 def _flat(module: nn.Module) -> Iterable[nn.Module]:
@@ -227,10 +235,10 @@ def _flat(module: nn.Module) -> Iterable[nn.Module]:
 
 
 def _dense(modules: Iterable[nn.Module]) -> tuple[Dense, ...]:
-    """Return the layers that modules in order are.
+    """Convert torch modules to layers.
 
     Raises:
-        NotDeployable: there is another module than linear layers, tanh and ReLU.
+        NotDeployable: a module is not a linear layer, tanh or ReLU.
     """
     from torch import nn
 
@@ -251,7 +259,7 @@ def _dense(modules: Iterable[nn.Module]) -> tuple[Dense, ...]:
 def _check(controller: Controller, spec: EnvironmentSpec, predict: Predict) -> None:
     """Compare the controller with the policy on random observations.
 
-    Choices whose scores are equal up to rounding may differ.
+    Different choices whose scores are equal up to rounding are accepted.
 
     Raises:
         NotDeployable: the actions differ.
@@ -276,7 +284,7 @@ def _check(controller: Controller, spec: EnvironmentSpec, predict: Predict) -> N
 
 
 def _close(y: Array, counts: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Whether (N, F) the two best choices of outputs (N, A) are equal up to rounding."""
+    """Return whether (N, F) the two best choices of outputs (N, A) are equal up to rounding."""
     groups = np.split(y, np.cumsum(counts)[:-1], axis=1)
     best = [np.sort(group, axis=1)[:, -2:] for group in groups]
     return np.stack([b[:, 1] - b[:, 0] <= TOLERANCE * (1 + np.abs(b[:, 1])) for b in best], axis=1)

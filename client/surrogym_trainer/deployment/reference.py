@@ -1,4 +1,4 @@
-"""A controller in NumPy: what every target must compute.
+"""A controller in NumPy, which defines what the code for every target must compute.
 
 Shapes: N controllers at once, C coordinates, R measurements, D observation entries, A outputs, F action entries.
 """
@@ -29,7 +29,7 @@ TURN = 2 * np.pi
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """What N controllers remember of the step before."""
+    """The state of N controllers between two steps: the last coordinates and action."""
 
     coordinates: Array  # (N, C)
     action: Array  # (N, F)
@@ -38,24 +38,31 @@ class Memory:
 
 
 class Decided(NamedTuple):
-    """Result of one decision."""
+    """The result of one decision of N controllers."""
 
     memory: Memory
     action: Array  # (N, F)
-    status: Ints  # (N,) 0, or the bits of what was wrong
+    status: Ints  # (N,) 0, or the bits of the faults
 
 
 def begin(controller: Controller, number: int = 1) -> Memory:
-    """Return the memory of controllers that have not acted yet."""
+    """Return the memory of ``number`` controllers that have not acted yet."""
     coordinates = np.zeros((number, len(controller.coordinates)))
     return Memory(coordinates, np.zeros((number, len(controller.low))), *np.zeros((2, number), dtype=np.bool_))
 
 
 def decide(controller: Controller, memory: Memory, measurements: Array, age: Array | float = 0.0) -> Decided:
-    """Take one decision for measurements (N, R) of an age (N,) in seconds."""
+    """Take one decision of N controllers.
+
+    Args:
+        controller: the controller.
+        memory: the memory after the previous step.
+        measurements: measurements (N, R).
+        age: age of the measurements in seconds, (N,) or one for all.
+    """
     read = np.asarray(measurements, dtype=np.float64)
     status = judged(controller, read, np.broadcast_to(np.asarray(age, dtype=np.float64), len(read)))
-    sound = np.where((status == 0)[:, None], read, 0.0)  # a fault's numbers go nowhere
+    sound = np.where((status == 0)[:, None], read, 0.0)  # faulty measurements may be NaN, and are not used
     coordinates = _placed(controller, memory, sound, status == 0)
     action, wrong = act(controller, observe(controller, coordinates))
     status = np.where((status == 0) & wrong, NO_ACTION, status)
@@ -65,7 +72,7 @@ def decide(controller: Controller, memory: Memory, measurements: Array, age: Arr
 
 
 def judged(controller: Controller, read: Array, age: Array) -> Ints:
-    """Return what is wrong (N,) with measurements (N, R) of an age (N,); 0 if nothing is."""
+    """Return the faults (N,) of measurements (N, R) of an age (N,) as the sum of their bits; 0 if there are none."""
     lowest, highest = (np.array([getattr(m, n) for m in controller.measurements]) for n in ("lowest", "highest"))
     finite = np.isfinite(read)
     outside = finite & ((read < lowest) | (read > highest))
@@ -75,7 +82,7 @@ def judged(controller: Controller, read: Array, age: Array) -> Ints:
 
 
 def observe(controller: Controller, coordinates: Array) -> Array:
-    """Return observations (N, D), rounded to float32, at coordinates (N, C)."""
+    """Return the observations (N, D) of coordinates (N, C), rounded to float32."""
     rows = np.stack([_entry(one, coordinates) for one in controller.observation], axis=1)
     return rows.astype(np.float32).astype(np.float64)
 
@@ -106,7 +113,14 @@ def scores(decision: Decision, observation: Array) -> Array:
 
 
 def _placed(controller: Controller, memory: Memory, read: Array, sound: Bools) -> Array:
-    """Return coordinates (N, C): measurements (N, R), where they are sound, and lags."""
+    """Return the coordinates (N, C).
+
+    Args:
+        controller: the controller.
+        memory: the memory after the previous step.
+        read: measurements (N, R); 0 where they have a fault.
+        sound: whether (N,) the measurements have no fault.
+    """
     after = memory.coordinates.copy()
     for i, one in enumerate(controller.measurements):
         after[:, one.place] = wrapped(read[:, i]) if one.angle else np.clip(read[:, i], one.low, one.high)

@@ -1,4 +1,4 @@
-"""A deployed controller that runs beside the policy that it was made from: actions and returns are compared.
+"""Comparison of a deployed controller with the policy that it was made from, by their actions and returns.
 
 Shapes: R measurements, F action entries.
 """
@@ -17,15 +17,15 @@ from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_trainer.deployment.controller import Array, Controller
 from surrogym_trainer.policies.predict import Predict
 
-NEGLIGIBLE = 1e-6, 1e-4  # difference of actions in double and in float, as a share of their range
+NEGLIGIBLE = 1e-6, 1e-4  # largest negligible difference of actions in double and in float, as a share of their range
 
 
 class Running(ABC):
-    """A running controller.
+    """A running controller of some target.
 
     Attributes:
-        microseconds: of one decision; None if it was not measured.
-        single: whether it computes in float.
+        microseconds: duration of one decision; None if it was not measured.
+        single: whether it computes in float instead of double.
     """
 
     microseconds: float | None = None
@@ -33,7 +33,7 @@ class Running(ABC):
 
     @abstractmethod
     def reset(self) -> None:
-        """Begin an episode."""
+        """Forget earlier steps, and begin an episode."""
 
     @abstractmethod
     def step(self, measurement: Array, age: float = 0.0) -> tuple[int, Array]:
@@ -42,14 +42,14 @@ class Running(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """A controller and its policy, over the same N starts."""
+    """The results of a controller and of its policy, from the same N starts."""
 
-    returns: Array  # (N,) of the controller
+    returns: Array  # (N,) returns of the controller
     policy_returns: Array  # (N,)
-    steps: int  # of the controller
-    largest: float  # largest difference of their actions in the states of the controller, as a share of the range
-    different: int  # steps with another choice, or a difference above 1e-6 of the range, 1e-4 in float
-    faults: int  # steps in which the controller took its fallback
+    steps: int  # number of steps of the controller
+    largest: float  # largest difference of both actions in states of the controller, as a share of the action's range
+    different: int  # number of steps with another choice, or a difference above 1e-6 of the range (1e-4 in float)
+    faults: int  # number of steps in which the controller took its fallback action
     microseconds: float | None
 
 
@@ -57,15 +57,15 @@ class Comparison:
     """Episodes of a controller and of its policy, each from the same starts.
 
     Args:
-        controller: what was deployed.
-        running: the deployed controller.
+        controller: the controller that was deployed.
+        running: the deployed controller, running.
         policy: the original policy.
         episode: an instance of the environment.
     """
 
     def __init__(self, controller: Controller, running: Running, policy: Predict, episode: Episode) -> None:
-        self.begun = 0  # steps of the environment, of both
-        self.ended = 0  # episodes, of both
+        self.begun = 0  # number of steps of the environment, of both together
+        self.ended = 0  # number of finished episodes, of both together
         self._running, self._policy, self._episode = running, policy, episode
         self._places = [m.place for m in controller.measurements]
         self._width = controller.high - controller.low
@@ -73,7 +73,8 @@ class Comparison:
         self._faults = 0
 
     def over(self, seeds: range, progress: Callable[[float], None]) -> Checked:
-        """Run an episode of each for every reset seed. ``progress`` is called with the share that is done."""
+        """Run one episode of each for every reset seed. ``progress`` is called with the share of episodes that are
+        done."""
         returns: list[tuple[float, float]] = []
         for seed in seeds:
             returns.append((self._run(seed, deployed=False), self._run(seed, deployed=True)))
@@ -90,7 +91,7 @@ class Comparison:
         )
 
     def _run(self, seed: int, *, deployed: bool) -> float:
-        """Run one episode, and return its return."""
+        """Run one episode, of the deployed controller or of the policy, and return its return."""
         moment, total = self._episode.reset(seed), 0.0
         self._running.reset()
         for _ in range(self._episode.spec.time_limit or LONGEST_EPISODE):
@@ -106,7 +107,7 @@ class Comparison:
         return total
 
     def _decided(self, moment: Moment, expected: Array) -> Array:
-        """Return the controller's action (F,), and note how far it is from the policy's."""
+        """Return the controller's action (F,), and record its difference from the policy's."""
         status, action = self._running.step(moment.coordinates[self._places])
         self._faults += status != 0
         self._differences.append(float((np.abs(action - expected) / self._width).max()) if status == 0 else 0.0)

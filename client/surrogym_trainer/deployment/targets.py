@@ -1,4 +1,4 @@
-"""The targets of a deployment, by name, and the folder that one is written to."""
+"""The targets of a deployment by name, and the writing of their files to a folder."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from surrogym_trainer.policies.controller_check import FILE
 
 @dataclass(frozen=True)
 class Target:
-    """What a controller can be written as.
+    """A form in which a controller can be written.
 
     Attributes:
-        write: write the files of a controller into an empty folder.
-        running: run the controller as the target does; None if nothing on this machine can.
+        write: writes the files of a controller into an empty folder.
+        running: runs the controller as the target does; None if nothing on this machine can.
     """
 
     write: Callable[[Controller, Path], None]
@@ -45,17 +45,17 @@ TARGETS = {
 
 
 def target_of(name: str) -> Target:
-    """Return a target by its name. Raises ``NotDeployable`` if there is none."""
+    """Return the target with this name. Raises ``NotDeployable`` if there is none."""
     if name not in TARGETS:
-        raise NotDeployable(f"expected the target {', '.join(TARGETS)}, got {name!r}")
+        raise NotDeployable(f"expected one of the targets {', '.join(TARGETS)}, got {name!r}")
     return TARGETS[name]
 
 
 def deploy(controller: Controller, target: str, out: Path) -> list[Path]:
-    """Write a controller's files to a folder, and return their paths.
+    """Write a controller's files for a target to a folder, and return their paths.
 
-    A folder that already has exactly these files, and a check of them, stays as it is. Any other folder with files is
-    left alone.
+    A folder that already contains exactly these files, with or without the record of a check, stays as it is. A folder
+    with other files is refused.
 
     Raises:
         NotDeployable: the target is unknown, it can't express the controller, or the folder has other files.
@@ -74,7 +74,7 @@ def deploy(controller: Controller, target: str, out: Path) -> list[Path]:
 
 
 def _copy(made: Path, out: Path, names: list[Path]) -> None:
-    """Copy the files that are not there yet: all of them, or none."""
+    """Copy the files that do not exist yet; if one fails, delete those that were copied."""
     written = []
     try:
         for name in (name for name in names if not (out / name).exists()):
@@ -89,8 +89,8 @@ def _copy(made: Path, out: Path, names: list[Path]) -> None:
 
 
 def _other(out: Path, made: Path, names: list[Path]) -> str:
-    """Return the name of a file in the folder that is not one of the files made; empty if there is none. A check is one
-    of them where all the others are."""
+    """Return the name of a file in the folder that is not one of the files to write; empty if there is none. The record
+    of a check is accepted if all files to write exist."""
     if not out.exists():
         return ""
     if not out.is_dir():

@@ -1,4 +1,4 @@
-"""Test vectors of a controller: steps of episodes, and what the controller must answer.
+"""Test vectors of a controller: steps of episodes, with the answers that the controller must give.
 
 Shapes: R measurements, F action entries.
 """
@@ -14,14 +14,14 @@ from surrogym_trainer.deployment.controller import Array, Controller
 from surrogym_trainer.deployment.reference import Memory, begin, decide, judged
 
 EPISODES, STEPS, TRIES = 3, 16, 20
-WALKED = 20.0  # rad
-ROUNDING = 1e-6  # share of a measurement
+WALKED = 20.0  # largest distance from 0 of a random walk of an angle, in radians
+ROUNDING = 1e-6  # relative error of a measurement that is rounded to float32
 STEADY = 2e-5  # share of an action's range by which rounding a measurement may change the action
 
 
 @dataclass(frozen=True, eq=False)
 class Vector:
-    """One step, and its answer."""
+    """One step of a test, and the answer that the controller must give."""
 
     first: bool  # whether an episode begins
     measurement: Array  # (R,)
@@ -31,10 +31,11 @@ class Vector:
 
 
 def vectors_of(controller: Controller, seed: int = 0) -> list[Vector]:
-    """Return vectors: random walks, ends of the sensors, and each kind of fault, with steps after it.
+    """Return the test vectors: random walks, ends of the sensors' ranges, and each kind of fault with steps after it.
 
-    A measurement whose rounding to float32 would change the action is left out, such as one at half a turn. If that
-    leaves none without a fault, it stays: then float is not precise enough for this policy, and fails the vectors.
+    A measurement whose rounding to float32 would change the action, such as one at half a turn, is left out. If this
+    leaves none without a fault, such measurements are kept: then float is not precise enough for this policy, and the
+    test fails.
     """
     vectors = _vectors_of(controller, np.random.default_rng(seed), only_steady=True)
     if all(vector.status for vector in vectors):
@@ -57,7 +58,7 @@ def _vectors_of(controller: Controller, rng: np.random.Generator, *, only_steady
                 if step == 5:
                     read = (low if rng.random() < 0.5 else high).copy()
                 elif judged(controller, read[None], np.zeros(1))[0]:
-                    continue  # rounded past an end
+                    continue  # rounding moved it beyond the end of its range
                 if _is_steady(controller, memory, read) or not only_steady:
                     walk = read
                     memory, vector = _answered(controller, memory, first, read, 0.0)
@@ -74,13 +75,14 @@ def _vectors_of(controller: Controller, rng: np.random.Generator, *, only_steady
 
 
 def sensors_of(controller: Controller) -> tuple[Array, Array]:
-    """Return the smallest and the largest reading (R,) of each sensor."""
+    """Return the smallest and the largest valid reading (R,) of each sensor."""
     measurements = controller.measurements
     return np.array([m.lowest for m in measurements]), np.array([m.highest for m in measurements])
 
 
 def _walked(controller: Controller) -> tuple[Array, Array]:
-    """Return the range (R,) of random walks: a few turns of an angle whose sensor counts many."""
+    """Return the range (R,) of random walks: that of the sensor, or a few turns of an angle whose sensor
+    counts many."""
     low, high = sensors_of(controller)
     near = np.clip(0.0, low, high)
     angle = np.array([m.angle for m in controller.measurements])
@@ -88,7 +90,7 @@ def _walked(controller: Controller) -> tuple[Array, Array]:
 
 
 def _faults(controller: Controller, rng: np.random.Generator, low: Array, high: Array) -> Iterator[tuple[Array, float]]:
-    """Yield measurements and their ages: faults, each with two sound steps after it."""
+    """Yield measurements (R,) and their ages in seconds: faults, each followed by steps without a fault."""
     begun, ended = _walked(controller)
 
     def sound() -> tuple[Array, float]:
@@ -118,7 +120,7 @@ def _answered(controller: Controller, memory: Memory, first: bool, read: Array, 
 
 
 def _is_steady(controller: Controller, memory: Memory, read: Array) -> bool:
-    """Whether the action stays when the measurements are rounded."""
+    """Return whether rounding the measurements leaves the action unchanged."""
     both = np.stack([read, read * (1 + ROUNDING), read * (1 - ROUNDING)]).clip(*sensors_of(controller))
     repeated = Memory(*(np.repeat(part, 3, axis=0) for part in vars(memory).values()))
     action = decide(controller, repeated, both).action

@@ -1,4 +1,5 @@
-"""Episodes in the virtual environment whose states can be read, as a controller measures states."""
+"""Episodes in the virtual environment whose states can be read, because a controller measures states and not
+observations."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ from surrogym_shared.spec import EnvironmentSpec
 
 
 class VirtualEpisode(Episode):
-    """An episode of a surrogate, in a session of one lane. Each step takes a second request, for the state."""
+    """An episode of a surrogate, in a session with one environment. Each step makes a second request, for the state."""
 
     parallel = True
 
@@ -35,10 +36,11 @@ class VirtualEpisode(Episode):
     def step(self, action: Array) -> Moment:
         step = self._lanes.step(_as_sent(self.spec, action)[None])
         if step.lost is not None:
-            raise SurrogymClientError(f"the check lost its session: {step.lost}")
+            raise SurrogymClientError(f"the check of the controller lost its session: {step.lost}; start it again")
         result = step.result
         ended = bool(result.terminated[0] or result.truncated[0])
-        at = np.zeros(0) if ended else self._coordinates()  # a lane that ended is at its next start
+        # after its end, the environment is already in the next episode
+        at = np.zeros(0) if ended else self._coordinates()
         return Moment(
             np.asarray(result.observation[0]),
             float(result.reward[0]),
@@ -48,11 +50,11 @@ class VirtualEpisode(Episode):
         )
 
     def place(self, coordinates: Array) -> Moment:
-        raise NotSettable(f"a session can't be set to {coordinates.tolist()}: it can only be reset")
+        raise NotSettable(f"a session of a surrogate can't be set to {coordinates.tolist()}: it can only be reset")
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
         del rng, sigma
-        raise NotPerturbable("a surrogate can't be perturbed")
+        raise NotPerturbable("a surrogate can't be perturbed: check the controller without a perturbation")
 
     def close(self) -> None:
         self._lanes.close()
@@ -62,7 +64,8 @@ class VirtualEpisode(Episode):
 
 
 def _as_sent(spec: EnvironmentSpec, action: Array) -> NDArray[Any]:
-    """Return an action (F,) of the environment as a session takes it: numbers of choices, if there are choices."""
+    """Return an action (F,) of the environment in the form that a session takes: the numbers of the choices, if there
+    are choices."""
     counts = np.array(counts_of(spec))
     if not counts.size:
         return action

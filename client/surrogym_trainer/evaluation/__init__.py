@@ -1,4 +1,5 @@
-"""Measure what a policy earns: in real episodes of the original environment, or in imagined ones of the surrogate."""
+"""Evaluation of policies: the returns of real episodes in the original environment, or of imagined ones in the
+surrogate."""
 
 from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationInterrupted, EvaluationSettings, evaluate
 from surrogym_trainer.evaluation.imagined import imagined_returns, observation_statistics

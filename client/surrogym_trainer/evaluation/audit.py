@@ -1,4 +1,10 @@
-"""The audit of a policy: choose states on its imagined way, and judge the model by real steps there. Pure."""
+"""The audit of a policy: the choice of states that it visits in the model, and the judgement of the model by real steps
+there.
+
+All functions are pure.
+
+Shapes: n steps, O outputs, C coordinates, F action entries, K sampled errors.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +21,20 @@ from surrogym_trainer.evaluation.systematic import Inputs, Systematic, columns, 
 from surrogym_trainer.policies.evidence import Audit, Promise
 
 AUDIT_STEPS = 8
-MOST_STEPS = 40  # of an audit that is undecided
+MOST_STEPS = 40  # largest number of steps of an audit that is undecided
 ALARM = 0.01  # probability that the test of output errors fails for a right model
 SHIFT_ALARM = 0.05  # probability that the errors of a right model ever count as shifted, at any number of steps
-UNDECIDED = 0.05  # probability of a lost promise from which on an audit takes more steps, and the promise widens
+# probability that the return leaves the promise above which an audit takes more steps, and the promise widens
+UNDECIDED = 0.05
 MISPLACED_ENDS = 2  # an audit fails if the model predicted the termination of this many steps wrongly
-SLACK = 0.1  # share of the gain over an untrained policy by which a promise may leave its former interval
-FAR = 1.0  # standard deviations of a coordinate on the policy's way
+# share of the gain over an untrained policy by which a new promise may leave the interval of the former one
+SLACK = 0.1
+# distance at which states count as far apart, in standard deviations of a coordinate over the policy's states
+FAR = 1.0
 MOST_UNTESTED = 0.2  # share of a policy's states that may be far from every step of an audit
-QUANTILES = 200  # of a promise's distribution
-UNSURE = 0.2  # share of the same gain: real steps may narrow a promise whose lower half is wider
+QUANTILES = 200  # number of quantiles that represent a promise's distribution
+# share of the gain over an untrained policy; if the lower half of a promise is wider, more real steps may narrow it
+UNSURE = 0.2
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -41,9 +51,9 @@ class Compared:
         expected: error (O,) that the model allows in addition: its tolerance, or its leave-one-out error if that is
             larger, which includes the noise; for the reward at least the error that matters for the return.
         misplaced: number of steps whose termination was predicted wrongly.
-        cut_short: whether the steps are one rollout that an end has cut short which the model did not predict.
-        unanswered: number of steps on the policy's way that the original environment failed to take.
-        elsewhere: number of steps off the policy's way; they come last.
+        cut_short: whether the steps are one rollout that ended earlier than the model predicted.
+        unanswered: number of chosen states at which the original environment failed to take the step.
+        elsewhere: number of steps in states that the policy does not visit; they come last.
         claimed_alone: error (O,) of the model on left-out samples, without any tolerance.
         states: states (n, C) at which the steps began.
         actions: actions (n, F) of the steps.
@@ -63,14 +73,14 @@ class Compared:
 
     @property
     def claimed(self) -> Array:
-        """Standard deviation (n, O) of each error that the model claims."""
+        """The standard deviation (n, O) that the model predicts for each error."""
         scale: Array = np.sqrt(self.deviations**2 + self.expected**2)
         return scale
 
     @property
     def surprising(self) -> Bools:
-        """Which outputs (O,) have larger errors on the policy's way than the model's own claim without any tolerance,
-        beyond chance."""
+        """Which outputs (O,) have larger errors in states that the policy visits than the model predicts without any
+        tolerance, beyond chance."""
         on_way = slice(len(self.errors) - self.elsewhere)
         errors, deviations = self.errors[on_way], self.deviations[on_way]
         sums = (errors**2 / (deviations**2 + self.claimed_alone**2)).sum(0)
@@ -78,7 +88,7 @@ class Compared:
         return beyond
 
     def together(self, spec: EnvironmentSpec, inputs: Inputs) -> Systematic:
-        """Test the errors on the policy's way together."""
+        """Test whether the errors in states that the policy visits have a part that all steps share."""
         on_way = slice(len(self.errors) - self.elsewhere)
         return systematic(
             self.names,
@@ -92,13 +102,13 @@ class Compared:
 
 @dataclass(frozen=True)
 class Consequence:
-    """What the errors that all steps share would change in a policy's return.
+    """The change of a policy's return that the errors common to all steps of an audit would cause.
 
     Attributes:
         shifted: the joint test of the errors.
-        changes: changes (K,) of the mean return, under errors that the steps support.
-        before: promise without them.
-        slack: by how much a return may leave the promise.
+        changes: changes (K,) of the mean return, each under one sample of the errors that the steps support.
+        before: the promise without these errors.
+        slack: distance by which a return may leave the promise.
     """
 
     shifted: Systematic
@@ -108,24 +118,25 @@ class Consequence:
 
     @property
     def beyond(self) -> Bools:
-        """Under which of the errors (K,) the return leaves the promise."""
+        """Which of the sampled errors (K,) move the return out of the promise."""
         returns = self.before.median + self.changes
         outside: Bools = (returns < self.before.low - self.slack) | (returns > self.before.high + self.slack)
         return outside
 
     @property
     def undecided(self) -> bool:
-        """Whether more steps are needed to tell whether the promise stands."""
+        """Whether more steps are needed to decide whether the promise holds."""
         return float(self.beyond.mean()) > UNDECIDED and not self.proven
 
     @property
     def proven(self) -> bool:
-        """Whether the model is shifted for certain, and the promise more likely lost than not."""
+        """Whether the model is shifted almost certainly, and the return more likely outside of the promise
+        than inside."""
         moved = self.changes[self.changes != 0]
         return self.shifted.evidence >= 1 / SHIFT_ALARM and len(moved) > 0 and self.beyond.sum() > len(moved) / 2
 
     def fault(self, compared: Compared) -> str | None:
-        """Describe what is wrong in a sentence; None if nothing is proven."""
+        """Return a sentence about the error with the largest effect; None if nothing is proven."""
         if not self.proven:
             return None
         worst = int(np.argmax(self.shifted.chances))
@@ -137,9 +148,10 @@ class Consequence:
         )
 
     def widened(self, promise: Promise) -> Promise:
-        """The promise of a model that has learned from the steps, with the returns that the errors make likely.
+        """Return the promise of a model that has learned from the steps, widened by the returns that the errors make
+        likely.
 
-        Unchanged if it is hardly possible that they matter.
+        It is unchanged if the errors hardly matter.
         """
         if float(self.beyond.mean()) <= UNDECIDED:
             return promise
@@ -161,13 +173,13 @@ def judge(
 
     An output is at fault in either of two cases:
 
-    - The sum of its squared errors, each divided by its claimed deviation, is larger than chance explains: beyond the
+    - The sum of its squared errors, each divided by its predicted deviation, is larger than chance explains: beyond the
       1 % quantile of the chi-squared distribution, shared between the outputs. Single errors within the tolerance are
       never a fault.
     - The errors have a part that all steps share, beyond chance, and with it in the model the policy's return leaves
-      the promise, see ``Consequence``. A shared part that costs nothing is no fault.
+      the promise, see ``Consequence``. A shared part without an effect on the return is not a fault.
 
-    A rollout has one end at most, so a single one that was not predicted is a fault. A step that the original
+    A rollout has at most one end, so a single one that was not predicted is a fault. A step that the original
     environment fails to take is a fault, because the policy would need it.
 
     Args:
@@ -175,7 +187,7 @@ def judge(
         before: promise before the audit.
         after: promise of the model that has learned from the audit.
         floor: return of an untrained policy; None if it was not measured.
-        consequence: what the errors together mean for the return; None if that was not computed.
+        consequence: effect of the errors together on the return; None if it was not computed.
     """
     n, count = compared.errors.shape
     sums = ((compared.errors / compared.claimed) ** 2).sum(0)
@@ -213,9 +225,10 @@ def judge(
 
 
 def missed(audit: Audit, returns: Array, floor: float | None) -> Audit:
-    """Compare the returns (k,) of whole real episodes with the promise, in addition to their steps.
+    """Add a fault to an audit if the returns (k,) of whole real episodes miss the promise, and return the audit.
 
-    Their mean may leave the promise by ``SLACK`` of the gain, and by two of its standard errors.
+    Their mean may leave the promise by ``SLACK`` of the gain over the return ``floor`` of an untrained policy, and by
+    two of its standard errors.
     """
     mean, before = float(returns.mean()), audit.before
     chance = 2 * float(returns.std(ddof=1)) / sqrt(len(returns)) if len(returns) > 1 else 0.0
@@ -230,9 +243,9 @@ def missed(audit: Audit, returns: Array, floor: float | None) -> Audit:
 
 
 def untested(spec: EnvironmentSpec, q: Array, audited: Array) -> float:
-    """Share of the states q (m, C) of a policy's way from which every audited state (n, C) is far.
+    """Return the share of the states q (m, C) that a policy visits that are far from every audited state (n, C).
 
-    A state is far from another one if a coordinate differs by more than ``FAR`` standard deviations over the way.
+    Two states are far apart if a coordinate differs by more than ``FAR`` standard deviations over the visited states.
     """
     none = np.zeros((len(q) + len(audited), 0))
     at = on_one_scale(spec, np.concatenate([q, audited]), none, len(q))
@@ -244,15 +257,16 @@ def untested(spec: EnvironmentSpec, q: Array, audited: Array) -> float:
 
 
 def unanswered(count: int, of: int) -> str:
-    """Describe that the original environment failed at ``count`` queries ``of`` an audit."""
+    """Return the sentence that the original environment failed at ``count`` queries ``of`` an audit."""
     return f"the original environment failed at {count} of {of} queries, so nothing is known there"
 
 
 def disappointed(audit: Audit, floor: float | None, imagined: float | None = None) -> bool:
-    """Whether the model that has learned from an audit promises clearly less than the model that chose the policy.
+    """Return whether the model that has learned from an audit promises clearly less than the model that chose the
+    policy.
 
-    The policy was chosen by its imagined return. A promise is lower from the beginning if the imagined return rests on
-    what the model does not know. So the promise is compared with the larger of the two.
+    The policy was chosen by its imagined return. The promise is lower than that from the beginning if the imagined
+    return depends on what the model does not know. So the new promise is compared with the larger of the two.
 
     Args:
         audit: the audit.
@@ -265,26 +279,29 @@ def disappointed(audit: Audit, floor: float | None, imagined: float | None = Non
 
 
 def wider(promise: Promise, share: float, floor: float | None) -> bool:
-    """Whether the lower half of a promise is wider than ``share`` of the gain over an untrained policy of ``floor``."""
+    """Return whether the lower half of a promise is wider than ``share`` of the gain over an untrained policy of return
+    ``floor``."""
     return not promise.median - promise.low <= share * earned(promise, floor)
 
 
 def earned(promise: Promise, floor: float | None) -> float:
-    """Gain of a policy over an untrained one of return ``floor``. Without ``floor``, the policy's whole return."""
+    """Return the gain of a policy over an untrained one of return ``floor``. Without ``floor``, it is the policy's
+    whole return."""
     return abs(promise.median - (floor or 0.0))
 
 
 def chi_squared(degrees: int, above: float) -> float:
-    """Value that a chi-squared variable exceeds with probability ``above`` (Wilson and Hilferty 1931)."""
+    """Return the value that a chi-squared variable exceeds with probability ``above`` (Wilson and Hilferty 1931)."""
     z, c = NormalDist().inv_cdf(1 - above), 2 / (9 * degrees)
     return float(degrees * (1 - c + z * sqrt(c)) ** 3)
 
 
 def places(spec: EnvironmentSpec, q: Array, u: Array, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Choose at most ``count`` of the visited states q (m, C) and their actions u (m, F) for an audit.
+    """Choose at most ``count`` of the visited states q (m, C) and their actions u (m, F) for an audit, and return their
+    indices.
 
     Half of them are drawn at random, so that they represent the policy's time. Each other one is the farthest from all
-    chosen before, so that they cover the policy's way. Distances are in standard deviations of the visited states.
+    chosen before, so that they cover all visited states. Distances are in standard deviations of the visited states.
     """
     settable = np.flatnonzero(_settable(spec, q))
     count = min(count, len(settable))
@@ -303,10 +320,11 @@ def places(spec: EnvironmentSpec, q: Array, u: Array, count: int, rng: np.random
 
 
 def gaps(spec: EnvironmentSpec, q: Array, u: Array, samples: tuple[Array, Array], count: int) -> NDArray[np.intp]:
-    """Choose at most ``count`` of the states q (m, C) and actions u (m, F) in the widest gaps of single inputs.
+    """Choose at most ``count`` of the states q (m, C) and actions u (m, F) in the widest gaps of single inputs, and
+    return their indices.
 
-    A gap is a coordinate's or an action's distance from the nearest of the samples, states (n, C) and actions (n, F),
-    as a share of the range of q and u. No sample can show a wall or a threshold behind such a gap.
+    A gap is the distance of a coordinate or an action entry from the nearest of the samples, states (n, C) and actions
+    (n, F), as a share of the range of q and u. No sample can show a wall or a threshold inside such a gap.
     """
     settable = np.flatnonzero(_settable(spec, q))
     q, u = q[settable], u[settable]
@@ -315,7 +333,7 @@ def gaps(spec: EnvironmentSpec, q: Array, u: Array, samples: tuple[Array, Array]
     ranges[ranges == 0] = np.inf
 
     def away(states: Array, actions: Array) -> Array:
-        """Distance (m, C + F) of each input from the nearest of these points."""
+        """Return the distance (m, C + F) of each input from the nearest of these points."""
         off = differences(spec, q[:, None], states[None]), u[:, None] - actions[None]
         nearest: Array = np.abs(np.concatenate(off, 2)).min(1)
         return nearest
@@ -330,7 +348,7 @@ def gaps(spec: EnvironmentSpec, q: Array, u: Array, samples: tuple[Array, Array]
 
 
 def differences(spec: EnvironmentSpec, real: Array, predicted: Array) -> Array:
-    """Real minus predicted coordinates, (..., C). Angles differ by the shorter way."""
+    """Return real minus predicted coordinates (..., C). Angles differ by the shorter way."""
     difference = real - predicted
     for index, coordinate in enumerate(spec.coordinates):
         if coordinate.kind == "angle":
@@ -341,7 +359,7 @@ def differences(spec: EnvironmentSpec, real: Array, predicted: Array) -> Array:
 def on_one_scale(spec: EnvironmentSpec, q: Array, u: Array, first: int | None = None) -> Array:
     """Scale states q (m, C) and actions u (m, F) to points whose distances are meaningful.
 
-    Each column is divided by its standard deviation, or by that of the ``first`` rows.
+    Each column is divided by its standard deviation over all rows, or over the ``first`` rows.
     """
     at = columns(spec, q, u)
     spread = at[:first].std(0)
@@ -350,7 +368,7 @@ def on_one_scale(spec: EnvironmentSpec, q: Array, u: Array, first: int | None = 
 
 
 def _settable(spec: EnvironmentSpec, q: Array) -> Bools:
-    """Which states (m,) the original environment can be set to."""
+    """Return which of the states (m, C) the original environment can be set to, (m,)."""
     inside = np.ones(len(q), dtype=bool)
     for index, coordinate in enumerate(spec.coordinates):
         low, high = coordinate.settable

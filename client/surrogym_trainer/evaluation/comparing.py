@@ -1,4 +1,4 @@
-"""Compare real steps with a model's predictions, and find the steps at which the two disagree.
+"""Comparison of real steps with a model's predictions, and search for the steps at which the two disagree.
 
 Shapes: n steps, O outputs, C coordinates.
 """
@@ -19,13 +19,13 @@ from surrogym_trainer.evaluation.audit import ALARM, Compared, chi_squared, diff
 from surrogym_trainer.evaluation.evaluator import ROUNDING, Trace, span
 from surrogym_trainer.evaluation.systematic import LEAST
 
-MOST = 400  # most real steps to compare
-LEAST_ERROR = 1e-12  # in an output's unit, so that an exact output can be tested
+MOST = 400  # largest number of real steps to compare
+LEAST_ERROR = 1e-12  # smallest error in an output's unit, so that an exact output can be tested
 SHOWN = 3  # number of worst steps, and of worst episodes, to show
 
 
 class Step(Protocol):
-    """One real step, from a sample or an episode."""
+    """One real step, from a sample or from an episode."""
 
     @property
     def coordinates(self) -> Any: ...
@@ -42,9 +42,14 @@ class Step(Protocol):
 def compared(
     api: Api, spec: EnvironmentSpec, view: SurrogateView, samples: Sequence[Step], matters: float = 0.0
 ) -> Compared:
-    """Return real steps together with the predictions of the model of ``view``, which was not fitted to them.
+    """Return real steps together with the predictions of a surrogate's model, which was not fitted to them.
 
-    Errors of the reward below ``matters`` don't count.
+    Args:
+        api: the connection to the server.
+        spec: the specification.
+        view: the surrogate, with its model version.
+        samples: the real steps.
+        matters: largest error of the reward that does not matter for the return.
     """
     q, u = [list(sample.coordinates) for sample in samples], [list(sample.action) for sample in samples]
     predicted = api.predict(view.name, q, u, model=view.model_version)
@@ -72,19 +77,21 @@ def compared(
 
 
 def _expected(claim: OutputFidelity, matters: float) -> float:
-    """Error of an output that the model allows: its tolerance, its error on left-out samples, or one without effect."""
+    """Return the error of an output that the model allows: the largest of its tolerance, its error on left-out samples,
+    and ``matters``."""
     return max(claim.tolerance, claim.leave_one_out_error or 0.0, matters)
 
 
 def _alone(claim: OutputFidelity) -> float:
-    """Error of an output on left-out samples, noise included; its tolerance if the family of models knows none."""
+    """Return the error of an output on left-out samples, noise included; its tolerance if the family of models has no
+    such error."""
     known = claim.tolerance if claim.leave_one_out_error is None else claim.leave_one_out_error
     return max(known, claim.noise, LEAST * claim.tolerance, LEAST_ERROR)
 
 
 @dataclass(frozen=True)
 class StepOfEpisode:
-    """One real step with the number of its episode, and its own number there, both from 0."""
+    """One real step, with the number of its episode and its own number in the episode, both from 0."""
 
     episode: int
     number: int
@@ -96,14 +103,14 @@ class StepOfEpisode:
 
 
 def steps_of(traces: Sequence[Trace], most: int = MOST) -> list[StepOfEpisode]:
-    """Return at most ``most`` steps of episodes, evenly spaced."""
+    """Return at most ``most`` evenly spaced steps of episodes."""
     places = [(episode, t) for episode, trace in enumerate(traces) for t in range(len(trace.reward))]
     kept = np.unique(np.linspace(0, len(places) - 1, min(len(places), most)).astype(int))
     return [_step(traces[episode], episode, t) for episode, t in (places[i] for i in kept)]
 
 
 def steady(spec: EnvironmentSpec, steps: Sequence[StepOfEpisode]) -> list[StepOfEpisode]:
-    """Return the steps within which no constant changed, such as a setpoint. A model keeps constants."""
+    """Return the steps in which no constant coordinate changed, such as a setpoint, because a model keeps constants."""
     held = [(i, ROUNDING * span(c)) for i, c in enumerate(spec.coordinates) if c.kind == "constant"]
     return [one for one in steps if all(abs(one.next_coordinates[i] - one.coordinates[i]) <= most for i, most in held)]
 
@@ -123,8 +130,8 @@ def _step(trace: Trace, episode: int, t: int) -> StepOfEpisode:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A real step that the model excludes, with its worst output, the error there, and the error that the model
-    claimed."""
+    """A real step that contradicts the model: its worst output, the error of that output, and the error that the model
+    predicted."""
 
     step: StepOfEpisode
     output: str
@@ -134,13 +141,13 @@ class Disagreement:
 
 @dataclass(frozen=True)
 class Disagreements:
-    """Disagreements between a model and real episodes.
+    """The disagreements between a model and real episodes.
 
     Attributes:
         compared: number of real steps that were compared.
         found: steps whose error exceeds the model's claim, the worst first.
-        missing: real minus predicted reward over the compared steps of each episode, by its number.
-        shared: further steps that have much of an error that all steps share, the most first.
+        missing: real minus predicted reward over the compared steps of each episode, by the episode's number.
+        shared: further steps that contribute most to an error that all steps share, the largest first.
     """
 
     compared: int
@@ -149,7 +156,7 @@ class Disagreements:
     shared: tuple[StepOfEpisode, ...] = ()
 
     def by_episode(self) -> dict[int, int]:
-        """Number of excluded steps of each episode, the largest first."""
+        """Return the number of steps that contradict the model, by episode, the largest first."""
         counts: dict[int, int] = {}
         for one in self.found:
             counts[one.step.episode] = counts.get(one.step.episode, 0) + 1
@@ -157,7 +164,12 @@ class Disagreements:
 
 
 def disagreements(steps: Sequence[StepOfEpisode], beside: Compared) -> Disagreements:
-    """Find the steps whose error is larger than chance explains, at a level of 1 % for all of them together."""
+    """Find the steps whose error is larger than chance explains, at a level of 1 % for all of them together.
+
+    Args:
+        steps: the real steps.
+        beside: the same steps with the model's predictions.
+    """
     n, count = beside.errors.shape
     limit = sqrt(chi_squared(1, ALARM / (n * count)))
     ratio = np.abs(beside.errors) / beside.claimed
@@ -178,10 +190,10 @@ def disagreements(steps: Sequence[StepOfEpisode], beside: Compared) -> Disagreem
 
 
 def samples_of(found: Disagreements, most: int) -> list[NewSample]:
-    """Return at most ``most`` of the steps as samples: those that differ each by itself, then those that explain an
-    error that all steps share.
+    """Return at most ``most`` of the steps as samples: first those that disagree by themselves, then those that explain
+    an error that all steps share.
 
-    Of either kind the worst step of each episode comes first, then the second worst, and so on. Neighbours in one
+    Of either kind, the worst step of each episode comes first, then the second worst, and so on. Neighbours in one
     episode often err for the same reason, so the episodes take turns.
     """
     alone = [one.step for one in found.found]
@@ -191,7 +203,7 @@ def samples_of(found: Disagreements, most: int) -> list[NewSample]:
 
 
 def _in_turns(steps: Sequence[StepOfEpisode]) -> list[StepOfEpisode]:
-    """Order steps, so that their episodes take turns."""
+    """Order steps so that their episodes take turns."""
     rank: dict[int, int] = {}
     turns: list[tuple[int, StepOfEpisode]] = []
     for step in steps:
@@ -201,7 +213,7 @@ def _in_turns(steps: Sequence[StepOfEpisode]) -> list[StepOfEpisode]:
 
 
 def as_samples(steps: Sequence[StepOfEpisode]) -> list[NewSample]:
-    """Return the steps as samples."""
+    """Return the steps as samples to send to a server."""
     return [
         NewSample(
             coordinates=list(step.coordinates),

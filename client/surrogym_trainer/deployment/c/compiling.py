@@ -1,4 +1,5 @@
-"""Compile a controller in C on this machine, and drive it by lines of JSON, as executables are."""
+"""Compilation of a controller in C on this machine. The program is driven by lines of JSON, as original environments
+are."""
 
 from __future__ import annotations
 
@@ -18,17 +19,17 @@ from surrogym_trainer.deployment.controller import Array, Controller, NotDeploya
 from surrogym_trainer.deployment.running import Running
 
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
-SECONDS = 10.0  # until the program answers
+SECONDS = 10.0  # seconds until the program must answer
 
 
 class CompiledController(Running):
-    """A compiled controller.
+    """A compiled controller, running as a program.
 
     Args:
-        program: executable of the controller's sources.
+        program: the program made from the controller's C sources.
         actions: number of entries of an action, F.
-        microseconds: of one decision.
-        single: whether it computes in float.
+        microseconds: duration of one decision.
+        single: whether it computes in float instead of double.
     """
 
     def __init__(self, program: Program, actions: int, microseconds: float, single: bool) -> None:
@@ -46,11 +47,11 @@ class CompiledController(Running):
 
 @contextmanager
 def running(controller: Controller, *, single: bool = False) -> Iterator[CompiledController]:
-    """Compile a controller, run its test vectors and start it. With ``single`` it computes in float.
+    """Compile a controller, run its test vectors, and start it; with ``single`` it computes in float instead of double.
 
     Raises:
         CannotCompile: there is no C compiler, or it refuses the controller.
-        NotDeployable: the vectors fail.
+        NotDeployable: the compiled controller fails a test vector.
     """
     with TemporaryDirectory() as made:
         folder = Path(made)
@@ -62,9 +63,11 @@ def running(controller: Controller, *, single: bool = False) -> Iterator[Compile
         try:
             vectors = subprocess.run([executable], capture_output=True, text=True, check=False)
         except OSError as error:
-            raise CannotCompile(f"expected a C compiler for this machine: {error.strerror}") from error
+            raise CannotCompile(
+                f"expected a C compiler for this machine, got one whose program can't run here: {error.strerror}"
+            ) from error
         if vectors.returncode != 0:
-            raise NotDeployable(f"the compiled controller fails its vectors: {vectors.stdout[-400:]}")
+            raise NotDeployable(f"the compiled controller fails its test vectors: {vectors.stdout[-400:]}")
         timed = subprocess.run([executable, "time"], capture_output=True, text=True, check=True)
         program = Program(shlex.join([str(executable), "lines"]), "the compiled controller")
         program.start()

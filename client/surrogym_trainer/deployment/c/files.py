@@ -1,4 +1,4 @@
-"""The files of a controller in C99, and the layout in which Arduino and PlatformIO find them."""
+"""The files of a controller in C99, and their layout for Arduino and PlatformIO."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from surrogym_trainer.deployment.c import source
 from surrogym_trainer.deployment.controller import Array, Controller, NotDeployable
 from surrogym_trainer.deployment.vectors import Vector, vectors_of
 
-LONGEST = 2_000_000  # s; a sketch counts to 2^31 milliseconds
+LONGEST = 2_000_000  # longest period in seconds; a sketch can count 2^31 milliseconds
 
 
 def prefix_of(controller: Controller) -> str:
-    """Return the prefix of all names in C: the surrogate's name with letters that an identifier may have."""
+    """Return the prefix of all C names of a controller: the surrogate's name, with other characters than letters and
+    digits replaced."""
     name = re.sub(r"[^A-Za-z0-9]+", "_", controller.name).strip("_").lower() or "policy"
     return f"p{name}" if name[0].isdigit() else name
 
 
 def write(controller: Controller, folder: Path) -> None:
-    """Write the header, the source and the program that runs test vectors."""
+    """Write header, source, and the program that runs test vectors into a folder."""
     write_sources(controller, folder)
     prefix = prefix_of(controller)
     (folder / f"{prefix}_main.c").write_text(main_of(controller, vectors_of(controller)), encoding="utf-8")
 
 
 def write_arduino(controller: Controller, folder: Path) -> None:
-    """Write a library for the Arduino IDE and PlatformIO: the same header and source, and a sketch that uses them."""
+    """Write a library for the Arduino IDE and PlatformIO: the C header and source, and a sketch that uses them."""
     prefix = prefix_of(controller)
     (folder / "src").mkdir()
     write_sources(controller, folder / "src", single=True)
@@ -65,7 +66,7 @@ def write_arduino(controller: Controller, folder: Path) -> None:
 
 
 def main_of(controller: Controller, vectors: list[Vector]) -> str:
-    """Return the program that runs test vectors."""
+    """Return the source of the program that runs test vectors."""
     rows = [
         f"    {{{int(v.first)}, {{{_joined(v.measurement)}}}, {source.number(v.age)}, {v.status}, "
         f"{{{_joined(v.action)}}}}},"
@@ -76,7 +77,8 @@ def main_of(controller: Controller, vectors: list[Vector]) -> str:
 
 
 def write_sources(controller: Controller, folder: Path, *, single: bool = False) -> None:
-    """Write header and source. With ``single`` the header itself chooses float: a sketch has no flags of its own."""
+    """Write header and source into a folder. With ``single``, the header itself chooses float, because a sketch has no
+    compiler flags."""
     names, prefix = _names(controller), prefix_of(controller)
     flag = f"{prefix.upper()}_FLOAT"
     chosen = {"single": f"#ifndef {flag}\n#define {flag}\n#endif\n" if single else ""}
@@ -117,7 +119,7 @@ def _header(controller: Controller) -> dict[str, Any]:
 
 
 def _digest(controller: Controller, name: str, value: str) -> str:
-    """Return a digest as a text that a program can print, so that a running machine can name its controller."""
+    """Return a digest as a C definition of a text, so that a running machine can print which controller it has."""
     return f"#define {prefix_of(controller).upper()}_{name.replace(' ', '_').upper()}_SHA256 {source.text(value)}"
 
 
@@ -131,12 +133,19 @@ def _title(controller: Controller) -> str:
 
 
 def _clock(controller: Controller) -> dict[str, str]:
-    """Return the sketch's clock of 32 bits: microseconds if they suffice for the period and the timeout."""
+    """Return the names and numbers of the sketch's 32-bit clock: microseconds if the period and the timeout fit, else
+    milliseconds."""
     if controller.period is None:
-        raise NotDeployable("a sketch has a period: give it by --period, or by sampling_period in the specification")
+        raise NotDeployable(
+            "a sketch needs a period, and none is declared: give it by --period, or by sampling_period in the "
+            "specification"
+        )
     longest = max(controller.period, controller.timeout)
     if longest > LONGEST:
-        raise NotDeployable(f"expected a period and a timeout of a sketch up to {LONGEST:,} s, got {longest:g} s")
+        raise NotDeployable(
+            f"expected a period and a timeout of at most {LONGEST:,} s for a sketch, got {longest:g} s: give smaller "
+            "ones"
+        )
     unit, clock, second = ("us", "micros", 1_000_000) if longest < LONGEST / 1000 else ("ms", "millis", 1000)
     period = max(1, round(second * controller.period))
     return {"period": str(period), "unit": unit, "clock": clock, "second": str(second)}

@@ -15,8 +15,8 @@ import numpy as np
 
 from surrogym_trainer.deployment.controller import Array, Controller, Decision, Observed, Part
 
-PER_LINE = 6  # numbers in a line of an array
-UNROLLED = 4  # inputs of a layer in one pass over its outputs
+PER_LINE = 6  # number of constants in a line of an array
+UNROLLED = 4  # number of inputs of a layer that one pass over its outputs adds
 
 WRAPPED = """
 /* An angle in [-pi, pi). */
@@ -44,7 +44,7 @@ static real squashed(real x)
 
 
 def number(value: float) -> str:
-    """Return a number as a constant in C, exactly."""
+    """Return a number as an exact constant in C."""
     value = float(value)
     if math.isnan(value):
         return "NAN"
@@ -54,14 +54,14 @@ def number(value: float) -> str:
 
 
 def real(value: float) -> str:
-    """Return a number as a constant of the type ``real``; an infinite one as the largest."""
+    """Return a number as a C constant of the type ``real``; an infinity becomes the largest finite number."""
     if math.isinf(value):
         return "LARGEST" if value > 0 else "-LARGEST"
     return f"R({number(value)})"
 
 
 def plain(text: str) -> str:
-    """Return a text that can't end a comment in C: names are free text."""
+    """Return a text without characters that would end a comment in C; names may contain any text."""
     printable = "".join(c if c.isprintable() else " " for c in text)
     return re.sub(r"\?\?", "? ?", printable.replace("*/", "* /").replace("/*", "/ *").rstrip("\\"))
 
@@ -72,13 +72,13 @@ def text(value: str) -> str:
 
 
 def stack_of(controller: Controller) -> int:
-    """Return how many numbers are on the stack at most."""
+    """Return the largest number of values that the controller has on the stack."""
     sizes = _sizes(controller.decision)
     return max(sizes[::2]) + max([*sizes[1::2], 0]) + len(controller.observation) + len(controller.coordinates)
 
 
 def parts_of(controller: Controller) -> dict[str, str]:
-    """Return the parts of the source by their names in the template."""
+    """Return the parts of the C source, by their names in the template."""
     body = {
         "observation": _observation(controller.observation),
         "place": _place(controller),
@@ -98,7 +98,7 @@ def parts_of(controller: Controller) -> dict[str, str]:
 
 
 def constants_of(controller: Controller) -> int:
-    """Return how many constant numbers the source has."""
+    """Return the number of constants in the C source."""
     return sum(array.size for array in _constants(controller).values())
 
 
@@ -121,7 +121,7 @@ def _arrays(controller: Controller) -> str:
 
 
 def _array(name: str, array: Array) -> str:
-    """Weights (I, O) are flat, with the outputs of one input beside each other."""
+    """Return the definition of a constant array in C. Weights (I, O) are stored flat, row by row."""
     numbers = [number(value) for value in array.ravel()]
     rows = (", ".join(numbers[i : i + PER_LINE]) for i in range(0, len(numbers), PER_LINE))
     return f"static const real {name}[{array.size}] = {{\n    " + ",\n    ".join(rows) + "};\n"
@@ -195,7 +195,8 @@ def _network(decision: Decision) -> str:
 
 
 def _products(weights: str, inputs: int, outputs: int) -> list[str]:
-    """Return the loops that add x @ weights to y: four inputs at a time, which halves the time, and the rest."""
+    """Return the C loops that add x @ weights to y: first four inputs at a time, which halves the duration, then the
+    remaining inputs."""
     together = inputs // UNROLLED * UNROLLED
     lines = []
     if together:

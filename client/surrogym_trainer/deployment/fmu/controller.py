@@ -1,4 +1,5 @@
-"""A controller as an FMU: it decides at the beginning of each sampling period, from its inputs there."""
+"""A controller as an FMU, which decides at the beginning of each sampling period from the values of its inputs at that
+time."""
 
 from __future__ import annotations
 
@@ -18,10 +19,10 @@ STATUS = "0, or a sum of 1: not finite, 2: out of range, 4: late, 8: the network
 
 
 def write(controller: Controller, folder: Path) -> None:
-    """Write the FMU, with native code if a C compiler is at hand.
+    """Write a controller as an FMU into a folder, with native code if a C compiler is installed.
 
     Raises:
-        NotDeployable: nobody declared the sampling period, or two variables have the same name.
+        NotDeployable: no sampling period is declared, or two variables have the same name.
         CannotCompile: the compiler refused the sources.
     """
     try:
@@ -31,9 +32,13 @@ def write(controller: Controller, folder: Path) -> None:
 
 
 def block_of(controller: Controller) -> Block:
-    """Return the block of a controller. Raises ``NotDeployable``."""
+    """Return a controller as the block that an FMU is made from. Raises ``NotDeployable`` if no sampling period is
+    declared."""
     if controller.period is None:
-        raise NotDeployable("an FMU has a period: give it by --period, or by sampling_period in the specification")
+        raise NotDeployable(
+            "an FMU needs a period, and none is declared: give it by --period, or by sampling_period in the "
+            "specification"
+        )
     prefix = prefix_of(controller)
     names = {"prefix": prefix, "PREFIX": prefix.upper(), "fallback": ", ".join(map(number, controller.fallback))}
     glue = Template(files(__package__).joinpath("block.c.txt").read_text(encoding="utf-8")).substitute(names)
@@ -51,14 +56,15 @@ def block_of(controller: Controller) -> Block:
 
 
 def _sources(controller: Controller) -> dict[str, str]:
-    """The header and the source of the controller in C, by their names."""
+    """Return the header and the source of the controller in C, by file name."""
     with TemporaryDirectory() as folder:
         write_sources(controller, Path(folder))
         return {path.name: path.read_text(encoding="utf-8") for path in sorted(Path(folder).iterdir())}
 
 
 def _variables(controller: Controller) -> Iterator[Variable]:
-    """All variables, in the order of the values in ``block.c.txt``. A name that is taken is preceded by its kind."""
+    """Yield all variables, in the order in which ``block.c.txt`` reads their values. If a name is taken, its kind is
+    put before it."""
     free = Names().free
     for one in controller.measurements:
         about = f"measurement, from {one.lowest:.6g} to {one.highest:.6g}"

@@ -1,4 +1,4 @@
-"""The FMU of a controller, run by fmpy."""
+"""A controller's FMU, run by fmpy."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from surrogym_trainer.deployment.running import Running
 
 
 class RunningFmu(Running):
-    """A controller's FMU that steps once a period.
+    """A controller's FMU, which takes one step per sampling period.
 
     Args:
-        fmu: an instance in fmpy.
-        controller: what the FMU was made from.
+        fmu: the instance in fmpy.
+        controller: the controller that the FMU was made from.
         period: seconds of a step.
     """
 
@@ -56,9 +56,9 @@ def running(controller: Controller) -> Iterator[RunningFmu]:
     """Write the FMU of a controller with native code, and load it.
 
     Raises:
-        NotDeployable: nobody declared the sampling period.
+        NotDeployable: no sampling period is declared.
         CannotCompile: there is no C compiler, or it refuses the sources.
-        ModuleNotFoundError: the extra ``fmu`` is missing.
+        ModuleNotFoundError: the extra ``fmu`` is not installed.
     """
     from fmpy.fmi3 import FMU3Slave
 

@@ -1,7 +1,7 @@
-"""A controller as one function block of structured text, with the numbers in constant arrays.
+"""A controller as one function block of structured text, with its numbers in constant arrays.
 
-``surrogym_trainer.deployment.reference`` is the same in NumPy. Names avoid the keywords of IEC 61131-3, such as ACTION
-and STEP. The block uses no function but EXP, SIN, COS, TRUNC and conversions of types.
+``surrogym_trainer.deployment.reference`` computes the same in NumPy. Names avoid the keywords of IEC 61131-3, such as
+ACTION and STEP. The block calls no functions other than EXP, SIN, COS, TRUNC and conversions of types.
 
 Shapes: R measurements, D observation entries, A outputs, F action entries.
 """
@@ -20,10 +20,10 @@ import numpy as np
 from surrogym_trainer.deployment.c.files import prefix_of
 from surrogym_trainer.deployment.controller import Controller, Decision, Dense, NotDeployable, Observed, Part
 
-REAL_TYPES = ("LREAL", "REAL")  # of 64 and of 32 bits
+REAL_TYPES = ("LREAL", "REAL")  # types of numbers with 64 and with 32 bits
 LARGEST = {"LREAL": float(np.finfo(np.float64).max), "REAL": 3.4028234e38}
-PER_LINE = 5  # numbers in a line of an array
-MOST_TURNS = 1e9  # of an angle that TRUNC counts in a DINT
+PER_LINE = 5  # number of constants in a line of an array
+MOST_TURNS = 1e9  # largest number of turns of an angle, because TRUNC returns a DINT
 KINDS = ("action", "steps", "value", "change")
 
 WRAP = """\
@@ -121,14 +121,14 @@ END_FOR"""
 
 
 def write(controller: Controller, folder: Path) -> None:
-    """Write one function block with numbers of 64 bits, and one with numbers of 32 bits."""
+    """Write two function blocks into a folder: one with numbers of 64 bits, one with numbers of 32 bits."""
     for real in REAL_TYPES:
         name = f"{prefix_of(controller)}_controller{'' if real == 'LREAL' else '_real'}"
         (folder / f"{name}.st").write_text(source_of(controller, real, name), encoding="utf-8")
 
 
 def source_of(controller: Controller, real: str, name: str) -> str:
-    """Return the function block, with numbers of the type ``real``.
+    """Return the source of the function block called ``name``, with numbers of the type ``real``.
 
     Raises:
         NotDeployable: the sensor of an angle may give more turns than a DINT can count.
@@ -213,7 +213,7 @@ def _array(name: str, kind: str, values: Sequence[str]) -> str:
 
 
 def _number(value: float, real: str) -> str:
-    """A number as a literal, which needs a decimal point; the largest one for an infinite one."""
+    """Return a number as a literal with a decimal point; an infinity becomes the largest finite number."""
     limited = min(max(float(value), -LARGEST[real]), LARGEST[real])
     digits, _, exponent = (repr(limited) if real == "LREAL" else str(np.float32(limited))).partition("e")
     point = digits if "." in digits else f"{digits}.0"
@@ -232,7 +232,8 @@ def _observation(entries: Iterable[Observed], rounded: Callable[[str], str]) -> 
 
 
 def _sum(terms: Iterable[tuple[float, str]]) -> str:
-    """A sum of weights times what they weigh; "" weighs 1. Neither ones nor two signs in a row are written."""
+    """Return the source of a weighted sum. Each term is a weight and the text that it multiplies; an empty text stands
+    for 1. Weights of 1, and two signs in a row, are not written."""
     written = ""
     for weight, of in terms:
         size = _number(abs(weight), "LREAL")
@@ -250,7 +251,7 @@ def _part(part: Part) -> tuple[float, str]:
 
 
 def _rounded(value: str) -> str:
-    """Rounded to 32 bits, as observations and remembered actions are."""
+    """Return the source that rounds a value to 32 bits, as observations and remembered actions are."""
     return f"REAL_TO_LREAL(LREAL_TO_REAL({value}))"
 
 
@@ -292,7 +293,7 @@ def _comments(controller: Controller) -> dict[str, str]:
 
 
 def plain(text: str) -> str:
-    """Return a text that can't end a comment, since names are free text."""
+    """Return a text without characters that would end a comment in structured text; names may contain any text."""
     printable = "".join(c if c.isprintable() else " " for c in text)
     return printable.replace("(*", "( *").replace("*)", "* )")
 
