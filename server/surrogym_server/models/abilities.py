@@ -1,6 +1,7 @@
 """Abilities that only some families of models have. Each is a class that a model inherits besides ``DynamicsModel``.
 
-Code that uses an ability calls ``offers``, and has a fallback for models without it. The ability's docstring states it.
+To use an ability, code calls ``offers`` and has a fallback for models without it. The ability's docstring states the
+fallback.
 
 Shapes as in ``models.port``; r reference points, b paths of T steps, N lanes, W numbers of a drawn function.
 """
@@ -30,36 +31,37 @@ def offers(model: DynamicsModel, ability: type[A]) -> A | None:
 
 
 class TakesPrior(ABC):
-    """Ability of a ``Learner`` to learn beside a prior: a model of the same family and definition, of what is known
-    beforehand, such as one of a simulator.
+    """Ability of a ``Learner`` to use a prior: a model of the same family and definition that represents earlier
+    knowledge, such as a model of a simulator.
 
-    Fallback of ``services``: a prior is refused.
+    Fallback of ``services``: the prior is refused.
     """
 
     @abstractmethod
     def learn_beside(
         self, prior: DynamicsModel, definition: EnvironmentDefinition, samples: Samples, warm: Warm | None = None
     ) -> Learned:
-        """Fit as ``Learner.learn`` does. Each output uses the prior only if it then predicts left-out samples better.
+        """Fit as ``Learner.learn`` does, with the prior's prediction as the mean of those outputs for which this
+        predicts left-out samples better.
 
         Raises:
-            TypeError: the prior is of another family.
-            InvalidInput, NumericalFailure: as ``Learner.learn``.
+            TypeError: the prior belongs to another family.
+            InvalidInput: too few samples to learn from.
+            NumericalFailure: the fit fails on these samples.
         """
 
 
 class FunctionDraws(ABC):
     """Ability to sample whole functions from the posterior, each consistent for a whole episode.
 
-    Fallback of ``draws``: one standard normal number for each transition output is kept for the episode, and shifts
-    this output everywhere by as many standard deviations. These are the draws of outputs whose errors are the same at
-    all states.
+    Fallback of ``models.draws``: keep one standard normal number for each transition output during an episode, and
+    shift the output everywhere by that many standard deviations, as if its error were the same at all states.
     """
 
     @property
     @abstractmethod
     def path_size(self) -> int:
-        """Number of standard normal numbers that a draw takes, which is also the size of the draw, W."""
+        """Number W of standard normal numbers that a sampled function takes, which is also its number of weights."""
 
     @abstractmethod
     def draw(self, noise: Tensor) -> Tensor:
@@ -81,23 +83,25 @@ class FunctionDraws(ABC):
     ) -> Transition:
         """Predict as ``transition`` does, with each row along a sampled function of its own.
 
-        ``paths`` (m, W) are the functions; the first ``path_size`` columns are used.
+        Args:
+            paths: (m, W') the functions, W' >= W; the first W = ``path_size`` columns are used.
+            q, u, process, stds, reward_std: as for ``transition``.
         """
 
 
 class UncertainHyperparameters(ABC):
-    """Ability to sample functions with uncertain hyperparameters, because few samples don't determine them.
+    """Ability to sample functions with sampled hyperparameters, because few samples don't determine these.
 
-    Fallback of ``virtual``: the functions of ``FunctionDraws``, which are drawn with the optimal hyperparameters.
+    Fallback of ``virtual``: the functions of ``FunctionDraws``, sampled with the optimal hyperparameters.
     """
 
     @property
     @abstractmethod
     def uncertain_functions(self) -> FunctionDraws:
-        """Return the object that samples functions with uncertain hyperparameters.
+        """Object that samples functions with uncertain hyperparameters.
 
-        The model's first call may take as long as a fit. If the object has compiled steps, they are those of its own
-        ``CompiledSteps``.
+        The first use of this property may take as long as a fit. If the object has compiled steps, they are those of
+        its own ``CompiledSteps``.
         """
 
 
@@ -106,8 +110,8 @@ class LeaveOneOutErrors:
     """Errors of one output when each sample in turn is predicted from all others."""
 
     error: float  # root mean square, in the output's unit
-    within_one: float  # share of the samples within one predictive standard deviation; 0.68 if that is right
-    within_two: float  # the same within two: 0.95
+    within_one: float  # share of the samples within one predictive standard deviation; ideally 0.68
+    within_two: float  # share of the samples within two; ideally 0.95
 
 
 class LeaveOneOut(ABC):
@@ -125,7 +129,7 @@ class LeaveOneOut(ABC):
 class LearnedNoise(ABC):
     """Ability to learn the noise of a single step together with the function.
 
-    Fallback of ``sampling``: the environment counts as noiseless, and no step is repeated.
+    Fallback of ``sampling``: the environment counts as noiseless, and no query is repeated.
     """
 
     @property
@@ -135,18 +139,18 @@ class LearnedNoise(ABC):
 
     @property
     def possible_noise(self) -> tuple[float, ...]:
-        """Standard deviation of each output's noise in another explanation of the samples, if it is at least
-        as likely, (O,). Those that it has learned if the family looks for no other."""
+        """Standard deviation of each output's noise in the noisiest explanation of the samples that is at least as
+        likely as the learned one, (O,). Equal to ``noise_stds`` in a family that looks for no other explanation."""
         return self.noise_stds
 
 
 @dataclass(frozen=True)
 class AtSamples:
-    """One output's process at k of the samples, in the output's unit."""
+    """Prior of one output's process at k of the samples, in the output's unit."""
 
-    rows: Tensor  # (k,) of the samples
-    targets: Tensor  # (k,) less their mean
-    covariance: Tensor  # (k, k) of the function before it has seen them, without noise
+    rows: Tensor  # (k,) indices of the samples
+    targets: Tensor  # (k,) values of the output less their mean
+    covariance: Tensor  # (k, k) prior covariance of the function at the samples, without noise
     noise_variance: float
 
 
@@ -154,23 +158,24 @@ class SampledFunctions(ABC):
     """Ability to give the covariance of an output's function at the samples, so that other explanations of the noise
     can be compared with independent noise.
 
-    Fallback of ``sampling``: noise of the sensors is not told from noise of the process.
+    Fallback of ``sampling``: sensor noise is not distinguished from process noise.
     """
 
     @abstractmethod
     def at_samples(self, samples: Samples, column: int) -> AtSamples | None:
-        """Return the output ``column`` at the samples that it learns from; None for an output that never varied."""
+        """Return the process of the output ``column`` at the samples from which it learns; None for an output that
+        never varied."""
 
 
 class OutputOutlook(ABC):
-    """Forecast of one output's standard deviations at m candidates after some further queries, in the output's unit."""
+    """Forecast of one output's standard deviations at m candidates after some assumed queries, in the output's unit."""
 
     learns: Tensor  # (m,) bool: whether a sample at the candidate would improve this output
 
     @property
     @abstractmethod
     def std(self) -> Tensor:
-        """Return the standard deviations at the candidates, (m,)."""
+        """Standard deviations at the candidates, (m,)."""
 
     @abstractmethod
     def reduction(self, weights: Tensor) -> Tensor:
@@ -181,31 +186,40 @@ class OutputOutlook(ABC):
 
     @abstractmethod
     def observe(self, index: int) -> OutputOutlook:
-        """Assume that the candidate ``index`` has been sampled as well."""
+        """Return the forecast as if the candidate ``index`` had been sampled as well."""
 
 
 class PathOutlook(ABC):
     """Forecast of one output along b predicted paths of T steps."""
 
-    learns: Tensor  # (b, T) bool: whether a real step there would improve this output
+    learns: Tensor  # (b, T) bool: whether a real step at that point of a path would improve this output
 
     @property
     @abstractmethod
     def std(self) -> Tensor:
-        """Return the standard deviation at each step, in the output's unit, (b, T)."""
+        """Standard deviation at each step, in the output's unit, (b, T)."""
 
     @abstractmethod
     def information(self, weight: Tensor, tolerance: float) -> Tensor:
-        """Return the information of the steps up to each one, in nats, (b, T).
+        """Return the information that the first steps of each path give about this output, in nats, (b, T).
 
-        The steps have weights (b, T), and the tolerance is in the output's unit. A step is evaluated given those before
-        it, so a repeated state adds little.
+        Entry t counts all steps up to t. A step is evaluated given the earlier ones, so a repeated state adds little.
+
+        Args:
+            weight: (b, T) weight of each step.
+            tolerance: tolerance of the output, in its unit.
         """
 
 
 @dataclass(frozen=True)
 class PredictedSteps:
-    """Steps of predicted paths: coordinates (..., C), actions (..., F), and coordinates after the step (..., C)."""
+    """Steps of predicted paths, such as (b, T) of them.
+
+    Attributes:
+        q: coordinates before each step, (..., C).
+        u: actions, (..., F).
+        q_next: coordinates after each step, (..., C).
+    """
 
     q: Tensor
     u: Tensor
@@ -213,7 +227,7 @@ class PredictedSteps:
 
     @property
     def flat(self) -> PredictedSteps:
-        """Return the same steps with a single leading dimension."""
+        """The same steps with a single leading dimension."""
         return PredictedSteps(*(tensor.flatten(0, -2) for tensor in (self.q, self.u, self.q_next)))
 
 
@@ -227,7 +241,8 @@ class Lookahead(ABC):
 
     @abstractmethod
     def outlook(self, candidates: Points, reference: Points, assumed: Points) -> tuple[OutputOutlook | None, ...]:
-        """Forecast every output (O,) at m candidates and r reference points, once the queries ``assumed`` are answered.
+        """Forecast every output (O,) at m candidates and r reference points, as if the queries ``assumed`` had been
+        answered.
 
         The entry of an output that never varied is None.
         """
@@ -250,8 +265,8 @@ class RewardEdges(ABC):
 
     @abstractmethod
     def reward_edge_doubts(self, q: Tensor, q_next: Tensor) -> Iterator[Tensor]:
-        """Return for each edge the probability (m,) that the model has steps from q (m, C) to q_next (m, C) on the
-        wrong side."""
+        """Yield, for each edge, the probability (m,) that the model puts steps from q (m, C) to q_next (m, C) on the
+        wrong side of the edge."""
 
 
 class RewardPeaks(ABC):
@@ -263,14 +278,15 @@ class RewardPeaks(ABC):
     @property
     @abstractmethod
     def reward_hides(self) -> bool:
-        """Whether this model's reward is nearly zero almost everywhere, and was learned in the way that finds its
+        """Whether this model's reward is nearly zero almost everywhere and was learned in the way that finds its
         peaks."""
 
     @abstractmethod
     def promise(self, q: Tensor, u: Tensor) -> Tensor:
-        """Return how high the reward of steps from q (m, C) under u (m, F) may be, given the uncertainty, (m,).
+        """Return an optimistic score of the reward of steps from q (m, C) under u (m, F), (m,): the higher, the larger
+        the reward may be given the uncertainty.
 
-        The unit is free. The values keep the order of rewards, and distinguish points whose rewards are nearly zero.
+        The scores have no unit. They keep the order of rewards, and distinguish points whose rewards are nearly zero.
         """
 
 
@@ -279,16 +295,16 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ArrayTransition:
-    """Predicted step from m points, as arrays."""
+    """Predicted step from each of m points, as NumPy arrays."""
 
     q_next: Floats  # (m, C)
-    reward: Floats  # (m,) as in ``Transition``
-    std: Floats  # (m, O) of the requested outputs, the reward's last
-    terminated: NDArray[np.bool_]  # (m,)
+    reward: Floats  # (m,) mean, without the penalty and without the terminal reward
+    std: Floats  # (m, O) requested standard deviations, the reward's last
+    terminated: NDArray[np.bool_]  # (m,) whether the step ends the episode
 
 
 class ArraySteps(ABC):
-    """``transition`` and ``terminated`` of one model in one call. Compared and hashed by identity."""
+    """A model's ``transition`` and ``terminated`` in one call on NumPy arrays. Compared and hashed by identity."""
 
     definition: EnvironmentDefinition
 
@@ -306,16 +322,17 @@ class ArraySteps(ABC):
     ) -> ArrayTransition:
         """Predict the step from q (m, C) under u (m, F).
 
-        The arguments are those of ``transition``, and ``paths`` (m, W) as in ``transition_along`` for a family that
-        draws functions.
+        Args:
+            q, u, noise, process, stds, reward_std: as for ``DynamicsModel.transition``.
+            paths: (m, W) sampled functions, as for ``FunctionDraws.transition_along``; None for the mean.
         """
 
 
 class CompiledSteps(ABC):
-    """Ability to step by compiled code on CPU arrays. Results are the same except for the last bits. A few rows take a
-    tenth of the time.
+    """Ability to step by compiled code on CPU arrays. Results agree with ``transition`` except for the last bits. A few
+    rows take a tenth of the time.
 
-    Fallback of ``virtual``: ``transition`` and ``terminated``.
+    Fallback of ``virtual``: call ``transition`` and ``terminated``.
     """
 
     @abstractmethod
@@ -328,25 +345,28 @@ class CompiledSteps(ABC):
 
     @abstractmethod
     def compiled_pays(self, *, stds: bool) -> bool:
-        """Whether compiled steps are faster, with standard deviations in every step or without."""
+        """Return whether compiled steps are faster than ``transition``; ``stds``: with standard deviations in each
+        step."""
 
 
 @dataclass(frozen=True)
 class StepSource:
-    """C99 source of ``transition``, its standard deviations and ``terminated``: the functions that its ``step.h``
-    declares."""
+    """C99 source of a model's mean step, its standard deviations and its termination. The functions are declared in
+    its ``step.h``."""
 
-    files: Mapping[str, str]  # content by name; step.c is what a compiler takes
-    numbers: int  # float64 constants in it
+    files: Mapping[str, str]  # file contents by name; step.c is the file to compile
+    numbers: int  # number of float64 constants in the source
 
 
 class WrittenInC(ABC):
     """Ability to write the mean step as C source, for programs that have no Python.
 
-    Fallback of ``deployment``: the model is refused, with the families that have this ability.
+    Fallback of ``deployment``: the model is refused, and the message names the families that have this ability.
     """
 
     @abstractmethod
     def step_source(self) -> StepSource | None:
-        """Return the source; None if this installation lacks numba, which lays out the tables, or if the model is on
-        another device. Its steps are those of ``transition``, except for the last bits."""
+        """Return the C source of the mean step, which agrees with ``transition`` except for the last bits.
+
+        None if this installation lacks numba, which lays out the tables, or if the model is on another device.
+        """

@@ -1,4 +1,4 @@
-"""Functions sampled from any model: by its family's ``FunctionDraws``, or by the fallback for families without it."""
+"""Functions sampled from any model: by its ``FunctionDraws``, or by a fallback if its family has no such ability."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from surrogym_server.models.port import DynamicsModel, Transition
 def function_draws(model: DynamicsModel, functions: int | None = None) -> FunctionDraws:
     """Return the object that samples functions of a model: the model itself, or a fallback if its family samples none.
 
-    If lanes share a number of ``functions``, hyperparameters are drawn too, so that the few functions cover their
-    uncertainty.
+    Args:
+        model: the model.
+        functions: number of functions that the lanes share, or None if each episode has its own. With a number,
+            hyperparameters are sampled too, so that the few functions cover their uncertainty.
     """
     if functions is not None and (able := offers(model, UncertainHyperparameters)) is not None:
         return able.uncertain_functions
@@ -23,10 +25,10 @@ def function_draws(model: DynamicsModel, functions: int | None = None) -> Functi
 
 @dataclass(frozen=True)
 class ConstantErrors(FunctionDraws):
-    """Functions that have the same distance from the mean everywhere, in standard deviations. The reward's function is
+    """Functions at a constant distance from the mean, in standard deviations of each output; the reward's function is
     its mean.
 
-    A draw is one standard normal number for each transition output.
+    Each function is one standard normal number for each transition output.
     """
 
     model: DynamicsModel

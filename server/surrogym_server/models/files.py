@@ -1,4 +1,4 @@
-"""A model as one file: safetensors with a JSON header that names its family. Nothing is pickled or evaluated."""
+"""A model as one file: safetensors with a JSON header that names its family. Nothing in it is pickled or evaluated."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from surrogym_server.models.registry import learner_of
 
 METADATA = "surrogym"
 FAMILY, CHECKSUM = "family", "checksum"
-AGAIN = "export it again"
-SHOWN = 80  # largest number of characters of a name from a file
+AGAIN = "export the model again"
+SHOWN = 80  # greatest number of characters of a file's content that a message quotes
 MALFORMED = (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError)
 
 
 def to_bytes(model: DynamicsModel) -> bytes:
-    """Write the whole model, serving arrays included."""
+    """Return a whole model as the bytes of a file, so that loading it repeats no long computation."""
     family = model.definition.learning.model
     data = learner_of(family).codec.encode(model)
     return with_checksum({FAMILY: family.name, **data.header}, data.tensors)
 
 
 def with_checksum(header: dict[str, Any], tensors: dict[str, Tensor]) -> bytes:
-    """Write a header that JSON can represent, and named tensors, with the checksum of both."""
+    """Return a header that JSON can represent, and named tensors, as the bytes of a file with a checksum of both."""
     return save(tensors, {METADATA: json.dumps(header | {CHECKSUM: _checksum(header, tensors)})})
 
 
@@ -38,20 +38,24 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
     """Read the model that ``to_bytes`` wrote.
 
     Raises:
-        InvalidInput: not such a file, or a damaged one, or one of another family than the definition's, or of an
-            environment with other outputs.
+            InvalidInput: the bytes are not a model file, or a damaged one, or the model is of another family or of
+                other outputs than the definition's.
     """
     header, tensors = _content(data)
     try:
         return _model(definition, header, tensors)
     except KeyError as error:
-        raise InvalidInput(f"expected a model with the entry {str(error)[:SHOWN]}, got one without: {AGAIN}") from error
+        raise InvalidInput(
+            f"the model file has no entry {str(error)[:SHOWN]}, which every model needs; {AGAIN}"
+        ) from error
     except MALFORMED as error:
-        raise InvalidInput(f"expected a model whose entries fit together, got others: {AGAIN}") from error
+        raise InvalidInput(
+            f"an entry of the model file has a value of a wrong type or size ({type(error).__name__}); {AGAIN}"
+        ) from error
 
 
 def _content(data: bytes) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return header and tensors of a file. Raises ``InvalidInput`` unless they are as they were written."""
+    """Return header and tensors of a file. Raises ``InvalidInput`` unless its checksum is that of its content."""
     length = int.from_bytes(data[:8], "little")
     try:
         header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"][METADATA])
@@ -59,11 +63,11 @@ def _content(data: bytes) -> tuple[dict[str, Any], dict[str, Tensor]]:
         written = header.pop(CHECKSUM)
     except MALFORMED as error:
         raise InvalidInput(
-            f"expected a Surrogym model in safetensors form with a checksum, got {len(data)} bytes of another "
-            f"form: {AGAIN}"
+            f"expected a model file of Surrogym (safetensors with a checksum), got {len(data)} bytes that are none; "
+            f"{AGAIN}"
         ) from error
     if written != _checksum(header, tensors):
-        raise InvalidInput(f"the model is damaged: its checksum differs from the one that it was written with; {AGAIN}")
+        raise InvalidInput(f"the model file is damaged: its content does not match its checksum; {AGAIN}")
     return header, tensors
 
 
@@ -77,7 +81,7 @@ def _model(definition: EnvironmentDefinition, header: dict[str, Any], tensors: d
 
 
 def _checksum(header: dict[str, Any], tensors: dict[str, Tensor]) -> str:
-    """SHA-256 of the content, independent of the order of the arrays in the file."""
+    """Return the SHA-256 of header and tensors, independent of the order of the tensors in the file."""
     total = hashlib.sha256(json.dumps(header).encode())
     for name in sorted(tensors):
         total.update(f"{name} {tensors[name].dtype} {list(tensors[name].shape)}".encode())

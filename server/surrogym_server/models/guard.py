@@ -1,4 +1,4 @@
-"""Guard around a family's code, which anybody may have written: its errors become messages, and its arrays are checked.
+"""Guard around the code of a model family, which may be a plugin: errors become messages, and arrays are checked.
 
 Shapes as in ``models.port``.
 """
@@ -20,28 +20,29 @@ from surrogym_server.models.port import DynamicsModel, Learned, Transition, Warm
 from surrogym_server.models.registry import learner_of
 from surrogym_server.plugins import failed, guarded, in_one_line
 
-POINTS = 16  # number of samples at which a new model is tried
+POINTS = 16  # number of samples at which a new model is checked
 
 
 def failure_of(definition: EnvironmentDefinition, error: BaseException) -> SurrogymError:
-    """Describe an error of a family's code in one sentence that names the family."""
+    """Return the error that reports ``error``, raised by a family's code, in one sentence that names the family."""
     return failed(_family(definition), PluginFailed, error)
 
 
 def plugin_calls(definition: EnvironmentDefinition, *, interrupts: bool = False) -> AbstractContextManager[None]:
-    """Turn every error of the code of a definition's family within the context into ``PluginFailed``; see
-    ``guarded``."""
+    """Context in which every error of the definition's model family becomes ``PluginFailed``; ``interrupts`` is
+    explained in ``guarded``."""
     return guarded(_family(definition), PluginFailed, interrupts=interrupts)
 
 
 def learn(
     definition: EnvironmentDefinition, samples: Samples, warm: Warm | None, prior: DynamicsModel | None = None
 ) -> Learned:
-    """Learn a model of the specified family, and try it at a few of its own samples.
+    """Learn a model of the specified family, and check its predictions at a few of its own samples.
 
     Raises:
-        InvalidInput, NumericalFailure: as ``Learner.learn``.
-        PluginFailed: the family's code raised another error, or returned something that is not a model.
+        InvalidInput: too few samples to learn from.
+        NumericalFailure: the fit fails on these samples.
+        PluginFailed: the family's code raised another error, or its result breaks the rules of ``models.port``.
     """
     with plugin_calls(definition):
         learner = learner_of(definition.learning.model)
@@ -83,12 +84,14 @@ def require_sound(model: DynamicsModel, q: Tensor, u: Tensor) -> None:
     try:
         json.dumps([model.description, list(model.structures)], allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise _wrong(definition, "expected a description that can be written as JSON", in_one_line(error)) from error
+        raise _wrong(
+            definition, "expected a description and structures that JSON can represent", in_one_line(error)
+        ) from error
 
 
 def require_shapes(model: DynamicsModel, predicted: Transition, q: Tensor, *, stds: bool = False) -> None:
-    """Raise ``PluginFailed`` unless a prediction from q (m, C) has the shapes of the port. With ``stds`` these
-    must be present."""
+    """Raise ``PluginFailed`` unless a prediction from q (m, C) has the shapes of the port. With ``stds`` it must
+    include standard deviations."""
     definition, rows = model.definition, len(q)
     if not isinstance(predicted, Transition):
         raise _wrong(definition, "expected transition to return a Transition", type(predicted).__name__)
@@ -111,7 +114,7 @@ def require_stds(model: DynamicsModel, std: Tensor) -> None:
 
 
 def require_numbers(definition: EnvironmentDefinition, what: str, values: Tensor, shape: tuple[int, ...]) -> None:
-    """Raise ``PluginFailed`` unless a tensor has a shape and finite numbers."""
+    """Raise ``PluginFailed`` unless a tensor has this shape and finite numbers; ``what`` names it in the message."""
     _require_shape(definition, what, values, shape)
     if not bool(torch.isfinite(values).all()):
         raise _wrong(definition, f"{what}: expected finite numbers", f"{_worst(values):g}")
@@ -125,7 +128,7 @@ def _require_shape(definition: EnvironmentDefinition, what: str, values: Tensor 
 
 
 def _worst(values: Tensor) -> float:
-    """A value that is not finite, or else the one farthest from 0."""
+    """Return a value that is not finite if there is one, otherwise the value farthest from 0."""
     return float(values.flatten()[torch.where(values.isfinite(), values.abs(), torch.inf).argmax()])
 
 

@@ -2,7 +2,7 @@
 
 A family of models is three classes: a ``DynamicsModel``, the ``Learner`` that fits it to samples, and the
 ``ModelCodec`` that turns it into named arrays and back. Their docstrings are the laws that every family keeps;
-``surrogym_server.testing`` checks them. Abilities of some families only are classes of their own in
+``surrogym_server.testing`` checks them. Abilities that only some families have are separate classes in
 ``models.abilities``.
 
 Shapes: m points, n samples, C coordinates, F action entries, M transition outputs, O = M + 1 outputs in the order of
@@ -28,17 +28,17 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.tensors import to_device
 
 Warm = Mapping[str, NDArray[np.float64]]  # named arrays that one fit leaves for a warm start of the next
-MOST_SAMPLES = 2**31 - 1  # of a model, as databases store them
+MOST_SAMPLES = 2**31 - 1  # greatest number of samples of a model, the limit of a database's integer column
 
 
 @dataclass(frozen=True)
 class Transition:
-    """Predicted step from m points."""
+    """Predicted step from each of m points."""
 
     q_next: Tensor  # (m, C)
     reward: Tensor  # (m,) mean, without the penalty and without the terminal reward; see ``paid``
-    std: Tensor | None  # (m, M) of each transition output, if requested
-    reward_std: Tensor | None  # (m,) if requested
+    std: Tensor | None  # (m, M) standard deviation of each transition output, if requested
+    reward_std: Tensor | None  # (m,) standard deviation of the reward, if requested
 
 
 class DynamicsModel(ABC):
@@ -59,7 +59,7 @@ class DynamicsModel(ABC):
     definition: EnvironmentDefinition
     terminal_reward: float  # added to the reward of ``transition`` in a step that ends the episode
     samples: int  # number of samples of the fit
-    digest: str  # ``Samples.digest`` of them
+    digest: str  # ``Samples.digest`` of the samples of the fit
 
     @abstractmethod
     def transition(
@@ -98,11 +98,12 @@ class DynamicsModel(ABC):
         learned."""
 
     def termination_probability(self, q: Tensor) -> Tensor:
-        """Probability (m,) that an episode ends on arriving at q (m, C): 0 or 1 if termination is declared."""
+        """Return the probability (m,) that an episode ends on arriving at q (m, C): 0 or 1 if termination is
+        declared."""
         return self.learned_termination(q) if self.definition.learns_termination else self.terminated(q).to(q.dtype)
 
     def terminated(self, q: Tensor) -> Tensor:
-        """Whether an episode ends on arriving at q (m, C), (m,) bool."""
+        """Return whether an episode ends on arriving at q (m, C), (m,) bool."""
         if self.definition.learns_termination:
             return self.learned_termination(q) > 0.5
         return self.definition.terminated(q)
@@ -110,8 +111,8 @@ class DynamicsModel(ABC):
     @property
     @abstractmethod
     def scales(self) -> Tensor:
-        """Standard deviation of each output over the samples, (O,), in its own unit; 1 for an output that
-        never varied."""
+        """Standard deviation of each output over the samples, (O,), in its own unit; 1 for an output that never
+        varied."""
 
     @property
     @abstractmethod
@@ -124,7 +125,7 @@ class DynamicsModel(ABC):
         """Describe the model in detail as JSON: ``outputs`` with one entry each, and further fields of the family."""
 
     def on(self, device: torch.device) -> DynamicsModel:
-        """Return the same model with its arrays on a device."""
+        """Return the same model with its arrays on ``device``."""
         return self if device == self.definition.device else to_device(self, device)
 
 
@@ -145,7 +146,7 @@ class StoredModel:
 
 
 def require_format(got: object, expected: int) -> None:
-    """Raise ``InvalidInput`` if a model is stored in another format than the one that this version writes."""
+    """Raise ``InvalidInput`` unless a stored model has the format number that this version writes."""
     if got != expected:
         raise InvalidInput(
             f"expected a model of format {expected}, got format {str(got)[:80]}, which another version wrote: "
@@ -154,7 +155,8 @@ def require_format(got: object, expected: int) -> None:
 
 
 def require_sums(terminal_reward: float, samples: int) -> None:
-    """Raise ``InvalidInput`` if no fit gives this reward of terminal states and this number of samples."""
+    """Raise ``InvalidInput`` unless the terminal reward is finite and the number of samples is one that a fit can
+    have."""
     if not math.isfinite(terminal_reward) or not 1 <= samples <= MOST_SAMPLES:
         got = f"{terminal_reward} and {samples if abs(samples) <= MOST_SAMPLES else 'more'}"
         raise InvalidInput(f"expected a finite terminal_reward and 1 to {MOST_SAMPLES} in samples, got {got}")
@@ -173,7 +175,7 @@ class ModelCodec(ABC):
 
     @abstractmethod
     def encode(self, model: DynamicsModel) -> StoredModel:
-        """Return all of a model except its definition.
+        """Return everything of a model except its definition.
 
         Raises:
             TypeError: the model belongs to another family.
@@ -193,8 +195,8 @@ class ModelCodec(ABC):
 class Learner(ABC):
     """Learning algorithm of a family of models.
 
-    Its settings are the fields of a frozen dataclass: numbers, booleans and strings, as in the specification. An
-    invalid setting raises a ValueError that says what is allowed.
+    The settings are the fields of a frozen dataclass: numbers, booleans and strings, as in the specification. An
+    invalid setting raises a ValueError that states the allowed values.
 
     Laws:
 

@@ -1,4 +1,4 @@
-"""Families of models by name: those of this package, and those of installed packages."""
+"""Registry of model families: those of this package, and those of installed packages."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from surrogym_server.models.port import Learner
 from surrogym_server.plugins import Choice, Registry
 
 GAUSSIAN_PROCESS = "gaussian_process"
-SHORT: dict[str, Choice] = {
-    "sparse_gaussian_process": Choice(GAUSSIAN_PROCESS, (("inducing", 300),))
-}  # see ``in_full``
+# Names that stand for a family with some settings; see ``in_full``.
+SHORT: dict[str, Choice] = {"sparse_gaussian_process": Choice(GAUSSIAN_PROCESS, (("inducing", 300),))}
 BUILT_IN: dict[str, type[Learner] | str] = {
     GAUSSIAN_PROCESS: GaussianProcesses,
     "ensemble": NetworkEnsembles,
@@ -20,12 +19,15 @@ MODELS: Registry[Learner] = Registry("model", "surrogym.models", Learner, BUILT_
 
 
 def learner_of(choice: Choice) -> Learner:
-    """Return the learner with a family's name and settings. Raises ``InvalidSpec``."""
+    """Return the learner of a chosen family and its settings. Raises ``InvalidSpec`` for an unknown name or setting."""
     return MODELS.make(choice)
 
 
 def in_full(choice: Choice) -> Choice:
-    """Return a choice by a name that stands for a family with some settings, as this family; any other as it is."""
+    """Replace a short name, which stands for a family with some settings, by that family and these settings.
+
+    A choice by any other name is returned unchanged. Settings of the choice override those of the short name.
+    """
     if (short := SHORT.get(choice.name.casefold())) is None:
         return choice
     return Choice(short.name, tuple({**dict(short.settings), **dict(choice.settings)}.items()))

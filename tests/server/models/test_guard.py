@@ -39,8 +39,8 @@ def job(**changes: object) -> DesignJob:
         ("learn.cancel", ": CancelledError"),
         ("learn.nothing", ": expected learn to return a Learned with a DynamicsModel, got NoneType"),
         ("warm", ": expected the warm start 'theta' to be an array of numbers, got str"),
-        ("tensor", ": expected a description that can be written as JSON, got TypeError: "),
-        ("infinite", ": expected a description that can be written as JSON, got ValueError: "),
+        ("tensor", ": expected a description and structures that JSON can represent, got TypeError: "),
+        ("infinite", ": expected a description and structures that JSON can represent, got ValueError: "),
     ],
 )
 def test_an_invalid_plugin_model_fails_the_fit_with_one_sentence(monkeypatch: pytest.MonkeyPatch, mode: str, said: str):

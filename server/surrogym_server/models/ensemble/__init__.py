@@ -1,4 +1,4 @@
-"""The family of network ensembles, whose uncertainty is the disagreement of networks trained on the same samples."""
+"""Model family of network ensembles: the disagreement of networks trained on the same samples is the uncertainty."""
 
 from surrogym_server.models.ensemble.family import NetworkEnsembles
 

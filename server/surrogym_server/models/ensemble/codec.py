@@ -24,12 +24,13 @@ Arrays = Mapping[str, Tensor]
 
 @dataclass(frozen=True)
 class Header:
-    """Header of a file.
+    """Header of a stored ensemble.
 
     Attributes:
-        terminal_reward: added on a step that ends an episode.
-        samples, digest: of what the model has learned from.
-        label: the only label of an ending, if there is one; not checked.
+        terminal_reward: reward that is added on a step that ends an episode.
+        samples: number of samples of the fit.
+        digest: ``Samples.digest`` of these samples.
+        label: the label of termination if all samples have the same one, 0 or 1; otherwise None. Not checked here.
     """
 
     terminal_reward: float
@@ -67,7 +68,7 @@ class NetworkEnsembleCodec(ModelCodec):
 
 
 def _checked(definition: EnvironmentDefinition, arrays: Arrays, header: Header) -> NetworkEnsembleModel:
-    """Build the model of these arrays, after a check of every shape against the environment."""
+    """Build the model from stored arrays and header, after a check of every shape against the environment."""
     inputs = Inputs(definition)
     q = torch.zeros(1, len(definition.coordinates), dtype=torch.float64)
     u = torch.zeros(1, definition.action.size, dtype=torch.float64)
@@ -137,7 +138,7 @@ def _networks(name: str, arrays: Arrays, d: int, p: int, *, quadratic: bool) -> 
 
 
 def _checked_header(definition: EnvironmentDefinition, stored: StoredModel) -> Header:
-    """The header of a model, after a check of all numbers.
+    """Return the header of a stored model, after a check of all its numbers and those of its arrays.
 
     Raises:
         InvalidInput: another format or other outputs, or numbers that no fit gives.
@@ -145,7 +146,10 @@ def _checked_header(definition: EnvironmentDefinition, stored: StoredModel) -> H
     header, outputs = stored.header, tuple(stored.header["outputs"])
     require_format(header["format"], FORMAT)
     if outputs != definition.outputs:
-        raise InvalidInput(f"expected a model with the outputs {definition.outputs}, got one with {outputs}")
+        raise InvalidInput(
+            f"expected a model with the outputs {definition.outputs}, got one with {outputs}; "
+            "load it with the specification that it was learned for"
+        )
     terminal_reward, samples = float(header["terminal_reward"]), int(header["samples"])
     require_sums(terminal_reward, samples)
     for name, array in stored.tensors.items():
@@ -156,17 +160,17 @@ def _checked_header(definition: EnvironmentDefinition, stored: StoredModel) -> H
 
 
 def _require_shapes(name: str, arrays: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Raise ``InvalidInput`` if an array of a part of a model has another shape."""
+    """Raise ``InvalidInput`` unless each array in ``shapes`` has its shape; ``name`` is the part of the model."""
     for part, shape in shapes.items():
         if (got := tuple(arrays[part].shape)) != shape:
             raise InvalidInput(f"{name}: expected {part} of shape {shape}, got {got}")
 
 
 def _only_label(label: object) -> float:
-    """The label of an ending whose samples have no other one. Raises ``InvalidInput`` if it is neither 0 nor 1."""
+    """Return the stored label of termination, which all samples share. Raises ``InvalidInput`` unless it is 0 or 1."""
     if label not in (0.0, 1.0):
         raise InvalidInput(
-            "expected ending as 0 or 1, because all samples agree whether a step ends the episode, got "
-            f"{str(label)[:80]}"
+            "ending: expected 0 or 1, the label that all samples share, because no network of termination is stored, "
+            f"got {str(label)[:80]}"
         )
     return float(bool(label))

@@ -18,16 +18,17 @@ LEAST = {"members": 2, "units": 1, "steps": 1, "seed": 0}
 
 @dataclass(frozen=True)
 class NetworkEnsembles(Learner):
-    """Networks of two hidden layers, each anchored to its own initial weights, with noise that depends on the state.
+    """Learner of networks of two hidden layers, each anchored to its own initial weights, with noise that depends on
+    the state.
 
-    There is no warm start, because continued networks would remember the first samples better than later ones.
+    There is no warm start: networks whose training continues would fit the first samples better than later ones.
 
     Attributes:
         members: number of networks.
-        units: of each hidden layer.
-        steps: of gradient descent.
-        seed: of initial weights and of batches.
-        beta: from 0, where noise explains what is hard to learn, to 1, where the mean learns all samples alike.
+        units: number of units of each hidden layer.
+        steps: number of steps of gradient descent.
+        seed: seed of initial weights and of batches.
+        beta: from 0, where noise explains what is hard to learn, to 1, where the mean fits all samples alike.
     """
 
     members: int = 5

@@ -1,5 +1,4 @@
-"""Inputs of the networks of one environment: features with mean near 0 and standard deviation near 1, without a choice
-by evidence."""
+"""Inputs of the networks of one environment: fixed features with mean near 0 and standard deviation near 1."""
 
 from __future__ import annotations
 
@@ -20,11 +19,12 @@ class Inputs:
     definition: EnvironmentDefinition
 
     def of_transition(self, q: Tensor, u: Tensor) -> Tensor:
-        """Inputs of the transition at q (m, C) and u (m, F): (m, d)."""
+        """Return the inputs (m, d) of the transition networks at coordinates q (m, C) and actions u (m, F)."""
         return self._of_transition(q, u)
 
     def of_reward(self, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
-        """Inputs of the reward, before or after the step as the reward's timing says, (m, d)."""
+        """Return the inputs (m, d) of the reward networks: of the state before the step, after it, or both, by
+        ``reward_timing``."""
         match self.definition.reward_timing:
             case "before":
                 return self._of_state(q, u)
@@ -34,7 +34,7 @@ class Inputs:
                 return torch.cat([self._of_state(q, u), self._of_state(q_next, u)], -1)
 
     def of_end(self, q: Tensor) -> Tensor:
-        """Inputs of the learned termination at the next state q (m, C): (m, d)."""
+        """Return the inputs (m, d) of the termination networks at the next coordinates q (m, C)."""
         return self._of_state(q, q.new_zeros(len(q), self.definition.action.size))
 
     @cached
@@ -43,7 +43,7 @@ class Inputs:
 
     @cached
     def _of_state(self) -> Encoder:
-        """Coordinates, and the observation if it combines coordinates."""
+        """Encoder of the coordinates, and of the observation if it combines coordinates."""
         combined = self.definition.observation_combines or self.definition.moves_observation
         more: tuple[State, ...] = ("observation",) if combined else ()
         return self._encoder("both", *more)

@@ -15,15 +15,17 @@ from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Noise, R
 from surrogym_server.models.ensemble.networks import Networks
 from surrogym_server.models.ensemble.training import Training, cross_entropy, squared_error, train, train_with_noise
 
-MIN_POINTS = 2
+MIN_POINTS = 2  # least number of samples to learn from
 CONSTANT = 1e-9  # an output whose standard deviation is below this share of its own size never varied
-REWARD_SEED, END_SEED = 1, 2  # added to the seed, so that reward and end have other networks than the transition
+REWARD_SEED, END_SEED = 1, 2  # added to the seed, so that reward and termination networks start with other weights
 
 
 def learn(training: Training, definition: EnvironmentDefinition, samples: Samples) -> NetworkEnsembleModel:
-    """Learn as ``Learner.learn`` says. Raises ``InvalidInput`` for fewer than two samples."""
+    """Learn a model from samples. Raises ``InvalidInput`` for fewer than two samples."""
     if len(samples) < MIN_POINTS:
-        raise InvalidInput(f"a model needs at least {MIN_POINTS} samples, got {len(samples)}")
+        raise InvalidInput(
+            f"a model needs at least {MIN_POINTS} samples, got {len(samples)}; add samples before you learn"
+        )
     inputs = Inputs(definition)
     usable = enough(~saturated(definition, samples.q_next))
     x, change = inputs.of_transition(samples.q, samples.u), increments(definition, samples)
@@ -36,7 +38,8 @@ def learn(training: Training, definition: EnvironmentDefinition, samples: Sample
 
 
 def _reward(training: Training, inputs: Inputs, samples: Samples) -> tuple[Regression | None, float]:
-    """The reward of non-terminating steps, and the mean of what terminating steps pay in addition."""
+    """Fit the reward of non-terminating steps. Return the networks, or None if the reward is declared, and the mean
+    reward that terminating steps pay in addition."""
     if (declared := inputs.definition.declared_reward) is not None:
         return None, declared.terminal
     goes_on = enough(~samples.terminated)
@@ -49,14 +52,14 @@ def _reward(training: Training, inputs: Inputs, samples: Samples) -> tuple[Regre
 
 
 def _ending(training: Training, x: Tensor, ended: Tensor) -> Networks | float:
-    """Networks that predict which states end an episode. If there is only one label, that label."""
+    """Fit networks that predict which states end an episode; if all samples have the same label, return this label."""
     if bool(ended.all()) or not bool(ended.any()):
         return float(ended[0])
     return train(training, x, ended.double()[:, None], cross_entropy)
 
 
 def _with_noise(training: Training, x: Tensor, y: Tensor) -> Regression:
-    """Networks of inputs x (n, d) and targets y (n, p), and of their noise."""
+    """Fit networks, and networks of their noise, to inputs x (n, d) and targets y (n, p)."""
     target, centre, scale = standardised(y)
     networks, noisy = train_with_noise(training, x, target)
     noise = Noise(noisy, torch.zeros_like(scale))
@@ -65,21 +68,21 @@ def _with_noise(training: Training, x: Tensor, y: Tensor) -> Regression:
 
 
 def _noiseless(training: Training, x: Tensor, y: Tensor) -> Regression:
-    """Networks of inputs x (n, d), squares included, and targets y (n, p)."""
+    """Fit networks without noise to inputs x (n, d), squares included, and targets y (n, p)."""
     target, centre, scale = standardised(y)
     return Regression(train(training, x, target, squared_error, quadratic=True), centre, scale)
 
 
 def standardised(y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Targets (n, p) in standard deviations, their mean (p,) and their standard deviation (p,), 0 for one that never
-    varied."""
+    """Standardise targets y (n, p). Return them with their means (p,) and standard deviations (p,), 0 for a target that
+    never varied."""
     centre, scale = y.mean(0), y.std(0, correction=0)
     scale = torch.where(scale > CONSTANT * centre.abs(), scale, 0.0)
     return (y - centre) / torch.where(scale > 0, scale, 1.0), centre, scale
 
 
 def enough(chosen: Tensor) -> Tensor:
-    """The chosen samples (n,), or all of them if the chosen ones are too few to learn from."""
+    """Return the mask ``chosen`` (n,), or one of all samples if it selects too few to learn from."""
     return chosen if int(chosen.sum()) >= MIN_POINTS else torch.ones_like(chosen)
 
 

@@ -18,19 +18,20 @@ from surrogym_server.tensors import cached
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of single steps that depends on the inputs, in standard deviations of the outputs."""
+    """Learned noise of single steps, which depends on the inputs; unit: standard deviations of the outputs."""
 
-    networks: Networks  # of its log variance
-    size: Tensor  # (p,) standard deviation over the samples: root mean square
+    networks: Networks  # predict the log variance of the noise
+    size: Tensor  # (p,) root mean square of the noise over the samples
 
     def std(self, x: Tensor) -> Tensor:
-        """Standard deviation at x (m, d), that of the members' mean variance, (m, p)."""
+        """Return the standard deviation (m, p) of the noise at x (m, d), from the mean of the members' variances."""
         return bounded(self.networks(x)).exp().mean(0).sqrt()
 
 
 @dataclass(frozen=True)
 class Regression:
-    """Networks of some outputs in their own units: centre + scale * f(x). An output that never varied has scale 0."""
+    """Networks f of some outputs in the outputs' units: centre + scale * f(x). An output that never varied has scale
+    0."""
 
     networks: Networks
     centre: Tensor  # (p,)
@@ -38,33 +39,34 @@ class Regression:
     noise: Noise | None = None  # None for a reward, whose noise is not learned
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Values of every member at x (m, d), (K, m, p)."""
+        """Return the values of every member at x (m, d), (K, m, p)."""
         return self.centre + self.scale * self.networks(x)
 
     def shaken(self, x: Tensor, process: Tensor) -> Tensor:
-        """Noise at x (m, d), of standard normal numbers (m, p), (m, p)."""
+        """Return the noise at x (m, d), in the outputs' units, for standard normal numbers ``process`` (m, p):
+        (m, p)."""
         assert self.noise is not None
         return self.scale * self.noise.std(x) * process
 
 
 @dataclass(frozen=True)
 class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
-    """K members. The mean is the members' mean, and the standard deviation that between members. The noise of a
-    transition depends on the state; the reward has none."""
+    """Model of K networks (members). The mean and the standard deviation are those of the members' predictions. The
+    noise of a transition depends on the state; the reward has none."""
 
     rows = 8_192
 
     definition: EnvironmentDefinition
     transitions: Regression  # M outputs
-    reward: Regression | None  # None where it is declared
-    ending: Networks | float | None  # logits of an end; the only label if there is one; None if ends are declared
+    reward: Regression | None  # None if the reward is declared
+    ending: Networks | float | None  # logits of termination, or its only label; None if termination is declared
     terminal_reward: float
     samples: int
     digest: str
 
     @property
     def noise_stds(self) -> tuple[float, ...]:
-        """Root mean squares over the samples; 0 for the reward."""
+        """Standard deviation of each output's noise, as a root mean square over the samples; 0 for the reward."""
         assert self.transitions.noise is not None
         return (*(self.transitions.scale * self.transitions.noise.size).tolist(), 0.0)
 
@@ -73,7 +75,7 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         return 1
 
     def draw(self, noise: Tensor) -> Tensor:
-        """Sample functions. A function is a member, chosen with equal probability, and is given by its number."""
+        """Sample functions. Each is one of the members, chosen with equal probability, and is stored as its index."""
         return drawn_member(noise, self.transitions.networks.members)
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
@@ -83,7 +85,7 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         return torch.cat([change, reward[:, None]], -1)
 
     def learned_termination(self, q: Tensor) -> Tensor:
-        """The members' mean probability. If all samples have the same label, that label."""
+        """Return the members' mean probability of termination; if all samples have the same label, that label."""
         if isinstance(self.ending, Networks):
             return self.ending(self._inputs.of_end(q))[..., 0].sigmoid().mean(0)
         return q.new_full((len(q),), self.ending or 0.0)
@@ -135,7 +137,7 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         return q_next, _of_member(rewards, member), spread, doubt
 
     def _rewards(self, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
-        """Rewards of every member, (K, m)."""
+        """Return the reward that every member predicts, (K, m)."""
         if (declared := self.definition.declared_reward) is not None:
             return declared(q_next if declared.after else q, u).expand(self.transitions.networks.members, -1)
         assert self.reward is not None
@@ -143,7 +145,8 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
 
 
 def _of_member(values: Tensor, member: Tensor | None) -> Tensor:
-    """The mean of members' values (K, m, ...), or the value of one member (m,) in each row."""
+    """Return the mean of members' values (K, m, ...), or in each row the value of the member that ``member`` (m,)
+    selects."""
     if member is None:
         return values.mean(0)
     return values[member, torch.arange(len(member), device=member.device)]

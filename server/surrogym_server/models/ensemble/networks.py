@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-LEAST_NOISE, MOST_NOISE = 0.003, 10.0  # bounds of a standard deviation of noise, in standard deviations of an output
+LEAST_NOISE, MOST_NOISE = 0.003, 10.0  # bounds of the noise, as shares of an output's standard deviation
 
 
 @dataclass(frozen=True)
 class Networks:
-    """Weights of K members."""
+    """Weights of K networks, the members."""
 
     skip: Tensor  # S (K, s, p)
     first: Tensor  # W_1 (K, d, h)
@@ -33,28 +33,28 @@ class Networks:
 
     @property
     def hidden(self) -> tuple[Tensor, ...]:
-        """Weights trained by gradients: all except the skip."""
+        """Weights that gradient descent trains in the hidden layers: all except ``skip``."""
         return (self.first, self.first_bias, self.second, self.second_bias, self.last)
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Values of every member at x (m, d), (K, m, p)."""
+        """Return the values of every member at x (m, d), (K, m, p)."""
         quadratic = self.skip.shape[1] > x.shape[-1] + 1
         return basis(x, quadratic) @ self.skip + nonlinear(x, self.hidden)
 
 
 def bounded(log_variance: Tensor) -> Tensor:
-    """Log variances of noise, softly kept within ``LEAST_NOISE`` and ``MOST_NOISE``."""
+    """Return log variances of noise, softly limited to the range from ``LEAST_NOISE`` to ``MOST_NOISE``."""
     low, high = 2 * math.log(LEAST_NOISE), 2 * math.log(MOST_NOISE)
     return low + softplus(high - softplus(high - log_variance) - low)
 
 
 def basis(x: Tensor, quadratic: bool) -> Tensor:
-    """b(x) of x (m, d), (m, s)."""
+    """Return [1, x], with ``quadratic`` [1, x, x^2], for inputs x (m, d): shape (m, s)."""
     return torch.cat([torch.ones_like(x[:, :1]), x, *([x.square()] if quadratic else [])], -1)
 
 
 def nonlinear(x: Tensor, hidden: tuple[Tensor, ...]) -> Tensor:
-    """The part of the hidden layers at x (m, d), (K, m, p)."""
+    """Return the output of the hidden layers at x (m, d), (K, m, p)."""
     first, first_bias, second, second_bias, last = hidden
     z = torch.tanh(torch.baddbmm(first_bias, x.expand(len(first), -1, -1), first))
     z = torch.tanh(torch.baddbmm(second_bias, z, second))

@@ -1,4 +1,4 @@
-"""Steps of models whose sampled functions are members of networks: in blocks, from changes to next states."""
+"""Steps of models whose sampled functions are members of an ensemble, computed in blocks of rows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from surrogym_server.tensors import in_blocks
 
 
 class SteppedInBlocks(DynamicsModel, FunctionDraws):
-    """A model that predicts at most ``rows`` steps at once."""
+    """Model that predicts at most ``rows`` steps at once, to bound memory."""
 
     rows: ClassVar[int]
 
@@ -57,11 +57,19 @@ class SteppedInBlocks(DynamicsModel, FunctionDraws):
         process: Tensor | None,
         paths: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Next states (m, C), rewards (m,), and the requested standard deviations, (m, M) and (m,), else (m, 0) and
-        (m,).
+        """Predict one block of m steps.
 
-        Each row follows the mean, moved by ``noise`` (m, M) standard deviations, or its own function of ``paths``
-        (m, W). ``process`` (m, M) adds the learned noise.
+        Args:
+            stds, reward_std: whether standard deviations of transition outputs and of the reward are needed.
+            q: coordinates (m, C).
+            u: actions (m, F).
+            noise: standard deviations by which each output is moved from the mean, (m, M), or None.
+            process: standard normal numbers of the learned noise, (m, M), or None.
+            paths: sampled function of each row, (m, W), or None for the mean.
+
+        Returns:
+            Next coordinates (m, C), rewards (m,), and the standard deviations (m, M) and (m,); (m, 0) and (m,) if they
+            are not needed.
         """
 
     def _in_blocks(
@@ -91,11 +99,12 @@ class SteppedInBlocks(DynamicsModel, FunctionDraws):
 
 
 def drawn_member(noise: Tensor, members: int) -> Tensor:
-    """Numbers of members, all as likely, of standard normal numbers. They are stored as floats."""
+    """Return indices of members, all equally likely, as floats, from standard normal numbers ``noise``."""
     numbers: Tensor = (members * torch.special.ndtr(noise)).floor().clamp_max(members - 1)
     return numbers
 
 
 def between(values: Tensor, correction: int = 1) -> Tensor:
-    """Variance between members (K, ...): none of no points, of which torch's would warn."""
+    """Return the variance between members' values (K, ...). An empty array is returned as it is, without the warning of
+    torch."""
     return values.var(0, correction=correction) if values.numel() else values[0]

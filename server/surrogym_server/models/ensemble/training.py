@@ -1,4 +1,4 @@
-"""Training of anchored networks: each member is pulled to the random weights with which it began.
+"""Training of anchored networks: each member is pulled towards the random weights with which it started.
 
 Of member k the weights minimise, over n samples (x_i, y_i) of standardised inputs and outputs,
 
@@ -34,12 +34,13 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from surrogym_server.models.ensemble.networks import Networks, basis, bounded, nonlinear
 from surrogym_server.tensors import in_rows
 
-NOISE = 0.01  # sigma, in standard deviations of an output
-RIDGE = 1e-3  # of the skip, in samples
+NOISE = 0.01  # sigma, as a share of an output's standard deviation
+RIDGE = 1e-3  # ridge penalty of the linear part
 RATE = 0.01  # initial learning rate; it decays to 0 by a cosine
 LARGEST_BATCH = 512
-NOISE_BEGINS = math.exp(-1.5)  # std of the noise before training, in stds of an output; 0.05 fails at contacts
-Loss = Callable[[Tensor, Tensor], Tensor]  # of predictions (K, m, p) and targets (m, p)
+# Noise before training, as a share of an output's standard deviation. With 0.05 training fails near contacts.
+NOISE_BEGINS = math.exp(-1.5)
+Loss = Callable[[Tensor, Tensor], Tensor]  # arguments: predictions (K, m, p) and targets (m, p)
 
 
 @dataclass(frozen=True)
@@ -52,19 +53,19 @@ class Training:
 
 
 def squared_error(predicted: Tensor, target: Tensor) -> Tensor:
-    """Summed over members and outputs, averaged over samples."""
+    """Return the squared error, summed over members and outputs and averaged over samples."""
     return (predicted - target).square().mean(1).sum()
 
 
 def cross_entropy(predicted: Tensor, target: Tensor) -> Tensor:
-    """Cross entropy of logits and labels 0 or 1, summed over members and averaged over samples."""
+    """Return the cross entropy of logits and labels 0 or 1, summed over members and averaged over samples."""
     each = binary_cross_entropy_with_logits(predicted, target.expand_as(predicted), reduction="none")
     total: Tensor = each.mean(1).sum()
     return total
 
 
 def train(training: Training, x: Tensor, y: Tensor, loss: Loss, *, quadratic: bool = False) -> Networks:
-    """Fit networks to inputs x (n, d) and targets y (n, p)."""
+    """Fit networks to inputs x (n, d) and targets y (n, p); ``quadratic`` adds squares to the linear part."""
     generator = torch.Generator().manual_seed(training.seed)
     anchors, variances = _priors(training, x.shape[1], y.shape[1], generator)
     linear = basis(x, quadratic)
@@ -82,7 +83,8 @@ def train(training: Training, x: Tensor, y: Tensor, loss: Loss, *, quadratic: bo
 
 
 def train_with_noise(training: Training, x: Tensor, y: Tensor) -> tuple[Networks, Networks]:
-    """Fit networks to inputs x (n, d) and targets y (n, p), and others to the log variance of their noise."""
+    """Fit networks to inputs x (n, d) and targets y (n, p), and further networks to the log variance of the noise.
+    Return both."""
     generator = torch.Generator().manual_seed(training.seed)
     anchors, variances = _priors(training, x.shape[1], y.shape[1], generator)
     drawn, _ = _priors(training, x.shape[1], y.shape[1], generator)
@@ -100,22 +102,23 @@ def train_with_noise(training: Training, x: Tensor, y: Tensor) -> tuple[Networks
         return _unlikely(mean, log_variance, y[rows], training.beta) + NOISE**2 / len(x) * torch.stack(pull).sum()
 
     _descend((skip, *hidden, log_noise, *noisy), objective, training.steps)
-    constant = torch.cat(
-        [log_noise, log_noise.new_zeros(len(log_noise), x.shape[1], y.shape[1])], 1
-    )  # it reads x by units alone
+    # The linear part of the noise networks is a constant: weight 0 for every input.
+    constant = torch.cat([log_noise, log_noise.new_zeros(len(log_noise), x.shape[1], y.shape[1])], 1)
     return Networks(*map(in_rows, (skip, *hidden))), Networks(*map(in_rows, (constant, *noisy)))
 
 
 def _unlikely(mean: Tensor, log_variance: Tensor, target: Tensor, beta: float) -> Tensor:
-    """Negative log likelihood of targets (m, p), less a constant: summed over members and outputs, averaged over
-    samples, each weighted by its predicted variance to the power of ``beta``. Mean and log variance are those of every
-    member, (K, m, p)."""
+    """Return the negative log likelihood of targets (m, p), less a constant.
+
+    It is summed over members and outputs, and averaged over samples. Each sample's term is weighted by the predicted
+    variance to the power of ``beta``. ``mean`` and ``log_variance`` are those of every member, (K, m, p).
+    """
     each = 0.5 * (log_variance + (target - mean).square() * (-log_variance).exp())
     return (each * (beta * log_variance.detach()).exp()).mean(1).sum()
 
 
 def _descend(weights: Sequence[Tensor], objective: Callable[[], Tensor], steps: int) -> None:
-    """Change weights in place by Adam."""
+    """Minimise the objective by Adam, which changes the weights in place."""
     adam = torch.optim.Adam(weights, lr=RATE)
     rate = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
     for _ in range(steps):
@@ -126,14 +129,14 @@ def _descend(weights: Sequence[Tensor], objective: Callable[[], Tensor], steps: 
 
 
 def _batch(count: int, generator: torch.Generator) -> Tensor | slice:
-    """Rows for one step: all of them, or a random choice if there are many."""
+    """Return the rows of one step of gradient descent: all ``count``, or a random choice if there are many."""
     return slice(None) if count <= LARGEST_BATCH else torch.randint(count, (LARGEST_BATCH,), generator=generator)
 
 
 def _priors(
     training: Training, d: int, p: int, generator: torch.Generator
 ) -> tuple[tuple[Tensor, ...], tuple[float, ...]]:
-    """Random initial weights of the hidden layers, and the variances of their distribution."""
+    """Return random initial weights of the hidden layers for d inputs and p outputs, and their prior variances."""
     h, k = training.units, training.members
     shapes = ((k, d, h), (k, 1, h), (k, h, h), (k, 1, h), (k, h, p))
     variances = (1 / d, 1.0, 1 / h, 1.0, 1 / h)
@@ -142,7 +145,7 @@ def _priors(
 
 
 def _ridge(b: Tensor, target: Tensor) -> Tensor:
-    """Ridge regression: weights (K, s, p) of inputs b (n, s) for targets (K, n, p), which initialise the skip."""
+    """Return initial weights (K, s, p) of the linear part by ridge regression of targets (K, n, p) on b (n, s)."""
     gram = b.T @ b + RIDGE * torch.eye(b.shape[1], dtype=b.dtype)
     weights: Tensor = torch.linalg.solve(gram, b.T @ target)
     return weights

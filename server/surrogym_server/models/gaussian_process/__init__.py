@@ -1,4 +1,4 @@
-"""The family of exact Gaussian processes: structure chosen by evidence, every posterior in closed form."""
+"""Model family of Gaussian processes: structure chosen by evidence, every posterior in closed form."""
 
 from surrogym_server.models.gaussian_process.family import GaussianProcesses
 

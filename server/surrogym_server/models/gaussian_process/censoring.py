@@ -1,4 +1,4 @@
-"""Samples that ended at a bound. Their increments are cut, so they say little about the dynamics."""
+"""Samples that ended at a bound. Their increments are cut off there, so they say little about the dynamics."""
 
 from __future__ import annotations
 
@@ -15,9 +15,12 @@ from surrogym_server.environment.samples import saturated
 def usable(
     definition: EnvironmentDefinition, column: int, q_next: Tensor, feature_map: FeatureMap, *, past_limits: bool
 ) -> Tensor:
-    """Which samples that end at q_next (m, C) the transition output ``column`` learns from with a map, (m,) bool.
+    """Return which samples that end at q_next (m, C) a transition output learns from, (m,) bool.
 
-    ``past_limits`` means that it also learns from those that end at a limit of another coordinate.
+    Args:
+        column: the output.
+        feature_map: features that the output's process reads.
+        past_limits: whether the output also learns from samples that end at a limit of another coordinate.
     """
     if definition.moves_observation:
         return torch.ones(len(q_next), dtype=torch.bool)
@@ -29,8 +32,10 @@ def usable(
 
 
 def stopped(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Tensor:
-    """Samples (n,) that ended at a bound after which coordinate ``index`` is unknown: its own bound, or a wall. The
-    limit of another coordinate, such as a relief valve's, does not make a sample useless."""
+    """Return which samples (n,) ended at a bound after which coordinate ``index`` is unknown: its own, or a wall.
+
+    A limit of another coordinate, such as a relief valve's, does not make a sample useless.
+    """
     limits = [i for i in definition.moving if i != index and definition.coordinates[i].stops is None]
     others = q_next.clone()
     others[:, limits] = math.nan
@@ -38,7 +43,7 @@ def stopped(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Te
 
 
 def saturates(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Tensor:
-    """Samples (n,) in which a coordinate other than the lead ended at a bound, coordinate ``index`` included."""
+    """Return which samples (n,) ended with coordinate ``index``, or any other except the leading one, at a bound."""
     others = q_next.clone()
     others[:, leading(definition)] = math.nan
     others[:, index] = q_next[:, index]

@@ -1,4 +1,4 @@
-"""GaussianProcesses: Gaussian processes, as a family for the registry of models."""
+"""GaussianProcesses: Gaussian processes as a family for the registry of models."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from surrogym_server.models.port import DynamicsModel, Learned, Learner, ModelCo
 
 @dataclass(frozen=True)
 class GaussianProcesses(Settings, Learner, TakesPrior):
-    """One process for each output, with a structure chosen by evidence. The warm start is hyperparameters."""
+    """Learner of one Gaussian process for each output, with a structure chosen by evidence. Hyperparameters of an
+    earlier fit are its warm start."""
 
     @property
     def codec(self) -> ModelCodec:

@@ -11,11 +11,11 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import Drift, Encoding, Feature, FeatureMap, Parity, State, features, leading
 from surrogym_server.gp import Reflection
 
-CENTRED = 1e-9  # of its scale: largest distance of the middle of a range from 0
+CENTRED = 1e-9  # a range is centred if its middle is no farther from 0 than this share of its scale
 
 
 def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ...]:
-    """Candidate maps of the reward: of the state before the step, after it, or both, as its timing says.
+    """Return candidate maps of the reward: of the state before the step, after it, or both, by ``reward_timing``.
 
     Rewards often depend on features that the observation combines, such as the distance to a target.
     """
@@ -29,10 +29,13 @@ def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ..
 def candidates(
     definition: EnvironmentDefinition, follows: bool, drift: Drift = (), parity: Parity = "odd"
 ) -> tuple[FeatureMap, ...]:
-    """Candidate maps of one output.
+    """Return candidate feature maps of one output. With lags, each map comes with every shorter history.
 
-    ``follows`` says that it may read the lead, ``drift`` is the learned motion of angles, and ``parity`` is the
-    output's parity if the environment is its own mirror image. With lags, each map comes with every shorter history.
+    Args:
+        definition: the environment.
+        follows: whether the output may read the change of the leading coordinate in the same step.
+        drift: learned motion of angles, or empty.
+        parity: parity of the output if the environment has mirror symmetry.
     """
     if definition.moves_observation:
         return (FeatureMap(state="observation"),)
@@ -53,10 +56,11 @@ def candidates(
 
 
 def reflection(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Reflection | None:
-    """Signs of a map's features under a change of sign of every coordinate and the action, for its parity.
+    """Return the signs of a map's features under a change of sign of every coordinate and of the action, with the map's
+    parity.
 
-    None without a parity, or if the features have no such rule: ranges that are not centred at 0, one-hot actions,
-    observations.
+    None if the map has no parity, or if a feature has no such sign: a range that is not centred at 0, a one-hot action,
+    or an observation.
     """
     if not feature_map.parity:
         return None
@@ -68,14 +72,14 @@ def reflection(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Re
 
 
 def _sign(definition: EnvironmentDefinition, feature: Feature) -> int:
-    """1 if the feature stays when all signs change, -1 if it changes its own sign, 0 otherwise."""
+    """Return 1 if a feature stays the same when all signs change, -1 if its own sign changes, 0 otherwise."""
     match feature.function:
         case "cos" | "turned_cos":
             return 1
         case "sin" | "turned_sin" | "wrapped":
             return -1
         case "affine" if feature.entry >= len(definition.coordinates) and definition.action.nvec:
-            return -1  # numbers of discrete actions count from one end; reversed they are each other's mirror image
+            return -1  # discrete actions are numbered from one end, and the reverse order is the mirror image
         case "affine" | "lead":
             return -1 if abs(feature.centre) <= CENTRED * feature.scale else 0
     return 0

@@ -1,4 +1,4 @@
-"""GaussianProcessModel: exact Gaussian processes fitted to one environment. A stored one is complete."""
+"""GaussianProcessModel: Gaussian processes fitted to one environment. A stored one repeats no computation."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from surrogym_shared import compiled
 if TYPE_CHECKING:
     from surrogym_server.models.gaussian_process.prediction.compiled.step import StepsOfModel
 
-COMPILED_SOLVES = 300  # points; with more of them a library of linear algebra solves triangular systems faster
+COMPILED_SOLVES = 300  # with more points than this, a library of linear algebra is faster than compiled code
 
 
 @dataclass(frozen=True)
@@ -70,17 +70,17 @@ class GaussianProcessModel(
     CompiledSteps,
     WrittenInC,
 ):
-    """One process for each output, and regions in which an episode ends or the reward jumps."""
+    """Model with one process for each output, and regions in which an episode ends or the reward jumps."""
 
     definition: EnvironmentDefinition
     transitions: tuple[OutputModel, ...]  # M, in the order of definition.outputs
     reward: OutputModel
-    terminal_reward: float  # reward of terminating steps, in addition to the reward process
+    terminal_reward: float  # reward that terminating steps pay in addition to the reward process
     samples: int
     digest: str
-    ending: Region | None = None  # region in which episodes end, if that is learned
-    jumps: tuple[Jump, ...] = ()  # of the reward, in addition to its process
-    prior: GaussianProcessModel | None = None  # its mean is added to the outputs that have a ``size_with_prior``
+    ending: Region | None = None  # region in which episodes end, if termination is learned
+    jumps: tuple[Jump, ...] = ()  # jumps of the reward, added to the reward process
+    prior: GaussianProcessModel | None = None  # its mean is added to those outputs that have a ``size_with_prior``
 
     @property
     def outputs(self) -> tuple[OutputModel, ...]:
@@ -105,7 +105,7 @@ class GaussianProcessModel(
         return torch.cat([change, reward[:, None]], -1)
 
     def means_before_end(self, q: Tensor, u: Tensor) -> Tensor:
-        """Predict as ``means`` does, (m, O), with a reward without the terminal reward."""
+        """Predict as ``means`` does, (m, O), but without the terminal reward."""
         change, _, reward = self._predictor.means(q, u)
         return torch.cat([change, reward[:, None]], -1)
 
@@ -123,7 +123,7 @@ class GaussianProcessModel(
 
     @property
     def description(self) -> dict[str, Any]:
-        """Structure and hyperparameters of every output, for people."""
+        """Structure and hyperparameters of every output, for display."""
         outputs = [describe(self.definition, o) for o in self.outputs]
         if self.definition.declared_reward is not None:
             outputs[-1]["kernel"] = "declared"
@@ -223,7 +223,7 @@ class GaussianProcessModel(
         return self.reward.warp is not None and self.reward.warp.sign > 0
 
     def promise(self, q: Tensor, u: Tensor) -> Tensor:
-        """Mean plus one standard deviation of the reward's targets."""
+        """Return the mean plus one standard deviation of the reward, in the unit in which its process is learned."""
         steps = PredictedSteps(q, u, self._predictor.transition(q, u, None, None, None, False, False).q_next)
         mean, std = self.reward.target(process_inputs(self.definition, self.reward, steps))
         return mean + std
@@ -244,7 +244,7 @@ class GaussianProcessModel(
         return step_source(self.definition, tables_of(self._predictor, self.ending))
 
     def _learns(self, column: int, q_next: Tensor) -> Tensor:
-        """Which samples that end at q_next (m, C) an output would learn from, (m,) bool."""
+        """Return which samples that end at q_next (m, C) the output ``column`` would learn from, (m,) bool."""
         if column == len(self.transitions):
             return ~self.terminated(q_next)
         output = self.transitions[column]

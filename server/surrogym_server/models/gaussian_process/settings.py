@@ -7,24 +7,24 @@ from dataclasses import dataclass
 from surrogym_server.models.setting_checks import require_whole
 
 CHOICES = {"kernel": ("composite", "squared_exponential"), "symmetry": ("auto", "none")}
-FEWEST, MOST = 10, 2_000  # inducing points
+FEWEST, MOST = 10, 2_000  # allowed numbers of inducing points
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Candidates that are compared by evidence.
+    """Settings of the learner: which structures are compared by evidence, and how many inducing points are used.
 
     Attributes:
-        kernel: of every process; ``composite`` adds a linear part, and for the reward a quadratic one.
+        kernel: kernel of every process; ``composite`` adds a linear part, and for the reward a quadratic one.
         reward_jumps: whether the reward may jump at the edge of a learned region.
-        symmetry: ``auto`` also compares feature maps that are their own mirror image, ``none`` does not.
-        rates: whether transitions may change the faster the further along an input; see ``gp.growth``.
+        symmetry: ``auto`` also compares feature maps with mirror symmetry, ``none`` does not.
+        rates: whether a transition may change the faster the further along an input; see ``gp.growth``.
         reward_peaks: whether the reward may be learned by its logarithm, if it is nearly zero almost everywhere.
-        drop_inputs: whether an output may leave out inputs that it does not read; see ``gp.selection``.
-        repeated_parts: whether outputs that do the same with inputs of their own may share samples; see ``gp.pooling``.
-            Needs ``drop_inputs``.
-        inducing: most inducing points of a process of many samples, whose hyperparameters then maximise a bound of all
-            samples; with so few samples it is exact. 0: see ``learning.many.BySubsets``.
+        drop_inputs: whether an output may ignore inputs that don't matter to it; see ``gp.selection``.
+        repeated_parts: whether outputs that are the same function of different inputs may share samples; see
+            ``gp.pooling``. Needs ``drop_inputs``.
+        inducing: greatest number of inducing points of a process. With more samples than that, hyperparameters maximise
+            a bound over all samples; with fewer the process is exact. 0 selects ``learning.many.BySubsets``.
     """
 
     kernel: str = "composite"

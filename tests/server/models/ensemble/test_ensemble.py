@@ -192,7 +192,7 @@ def test_an_ensemble_file_with_a_termination_label_other_than_0_or_1_is_refused(
     model = ensemble(spec, steps=20)
     assert model.ending == 0.0
     assert from_bytes(model.definition, to_bytes(model)).ending == 0.0
-    with pytest.raises(InvalidInput, match=r"ending as 0 or 1, .*, got 0\.5"):
+    with pytest.raises(InvalidInput, match=r"ending: expected 0 or 1, .* got 0\.5"):
         from_bytes(model.definition, with_header(model, ending=0.5))
 
 

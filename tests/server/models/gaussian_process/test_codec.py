@@ -123,7 +123,7 @@ def test_a_model_file_of_another_format_or_environment_is_refused(pendulum_defin
 def test_a_model_file_whose_transition_reads_the_next_state_is_refused(pendulum_definition, data):
     header = header_of(data)
     header["outputs"][1]["feature_map"] |= {"after": True}
-    with pytest.raises(InvalidInput, match="before the step"):
+    with pytest.raises(InvalidInput, match="after the step"):
         from_bytes(pendulum_definition, rewritten(data, header))
 
 
@@ -179,11 +179,11 @@ def beyond_the_end(head: dict) -> None:
 
 @pytest.mark.parametrize("change", [overlapping, beyond_the_end])
 def test_a_model_file_with_overlapping_or_overlong_arrays_is_refused(pendulum_definition, data, change):
-    with pytest.raises(InvalidInput, match="expected a Surrogym model"):
+    with pytest.raises(InvalidInput, match="expected a model file of Surrogym"):
         from_bytes(pendulum_definition, with_head(data, change))
 
 
 @pytest.mark.parametrize("length", [2**32, 2**63 - 1, 2**64 - 1])
 def test_a_model_file_that_announces_a_huge_header_is_refused(pendulum_definition, data, length):
-    with pytest.raises(InvalidInput, match="expected a Surrogym model"):
+    with pytest.raises(InvalidInput, match="expected a model file of Surrogym"):
         from_bytes(pendulum_definition, length.to_bytes(8, "little") + data[8:])

@@ -116,7 +116,7 @@ def test_a_stored_model_contains_its_prior(textbook):
 def test_a_stored_model_without_its_required_prior_is_refused(textbook):
     codec = GaussianProcessCodec()
     stored = codec.encode(learned(samples(Real(), 8, seed=3), textbook))
-    with pytest.raises(InvalidInput, match="with its prior"):
+    with pytest.raises(InvalidInput, match="no prior"):
         codec.decode(HINGE, replace(stored, header=stored.header | {"prior": None}))
 
 

@@ -1,1 +1,1 @@
-"""Conversion of a model to bytes and back."""
+"""Conversion of Gaussian process models to data and back."""

@@ -1,4 +1,4 @@
-"""GaussianProcessCodec: a model to a header and named arrays, and back. Loading recomputes nothing."""
+"""GaussianProcessCodec: convert a model to a header and named arrays, and back. Loading repeats no computation."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from surrogym_server.models.gaussian_process.prediction.regions import TERMINATI
 from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel, require_format, require_sums
 
 FORMAT = 8
-JUMP = "jump"  # prefix of the names of its arrays
-PRIOR = "prior."  # the same of a model's prior
+JUMP = "jump"  # prefix of the names of a jump's arrays
+PRIOR = "prior."  # prefix of the names of the arrays of a model's prior
 
 
 class GaussianProcessCodec(ModelCodec):
-    """Codec of one format. Models of another one are refused."""
+    """Codec of models in the current format. Models in any other format are refused."""
 
     def encode(self, model: DynamicsModel) -> StoredModel:
         if not isinstance(model, GaussianProcessModel):
@@ -48,7 +48,8 @@ class GaussianProcessCodec(ModelCodec):
         for region in (*(jump.region for jump in model.jumps), *([] if model.ending is None else [model.ending])):
             require_region(region)
         if not all(math.isfinite(jump.size) for jump in model.jumps):
-            raise InvalidInput(f"expected finite sizes of the jumps, got {[jump.size for jump in model.jumps][:4]}")
+            sizes = [jump.size for jump in model.jumps][:4]
+            raise InvalidInput(f"expected finite sizes of the jumps of the reward, got {sizes}")
         return model
 
 
@@ -86,7 +87,10 @@ def _read(definition: EnvironmentDefinition, stored: StoredModel) -> GaussianPro
     jumps = read_jumps(definition, header["jumps"], tensors, JUMP)
     names = tuple(output.name for output in outputs)
     if names != definition.outputs:
-        raise InvalidInput(f"expected a model with the outputs {definition.outputs}, got one with {names}")
+        raise InvalidInput(
+            f"expected a model with the outputs {definition.outputs}, got one with {names}; "
+            "load it with the specification that it was learned for"
+        )
     prior = _read_prior(definition, header["prior"], tensors)
     return GaussianProcessModel(
         definition, outputs[:-1], outputs[-1], terminal_reward, samples, digest, ending, jumps, prior
@@ -103,22 +107,24 @@ def _read_prior(
 
 
 def _require_consistent(model: GaussianProcessModel) -> None:
-    """Check that the numbers can come from a fit, and fit the definition. Raises ``InvalidInput``."""
+    """Raise ``InvalidInput`` if the parts of a model don't fit each other or the definition."""
     definition, reward = model.definition, model.reward
     if model.prior is None and any(output.size_with_prior is not None for output in model.outputs):
-        raise InvalidInput("expected a model with its prior, because outputs are learned beside it, got none")
+        raise InvalidInput("an output needs the prior beside which it was learned, but the model contains no prior")
     require_sums(model.terminal_reward, model.samples)
     if any(output.feature_map.after for output in model.transitions):
         raise InvalidInput(
-            "expected transition outputs that read the state before the step, got one that reads the state after it"
+            "a transition output reads the state after the step; expected all of them to read the state before it"
         )
     if (model.ending is not None) != definition.learns_termination:
         learned, got = ("learned" if x else "declared" for x in (definition.learns_termination, model.ending))
-        raise InvalidInput(f"expected a model of an environment whose termination is {learned}, got {got}")
+        raise InvalidInput(
+            f"expected a model of an environment whose termination is {learned}, got one whose termination is {got}"
+        )
     declared = definition.declared_reward
     if declared is not None and (reward.posterior, reward.centre, reward.feature_map.after) != (
         None,
         0.0,
         declared.after,
     ):
-        raise InvalidInput("expected a model without a learned reward, because the environment's reward is declared")
+        raise InvalidInput("the model has a learned reward, but the environment's reward is declared; learn it again")

@@ -1,4 +1,4 @@
-"""One output of a model to header and tensors, and back, with every number and shape checked."""
+"""Conversion of one output of a model to header and tensors, and back, with a check of every number and shape."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ KNOWN_MAPS = frozenset(
 
 
 def output_tensors(output: OutputModel, prefix: str) -> dict[str, Tensor]:
-    """The arrays of an output by name, with a prefix; none for an output that never varied."""
+    """Return the arrays of an output by name, each name with the prefix; none for an output that never varied."""
     if (posterior := output.posterior) is None:
         return {}
     arrays = {"x": posterior.x, "y": posterior.y, "factor": posterior.factor, "weights": posterior.weights}
@@ -39,7 +39,7 @@ def output_tensors(output: OutputModel, prefix: str) -> dict[str, Tensor]:
 
 
 def require_output(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Check the shapes of an output's arrays, and that its numbers are those of a process. Raises ``InvalidInput``."""
+    """Raise ``InvalidInput`` unless an output's arrays have the right shapes and its numbers are those of a process."""
     _require_drift(definition, output)
     _require_dropped(definition, output)
     _require_warp(output)
@@ -52,7 +52,7 @@ def require_output(definition: EnvironmentDefinition, output: OutputModel) -> No
 
 
 def output_header(output: OutputModel) -> dict[str, Any]:
-    """Everything of an output except its arrays, as JSON."""
+    """Return everything of an output except its arrays, as JSON."""
     entry: dict[str, Any] = {
         "name": output.name,
         "feature_map": asdict(output.feature_map),
@@ -84,16 +84,21 @@ def output_header(output: OutputModel) -> dict[str, Any]:
 def read_output(
     definition: EnvironmentDefinition, entry: dict[str, Any], tensors: Mapping[str, Tensor], prefix: str
 ) -> OutputModel:
-    """Build the output of a header's entry. Raises ``LookupError``, ``TypeError`` or ``ValueError`` if it is
-    malformed."""
+    """Build an output from its entry in the header and its arrays.
+
+    Raises:
+        LookupError, TypeError, ValueError: the entry is malformed.
+    """
     feature_map = _feature_map(entry["feature_map"])
     shorter = (None, *range(max(definition.ages)))
     plain = replace(feature_map, drift=(), history=None, rates=(), dropped=())
     if plain not in KNOWN_MAPS or feature_map.history not in shorter:
-        raise ValueError(f"expected inputs of a process that this version knows, got {feature_map}")
+        raise ValueError(f"expected a feature map that this version knows, got {feature_map}")
     mirror = reflection(definition, feature_map)
     if feature_map.parity and mirror is None:
-        raise ValueError(f"expected inputs without mirror images, because the environment has none, got {feature_map}")
+        raise ValueError(
+            f"expected a feature map without parity, because the environment has no mirror symmetry, got {feature_map}"
+        )
     posterior = None
     if (header := entry["posterior"]) is not None:
         arrays = {n: tensors[f"{prefix}.{n}"] for n in ("x", "y", "factor", "weights", "lengthscale")}
@@ -150,41 +155,43 @@ def _require_drift(definition: EnvironmentDefinition, output: OutputModel) -> No
 
 
 def _require_dropped(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Check that the features left out are some of the map's, in order, and that a process is left with one."""
+    """Raise ``InvalidInput`` unless the features left out are some of the map's, in ascending order, and at least one
+    is left."""
     if not (places := output.feature_map.dropped):
         return
     count = len(features(definition, replace(output.feature_map, rates=(), dropped=())))
     ordered = list(places) == sorted(set(places))
     if output.posterior is None or not ordered or len(places) >= count or not 0 <= min(places) <= max(places) < count:
         raise InvalidInput(
-            f"output {output.name!r}: expected the numbers of the inputs that are left out (dropped) to be some, "
-            "not all, "
-            f"of 0 to {count - 1} in rising order, got {places}"
+            f"output {output.name!r}: expected `dropped` as ascending indices of some, not all, of the inputs 0 to "
+            f"{count - 1}, got {places}"
         )
 
 
 def _require_size(output: OutputModel) -> None:
-    """Check that an output beside a prior has a size, and no warp."""
+    """Raise ``InvalidInput`` unless an output learned beside a prior has a finite size above 0 and no warp."""
     size = output.size_with_prior
     if size is not None and (not 0 < size < math.inf or output.warp is not None):
-        raise InvalidInput(f"output {output.name!r}: expected a finite size beside a prior and no warp, got {size}")
+        raise InvalidInput(
+            f"output {output.name!r}: expected `size_with_prior` as a finite number above 0, and no `warp` beside it, "
+            f"got {size} and {output.warp}"
+        )
 
 
 def _require_warp(output: OutputModel) -> None:
-    """Check that only the reward has a warp, and only with a process."""
+    """Raise ``InvalidInput`` if an output other than a learned reward has a warp."""
     if output.warp is None:
         return
     if output.name != REWARD or output.posterior is None or not output.warp.finite:
         raise InvalidInput(
-            f"output {output.name!r}: expected a transformation (warp) of a learned reward alone, with finite "
-            "numbers, got "
+            f"output {output.name!r}: expected `warp` only for a learned reward and with finite numbers, got "
             f"{output.warp}"
         )
 
 
 def _require_rates(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Check that only a transition has rates, one for each feature, and only features that can grow have one, and that
-    the amplitude is positive at all points."""
+    """Raise ``InvalidInput`` unless rates are those of a transition, one for each feature, with an amplitude above 0 at
+    all points."""
     if not (rates := output.feature_map.rates):
         return
     plain = replace(output.feature_map, rates=())
@@ -198,37 +205,38 @@ def _require_rates(definition: EnvironmentDefinition, output: OutputModel) -> No
         or not all(abs(rate) <= STEEPEST and (able or rate == 0) for rate, able in zip(rates, may, strict=True))
     ):
         raise InvalidInput(
-            f"output {output.name!r}: expected a rate of growth for each input of a next state, at most "
-            f"{STEEPEST:g} in "
-            f"size, and 0 where the input can't grow, got {rates}"
+            f"output {output.name!r}: expected `rates` only for a transition: a number of at most {STEEPEST:g} in size "
+            f"for each of {len(may)} inputs, 0 where the input can't have a rate, got {rates}"
         )
     if not bool((1 + output.posterior.x * torch.tensor(rates, dtype=torch.float64) > 0).all()):
         raise InvalidInput(
-            f"output {output.name!r}: expected rates of growth with which the amplitude is above 0 at all samples"
+            f"output {output.name!r}: expected `rates` with which the amplitude is above 0 at all samples, got {rates}"
         )
 
 
 def _require_at_limit(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Check that only a transition has points at a limit, and that each point has a side, or none has one."""
+    """Raise ``InvalidInput`` unless only a transition has points at a limit, and its sides are as many as its
+    points."""
     if not (sides := output.at_limit):
         return
     count = 0 if output.posterior is None else len(output.posterior.y)
     if output.name not in definition.outputs[:-1] or len(sides) != count or not set(sides) <= {-1, 0, 1}:
-        raise InvalidInput(f"output {output.name!r}: expected at_limit with -1, 0 or 1 for each of {count} samples")
+        raise InvalidInput(
+            f"output {output.name!r}: expected `at_limit` only for a transition: -1, 0 or 1 for each of {count} samples"
+        )
 
 
 def _require_shared(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Check that only a transition shares samples, with other transitions."""
+    """Raise ``InvalidInput`` unless an output that shares samples is a transition and shares them with transitions."""
     transitions = definition.outputs[:-1]
     if output.shared and not {output.name, *output.shared} <= set(transitions):
         raise InvalidInput(
-            f"output {output.name!r}: expected to share samples with some of {', '.join(transitions)}, got "
-            f"{output.shared}"
+            f"output {output.name!r}: expected `shared` to name some of {', '.join(transitions)}, got {output.shared}"
         )
 
 
 def _require_numbers(output: OutputModel) -> None:
-    """Check that every number is finite, and positive if it must be."""
+    """Raise ``InvalidInput`` unless every number is finite, and positive where it must be."""
     finite, positive, least_zero, tensors = [output.centre], [output.scale], [0.0], []
     if (posterior := output.posterior) is not None:
         hyper = posterior.hyper
@@ -248,7 +256,8 @@ def _require_numbers(output: OutputModel) -> None:
         and all(bool(torch.isfinite(t).all()) for t in tensors)
     ):
         raise InvalidInput(
-            f"output {output.name!r}: expected finite numbers, with scales and variances above 0, got others"
+            f"output {output.name!r}: expected finite numbers, and scale, length scales and variances above 0; the "
+            "model file is damaged or was changed, export the model again"
         )
 
 

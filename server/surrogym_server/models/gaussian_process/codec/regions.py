@@ -1,4 +1,4 @@
-"""A learned region to header and tensors, and back, with every number checked."""
+"""Conversion of a learned region to header and tensors, and back, with a check of every number."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from surrogym_server.models.gaussian_process.prediction.regions import (
 
 
 def region_header(region: Region) -> dict[str, Any]:
-    """Everything of a region except its arrays, as JSON."""
+    """Return everything of a region except its arrays, as JSON."""
     return {"forms": [[weight, _form_header(form)] for weight, form in region.forms], "scores": region.scores}
 
 
 def region_tensors(region: Region, prefix: str) -> dict[str, Tensor]:
-    """The arrays of a region by name, with a prefix."""
+    """Return the arrays of a region by name, each name with the prefix."""
     tensors: dict[str, Tensor] = {}
     for index, (_, form) in enumerate(region.forms):
         if isinstance(form, Classifier):
@@ -44,8 +44,11 @@ def region_tensors(region: Region, prefix: str) -> dict[str, Tensor]:
 def read_region(
     definition: EnvironmentDefinition, entry: Any, tensors: Mapping[str, Tensor], prefix: str
 ) -> Region | None:
-    """Build the region of a header's entry, None if it has none. Raises ``LookupError``, ``TypeError`` or
-    ``ValueError``."""
+    """Build a region from its entry in the header and its arrays; None for no entry.
+
+    Raises:
+        LookupError, TypeError, ValueError: the entry is malformed.
+    """
     if entry is None:
         return None
     forms = tuple(
@@ -58,21 +61,25 @@ def read_region(
 def read_jumps(
     definition: EnvironmentDefinition, entries: Any, tensors: Mapping[str, Tensor], prefix: str
 ) -> tuple[Jump, ...]:
-    """Build the jumps of a header's entries. Raises ``LookupError``, ``TypeError`` or ``ValueError``."""
+    """Build the jumps from their entries in the header and their arrays.
+
+    Raises:
+        LookupError, TypeError, ValueError: an entry is malformed.
+    """
     jumps = []
     for index, (size, entry) in enumerate(entries):
         region = read_region(definition, entry, tensors, f"{prefix}.{index}")
         if region is None:
-            raise ValueError("expected a region for each jump, got none")
+            raise ValueError(f"jump {index}: expected a region, got none")
         jumps.append(Jump(region, float(size)))
     return tuple(jumps)
 
 
 def require_region(region: Region) -> None:
-    """Check weights, processes, axes and widths of gaps of a region. Raises ``InvalidInput``."""
+    """Raise ``InvalidInput`` unless a region's weights, processes and thresholds are valid."""
     weights = [weight for weight, _ in region.forms]
     if not weights or min(weights) <= 0 or not math.isclose(sum(weights), 1, abs_tol=1e-6):
-        raise InvalidInput(f"expected weights of a region's forms above 0 that add up to 1, got {weights[:4]}")
+        raise InvalidInput(f"expected weights of a region's forms that are above 0 and add up to 1, got {weights[:4]}")
     for _, form in region.forms:
         if isinstance(form, Classifier):
             _require_classifier(form)
@@ -98,7 +105,7 @@ def _read_form(definition: EnvironmentDefinition, entry: Any, tensors: Mapping[s
 def _require_classifier(classifier: Classifier) -> None:
     if classifier.process.feature_map.lead:
         raise InvalidInput(
-            "expected a classifier that reads the state alone, got one that also reads the change of the state"
+            "expected a region's classifier to read the state alone, got one that also reads its change (`lead`)"
         )
     require_output(classifier.definition, classifier.process)
 
@@ -116,8 +123,8 @@ def _require_thresholds(thresholds: Thresholds) -> None:
     )
     if not (sound and thresholds.rules and all(thresholds.rules)):
         raise InvalidInput(
-            f"expected thresholds on the axes 0 to {axes - 1}, each with outside < inside and a weight above 0 and at "
-            f"most 1, got {cuts[:4]}"
+            f"expected a region's thresholds on the axes 0 to {axes - 1}, each with outside < inside and a "
+            f"weight above 0 and at most 1, got {cuts[:4]}"
         )
 
 

@@ -1,6 +1,6 @@
 """Drift: the angle that a joint reaches within a step by its present motion, learned from samples.
 
-A fast pole turns far within a step. The forces on it depend on the angles along the way, not only on the first one. So
+A fast pole turns far within a step. The forces on it depend on all angles on the way, not only on the first angle. So
 cosine and sine of angle + drift are better inputs than those of the angle alone. The drift is a linear regression.
 """
 
@@ -14,12 +14,14 @@ from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.features import Drift
 from surrogym_server.environment.samples import Samples
 
-POINTS_A_WEIGHT = 3
+POINTS_A_WEIGHT = 3  # least number of samples for each weight of the regression
 
 
 def learn_drift(definition: EnvironmentDefinition, samples: Samples) -> Drift:
-    """For each angle, the weights (C,) with which linear coordinates turn it: increment = w . q + constant, by least
-    squares. Empty if there is no angle, or too little data."""
+    """Fit, for each angle, weights (C,) of the coordinates w with increment = w . q + constant, by least squares.
+
+    Only linear coordinates have a weight other than 0. Return () if there is no angle or if the samples are too few.
+    """
     moved_by = [i for i, c in enumerate(definition.coordinates) if c.kind == "linear" and not _is_action(c.lag)]
     if not definition.angles or not moved_by or len(samples) < POINTS_A_WEIGHT * (len(moved_by) + 1):
         return ()

@@ -1,4 +1,4 @@
-"""Choice by evidence which inputs an output does not read, see ``gp.selection`` and ``gp.bound``."""
+"""Choice by evidence which inputs an output leaves out, see ``gp.selection`` and ``gp.bound``."""
 
 from __future__ import annotations
 
@@ -15,16 +15,23 @@ from surrogym_server.models.gaussian_process.learning.output_learner import Outp
 from surrogym_server.models.gaussian_process.learning.rates import inputs_of
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-ODDS = -1.0  # log odds of each input that is left out, before any data
-WIN = 2.0  # log odds for each sample by which fewer inputs must win: below, some made predictions too sure
-LESS = 0.5  # share of the leave-one-out error with all inputs that may be left
-FEWEST = 20  # samples: of fewer, some gave such odds to wrong inputs
+ODDS = -1.0  # prior log odds of leaving out one input
+WIN = 2.0  # log odds for each sample by which fewer inputs must win; with less, some made predictions too sure
+LESS = 0.5  # greatest leave-one-out error with fewer inputs, as a share of the error with all inputs
+FEWEST = 20  # least number of samples; with fewer, some wrong choices of inputs reached such odds
 
 
 def without_inputs(
     learner: OutputLearner, output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], used: Tensor
 ) -> OutputModel:
-    """The output without the inputs that it does not read, from the same samples, those of ``used`` (n,)."""
+    """Return the output without those inputs that hardly matter to it, or unchanged if all of them matter.
+
+    Args:
+        output: the learned output.
+        target: its targets (n,).
+        inputs: features (n, d) of each candidate map.
+        used: (n,) bool, the samples from which the output was learned.
+    """
     may, posterior = _may_be_dropped(learner, output), output.posterior
     if posterior is None or not bool(may.any()):
         return output
@@ -32,7 +39,7 @@ def without_inputs(
     if posterior.sparse is not None:
         x = inputs_of(output, inputs)[used]
         y = output.standardised(target[used], x)
-        if posterior.points != len(x):  # it has learned from further samples, which ended at limits
+        if posterior.points != len(x):  # the process also learned from samples that ended at limits
             return output
     try:
         if posterior.sparse is not None and (is_noisy(posterior.hyper) or not loses_nothing(posterior)):
@@ -50,7 +57,7 @@ def without_inputs(
 def _of_many(
     learner: OutputLearner, output: OutputModel, posterior: Posterior, may: Tensor, x: Tensor, y: Tensor
 ) -> OutputModel:
-    """The output of a process through inducing points, which are of the points x (n, d), y (n,)."""
+    """Leave out inputs of an output whose process has inducing points, given all of its points x (n, d), y (n,)."""
     selection = learner.many.fewer_inputs(x, y, learner.options(output.name), posterior, may, ODDS)
     if selection is None:
         return output
@@ -58,10 +65,10 @@ def _of_many(
 
 
 def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
-    """Inputs of an output, (d,) bool, that may be left out.
+    """Return which inputs of an output may be left out, (d,) bool.
 
-    The next value of a limited speed may not: it seems to say nothing new until a sample ends at the limit. Nor may an
-    input with a rate. No input may be left out if there are too few samples to tell, or if nothing is left to explain.
+    The next value of a limited speed may not: its effect only shows when a sample ends at the limit. An input with a
+    rate may not either. No input may if the samples are too few to decide, or if the process has little error left.
     """
     read = features(learner.definition, output.feature_map)
     may = torch.tensor([feature.function not in ("lead", "grown") for feature in read])
@@ -74,8 +81,8 @@ def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
 
 
 def _with_fewer(learner: OutputLearner, output: OutputModel, x: Tensor, y: Tensor, selection: Selection) -> OutputModel:
-    """The output with the inputs that were found, if with these each of its points x (n, d), y (n,) is predicted better
-    from the others."""
+    """Return the output with only the selected inputs, if this reduces its leave-one-out error enough; otherwise
+    unchanged. Its points are x (n, d), y (n,)."""
     assert output.posterior is not None
     mask, x = selection.mask, x[:, selection.mask]
     feature_map = map_without(output.feature_map, mask)
@@ -90,6 +97,6 @@ def _with_fewer(learner: OutputLearner, output: OutputModel, x: Tensor, y: Tenso
 
 
 def map_without(feature_map: FeatureMap, mask: Tensor) -> FeatureMap:
-    """The map with the features kept (d,)."""
+    """Return the feature map with only the features for which ``mask`` (d,) is true."""
     rates = tuple(rate for rate, left in zip(feature_map.rates, mask.tolist(), strict=False) if left)
     return replace(feature_map, dropped=tuple((~mask).nonzero()[:, 0].tolist()), rates=rates)

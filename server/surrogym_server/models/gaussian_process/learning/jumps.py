@@ -1,7 +1,8 @@
-"""Search for jumps of a reward: a split of its values that makes the process more likely than without it.
+"""Search for jumps of a reward: a split of its values that makes the rewards likelier than one process does.
 
-Both are compared as densities of the same rewards, in the same unit: the plain evidence against the product of the
-evidence outside, the probability of the rewards inside given one unknown jump, and the probability of the labels.
+Both explanations are compared as densities of the same rewards, in the same unit: the evidence of the plain process
+against the product of the evidence outside the region, the probability of the rewards inside given one unknown jump,
+and the probability of the labels.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from surrogym_server.models.gaussian_process.prediction.regions import Jump, Reg
 
 EDGE = "reward edge"
 MAX_JUMPS = 3
-SPLITS = 3  # the widest gaps of the sorted rewards are tried ...
-GAP = 0.2  # ... if they are wider than this share of their range
-MARGIN = 2.0  # log odds for each sample by which a jump must win: smooth bumps reached 1.5, jumps began at 2.9
+SPLITS = 3  # number of gaps of the sorted rewards at which a split is tried, the widest first
+GAP = 0.2  # least width of such a gap, as a share of the range of the rewards
+MARGIN = 2.0  # log odds for each sample by which a jump must win; smooth bumps reached 1.5, jumps began at 2.9
 WORTH = 5.0  # log odds by which one more jump must win
-SIZE = 3.0  # a priori standard deviation of a jump, in standard deviations of the reward
-FLOOR = 1e-4  # standard deviation of the noise of an output that never varied
+SIZE = 3.0  # prior standard deviation of a jump, in standard deviations of the reward
+FLOOR = 1e-4  # noise assumed for rewards that are all equal, in standard deviations of the reward
 
 Split = tuple[float, Region, OutputModel, Tensor]
 
@@ -36,7 +37,14 @@ Split = tuple[float, Region, OutputModel, Tensor]
 def with_jumps(
     learner: OutputLearner, samples: Samples, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
 ) -> tuple[OutputModel, tuple[Jump, ...]]:
-    """The reward's process and its jumps, from the samples ``going`` (n,), given the process without jumps."""
+    """Search for jumps of the reward. Return the process without them, and the jumps; none if they don't win.
+
+    Args:
+        samples: all n samples.
+        inputs: features (n, d) of each candidate map.
+        going: (n,) bool, the samples from which the reward is learned: the non-terminating steps.
+        plain: the process that was learned from them without jumps.
+    """
     best, process, total, rest = (0.0, plain, 0), plain, 0.0, going
     regions: list[tuple[Region, Tensor]] = []
     while process.posterior is not None and len(regions) < MAX_JUMPS:
@@ -46,7 +54,7 @@ def with_jumps(
         gain, edge, process, outside = max(splits, key=lambda split: split[0])
         regions.append((edge, rest & ~outside))
         total, rest = total + gain, outside
-        if total > max(MARGIN * int(going.sum()), best[0] + WORTH):  # one of two jumps alone may win little
+        if total > max(MARGIN * int(going.sum()), best[0] + WORTH):  # the first of two jumps may win little by itself
             best = (total, process, len(regions))
     _, process, count = best
     residual = samples.reward - process.mean(inputs[process.feature_map])
@@ -56,7 +64,8 @@ def with_jumps(
 def _splits(
     learner: OutputLearner, samples: Samples, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
 ) -> Iterator[Split]:
-    """Every candidate split: its gain, the region, the process outside it and the samples (n,) outside.
+    """Yield each candidate split of the rewards: its gain in log odds, the region inside, the process outside, and the
+    samples (n,) outside.
 
     A single sample counts as a jump only if all others have the same reward. Otherwise it may as well be a slope.
     """
@@ -85,7 +94,7 @@ def _splits(
 
 
 def _levels(reward: Tensor) -> list[float]:
-    """Levels at which to split rewards (n,): the middles of the widest gaps between them."""
+    """Return the levels at which to split rewards (n,): the middles of the widest gaps between them."""
     ordered = reward.sort().values
     gaps = ordered.diff()
     wide = [int(i) for i in gaps.argsort(descending=True)[:SPLITS] if gaps[i] > GAP * (ordered[-1] - ordered[0])]
@@ -93,14 +102,14 @@ def _levels(reward: Tensor) -> list[float]:
 
 
 def _evidence(process: OutputModel, points: int, unit: float) -> float:
-    """Log density of the points that a process was fitted to, in multiples of ``unit``."""
+    """Return the log density of the ``points`` targets to which a process was fitted, in multiples of ``unit``."""
     if process.posterior is None:
         return -points * (math.log(FLOOR) + 0.5 * math.log(2 * math.pi))
     return dict(process.scores)[str(process.feature_map)] - points * math.log(process.scale / unit)
 
 
 def _paid_inside(residual: Tensor, spread: Tensor) -> float:
-    """Log density of residuals (i,) that share one normal jump and deviate from it by spread (i,)."""
+    """Return the log density of residuals (i,) that share one normal jump and vary around it by ``spread`` (i,)."""
     shared = SIZE**2 * torch.ones(len(residual), len(residual), dtype=residual.dtype)
     covariance = shared + torch.diag(spread.square() + FLOOR**2)
     factor = torch.linalg.cholesky(covariance)

@@ -29,7 +29,7 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_server.models.port import Learned, Warm
 
-MIN_POINTS = 2
+MIN_POINTS = 2  # least number of samples to learn from
 
 
 def learn(
@@ -39,13 +39,16 @@ def learn(
     warm: Warm,
     prior: GaussianProcessModel | None = None,
 ) -> Learned:
-    """Learn as ``Learner.learn`` says.
+    """Learn a model from samples; see ``Learner.learn``. A ``prior`` is a model of the same environment, or None.
 
     Raises:
-        InvalidInput: fewer than two samples.
+        InvalidInput: there are fewer than two samples.
+        NumericalFailure: no jitter makes the covariance of the points positive definite.
     """
     if len(samples) < MIN_POINTS:
-        raise InvalidInput(f"a model needs at least {MIN_POINTS} samples, got {len(samples)}")
+        raise InvalidInput(
+            f"a model needs at least {MIN_POINTS} samples, got {len(samples)}; add samples before you learn"
+        )
     many = ByBound(settings.inducing) if settings.inducing else BySubsets()
     learner = OutputLearner(definition, settings, warm, {}, many)
     known = None if prior is None else Known.of(prior, samples)
@@ -60,17 +63,25 @@ def learn(
 
 @dataclass(frozen=True)
 class _Among:
-    """The n samples among which an output learns: masks (n,) and inputs of each candidate map."""
+    """Candidate inputs of one output, and masks of the n samples from which it may learn.
+
+    Attributes:
+        inputs: features (n, d) of each candidate map.
+        keep: samples that no bound has cut.
+        keep_lead: samples for maps that read the change of the leading coordinate.
+        past: samples to learn from if limits of other coordinates don't affect this output.
+        side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
+    """
 
     inputs: dict[FeatureMap, Tensor]
-    keep: Tensor  # those that count
-    keep_lead: Tensor  # those that count for maps that read the lead
-    past: Tensor  # those that count if the limits of others don't matter
-    side: Tensor  # see ``OutputLearner.output``
+    keep: Tensor
+    keep_lead: Tensor
+    past: Tensor
+    side: Tensor
 
 
 def _transitions(learner: OutputLearner, samples: Samples, known: Tensor | None) -> tuple[OutputModel, ...]:
-    """Learn the transition outputs. ``known`` (n, M) is what the prior predicts, if there is one."""
+    """Learn all transition outputs. ``known`` (n, M) is the prior's prediction at the samples, or None."""
     definition = learner.definition
     everything, change = torch.ones(len(samples), dtype=torch.bool), increments(definition, samples)
     columns = [None] * change.shape[1] if known is None else list(known.T)
@@ -88,7 +99,7 @@ def _transitions(learner: OutputLearner, samples: Samples, known: Tensor | None)
     keep = ~saturated(definition, samples.q_next)
     keep = keep if int(keep.sum()) >= MIN_POINTS else everything
     sides = limit_sides(definition, samples.q_next)
-    sides = sides * ((sides != 0).sum(-1, keepdim=True) == 1)  # a wall, or another limit, says nothing of this kind
+    sides = sides * ((sides != 0).sum(-1, keepdim=True) == 1)  # at several limits, no single inequality holds
     lead, drift = leading(definition), learn_drift(definition, samples)
     outputs = []
     for column, index in enumerate(definition.moving):
@@ -103,7 +114,7 @@ def _transitions(learner: OutputLearner, samples: Samples, known: Tensor | None)
 
 
 def _coordinate(learner: OutputLearner, among: _Among, name: str, target: Tensor) -> OutputModel:
-    """Learn the output of one coordinate from targets (n,)."""
+    """Learn the change of one coordinate from its targets (n,)."""
     inputs, keep, side = among.inputs, among.keep, among.side
     output = output_with_rates(learner, name, target, inputs, keep, among.keep_lead, side)
     output = past_limits(learner, output, target, inputs, keep, among.keep_lead, among.past, side)

@@ -1,18 +1,18 @@
-"""What outputs learn from samples that ended at a limit.
+"""Learning from samples that ended at a limit.
 
 At the limit of another coordinate: such a limit may change the rest of the step or not. A wall stops the speed, but a
 relief valve leaves the concentration as smooth as before. Without these samples the process extrapolates where the
-limit is reached. So both are learned, and the one with the smaller error over all of these samples is used, each
-predicted from the others.
+limit is reached. So a process is fitted with them and another without, and the one with the smaller error over all of
+these samples is used, each sample predicted from the others.
 
 At the output's own limit: without the limit the step would have gone at least as far, so the sample is an inequality.
-It says nothing where the process predicts a step beyond the limit. Where the process predicts less, the sample becomes
+It adds nothing where the process predicts a step beyond the limit. Where the process predicts less, the sample becomes
 an observation of the limit itself. Those that become observations are the active set of the inequalities: the most
 probable function that satisfies all of them meets these with equality. The set is found greedily, and may hold a few
-that are not needed. It is dropped if it makes things much worse: what the process falls short of limits, and the
-leave-one-out errors of the other samples, in one sum. A process of inducing points keeps its hyperparameters, and the
-residuals of its samples count. References: S. Da Veiga, A. Marrel (2012), Annales de la Faculte des Sciences de
-Toulouse 21(3); H. Maatouk, X. Bay (2017), Mathematical Geosciences 49(5).
+that are not needed. It is discarded if it makes the misfit much worse: the squared amounts by which the process falls
+short of limits, plus the squared leave-one-out errors of the other samples. A process of inducing points keeps its
+hyperparameters, and the residuals of its samples count. References: S. Da Veiga, A. Marrel (2012), Annales de la
+Faculte des Sciences de Toulouse 21(3); H. Maatouk, X. Bay (2017), Mathematical Geosciences 49(5).
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from surrogym_server.models.gaussian_process.learning.output_learner import Outp
 from surrogym_server.models.gaussian_process.learning.rates import inputs_of, output_with_rates
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-WIDER = " past limits"  # suffix of an output's name, for its hyperparameters
-HELD = " held"  # the same
-SHORT = 0.01  # a prediction that falls short of a limit by less satisfies the inequality; in stds of the targets
-ROUNDS = 3  # of fits, each with the inequalities that the last process violates
-WORSE = 10.0  # largest growth of the misfit by a round; few samples measure it roughly
-MOST = 200  # samples that become observations in one round
+WIDER = " past limits"  # suffix of an output's name in the keys of warm starts: fits with samples at other limits
+HELD = " held"  # suffix of an output's name in the keys of warm starts: fits with samples at the output's own limit
+SHORT = 0.01  # accepted shortfall of a prediction at a limit, in standard deviations of the targets
+ROUNDS = 3  # number of fits, each with the inequalities that the previous process violates
+WORSE = 10.0  # greatest growth of the misfit in a round; it is generous, because few samples measure it roughly
+MOST = 200  # greatest number of samples that become observations in one round
 
 
 def past_limits(
@@ -47,11 +47,15 @@ def past_limits(
     more: Tensor,
     side: Tensor,
 ) -> OutputModel:
-    """Return the output, or one that also learns from the samples ``more`` (n,) and reads no lead, if its error is
-    smaller.
+    """Return the output, or one that also learns from samples at limits of other coordinates if its error is smaller.
 
-    The output was learned from targets (n,) of the samples ``keep`` (n,), or ``keep_lead`` (n,) if it reads the lead.
-    ``side`` is as in ``within_limits``.
+    Args:
+        output: the output, learned from the samples ``keep``, or ``keep_lead`` if it reads the leading coordinate.
+        target: targets (n,) of all samples.
+        inputs: features (n, d) of each candidate map.
+        keep, keep_lead: (n,) bool, see ``output``.
+        more: (n,) bool, samples that may be used if such limits don't affect the output.
+        side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
     """
     rows = keep_lead if output.feature_map.lead else keep
     if not bool((more & ~keep).any()):
@@ -76,10 +80,14 @@ def within_limits(
     keep: Tensor,
     side: Tensor,
 ) -> OutputModel:
-    """The output, learned from samples ``keep`` (n,) with targets (n,), such that it satisfies the inequalities of the
-    others.
+    """Return the output with those samples added as observations of its own limit whose inequalities it violates.
 
-    ``side`` (n,) is 1 for a sample that ended at the output's own upper limit, -1 at the lower, else 0.
+    Args:
+        output: the output, learned from the samples ``keep``.
+        target: targets (n,) of all samples.
+        inputs: features (n, d) of each candidate map.
+        keep: (n,) bool.
+        side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
     """
     if output.feature_map.lead:
         return output
@@ -106,7 +114,7 @@ def within_limits(
 
 
 def _sides(output: OutputModel, side: Tensor) -> tuple[int, ...]:
-    """``side`` (n,) of an exact process' points. Inducing points are no samples, so they have none."""
+    """Return ``side`` (n,) as integers for an exact process; () for inducing points, which are not samples."""
     exact = output.posterior is not None and output.posterior.sparse is None
     return tuple(side.int().tolist()) if exact else ()
 
@@ -114,10 +122,10 @@ def _sides(output: OutputModel, side: Tensor) -> tuple[int, ...]:
 def _misfit(
     output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], rows: Tensor, side: Tensor
 ) -> float:
-    """Sum of squared errors of targets (n,).
+    """Return a sum of squared errors of an output's targets (n,).
 
-    A sample away from the output's limit, where ``side`` (n,) is 0, is predicted from the others of ``rows`` (n,).
-    One at the limit has the error by which the prediction falls short of it.
+    A sample of ``rows`` (n,) away from the output's limit, where ``side`` (n,) is 0, contributes its error when
+    predicted from the others. A sample at the limit contributes the amount by which the prediction falls short of it.
     """
     if output.posterior is None:
         return float("inf")
@@ -134,8 +142,10 @@ def _misfit(
 def _with_samples(
     learner: OutputLearner, output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], keep: Tensor
 ) -> OutputModel:
-    """The output with its own hyperparameters, learned from samples ``keep`` (n,). To fit many samples again takes
-    long, and a few more of them change no hyperparameter."""
+    """Learn the output from the samples ``keep`` (n,) with unchanged hyperparameters.
+
+    A new fit of many samples takes long, and a few more of them hardly change the hyperparameters.
+    """
     assert output.posterior is not None
     x = inputs_of(output, inputs)[keep]
     posterior = learner.many.conditioned(output.posterior.hyper, x, output.standardised(target[keep], x))
@@ -143,9 +153,16 @@ def _with_samples(
 
 
 def _violated(posterior: Posterior, x: Tensor, y: Tensor, side: Tensor) -> list[int]:
-    """Numbers of the points at x (k, d) that must be observed at y (k,), so that the process does not fall short of y
-    at any. ``side`` (k,) has the sign of the side, and the amplitude as its size. The one that falls the shortest is
-    observed first."""
+    """Select points to observe at their limits, so that the process falls short of no limit. Return their indices.
+
+    The point with the greatest shortfall is observed first.
+
+    Args:
+        posterior: the process.
+        x: inputs (k, d) of the points.
+        y: standardised limits (k,).
+        side: (k,) amplitude of the output at each point, negative for a lower limit.
+    """
     joint, mean = Joint.of(posterior, x), posterior.mean(x)
     points: list[int] = []
     while len(points) < min(MOST, len(y)):
@@ -160,11 +177,11 @@ def _violated(posterior: Posterior, x: Tensor, y: Tensor, side: Tensor) -> list[
 
 
 def _error(output: OutputModel, target: Tensor, x: Tensor, rows: Tensor, every: Tensor) -> float:
-    """Mean squared error of targets (n,) at inputs x (n, d), over the samples ``every`` (n,).
+    """Return the mean squared error of targets (n,) at inputs x (n, d), over the samples ``every`` (n,).
 
-    The samples ``rows`` (n,), from which the output was learned, count by their leave-one-out errors. A process of
-    inducing points has none of its samples: each of these points stands for many samples, so to leave one out says
-    nothing about a sample. There the residuals count, because each of many samples hardly influences the process.
+    The samples ``rows`` (n,), from which the output was learned, count with their leave-one-out errors, the others with
+    their residuals. A process of inducing points has no samples of its own to leave out, so all count with their
+    residuals; each of many samples hardly influences it.
     """
     assert output.posterior is not None
     if output.posterior.sparse is not None:

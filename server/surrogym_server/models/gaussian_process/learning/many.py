@@ -1,4 +1,4 @@
-"""What a fit does with more samples than it compares structures on."""
+"""How a process is fitted if there are more samples than structures are compared on."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from surrogym_server.gp import (
 )
 from surrogym_server.gp.subsets import SOME
 
-EXPLAINED = 0.01  # a process whose error is smaller needs no other structure; in standard deviations of the targets
+EXPLAINED = 0.01  # error, in standard deviations of the targets, below which no other structure is searched
 
 
 class ManySamples(ABC):
-    """A way to fit a process to many points, given its structure."""
+    """Strategy to fit a process of known structure to many points."""
 
     @abstractmethod
     def fitted(
@@ -47,12 +47,13 @@ class ManySamples(ABC):
         """Fit a process to all points x (n, d), y (n,), both standardised.
 
         Args:
-            theta: free parameters that were fitted to a subset.
-            mirror: symmetry of the process, if it has one.
-            at_limit: points of which only a side is known, if there are any; they may help to choose hyperparameters.
+            options: options of the fit.
+            theta: free parameters that were fitted to a subset of the points.
+            mirror: symmetry of the process, or None.
+            at_limit: points for which only a bound is known, or None; they may help to choose hyperparameters.
 
         Raises:
-            NumericalFailure: as ``gp.condition``.
+            NumericalFailure: no jitter makes the covariance of the points positive definite.
         """
 
     @abstractmethod
@@ -60,26 +61,33 @@ class ManySamples(ABC):
         """Condition a process with known hyperparameters on x (n, d) and y (n,), through inducing points.
 
         Raises:
-            NumericalFailure: as ``gp.condition``.
+            NumericalFailure: no jitter makes the covariance of the points positive definite.
         """
 
     def fewer_inputs(
         self, x: Tensor, y: Tensor, options: FitOptions, posterior: Posterior, may: Tensor, odds: float
     ) -> Fewer | None:
-        """Leave out inputs of a process through inducing points, from its points x (n, d), y (n,).
+        """Leave out inputs of a process that has inducing points. By default nothing is left out.
 
-        ``may`` (d,) marks the inputs that may be left out, and ``odds`` are the log odds of each before any data. None
-        if all are kept, which is the default.
+        Args:
+            x, y: all of the process's points, (n, d) and (n,).
+            options: options of the fit.
+            posterior: the process with all inputs.
+            may: (d,) bool, the inputs that may be left out.
+            odds: prior log odds of leaving out one input.
+
+        Returns:
+            The process with fewer inputs, or None if all are kept.
         """
         del x, y, options, posterior, may, odds
         return None
 
 
 class BySubsets(ManySamples):
-    """Hyperparameters of subsets; the process is exact up to ``gp.sparse.MAX_EXACT`` points.
+    """Fit hyperparameters to subsets of the samples; the process is exact up to ``gp.sparse.MAX_EXACT`` points.
 
-    Hyperparameters of the hard points are tried too, if the points are many and not foretold well from the others. A
-    process goes through inducing points as soon as these lose nothing, see ``gp.bound.loses_nothing``.
+    If there are more and some are predicted badly from the others, hyperparameters fitted to the worst points are tried
+    too. A process uses inducing points as soon as these lose no accuracy, see ``gp.bound.loses_nothing``.
     """
 
     def fitted(
@@ -110,7 +118,7 @@ class BySubsets(ManySamples):
 
 @dataclass(frozen=True)
 class ByBound(ManySamples):
-    """Hyperparameters that maximise the variational bound of all samples, through at most ``inducing`` points."""
+    """Fit hyperparameters that maximise the variational bound of all samples, through at most ``inducing`` points."""
 
     inducing: int
 
@@ -123,7 +131,7 @@ class ByBound(ManySamples):
         mirror: Reflection | None,
         at_limit: Censored | None,
     ) -> Posterior:
-        del at_limit  # the bound counts what inducing points leave, so nothing is left to choose
+        del at_limit  # it only helps to choose between candidates, and the bound yields a single one
         return fit_bound(x, y, options, theta, self.inducing, mirror)
 
     def conditioned(self, hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:

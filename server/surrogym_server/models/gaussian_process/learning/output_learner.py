@@ -19,28 +19,29 @@ from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE
 from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_server.models.port import Warm
 
-# Log odds of maps before any data. A map that reads the lead fits no better where nothing was cut, and alone is right
-# where something is; few samples look like noise over the lead alone; and what is seen of one side alone says nothing
-# of the other, mirrored or not. What pays in one place alone seldom asks for the action as well.
+# Prior log odds of feature maps. LEAD: a map that reads the lead (the change of the leading coordinate) fits no better
+# where nothing was cut, and alone is right where something was. ALONE: few samples look like noise over the lead alone.
+# PARITY: data from one side alone are no evidence for symmetry. PLACE: a reward paid in one place seldom depends on the
+# action.
 LEAD_ODDS, ALONE_ODDS, PARITY_ODDS, PLACE_ODDS = 3.0, -6.0, -3.0, 3.0
-CONSTANT = 1e-9  # an output whose standard deviation is below this share of its own size never varied
-SMALLEST = 1e-100  # standard deviation of an output: squares of a smaller one underflow
-PEAK = "reward peak"  # the logarithm of a reward
+CONSTANT = 1e-9  # an output whose standard deviation is below this share of its mean's size counts as constant
+SMALLEST = 1e-100  # smallest standard deviation of an output that varies; squares of a smaller one underflow
+PEAK = "reward peak"  # name of the output that learns the logarithm of a reward
 
 
 @dataclass
 class OutputLearner:
-    """Fits processes, each from its warm start, and keeps their hyperparameters."""
+    """Fitter of the outputs of one model. It keeps the hyperparameters of all fits for the next warm start."""
 
     definition: EnvironmentDefinition
     settings: Settings
-    warm: Warm  # hyperparameters of earlier fits by "output|feature map"
-    thetas: dict[str, NDArray[np.float64]]  # hyperparameters of this fit
-    many: ManySamples = field(default_factory=BySubsets)  # what is done with more than ``subsets.FEW`` samples
-    selections: dict[str, Selection] = field(default_factory=dict)  # inputs that evidence alone keeps, by output
+    warm: Warm  # free parameters of the previous fits, by "output|feature map"
+    thetas: dict[str, NDArray[np.float64]]  # free parameters of the present fits, by the same keys
+    many: ManySamples = field(default_factory=BySubsets)  # strategy for more than ``subsets.FEW`` samples
+    selections: dict[str, Selection] = field(default_factory=dict)  # by output name: inputs selected by evidence alone
 
     def allowed(self, maps: tuple[FeatureMap, ...]) -> tuple[FeatureMap, ...]:
-        """The maps that the settings allow to compare."""
+        """Return those of the maps that the settings allow."""
         return tuple(m for m in maps if self.settings.symmetry == "auto" or not m.parity)
 
     def output(
@@ -52,12 +53,18 @@ class OutputLearner:
         keep_lead: Tensor,
         side: Tensor | None = None,
     ) -> OutputModel:
-        """Fit one output's targets (n,) with each of the feature maps ``inputs`` (n, d), and return the best.
+        """Fit one output with each candidate feature map, and return the best.
 
-        ``keep`` (n,) marks the samples that count. Maps that read the lead may use more, ``keep_lead``. All are
-        compared on the same points. The maps with all lags are compared first, and then the histories of the best one.
-        ``side`` (n,) is 1 for a sample that ended at the output's own upper limit, -1 at the lower, else 0. Of those
-        that do not count, these help to choose hyperparameters if the samples are many.
+        All maps are compared on the same samples: first the maps with all lags, then shorter histories of the best.
+
+        Args:
+            name: name of the output.
+            target: targets (n,).
+            inputs: features (n, d) of each candidate map.
+            keep: (n,) bool, the samples to learn from.
+            keep_lead: (n,) bool, the samples to learn from if the best map reads the leading coordinate.
+            side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0. If there
+                are many samples, those outside ``keep`` help to choose hyperparameters.
         """
         centre, scale = float(target[keep].mean()), float(target[keep].std(correction=0))
         if scale <= max(CONSTANT * abs(centre), SMALLEST):
@@ -66,7 +73,7 @@ class OutputLearner:
         fits: dict[FeatureMap, Fitted] = {}
 
         def better(*maps: FeatureMap) -> FeatureMap:
-            """The best of the maps, and of those fitted before."""
+            """Fit the maps, and return the best of all maps fitted so far."""
             fits.update({m: self._fit(name, m, inputs[m][keep], (target[keep] - around[m]) / scale) for m in maps})
             return max(fits, key=lambda m: fits[m].score + _odds(m))
 
@@ -89,8 +96,7 @@ class OutputLearner:
         return OutputModel(name, best, posterior, centre, scale, int((~rows).sum()), scores)
 
     def _fit(self, name: str, feature_map: FeatureMap, x: Tensor, y: Tensor, also: str = "") -> Fitted:
-        """Fit to all points. If there are many, fit to some of them, and scale the score as if the others
-        were alike."""
+        """Fit a process to x (n, d), y (n,), or to a subset of many points, with the score scaled up to all points."""
         key, rows = f"{name}|{feature_map}{also}", spread(len(y), subsets.FEW)
         mirror = reflection(self.definition, feature_map)
         result = fit(x[rows], y[rows], self.options(name), self.warm.get(key), mirror)
@@ -106,12 +112,12 @@ class OutputLearner:
         theta: NDArray[np.float64],
         at_limit: Censored | None = None,
     ) -> Posterior:
-        """The process of all points x (n, d), y (n,); ``theta`` was fitted to a subset."""
+        """Fit the process of all points x (n, d), y (n,), given a ``theta`` that was fitted to a subset."""
         mirror = reflection(self.definition, feature_map)
         return self.many.fitted(x, y, self.options(name), theta, mirror, at_limit)
 
     def options(self, name: str) -> FitOptions:
-        """Dynamics tend to be near linear, and costs to be quadratic."""
+        """Return the options of an output's fit: a linear kernel part for all, and a quadratic one for rewards."""
         options = FitOptions(quadratic=name in (REWARD, PEAK))
         if self.settings.kernel == "squared_exponential":
             options = FitOptions(linear=False)
@@ -119,16 +125,16 @@ class OutputLearner:
 
 
 def is_unexplained(posterior: Posterior) -> bool:
-    """Whether other structures of a process are worth a search.
+    """Return whether a process leaves enough error that other structures are worth a search.
 
-    They are not if it predicts each sample well from the others. They are not either where inducing points stand for
-    the samples, and lose something.
+    It does not if it predicts each sample well from the others. Nor is a search worthwhile if inducing points represent
+    the samples with some loss.
     """
     return loses_nothing(posterior) and posterior.left_out.error > EXPLAINED
 
 
 def _with_whole_history(inputs: Mapping[FeatureMap, Tensor]) -> list[FeatureMap]:
-    """The maps that read all lags, or if there is none, the only history that is given."""
+    """Return the maps that read all lags; if there is none, all maps."""
     return [m for m in inputs if m.history is None] or list(inputs)
 
 

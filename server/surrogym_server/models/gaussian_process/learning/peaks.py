@@ -24,34 +24,41 @@ from surrogym_server.models.gaussian_process.learning.output_learner import PEAK
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.warp import Warp
 
-FAINT = 0.1  # share of the samples with a reward: the largest of these faint ones is compared with the best
-SPREAD = 3.0  # decades between the two where a peak is looked for; squares in one dimension spread as far at 6 % ...
-DECADES = 10.0  # ... and where nothing else spreads so far, neither noise nor rounding
-REFITS = 3  # with samples that contradict the fit before
-BELOW = 10.0  # nats: distance of the samples without a reward below the others, before they are predicted
-FEWEST = 3  # samples with a reward that are needed to predict the others
-EPS = 4 * torch.finfo(torch.float64).eps  # of the base: a value that is closer to it equals it
-RESOLUTION = 1e-3  # of the largest: resolution at which explanations of the samples are compared
-GAIN = 3.0  # nats by which structure in the logarithms must win where the spread leaves doubt
+FAINT = 0.1  # quantile of the rewards above the base whose height is compared with the greatest height
+# Decades between the two heights from which a peak is considered; squares in one dimension spread as far at 6 %.
+SPREAD = 3.0
+DECADES = 10.0  # decades from which only a peak explains the spread: neither noise nor rounding reaches this far
+REFITS = 3  # greatest number of further fits, each with samples that contradict the previous one
+BELOW = 10.0  # assumed logarithm of rewards at the base: this many nats below the others, if these can't predict it
+FEWEST = 3  # least number of samples with a reward that can predict the others
+EPS = 4 * torch.finfo(torch.float64).eps  # a reward within this share of the base equals the base
+RESOLUTION = 1e-3  # resolution at which explanations of the samples are compared, as a share of the largest reward
+GAIN = 3.0  # nats by which structure in the logarithms must win where the spread alone does not decide
 
 
 def hides(reward: Tensor) -> bool:
-    """Whether many of the rewards (n,) are nearly zero compared with the largest, or all are zero."""
+    """Return whether many of the rewards (n,) are nearly zero compared with the largest, or all are zero."""
     return bool((reward == 0).all()) or any(True for _ in _bases(reward))
 
 
 def with_peak(
     learner: OutputLearner, reward: Tensor, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
 ) -> OutputModel:
-    """The reward learned by its logarithm from the samples ``going`` (n,), if that explains them better; else
-    ``plain``."""
+    """Learn the reward by its logarithm, and return the result if it explains the samples better than ``plain``.
+
+    Args:
+        reward: rewards (n,).
+        inputs: features (n, d) of each candidate map.
+        going: (n,) bool, the samples to learn from.
+        plain: the output that was learned from the rewards themselves, returned if it explains them better.
+    """
     accounts = [_account_of(learner, reward, inputs, going, *base) for base in _bases(reward[going])]
     better = [account for account, structure in accounts if _better(account, structure, plain, reward, inputs, going)]
     return max(better, key=lambda account: _agreement(account, reward, inputs, going), default=plain)
 
 
 def _bases(reward: Tensor) -> Iterator[tuple[float, float]]:
-    """Candidate base and sign of peaks of rewards (n,): above or below 0, or above or below the median reward."""
+    """Yield candidate bases and signs of a peak of rewards (n,): above or below 0, above or below the median reward."""
     middle = float(reward.median())
     for base in dict.fromkeys((0.0, middle)):
         for sign in (1.0, -1.0):
@@ -61,20 +68,20 @@ def _bases(reward: Tensor) -> Iterator[tuple[float, float]]:
 
 
 def _heights(reward: Tensor, base: float, sign: float) -> Tensor:
-    """Heights of rewards (n,) above their base; 0 if the difference is rounding."""
+    """Return the heights of rewards (n,) above the base (below it for sign -1); 0 for a difference within rounding."""
     height = sign * (reward - base)
     return torch.where(height.abs() <= EPS * abs(base), 0.0, height)
 
 
 def _trace(height: Tensor, base: float) -> bool:
-    """Whether heights (n,) show an isolated peak: above 0 in few places, and elsewhere too small for a trainer, which
-    computes in float32."""
+    """Return whether heights (n,) are an isolated peak that is invisible in float32, in which trainers compute."""
     float32, highest = torch.finfo(torch.float32), float(height.max())
     return 0 < highest < max(float32.eps * abs(base), float32.tiny) and float(height.median()) == 0
 
 
 def _spread(height: Tensor) -> float:
-    """Decades between the largest and the faint ones of the samples with a reward, of heights (n,)."""
+    """Return the decades between the greatest of the heights (n,) above 0 and their lowest decile; 0 for fewer than
+    two."""
     heights = height[height > 0]
     if len(heights) < 2:
         return 0.0
@@ -90,10 +97,10 @@ def _account_of(
     base: float,
     sign: float,
 ) -> tuple[OutputModel, float]:
-    """A process of the logarithms, and the structure that it found in the samples that it was fitted to.
+    """Learn the logarithms of the heights above a base. Return the output, and its log odds against no structure.
 
-    It is fitted to the samples with a reward, and to those without one that would contradict it. It is conditioned on
-    all.
+    The process is fitted to the samples with a reward, and to those without one that would contradict it. It is then
+    conditioned on all samples of ``going``.
     """
     height = _heights(reward, base, sign)
     positive = going & (height > 0)
@@ -126,7 +133,10 @@ def _better(
     inputs: Mapping[FeatureMap, Tensor],
     going: Tensor,
 ) -> bool:
-    """Whether logarithms, with such ``structure`` in them, explain the samples better than their values do."""
+    """Return whether a process of the logarithms explains the samples better than ``plain``, a process of the values.
+
+    ``structure`` is the log odds of the logarithms' process against no structure; the others are as in ``with_peak``.
+    """
     if account.posterior is None:
         return False
     if plain.posterior is None:
@@ -139,7 +149,7 @@ def _better(
 
 
 def _structure(output: OutputModel) -> float:
-    """Log odds of a fitted process against targets that don't depend on their inputs."""
+    """Return the log odds of a fitted process against targets that don't depend on their inputs."""
     if output.posterior is None:
         return 0.0
     count = output.posterior.points
@@ -147,12 +157,13 @@ def _structure(output: OutputModel) -> float:
 
 
 def _agreement(output: OutputModel, reward: Tensor, inputs: Mapping[FeatureMap, Tensor], going: Tensor) -> float:
-    """Log probability of every sample, predicted from all others, to ``RESOLUTION`` of the largest."""
+    """Return the log probability of all rewards, each predicted from the others and rounded to ``RESOLUTION`` of the
+    largest."""
     posterior, warp = output.posterior, output.warp
     assert posterior is not None
     if posterior.sparse is None:
         mean, variance = posterior.leave_one_out()
-    else:  # one point of thousands hardly counts
+    else:  # of thousands of points each hardly influences its own prediction, so none is left out
         mean, latent = posterior.mean_and_variance(inputs[output.feature_map][going])
         variance = latent + posterior.hyper.noise_variance
     centre, spread = output.centre + output.scale * mean, output.scale * variance.sqrt()

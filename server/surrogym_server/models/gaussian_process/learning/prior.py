@@ -1,4 +1,4 @@
-"""Choice by held-out samples whether an output learns what a prior leaves, or learns without the prior.
+"""Choice by left-out samples whether an output learns the residual of a prior, or learns without the prior.
 
 A prior is another model of the same environment, such as one of a simulator. An output that uses it is the prior's mean
 plus a process: the discrepancy of Kennedy and O'Hagan (2001), Journal of the Royal Statistical Society B 63(3).
@@ -19,32 +19,39 @@ from surrogym_server.gp import LeftOut
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-NOTHING = 1e-9  # of an output's standard deviation: what a prior leaves is rounding if it is smaller
+NOTHING = 1e-9  # a residual of the prior below this share of an output's standard deviation is rounding
 BY_PRIOR = "with the prior, mean log density of a left-out sample"
-BESIDE = " beside prior"  # suffix of an output's name, for its hyperparameters
-Learn = Callable[[str, Tensor], OutputModel]  # name and targets (n,): a learned output
+BESIDE = " beside prior"  # suffix of an output's name in the keys of warm starts: fits beside a prior
+Learn = Callable[[str, Tensor], OutputModel]  # function of an output's name and its targets (n,)
 ALONE = "without the prior, mean log density of a left-out sample"
 
 
 @dataclass(frozen=True)
 class Known:
-    """What a prior predicts at n samples."""
+    """Predictions of a prior at n samples."""
 
-    change: Tensor  # (n, M) of each transition output
+    change: Tensor  # (n, M) change of each transition output
     reward: Tensor  # (n,) without the terminal reward
     terminal: float  # terminal reward
 
     @classmethod
     def of(cls, prior: GaussianProcessModel, samples: Samples) -> Self:
-        """Predict the samples."""
+        """Compute the predictions of a prior at the samples."""
         means = prior.means_before_end(samples.q, samples.u)
         return cls(means[:, :-1], means[:, -1], prior.terminal_reward)
 
 
 def better_of(learn: Learn, name: str, target: Tensor, known: Tensor | None, keep: Tensor) -> OutputModel:
-    """Learn an output's targets (n,) from samples ``keep`` (n,), with the prior's mean ``known`` (n,) or without.
+    """Learn an output from its targets (n,), with and without the prior, and return the better one.
 
-    The output that predicts the left-out samples better is returned, and the one with the prior if both are as good.
+    That is the output with the greater density of left-out samples, in doubt the one with the prior.
+
+    Args:
+        learn: function that fits an output.
+        name: name of the output.
+        target: targets (n,).
+        known: the prior's mean (n,), or None if there is no prior.
+        keep: (n,) bool, the samples to learn from.
     """
     alone = learn(name, target)
     if known is None or alone.posterior is None:
@@ -57,7 +64,7 @@ def better_of(learn: Learn, name: str, target: Tensor, known: Tensor | None, kee
 
 
 def beside(learn: Learn, name: str, target: Tensor, known: Tensor, keep: Tensor) -> OutputModel:
-    """Learn what the prior's mean ``known`` (n,) leaves of targets (n,), from samples ``keep`` (n,)."""
+    """Learn the residual of targets (n,) from the prior's mean ``known`` (n,), from the samples ``keep`` (n,)."""
     left, size = target - known, float(target[keep].std(correction=0))
     is_rounding = float(left[keep].abs().max()) <= NOTHING * size
     output = learn(name + BESIDE, torch.zeros_like(left) if is_rounding else left)
@@ -65,7 +72,8 @@ def beside(learn: Learn, name: str, target: Tensor, known: Tensor, keep: Tensor)
 
 
 def log_density(output: OutputModel) -> float:
-    """Mean log density of a left-out sample, in the output's unit; infinite for an output without a process."""
+    """Return the mean log density of a left-out sample, in the output's unit; infinite for an output without a
+    process."""
     if (posterior := output.posterior) is None:
         return math.inf
     if posterior.sparse is not None:

@@ -1,4 +1,4 @@
-"""Choice by evidence whether an output changes the faster the further along its inputs, see ``gp.growth``."""
+"""Choice by evidence whether an output changes faster further along its inputs, by rates; see ``gp.growth``."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from surrogym_server.models.gaussian_process.learning.output_learner import Outp
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.tensors import EDGE, amplitude, bend
 
-ODDS = -3.0  # log odds of each rate before any data
-FEWEST = 8  # samples for each rate: fewer leave a rate uncertain, and predictions with it are too sure
+ODDS = -3.0  # prior log odds of each rate
+FEWEST = 8  # least number of samples for each rate; fewer leave a rate uncertain, and its predictions too sure
 
 
 def output_with_rates(
@@ -28,7 +28,16 @@ def output_with_rates(
     keep_lead: Tensor,
     side: Tensor,
 ) -> OutputModel:
-    """Fit one output as ``OutputLearner.output`` does. Then its best map may get rates."""
+    """Fit one output as ``OutputLearner.output`` does, then add rates to its best map if they are likelier.
+
+    Args:
+        name: name of the output.
+        target: targets (n,).
+        inputs: features (n, d) of each candidate map.
+        keep: (n,) bool, the samples to learn from.
+        keep_lead: (n,) bool, the samples to learn from if the best map reads the leading coordinate.
+        side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
+    """
     output = learner.output(name, target, inputs, keep, keep_lead, side)
     may = _may_have_rates(learner, output, inputs, keep)
     if not bool(may.any()):
@@ -46,7 +55,7 @@ def output_with_rates(
 
 
 def inputs_of(output: OutputModel, inputs: Mapping[FeatureMap, Tensor]) -> Tensor:
-    """Inputs of an output's process, (n, d), from the features of maps without rates."""
+    """Return the inputs of an output's process, (n, d), from the features ``inputs`` of maps without rates."""
     x, rates = inputs[replace(output.feature_map, rates=())], output.feature_map.rates
     return bend(x, torch.tensor(rates, dtype=x.dtype)) if rates else x
 
@@ -54,9 +63,9 @@ def inputs_of(output: OutputModel, inputs: Mapping[FeatureMap, Tensor]) -> Tenso
 def _may_have_rates(
     learner: OutputLearner, output: OutputModel, inputs: Mapping[FeatureMap, Tensor], keep: Tensor
 ) -> Tensor:
-    """Inputs of an output, (d,) bool, that may have a rate.
+    """Return which inputs of an output may have a rate, (d,) bool.
 
-    No input may have one if there are too few samples to determine it, or if nothing is left to explain.
+    No input may if there are too few samples to determine the rates, or if the process has little error left.
     """
     plain, posterior = output.feature_map, output.posterior
     kinds = torch.tensor([feature.function == "affine" for feature in features(learner.definition, plain)])
@@ -76,11 +85,11 @@ def _growing(
     keep: Tensor,
     may: Tensor,
 ) -> OutputModel:
-    """The output with rates."""
+    """Fit the output with rates for the inputs ``may`` (d,), from the samples ``keep`` (n,)."""
     plain = output.feature_map
     z, t = inputs[plain][keep], (target[keep] - output.centre) / output.scale
     rows, among = spread(len(t), subsets.FEW), ",".join(map(str, may.nonzero().ravel().tolist()))
-    key = f"{output.name}|{plain}|rates of {among}"  # a warm start has a rate for each of these inputs
+    key = f"{output.name}|{plain}|rates of {among}"  # a warm start has a rate for each of these inputs, in this order
     starts = [learner.thetas[f"{output.name}|{plain}"], *([learner.warm[key]] if key in learner.warm else [])]
     growth = fit_growing(z[rows], t[rows], may, learner.options(output.name), starts)
     learner.thetas[key] = growth.fitted.theta
@@ -95,8 +104,10 @@ def _growing(
 
 
 def _evidence(outputs: Sequence[OutputModel], inputs: Mapping[FeatureMap, Tensor], keep: Tensor) -> list[float]:
-    """Log density of the targets by each of the outputs, in the output's scale: with inducing points, which have no
-    evidence of all samples, the density of each target given all others."""
+    """Return the log density of the targets under each of the outputs, in the output's scale.
+
+    With inducing points, which give no evidence of all samples, it is the sum over the targets given all others.
+    """
     pairs = [(output, posterior) for output in outputs if (posterior := output.posterior) is not None]
     exact = all(posterior.sparse is None for _, posterior in pairs)
     return [

@@ -1,4 +1,4 @@
-"""Learning of a region from labelled states; above all of the region in which episodes end."""
+"""Learning of a region from labelled states, such as the region in which episodes end."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from surrogym_server.models.gaussian_process.learning.thresholds import log_prob
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.regions import TERMINATION, Classifier, Form, Region, likely
 
-HANDICAP = 3.0  # log odds against the classifier, whose hyperparameters were fitted to the left-out labels too
-FAINT = 0.05  # a form is dropped if its weight is a smaller share of the best one's
+HANDICAP = 3.0  # log odds against the classifier, whose hyperparameters were fitted to the left-out labels as well
+FAINT = 0.05  # a form whose weight is below this share of the best one's is discarded
 
 
 def learn_termination(learner: OutputLearner, samples: Samples, prior: GaussianProcessModel | None = None) -> Region:
     """Learn the region in which episodes end. It is empty while no sample has ended an episode.
 
-    The region of a prior is used as long as all samples agree with it.
+    If the samples agree with the region of a prior without exception, that region is returned.
     """
     if prior is not None and prior.ending is not None:
         agrees = (prior.ending.probability(samples.q_next) > 0.5) == samples.terminated
@@ -32,8 +32,10 @@ def learn_termination(learner: OutputLearner, samples: Samples, prior: GaussianP
 
 
 def learn_region(learner: OutputLearner, name: str, q: Tensor, inside: Tensor) -> Region:
-    """Learn which of q (n, C) lie inside (n,): thresholds and a classifier, weighted by their leave-one-out predictions
-    of the labels."""
+    """Learn the region of those states q (n, C) for which ``inside`` (n,) is true.
+
+    It combines thresholds and a classifier, weighted by how well each predicts left-out labels.
+    """
     scored: list[tuple[Form, float]] = [_classifier(learner, name, q, inside)]
     scored += thresholds(learner.definition, q, inside)
     names = [str(form.description.get("inside", "classifier")) for form, _ in scored]
@@ -53,7 +55,7 @@ def _classifier(learner: OutputLearner, name: str, q: Tensor, inside: Tensor) ->
         return Classifier(definition, process), 0.0
     if process.posterior.sparse is None:
         mean, variance = process.posterior.leave_one_out()
-    else:  # one point of thousands hardly counts
+    else:  # of thousands of points each hardly influences its own prediction, so none is left out
         mean, latent = process.posterior.mean_and_variance(inputs[process.feature_map])
         variance = latent + process.posterior.hyper.noise_variance
     probability = likely(process.centre + process.scale * mean, process.scale * variance.sqrt())

@@ -1,4 +1,4 @@
-"""Choice by evidence which outputs do the same with inputs of their own and share samples, see ``gp.pooling``."""
+"""Choice by evidence which outputs are the same function of different inputs and share samples, see ``gp.pooling``."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from surrogym_server.models.gaussian_process.learning.dropping import WIN, map_w
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner, is_unexplained
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-ROLES = 4  # most inputs of a function that is shared
-MOST = subsets.FEW  # samples of its own and of others, beyond which those of others become fewer
+ROLES = 4  # greatest number of inputs of a shared function
+MOST = subsets.FEW  # greatest number of samples of an output with those of others; only the others' are thinned out
 
 
 @dataclass(frozen=True)
 class _Candidate:
     """An output that may share samples."""
 
-    place: int
+    place: int  # index of the output in the model
     output: OutputModel
     part: Part
-    every: tuple[int, ...]  # places, in the map that drops nothing, of the inputs of ``part``
+    every: tuple[int, ...]  # indices of the inputs of ``part`` in the feature map that leaves nothing out
 
 
 def with_samples_of_others(learner: OutputLearner, outputs: Sequence[OutputModel]) -> tuple[OutputModel, ...]:
-    """The outputs, of which those that repeat each other learn from each other's samples too."""
+    """Return the outputs; those that are the same function of different inputs learn from each other's samples too."""
     shared = list(outputs)
     if not learner.settings.repeated_parts or not any(_is_to_learn(learner, output) for output in outputs):
         return tuple(shared)
@@ -51,13 +51,13 @@ def with_samples_of_others(learner: OutputLearner, outputs: Sequence[OutputModel
 
 
 def _is_to_learn(learner: OutputLearner, output: OutputModel) -> bool:
-    """Whether something is left to explain, where the inputs of the output were looked at."""
+    """Return whether an output has error left to explain, and evidence about its inputs."""
     unexplained = output.posterior is not None and is_unexplained(output.posterior)
     return unexplained and output.name in learner.selections
 
 
 def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Candidate | None:
-    """The output with its process; None if it can't share samples."""
+    """Return the output with its process as a candidate; None if it can't share samples."""
     posterior, selection, feature_map = output.posterior, learner.selections.get(output.name), output.feature_map
     if posterior is None or posterior.sparse is not None or feature_map.rates or output.at_limit:
         return None
@@ -86,7 +86,7 @@ def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Cand
 
 
 def _sharing(members: Sequence[_Candidate], pool: Pool, member: int) -> OutputModel:
-    """A member with the samples of its pool, if its own are predicted no worse by them."""
+    """Return a member of a pool with the samples of the pool, or unchanged if these predict its own samples worse."""
     candidate, output = members[member], members[member].output
     assert output.posterior is not None
     x, y, hyper = pool.samples_of(member, MOST)

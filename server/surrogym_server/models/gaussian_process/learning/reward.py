@@ -20,15 +20,15 @@ from surrogym_server.models.gaussian_process.learning.prior import Known, beside
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.regions import Jump, jumped
 
-FEW = 2  # non-terminating steps; fewer are useless without the terminating ones
+FEW = 2  # with fewer non-terminating steps than this, terminating steps are learned from too
 
 
 def learn_reward(
     learner: OutputLearner, samples: Samples, prior: Known | None = None
 ) -> tuple[OutputModel, float, tuple[Jump, ...]]:
-    """The reward process of non-terminating steps, the additional reward of terminating steps, and the jumps.
+    """Return the reward process of non-terminating steps, the additional reward of terminating steps, and the jumps.
 
-    The reward of a prior is used if what it leaves has smaller leave-one-out errors.
+    A process of the residual of the ``prior`` is used if its leave-one-out errors are not larger.
     """
     definition = learner.definition
     if (declared := definition.declared_reward) is not None:
@@ -64,7 +64,7 @@ def _plain(
 
 
 def _without_action(definition: EnvironmentDefinition, samples: Samples) -> dict[FeatureMap, Tensor]:
-    """Inputs without the action, because a reward that is paid in one place seldom depends on it."""
+    """Encode the samples without the action, because a reward that is paid in one place seldom depends on it."""
     maps = {replace(m, action="none") for m in reward_candidates(definition) if not m.parity}
     return {
         m: encode(definition, m, samples.q_next if m.after else samples.q, samples.u) for m in sorted(maps, key=str)
@@ -72,7 +72,7 @@ def _without_action(definition: EnvironmentDefinition, samples: Samples) -> dict
 
 
 def _declared(reward: DeclaredRewardDefinition, samples: Samples) -> OutputModel:
-    """The declared reward without a process. Its score is the largest error over the samples."""
+    """Return the declared reward as an output without a process. Its score is the largest error over the samples."""
     rewards = reward(samples.q_next if reward.after else samples.q, samples.u) + reward.terminal * samples.terminated
     off = float((samples.reward - rewards).abs().max())
     scores = (("declared, largest error over the samples", off),)

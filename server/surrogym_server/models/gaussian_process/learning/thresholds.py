@@ -1,6 +1,6 @@
 """Search for thresholds from labelled states: the fewest axes that explain which states lie inside, and alternatives.
 
-If the level is a priori uniform over an axis' range, the probability of labels that it separates is gap / range. This
+If the level has a uniform prior over an axis's range, the probability of labels that it separates is gap / range. This
 is the weight of a cut among those that explain the same samples.
 """
 
@@ -17,16 +17,18 @@ from surrogym_server.models.gaussian_process.prediction.regions import Axes, Cut
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Rules = tuple[tuple[Cut, ...], ...]
-SLACK = 1e-9  # of an axis' range: closer values are the same
-RIVALS = 4
-FAINT = 0.05  # alternatives of less weight are dropped
-LEFT_OUT = 100  # samples left out, one by one, to score a rule
+SLACK = 1e-9  # values closer than this share of an axis's range are equal
+RIVALS = 4  # greatest number of alternative cuts of one rule
+FAINT = 0.05  # least weight of an alternative cut
+LEFT_OUT = 100  # greatest number of samples that are left out, one by one, to score a rule
 
 
 def thresholds(definition: EnvironmentDefinition, q: Tensor, inside: Tensor) -> list[tuple[Thresholds, float]]:
-    """Find thresholds that explain which of q (n, C) lie inside (n,), and their leave-one-out log probabilities.
+    """Find thresholds that explain which of the states q (n, C) lie inside, (n,) bool.
 
-    A union of them, a complement of a union of two or more (of one would be the same again), both or none.
+    Returns:
+        At most two forms with their leave-one-out log probabilities: a union of thresholds, and the complement of a
+        union of at least two (the complement of a single threshold would be a threshold again).
     """
     values, labels = Axes.of(definition)(q).numpy(), inside.numpy()
     forms = []
@@ -39,7 +41,8 @@ def thresholds(definition: EnvironmentDefinition, q: Tensor, inside: Tensor) -> 
 
 
 def explain(values: Floats, inside: Bools) -> Rules:
-    """Rules for the labels inside (n,) of samples with axis values (n, A); none if no union of thresholds fits."""
+    """Return rules for samples with axis values (n, A) and labels ``inside`` (n,); () if no union of thresholds
+    fits."""
     if inside.all() or not inside.any():
         return ()
     width = np.maximum(values.max(0) - values.min(0), 1e-300)
@@ -59,14 +62,19 @@ def explain(values: Floats, inside: Bools) -> Rules:
 
 
 def log_probability(probability: Tensor, inside: Tensor) -> float:
-    """Log probability of labels inside (n,), limited by the rule of succession, 1 / (n + 2)."""
+    """Return the log probability of labels inside (n,), each limited by the rule of succession to 1 / (n + 2)."""
     right = torch.where(inside, probability, 1 - probability)
     return float(right.clamp(1 / (len(right) + 2), 1).log().sum())
 
 
 def _cover(reached: Bools, share: Floats) -> list[int]:
-    """Axes that together reach every sample, chosen greedily. Of axes that reach as many, the one with the
-    widest gap."""
+    """Choose axes greedily that together explain every sample inside; () if there are none.
+
+    Args:
+        reached: (i, A) whether each axis separates each sample inside from those outside.
+        share: (i, A) gap between the sample and those outside, as a share of the axis's range. Of axes that explain
+            equally many samples, the one with the widest gap is chosen.
+    """
     axes: list[int] = []
     left = np.ones(len(reached), dtype=bool)
     while left.any():
@@ -80,8 +88,11 @@ def _cover(reached: Bools, share: Floats) -> list[int]:
 
 
 def _assign(reached: Bools, share: Floats, axes: list[int]) -> NDArray[np.int64]:
-    """Axis that explains each sample (i,): the only possible one, or the one beyond which it lies farthest, relative to
-    the samples that this axis alone explains."""
+    """Return which of the chosen axes explains each sample inside, (i,).
+
+    It is the only possible one, or the one on which the sample lies farthest beyond the threshold, relative to the
+    samples that this axis alone explains. ``reached`` and ``share`` are as in ``_cover``.
+    """
     able, distance = reached[:, axes], share[:, axes]
     sole = able.sum(1) == 1
     nearest = np.where(sole[:, None] & able, distance, np.inf).min(0, initial=np.inf)
@@ -90,7 +101,15 @@ def _assign(reached: Bools, share: Floats, axes: list[int]) -> NDArray[np.int64]
 
 
 def _rivals(inner: Floats, outside: Floats, width: Floats, own: Bools, axes: list[int]) -> tuple[Cut, ...]:
-    """Cuts along ``axes`` that explain a rule's own samples, by weight."""
+    """Return the cuts along ``axes`` that explain a rule's own samples, by descending weight.
+
+    Args:
+        inner: axis values (i, A) of the samples inside.
+        outside: greatest value of the samples outside on each axis, (A,).
+        width: range of each axis, (A,).
+        own: (i,) bool, the samples that the rule explains.
+        axes: axes to consider.
+    """
     inside = inner[own].min(0)
     weights = {axis: max(0.0, float((inside[axis] - outside[axis]) / width[axis])) for axis in axes}
     weights = {axis: weight for axis, weight in weights.items() if weight > SLACK}
@@ -102,8 +121,10 @@ def _rivals(inner: Floats, outside: Floats, width: Floats, own: Bools, axes: lis
 
 
 def _left_out(definition: EnvironmentDefinition, values: Floats, inside: Bools) -> float:
-    """Leave-one-out log probability of the labels. If there are more than ``LEFT_OUT`` samples, an even share
-    represents all."""
+    """Return the leave-one-out log probability of the labels ``inside`` (n,), given axis values (n, A).
+
+    Of more than ``LEFT_OUT`` samples, that many at equal distances are left out and represent all.
+    """
     count, rows = len(inside), torch.from_numpy(values)
     picked = np.unique(np.linspace(0, count - 1, min(count, LEFT_OUT)).astype(int))
     probabilities = torch.full((len(picked),), float(inside.mean() > 0.5), dtype=torch.float64)
