@@ -46,11 +46,11 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
         return _model(definition, header, tensors)
     except KeyError as error:
         raise InvalidInput(
-            f"the model file has no entry {str(error)[:SHOWN]}, which every model needs; {AGAIN}"
+            f"expected a model file with the entry {str(error)[:SHOWN]}, got one without it; {AGAIN}"
         ) from error
     except MALFORMED as error:
         raise InvalidInput(
-            f"an entry of the model file has a value of a wrong type or size ({type(error).__name__}); {AGAIN}"
+            f"expected a model file whose entries all have a valid type and size, got one with an invalid entry; {AGAIN}"
         ) from error
 
 

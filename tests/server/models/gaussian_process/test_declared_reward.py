@@ -131,7 +131,7 @@ def test_the_narrow_cart_pole_reward_of_pilco_can_be_declared():
 def test_a_model_with_declared_reward_survives_storage_and_one_with_learned_is_refused(model, pendulum_model):
     loaded = from_bytes(model.definition, to_bytes(model))
     assert loaded.description == model.description
-    with pytest.raises(InvalidInput, match="learned reward, .* declared"):
+    with pytest.raises(InvalidInput, match=r"learned reward, .* declared"):
         from_bytes(model.definition, to_bytes(pendulum_model))
 
 

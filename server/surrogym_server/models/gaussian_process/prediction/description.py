@@ -1,4 +1,4 @@
-"""Description of one output of a model, for people."""
+"""Description of one output of a model, for display."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 
 
 def describe(definition: EnvironmentDefinition, output: OutputModel) -> dict[str, Any]:
-    """Structure and hyperparameters of an output, as JSON. ``features`` has the order of ``lengthscale``."""
+    """Return the structure and hyperparameters of an output, as JSON. ``features`` and ``lengthscale`` have the same
+    order."""
     described: dict[str, Any] = {
         "name": output.name,
         "inputs": str(output.feature_map),
@@ -51,7 +52,7 @@ def describe(definition: EnvironmentDefinition, output: OutputModel) -> dict[str
 
 
 def _inputs(definition: EnvironmentDefinition, feature_map: FeatureMap) -> dict[str, Any]:
-    """Names of the features, of those left out, and the rate of each feature that has one."""
+    """Return the names of the features, of those left out, and the rate of each feature that has one."""
     names = feature_names(definition, feature_map)
     every = feature_names(definition, replace(feature_map, rates=(), dropped=()))
     rates = {name: rate for name, rate in zip(names, feature_map.rates, strict=False) if rate}
@@ -59,7 +60,7 @@ def _inputs(definition: EnvironmentDefinition, feature_map: FeatureMap) -> dict[
 
 
 def structure(output: OutputModel) -> str:
-    """Kernel and inputs of an output, in a few words."""
+    """Return the kernel and the inputs of an output, in a few words."""
     prefix = "" if output.size_with_prior is None else "prior + "
     if output.posterior is None:
         return f"{prefix}constant"

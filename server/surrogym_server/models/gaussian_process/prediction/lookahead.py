@@ -26,24 +26,31 @@ from surrogym_server.gp import Joint
 from surrogym_server.models.abilities import OutputOutlook, PathOutlook, PredictedSteps
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-BLOCK = 4_000_000  # numbers in a matrix of covariances at once
+BLOCK = 4_000_000  # greatest number of covariances held at once
 ROUNDING = 1e-12
-SMALLEST = 1e-300  # a slope that counts as zero
+SMALLEST = 1e-300  # avoids a division by 0 where every slope is 0
 
 
 @dataclass(frozen=True)
 class ProcessOutlook(OutputOutlook):
-    """Outlook of one output, in its own unit."""
+    """Forecast of one output's standard deviations at candidates, in the output's unit."""
 
-    joint: Joint  # at candidates, reference and assumed queries, in this order
-    learns: Tensor  # (m,) bool
-    shared: Tensor  # (r, m) covariance of reference and candidates, standardised; cached
+    joint: Joint  # process at m candidates, r reference points and the assumed queries, in this order
+    learns: Tensor  # (m,) bool: whether a sample at the candidate would improve the output
+    shared: Tensor  # (r, m) standardised covariance of reference points and candidates
     scale: float
-    slope: Tensor | None = None  # (m + r,) of the output over its process, if it is not 1
+    slope: Tensor | None = None  # (m + r,) derivative of the output over its process, in scales; None if 1 everywhere
 
     @classmethod
     def of(cls, output: OutputModel, x: Tensor, learns: Tensor, spans: tuple[int, int]) -> ProcessOutlook:
-        """Build it from inputs x (m + r + p, d): m candidates, r reference points, p points assumed observed."""
+        """Build the outlook of an output.
+
+        Args:
+            output: an output with a process.
+            x: inputs (m + r + p, d) of m candidates, r reference points and p queries that are assumed answered.
+            learns: (m + r + p,) bool: whether a sample at the point would improve the output.
+            spans: (m, m + r), the ends of candidates and reference points in x.
+        """
         assert output.posterior is not None
         joint = Joint.of(output.posterior, x)
         for index in range(spans[1], len(x)):
@@ -58,10 +65,10 @@ class ProcessOutlook(OutputOutlook):
         return std if self.slope is None else std * self.slope[:count]
 
     def reduction(self, weights: Tensor) -> Tensor:
-        """sum_r w_r k(x_r, x)^2 / (k(x, x) + sigma_n^2), Cohn (NIPS 1993), in closed form for a Gaussian process.
+        """Return sum_r w_r k(x_r, x)^2 / (k(x, x) + sigma_n^2) at each candidate x, (m,), with weights w (r,).
 
-        With a slope each reference point is weighted by it, as a share of the steepest. Only the order of the values
-        counts.
+        Cohn (NIPS 1993), in closed form for a Gaussian process. With a slope each reference point is also weighted by
+        its squared slope relative to the steepest. Only the order of the values matters.
         """
         if self.slope is not None:
             steep = self.slope[len(self.learns) :]
@@ -79,12 +86,12 @@ class ProcessOutlook(OutputOutlook):
 
 @dataclass(frozen=True)
 class ProcessAlongPaths(PathOutlook):
-    """Outlook of one output along paths."""
+    """Forecast of one output along paths of predicted steps."""
 
     definition: EnvironmentDefinition
     output: OutputModel
-    x: Tensor  # (b, T, d) inputs of its process
-    learns: Tensor  # (b, T) bool
+    x: Tensor  # (b, T, d) inputs of the output's process
+    learns: Tensor  # (b, T) bool: whether a real step at that point would improve the output
 
     @property
     def std(self) -> Tensor:
@@ -97,26 +104,27 @@ class ProcessAlongPaths(PathOutlook):
         if (slope := slope_at(output, self.x.flatten(0, 1))) is not None:
             weight = weight * slope.reshape(weight.shape)
         blocks = zip(torch.split(self.x, room), torch.split(weight, room), strict=True)
-        # Below the noise floor a covariance is rounding, which a finer tolerance would make larger than 1.
+        # Below the noise floor a covariance is rounding, which a very small tolerance would scale up beyond 1.
         ratio = min((output.scale / tolerance) ** 2, 1 / output.noise_floor)
         return torch.cat([_log_determinants(ratio * output.posterior.joint_covariance(b), w) for b, w in blocks])
 
 
 def process_inputs(definition: EnvironmentDefinition, output: OutputModel, steps: PredictedSteps) -> Tensor:
-    """Inputs of one output's process along steps (..., C): (..., d)."""
+    """Return the inputs (..., d) of one output's process for the steps (...,)."""
     state = steps.q_next if output.feature_map.after else steps.q
     return encode(definition, output.feature_map, state, steps.u, steps.q_next[..., leading(definition)])
 
 
 def slope_at(output: OutputModel, x: Tensor) -> Tensor | None:
-    """Slope of an output over its process, in scales, at inputs x (m, d), (m,). None if it is 1 everywhere."""
+    """Return the derivative of an output over its process, in scales, at inputs x (m, d): (m,), or None if it is 1
+    everywhere."""
     if output.warp is not None:
         return output.warp.slope(*output.target(x))
     return output.amplitude(x) if output.feature_map.rates else None
 
 
 def as_if_answered(output: OutputModel, x: Tensor) -> OutputModel:
-    """Condition the output on observations of its mean at inputs x (k, d)."""
+    """Condition an output on observations of its own mean at inputs x (k, d): the variance shrinks, the mean stays."""
     if (posterior := output.posterior) is not None:
         for point in x:
             posterior = posterior.extend(point, posterior.mean(point[None])[0])
@@ -124,7 +132,12 @@ def as_if_answered(output: OutputModel, x: Tensor) -> OutputModel:
 
 
 def _log_determinants(covariance: Tensor, weight: Tensor) -> Tensor:
-    """1/2 log det(1 + W S W) of all leading parts of S (b, T, T), W of diagonal weight (b, T): (b, T)."""
+    """Return 1/2 log det(1 + W S W) for the first t points of each path, t = 1 to T, (b, T).
+
+    Args:
+        covariance: S (b, T, T).
+        weight: diagonal of W, (b, T).
+    """
     one = torch.eye(weight.shape[1], dtype=weight.dtype)
     factor: Tensor = torch.linalg.cholesky(one + weight[:, :, None] * covariance * weight[:, None, :])
     return factor.diagonal(dim1=-2, dim2=-1).log().cumsum(-1)

@@ -1,4 +1,4 @@
-"""Outputs predicted together from one set of features: their means, and differences from these."""
+"""Outputs that are predicted together from one set of features."""
 
 from __future__ import annotations
 
@@ -16,34 +16,35 @@ from surrogym_server.tensors import amplitude
 
 @dataclass(frozen=True)
 class Drawn:
-    """Places of the draws of one output's function. W weights of all outputs of a model."""
+    """Where the weights of one output's sampled functions are among the W weights of all outputs."""
 
     column: int
-    span: slice  # of the W weights
-    inputs: Tensor  # columns of x
+    span: slice  # weights of this output
+    inputs: Tensor  # columns of x that the output reads
     scale: float
     pathwise: Pathwise
 
 
 @dataclass(frozen=True)
 class Grown:
-    """An output whose amplitude grows along its inputs."""
+    """Output with rates: its amplitude grows along its inputs."""
 
     column: int
-    inputs: Tensor  # columns of x
-    rates: Tensor  # of these
+    inputs: Tensor  # columns of x that the output reads
+    rates: Tensor  # rate of each of these inputs
     centre: float
 
 
 @dataclass(frozen=True)
 class OutputGroup:
-    """Some outputs of a model. It fills their columns of O, and leaves the others 0."""
+    """Outputs of a model that read the same features. Predictions have a column for each of the model's O outputs;
+    columns of outputs outside the group are 0."""
 
     encoder: Encoder
     serving: Serving
-    noise_std: Tensor  # (O,) learned noise, in each output's unit
-    drawn: tuple[Drawn, ...]  # by output, except constant ones, which have no function to draw
-    end: int  # end of its draws' weights
+    noise_std: Tensor  # (O,) standard deviation of the learned noise, in each output's unit
+    drawn: tuple[Drawn, ...]  # weights of each output's sampled functions; constant outputs have none
+    end: int  # end of this group's weights among the W weights of a sampled function
     grown: tuple[Grown, ...] = ()
 
     @classmethod
@@ -57,7 +58,16 @@ class OutputGroup:
         begin: int,
         grown: tuple[Grown, ...] = (),
     ) -> OutputGroup:
-        """Compile outputs for ``columns`` of them. Their draws' weights start at ``begin``."""
+        """Compile some outputs of a model.
+
+        Args:
+            encoder: encoder of the features x.
+            outputs: the outputs, each with its column.
+            columns: number O of columns of a prediction.
+            lead: whether the outputs read the change of the leading coordinate.
+            begin: index of the group's first weight in a sampled function.
+            grown: those of the outputs that have rates.
+        """
         device = encoder.definition.device
         noise, samplers = torch.zeros(columns, dtype=torch.float64, device=device), []
         for output in outputs:
@@ -75,10 +85,14 @@ class OutputGroup:
     def predict(
         self, x: Tensor, columns: tuple[int, ...], kick: Tensor | None, process: Tensor | None, paths: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Values at features x (m, d), and the latent standard deviations of the wanted columns, (m, O) each.
+        """Return values at features x (m, d), and latent standard deviations of ``columns``, (m, O) each.
 
-        A value is the posterior's mean. ``kick`` (m, O) moves it by latent standard deviations, ``process`` (m, O) by
-        standard deviations of the noise. With ``paths`` (m, W) it is that of a posterior sample, one for each row.
+        Args:
+            x: features.
+            columns: columns whose standard deviations are needed; if (), the second result is (m, 0).
+            kick: (m, O) latent standard deviations to add to the mean, or None.
+            process: (m, O) standard deviations of the noise to add, or None.
+            paths: (m, W) a sampled function for each row, whose value replaces the mean, or None.
         """
         if columns:
             value, spread = self.serving.mean_and_std(x, columns)

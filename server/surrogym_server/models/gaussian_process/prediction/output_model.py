@@ -1,4 +1,4 @@
-"""One output of a model: its process, and the scaling of its targets."""
+"""Model of one output: its process, and the scaling of its targets."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from surrogym_server.tensors import amplitude
 
 @dataclass(frozen=True)
 class OutputModel:
-    """The process of one output, and the scaling of its targets: y = (target - centre) / (scale * amplitude).
+    """Process of one output, and the scaling of its targets: y = (target - centre) / (scale * amplitude).
 
     The amplitude is 1, unless the feature map has rates. ``posterior`` is None for an output that never varied; its
     mean is ``centre`` and its standard deviation 0. With a ``warp`` the targets are logarithms, but means, standard
@@ -29,27 +29,27 @@ class OutputModel:
     posterior: Posterior | None
     centre: float
     scale: float
-    left_out: int = 0  # samples left out because they ended at a bound
-    scores: tuple[tuple[str, float], ...] = ()  # evidence of every candidate feature map
+    left_out: int = 0  # number of samples that were not used, because they ended at a bound
+    scores: tuple[tuple[str, float], ...] = ()  # log evidence of every candidate feature map
     warp: Warp | None = None
-    past_limits: bool = False  # whether it was learned from samples that ended at a limit of another coordinate
+    past_limits: bool = False  # whether it learned from samples that ended at a limit of another coordinate
     at_limit: tuple[int, ...] = ()  # for each point: 1 or -1 if it observes the upper or lower limit; () if none does
-    shared: tuple[str, ...] = ()  # outputs whose samples it learned from as well, see ``gp.pooling``
-    size_with_prior: float | None = None  # size of the output, if its process is what the model's prior leaves
+    shared: tuple[str, ...] = ()  # names of other outputs from whose samples it learned too, see ``gp.pooling``
+    size_with_prior: float | None = None  # the output's standard deviation, if its process adds to the model's prior
 
     def mean(self, x: Tensor) -> Tensor:
-        """Posterior mean at features x (m, d), in the output's unit, (m,)."""
+        """Return the posterior mean at features x (m, d), in the output's unit, (m,)."""
         if self.posterior is None:
             return x.new_full(x.shape[:-1], self.centre)
         mean = self.centre + self.scale * self.amplitude(x) * self.posterior.mean(x)
         return mean if self.warp is None else self.warp.value(mean)
 
     def mean_and_std(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Posterior mean and latent standard deviation at x (m, d), in the output's unit, (m,) each."""
+        """Return posterior mean and latent standard deviation at x (m, d), in the output's unit, (m,) each."""
         return paid(self.warp, *self.target(x))
 
     def target(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Posterior mean and latent standard deviation at x (m, d), in the targets' unit, (m,) each."""
+        """Return posterior mean and latent standard deviation at x (m, d), in the targets' unit, (m,) each."""
         if self.posterior is None:
             return x.new_full(x.shape[:-1], self.centre), x.new_zeros(x.shape[:-1])
         mean, variance = self.posterior.mean_and_variance(x)
@@ -57,17 +57,17 @@ class OutputModel:
         return self.centre + scale * mean, scale * variance.sqrt()
 
     def amplitude(self, x: Tensor) -> Tensor:
-        """Amplitude at inputs x (m, d), (m,); 1 without rates."""
+        """Return the amplitude at inputs x (m, d), (m,); 1 without rates."""
         rates = self.feature_map.rates
         return amplitude(x, x.new_tensor(rates)) if rates else x.new_ones(x.shape[:-1])
 
     def standardised(self, target: Tensor, x: Tensor) -> Tensor:
-        """The process' y of targets (m,) at its inputs x (m, d), (m,)."""
+        """Return targets (m,) at inputs x (m, d) in the standardised unit of the process, (m,)."""
         return (target - self.centre) / (self.scale * self.amplitude(x))
 
     @property
     def size(self) -> float:
-        """Standard deviation of the output over the samples, in its unit; 1 for one that never varied."""
+        """Standard deviation of the output over the samples, in its unit; 1 for an output that never varied."""
         if self.size_with_prior is not None:
             return self.size_with_prior
         return self.scale if self.warp is None else self.warp.size
@@ -79,13 +79,17 @@ class OutputModel:
 
     @property
     def noise_std(self) -> float:
-        """Standard deviation of the learned noise, in the output's unit; that of a warped output at a value as large as
-        its size, and with rates that at the points, as a root mean square."""
+        """Standard deviation of the learned noise, in the output's unit.
+
+        For a warped output it is the noise at a value as large as ``size``. With rates it is a root mean square over
+        the points.
+        """
         return 0.0 if self.posterior is None else self._of_noise(self.posterior.hyper.noise_variance)
 
     @property
     def possible_noise(self) -> float:
-        """The same standard deviation in an explanation by noise that is at least as likely, if a search finds one."""
+        """Standard deviation of the noise in a noisier explanation of the points that is at least as likely, in the
+        output's unit; ``noise_std`` if a search finds none."""
         if self.posterior is None:
             return 0.0
         hyper = self.posterior.hyper
@@ -97,9 +101,9 @@ class OutputModel:
         return noise if self.warp is None else noise * self.warp.size
 
     def leave_one_out(self) -> LeaveOneOutErrors:
-        """Leave-one-out errors of the process. An output that never varied has none.
+        """Return the leave-one-out errors of the process; 0 for an output that never varied.
 
-        A point that observes a limit is an inequality: a value beyond the limit is no error.
+        At a point that observes a limit, a prediction beyond the limit is no error.
         """
         if self.posterior is None:
             return LeaveOneOutErrors(0.0, 1.0, 1.0)
@@ -118,7 +122,7 @@ class OutputModel:
         return LeftOut.of(predictions - posterior.y, variance)
 
     def _predictions_left_out(self, posterior: Posterior) -> tuple[Tensor, Tensor]:
-        """Each y of an exact process from the others, within its limit, and the variance, (n,) each."""
+        """Return the prediction of each y from the others, at most up to its limit, and its variance, (n,) each."""
         mean, variance = posterior.leave_one_out()
         side = mean.new_tensor(self.at_limit or [0] * len(mean))
         beyond = side * (mean - posterior.y) > 0
@@ -126,13 +130,13 @@ class OutputModel:
 
     @property
     def _typical_amplitude(self) -> float:
-        """Root mean square of the amplitude at the points."""
+        """Root mean square of the amplitude over the points."""
         if self.posterior is None or not self.feature_map.rates:
             return 1.0
         return float(self.amplitude(self.posterior.x).square().mean().sqrt())
 
     def _left_out_grown(self, error: float) -> float:
-        """Root mean square error of targets, given that of the process' points."""
+        """Return the root mean square error of targets with rates, given that of the standardised points."""
         assert self.posterior is not None
         if self.posterior.sparse is not None:
             return self.scale * self._typical_amplitude * error
@@ -141,7 +145,7 @@ class OutputModel:
         return float(off.square().mean().sqrt())
 
     def _left_out_warped(self, warp: Warp, error: float) -> float:
-        """Root mean square error of predicted rewards, given that of their targets."""
+        """Return the root mean square error of predicted rewards, given that of their logarithms."""
         assert self.posterior is not None
         if self.posterior.sparse is not None:
             return error * warp.size
@@ -151,5 +155,5 @@ class OutputModel:
 
 
 def paid(warp: Warp | None, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation (m,) of the output, given those of its targets."""
+    """Return mean and standard deviation (m,) in the output's unit, given those of its targets."""
     return (mean, std) if warp is None else (warp.value(mean), warp.std(mean, std))

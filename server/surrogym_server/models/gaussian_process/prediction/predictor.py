@@ -1,4 +1,4 @@
-"""The processes of one model, compiled for prediction: outputs in groups, and the next state from their changes.
+"""All processes of one model, compiled for prediction: outputs in groups, and next states from predicted changes.
 
 The state moves in coordinates: q' = q + f(q, u), angles wrapped, saturated coordinates clipped (eq. 1 with zero mean).
 If the outputs move the observation instead, o' = o + f(o, u), the coordinates are read back from it.
@@ -27,13 +27,13 @@ from surrogym_server.tensors import cached, in_blocks
 
 @dataclass(frozen=True)
 class Predictor:
-    """Transition and reward of one environment."""
+    """Predictor of the transition and reward of one environment."""
 
     definition: EnvironmentDefinition
     transitions: tuple[OutputModel, ...]  # M, in the order of definition.outputs
     reward: OutputModel
-    jumps: tuple[Jump, ...]  # of the reward, in addition to its process
-    prior: Predictor | None = None  # its mean is added to the outputs that have a ``size_with_prior``
+    jumps: tuple[Jump, ...]  # jumps of the reward, added to its process
+    prior: Predictor | None = None  # its mean is added to those outputs that have a ``size_with_prior``
 
     def transition(
         self,
@@ -45,7 +45,10 @@ class Predictor:
         stds: bool,
         reward_std: bool,
     ) -> Transition:
-        """Predict like ``DynamicsModel.transition``, in blocks of rows, with variances only as requested."""
+        """Predict as ``DynamicsModel.transition`` does, in blocks of rows, with variances only where requested.
+
+        ``paths`` (m, W) are sampled functions that the rows follow, or None for the mean.
+        """
         columns = self._columns if stds or noise is not None else ()
         columns += (self._reward_column,) if reward_std else ()
         rows = min(group.serving.rows for group in self._groups if group)
@@ -59,14 +62,14 @@ class Predictor:
         )
 
     def means(self, q: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Changes (m, M), next coordinates (m, C) and rewards (m,) of the means."""
+        """Return the mean changes (m, M), next coordinates (m, C) and mean rewards (m,) at q (m, C) and u (m, F)."""
         q_next, mean, _ = self._step((), q, u, None, None, None)
         reward, _ = self._rewards(q, u, q_next, mean[:, -1])
         return mean[:, list(self._columns)], q_next, reward
 
     @cached_property
     def path_size(self) -> int:
-        """Number of weights of a sampled function, W."""
+        """Number W of weights of a sampled function."""
         return sum(one.pathwise.size for group in self._groups if group for one in group.drawn)
 
     def draw(self, noise: Tensor) -> Tensor:
@@ -84,9 +87,10 @@ class Predictor:
         process: Tensor | None,
         paths: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Next coordinates, changes and reward (m, columns), and the standard deviations of the wanted columns.
+        """Return next coordinates (m, C), means of all columns, and standard deviations of ``columns``, (m, all) each.
 
-        Each stage fills its own columns and leaves the others 0, so that the stages can be added.
+        The outputs are predicted in up to three stages. Each fills its own columns and leaves the others 0, so that
+        their results can be added.
         """
         first, second, after = self._groups
         kick, shake = self._in_columns(noise), self._in_columns(process)
@@ -105,7 +109,7 @@ class Predictor:
         return q_next, mean, spread
 
     def _by_prior(self, prior: Predictor, q: Tensor, u: Tensor) -> Tensor:
-        """What the prior adds to each column for steps from q (m, C) under u (m, F), (m, columns)."""
+        """Return the prior's mean for those columns that use it, 0 in the others, at q (m, C) and u (m, F)."""
         change, _, reward = prior.means(q, u)
         added = change.new_zeros(len(q), self._reward_column + 1)
         added[:, [*self._columns, self._reward_column]] = torch.cat([change, reward[:, None]], 1)
@@ -113,7 +117,7 @@ class Predictor:
 
     @cached
     def uses_prior(self) -> Tensor:
-        """1 for a column to which the prior's mean is added, else 0, (columns,)."""
+        """1 for each column to which the prior's mean is added, 0 for the others, (columns,)."""
         uses = torch.zeros(self._reward_column + 1, dtype=torch.float64, device=self.definition.device)
         outputs = (*self.transitions, self.reward)
         for column, output in zip((*self._columns, self._reward_column), outputs, strict=True):
@@ -121,8 +125,11 @@ class Predictor:
         return uses
 
     def _rewards(self, q: Tensor, u: Tensor, q_next: Tensor, mean: Tensor) -> tuple[Tensor, Tensor | float]:
-        """Rewards (m,) of steps from q (m, C) under u (m, F) to q_next (m, C): the process' mean, the jumps and the
-        declared reward. Also the variance (m,) that uncertain edges of jumps cause, 0 without jumps."""
+        """Return the rewards (m,) of steps from q (m, C) under u (m, F) to q_next (m, C), and the variance (m,) that
+        uncertain edges of jumps add.
+
+        ``mean`` (m,) is the mean of the reward's process, to which jumps and the declared reward are added.
+        """
         state = q_next if self.reward.feature_map.after else q
         if self.reward.warp is not None:
             mean = self.reward.warp.value(mean)
@@ -134,8 +141,8 @@ class Predictor:
         return mean + added, variance
 
     def _reward_spread(self, mean: Tensor, spread: Tensor, edges: Tensor | float) -> Tensor:
-        """Standard deviation (m,) of the reward, given mean and standard deviation (m,) of its process and the variance
-        of its edges."""
+        """Return the standard deviation of the reward, (m,), given mean and standard deviation (m,) of its process and
+        the variance ``edges`` from uncertain edges of jumps."""
         if self.reward.warp is not None:
             spread = self.reward.warp.std(mean, spread)
         return (spread.square() + edges).sqrt()
@@ -149,7 +156,7 @@ class Predictor:
 
     @cached_property
     def _columns(self) -> tuple[int, ...]:
-        """Column of each transition output: its coordinate, or its observation entry."""
+        """Column of each transition output: the index of its coordinate, or of its observation entry."""
         return tuple(range(len(self.transitions))) if self.definition.moves_observation else self.definition.moving
 
     @cached_property
@@ -159,8 +166,8 @@ class Predictor:
 
     @cached
     def _groups(self) -> tuple[OutputGroup, OutputGroup | None, OutputGroup | None]:
-        """Groups of outputs: those that read (q, u), those that also read the lead, and a reward that reads the next
-        state."""
+        """Groups of outputs: those that read (q, u), those that also read the change of the leading coordinate, and a
+        reward that reads the next state; None for an empty group."""
         after = self.reward.feature_map.after
         outputs = list(zip(self._columns, self.transitions, strict=True))
         reward = [(self._reward_column, self.reward)]

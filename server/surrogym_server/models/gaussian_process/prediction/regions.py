@@ -27,7 +27,7 @@ SIDES: tuple[Side, ...] = ("above", "below", "beyond")
 
 @dataclass(frozen=True)
 class Axes:
-    """Every order of states by one value x: by x, -x and |x|, where x is one of T coordinates and observation entries.
+    """Axes along which a threshold can lie: x, -x and |x| for each x of T coordinates and observation entries.
 
     There are A = 3 T axes.
     """
@@ -37,7 +37,7 @@ class Axes:
 
     @classmethod
     def of(cls, definition: EnvironmentDefinition) -> Axes:
-        """Axes of the moving coordinates, and of the observation entries that are not one of them."""
+        """Build the axes of the moving coordinates, and of those observation entries that are not one of them."""
         size, names = len(definition.coordinates), {}
         for index in definition.moving:
             weights = tuple(float(i == index) for i in range(size))
@@ -50,12 +50,12 @@ class Axes:
         return 3 * len(self.names)
 
     def __call__(self, q: Tensor) -> Tensor:
-        """Values of all axes at q (m, C), (m, A)."""
+        """Return the values of all axes at q (m, C), (m, A)."""
         value = self.terms(q)
         return torch.cat([value, -value, value.abs()], -1)
 
     def describe(self, axis: int, level: float) -> str:
-        """The inequality of ``axis`` and its ``level``, for people."""
+        """Return the inequality that ``axis`` exceeds ``level``, for display, such as `x > 0.5`."""
         name, side = self.names[axis % len(self.names)], SIDES[axis // len(self.names)]
         return {"above": f"{name} > {level:.6g}", "below": f"{name} < {-level:.6g}"}.get(
             side, f"|{name}| > {level:.6g}"
@@ -64,29 +64,29 @@ class Axes:
 
 @dataclass(frozen=True)
 class Cut:
-    """Threshold on one axis. A state is inside the region if its value on the axis lies beyond the threshold, on the
-    side of ``inside``. The threshold itself is only known to lie between ``outside`` and ``inside``."""
+    """Threshold on one axis. A state is inside if its value on the axis exceeds the threshold, which is only known to
+    lie between ``outside`` and ``inside``."""
 
     axis: int
-    outside: float
-    inside: float
+    outside: float  # greatest value of a state seen outside
+    inside: float  # least value of a state seen inside
     weight: float  # probability of this axis among those that explain the same samples
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """States lie inside if any of the rules holds. A rule holds the cuts that may explain its samples."""
+    """Region of the states for which any rule holds. A rule lists alternative cuts that explain the same samples."""
 
     definition: EnvironmentDefinition
     rules: tuple[tuple[Cut, ...], ...]
-    complement: bool = False  # inside if no rule holds
+    complement: bool = False  # whether the region is instead where no rule holds
 
     def probability(self, q: Tensor) -> Tensor:
-        """Probability that q (m, C) lies inside, (m,), with levels uniform within their gaps."""
+        """Return the probability that q (m, C) lies inside, (m,), if each level is uniform within its gap."""
         return self.at(self._axes(q))
 
     def at(self, values: Tensor) -> Tensor:
-        """Probability of lying inside, (m,), at given values of all axes (m, A)."""
+        """Return the probability of lying inside, (m,), at given values of all axes (m, A)."""
         columns, outside, width, membership = self._compiled
         reached = ((values[:, columns] - outside) / width).clamp(0, 1)
         union = 1 - (1 - reached @ membership).clamp(0, 1).prod(-1)
@@ -94,7 +94,7 @@ class Thresholds:
 
     @property
     def description(self) -> Mapping[str, Any]:
-        """Rules in words, with the widths of their gaps."""
+        """Rules in words, with the gaps in which their thresholds lie."""
         rules = [
             [
                 {
@@ -115,7 +115,8 @@ class Thresholds:
 
     @cached
     def _compiled(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Axis, outside and width of every cut, (K,) each, and each cut's weight in its rule, (K, R)."""
+        """Axis, outside value and width of the gap of every cut, (K,) each, and each cut's weight in its rule,
+        (K, R)."""
         cuts = [(row, cut) for row, rule in enumerate(self.rules) for cut in rule]
         outside = torch.tensor([cut.outside for _, cut in cuts], dtype=torch.float64)
         inside = torch.tensor([cut.inside for _, cut in cuts], dtype=torch.float64)
@@ -128,20 +129,21 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class Classifier:
-    """A process on labels +-1 (least-squares classification, Rasmussen and Williams (2006), section 6.5)."""
+    """Region learned by a process of labels +-1 (least-squares classification, Rasmussen and Williams (2006), section
+    6.5)."""
 
     definition: EnvironmentDefinition
     process: OutputModel
 
     def probability(self, q: Tensor) -> Tensor:
-        """Probability that q (m, C) lies inside, (m,): that the latent value is above 0."""
+        """Return the probability that q (m, C) lies inside, (m,): that the process is above 0 there."""
         u = q.new_zeros(len(q), self.definition.action.size)
         mean, std = self.process.mean_and_std(encode(self.definition, self.process.feature_map, q, u))
         return likely(mean, std)
 
     @property
     def description(self) -> Mapping[str, Any]:
-        """Description for people."""
+        """Kind and inputs of the classifier, for display."""
         return {"kind": "classifier", "inputs": str(self.process.feature_map)}
 
 
@@ -150,15 +152,15 @@ Form = Thresholds | Classifier
 
 @dataclass(frozen=True)
 class Region:
-    """Forms that explain the labels, each with its weight. Where they disagree, the region is uncertain."""
+    """Learned set of states: a mixture of forms that explain the labels. Where they disagree, it is uncertain."""
 
-    forms: tuple[tuple[float, Form], ...]  # weights add up to 1
-    scores: tuple[tuple[str, float], ...]  # leave-one-out log probability of every form compared
+    forms: tuple[tuple[float, Form], ...]  # forms with their weights, which add up to 1
+    scores: tuple[tuple[str, float], ...]  # leave-one-out log probability of every form that was compared
 
     def probability(self, q: Tensor) -> Tensor:
-        """Probability that q (m, C) lies inside, (m,)."""
+        """Return the probability that q (m, C) lies inside, (m,)."""
         mixed = torch.stack([weight * form.probability(q) for weight, form in self.forms]).sum(0)
-        return mixed.clamp(0, 1)  # the weights add up to 1 but for rounding
+        return mixed.clamp(0, 1)  # rounding could exceed 1
 
     @property
     def description(self) -> dict[str, Any]:
@@ -169,14 +171,14 @@ class Region:
 
 @dataclass(frozen=True)
 class Jump:
-    """A reward that is higher by ``size`` (lower if negative) inside a region."""
+    """Region inside which the reward is higher by ``size`` (lower if negative)."""
 
     region: Region
     size: float
 
 
 def jumped(jumps: Sequence[Jump], q: Tensor) -> tuple[Tensor, Tensor]:
-    """Contribution of jumps to the reward of states q (m, C), and its variance from their uncertain edges, (m,) each.
+    """Return what jumps add to the reward of states q (m, C), and its variance from uncertain edges, (m,) each.
 
     If the regions of jumps overlap, the first one counts.
     """
@@ -190,6 +192,6 @@ def jumped(jumps: Sequence[Jump], q: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def likely(mean: Tensor, std: Tensor) -> Tensor:
-    """Probability (m,) that a latent value with this mean and standard deviation is above 0."""
+    """Return the probability (m,) that a normal variable with this mean and standard deviation is above 0."""
     probability: Tensor = torch.special.ndtr(mean / std.clamp_min(1e-9))
     return probability

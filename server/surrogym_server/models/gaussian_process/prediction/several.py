@@ -1,13 +1,13 @@
-"""Functions of several models of the same samples, which differ in their hyperparameters.
+"""Functions sampled with uncertain hyperparameters: from several models of the same samples.
 
-A single optimum treats a length scale as certain, which five samples can't determine. So a function is drawn in two
-steps: one of the models, with equal probability, and a function of its processes. A drawn function consists of the
-number of its model and the weights that this model draws.
+A single optimum treats a length scale as certain, which five samples can't determine. So a function is sampled in two
+steps: choose one of the models, with equal probability, then sample a function of its processes. A sampled function
+consists of the index of its model and the weights for this model.
 
-A drawn function has no noise. So if a process explains its samples by noise that repeated steps don't show, its misfit
-would be in no function. The hyperparameters of such a process are drawn without this noise: the functions pass through
-the samples, and vary as much as the samples ask for. Where no step can be repeated nothing tells the two apart, and
-noise stays noise.
+A sampled function has no noise. So if a process explains its samples by noise that repeated steps don't show, no
+function would contain its misfit. The hyperparameters of such a process are sampled without this noise: the functions
+pass through the samples, and vary as much as the samples require. Where no step can be repeated, nothing distinguishes
+noise from misfit, and the noise is kept.
 """
 
 from __future__ import annotations
@@ -27,17 +27,19 @@ from surrogym_server.models.abilities import ArraySteps, ArrayTransition, Compil
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.port import Transition
 
-MODELS = 8
-MOST_POINTS = 128  # of a process with sampled hyperparameters; more points determine them well enough
-NEGLIGIBLE = 0.01**2  # variance of the noise, of the output's variance; misfit as small does no harm
-AT_MOST = 3.0**2  # largest ratio of learned noise to the variance of repeated steps, which may be few
+MODELS = 8  # number of models
+MOST_POINTS = 128  # a process with more points has certain enough hyperparameters, which are not sampled
+NEGLIGIBLE = 0.01**2  # noise variance, as a share of the output's variance, below which misfit does no harm
+AT_MOST = 3.0**2  # greatest credible ratio of learned noise variance to that of repeated steps, which may be few
 
 Floats = NDArray[np.float64]
 
 
 def uncertain_outputs(outputs: Sequence[OutputModel], *, repeatable: bool) -> list[list[OutputModel]]:
     """Copy the outputs (O,) ``MODELS`` times, on the CPU, with sampled hyperparameters for processes with few points.
-    Empty if no process has so few. ``repeatable``: whether steps can be repeated to test noise."""
+
+    Return [] if no process has few points. ``repeatable``: whether steps can be repeated, which would show noise.
+    """
     if not any(_uncertain(output) for output in outputs):
         return []
     columns = [_sampled(output, seed, repeatable) for seed, output in enumerate(outputs)]
@@ -59,12 +61,12 @@ def _sampled(output: OutputModel, seed: int, repeatable: bool) -> list[OutputMod
 
 
 def _misfits(posterior: Posterior) -> bool:
-    """Whether a process has learned noise that no equal points show."""
+    """Return whether a process has learned more noise than its equal points show."""
     return posterior.hyper.noise_variance > max(NEGLIGIBLE, AT_MOST * (posterior.noise_seen or 0.0))
 
 
 def _conditioned(posterior: Posterior, hyper: Hyperparameters) -> Posterior:
-    """The process with other hyperparameters; unchanged if its covariance can't be factored with these."""
+    """Return the process with other hyperparameters, or unchanged if its covariance can't be factored with these."""
     try:
         return condition(hyper, posterior.x, posterior.y)
     except NumericalFailure:
@@ -73,7 +75,8 @@ def _conditioned(posterior: Posterior, hyper: Hyperparameters) -> Posterior:
 
 @dataclass(frozen=True)
 class FunctionsOfSeveral(FunctionDraws, CompiledSteps):
-    """Functions of several models. The draws of all take the same number of random numbers."""
+    """Functions of several models, chosen with equal probability. Functions of all models have the same number of
+    weights."""
 
     models: tuple[FunctionDraws, ...]
 
@@ -133,7 +136,7 @@ class FunctionsOfSeveral(FunctionDraws, CompiledSteps):
 
 @dataclass(frozen=True, eq=False)
 class StepsOfSeveral(ArraySteps):
-    """The compiled steps of several models, along functions only."""
+    """Compiled steps of several models, for sampled functions only."""
 
     definition: EnvironmentDefinition
     models: tuple[ArraySteps, ...]
@@ -169,7 +172,8 @@ class StepsOfSeveral(ArraySteps):
 
 
 def _members(number: Tensor, count: int) -> list[tuple[int, Tensor]]:
-    """Rows (m,) of each of ``count`` models; models without rows are left out."""
+    """Return pairs of a model's index and its rows, given the index of the model of each row, (m,); models without
+    rows are omitted."""
     rows = [(index, (number == index).nonzero()[:, 0]) for index in range(count)]
     return [(index, which) for index, which in rows if len(which)]
 

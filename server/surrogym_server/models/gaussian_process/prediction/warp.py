@@ -16,18 +16,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-LARGEST = 300.0  # largest y: exp(300) is still a number
-PEAK_NOISE = 1e-10  # of the variance of y, at least: y spans hundreds, and 1 % of a reward must be resolved
+LARGEST = 300.0  # greatest y whose exponential is computed, to avoid overflow
+PEAK_NOISE = 1e-10  # least noise, as a share of the variance of y: y spans hundreds, a reward needs 1 % resolution
 
 
 @dataclass(frozen=True)
 class Warp:
-    """The transformation of one output.
+    """Transformation of one output between its values r and their logarithms y: r = base + sign exp(y).
 
     Attributes:
         base: reward far from the peak.
-        sign: 1 if rewards lie above it, -1 if below.
-        size: standard deviation of the rewards over the samples, in their unit: the ``scale`` of other outputs.
+        sign: 1 if rewards lie above the base, -1 if below.
+        size: standard deviation of the rewards over the samples, in their unit.
     """
 
     base: float
@@ -35,15 +35,15 @@ class Warp:
     size: float
 
     def value(self, y: Tensor) -> Tensor:
-        """Reward of y (m,)."""
+        """Return the reward of y (m,)."""
         return self.base + self.sign * y.clamp_max(LARGEST).exp()
 
     def std(self, y: Tensor, spread: Tensor) -> Tensor:
-        """Standard deviation of the reward if y (m,) has standard deviation spread (m,)."""
+        """Return the standard deviation of the reward if y (m,) has the standard deviation ``spread`` (m,)."""
         return 0.5 * ((y + spread).clamp_max(LARGEST).exp() - (y - spread).clamp_max(LARGEST).exp())
 
     def slope(self, y: Tensor, spread: Tensor) -> Tensor:
-        """Slope of the reward over y, (m,), where y may lie up to one standard deviation ``spread`` (m,) higher."""
+        """Return the derivative of the reward over y, (m,), one standard deviation ``spread`` (m,) above y."""
         return torch.exp((y + spread).clamp_max(LARGEST))
 
     def __str__(self) -> str:
@@ -52,5 +52,5 @@ class Warp:
 
     @property
     def finite(self) -> bool:
-        """Whether its numbers are finite, since a file may contain anything."""
+        """Whether all numbers are finite and valid, since a file may contain anything."""
         return math.isfinite(self.base) and self.sign in (1.0, -1.0) and math.isfinite(self.size) and self.size > 0

@@ -1,7 +1,7 @@
 """Layout of a model's tables for the compiled functions: the entries of the first matrix."""
 
-HEAD = 0  # place of the first matrix, a row of places of other matrices, sizes and flags
-NONE = -1  # in place of a place
+HEAD = 0  # index of the first matrix: one row of indices of other matrices, sizes and flags
+NONE = -1  # index of a matrix that does not exist
 (
     OBSERVE,
     FEATURES,
@@ -24,5 +24,5 @@ NONE = -1  # in place of a place
     WARP,
     HAS_STAGE,
 ) = range(20)
-ENTRIES = HAS_STAGE + 3  # one for each stage
-BLOCK = 32  # lanes computed at once, so that their data stay in the first cache
+ENTRIES = HAS_STAGE + 3  # number of entries of the first matrix; the last three are flags, one for each stage
+BLOCK = 32  # number of lanes computed at once, so that their data stay in the first-level cache

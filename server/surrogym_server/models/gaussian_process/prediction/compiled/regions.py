@@ -30,19 +30,21 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-# Of each form: its weight, whether it is a classifier, and the places of what it reads: axes, cuts and rules and
-# whether it is a complement, or features, process and number of features (a process of -1 is a constant).
+# Columns of a region's matrix, one row for each form: its weight, whether it is a classifier, and three more numbers.
+# For thresholds: index of the axes, index of the cuts and rules, and whether the form is a complement.
+# For a classifier: index of the features, index of the process, and number of features. If the process is constant, its
+# index is -i - 1, with i the index of the constant.
 WEIGHT, CLASSIFIES, FIRST, SECOND, THIRD = range(5)
-LEAST_STD = 1e-9
+LEAST_STD = 1e-9  # lower limit of a standard deviation, to avoid a division by 0
 
 
 def add_region(tables: TablesBuilder, region: Region) -> int:
-    """Add a region, and return its place."""
+    """Add a region to the tables, and return the index of its matrix."""
     return tables.add([(weight, *_add_form(tables, form)) for weight, form in region.forms])
 
 
 def add_jumps(tables: TablesBuilder, jumps: Sequence[Jump]) -> int:
-    """Add jumps, the size and region of each, and return their place."""
+    """Add jumps to the tables, the size and the region of each, and return the index of their matrix."""
     return tables.add(np.array([(jump.size, add_region(tables, jump.region)) for jump in jumps]).reshape(-1, 2))
 
 
@@ -108,7 +110,15 @@ def _classified(
 
 @compiled
 def probability(numbers: Floats, places: Ints, at: int, observe: int, q: Floats, actions: int) -> Floats:
-    """Probability that q (C, B) lies inside the region, (B,)."""
+    """Return the probability that states q (C, B) lie inside a region, (B,).
+
+    Args:
+        numbers, places: the tables.
+        at: index of the region's matrix.
+        observe: index of the terms of the observation.
+        q: coordinates, one state a column.
+        actions: number of action entries, F.
+    """
     forms = matrix(numbers, places, at)
     total = np.zeros(q.shape[1])
     for f in range(len(forms)):
@@ -125,7 +135,7 @@ def probability(numbers: Floats, places: Ints, at: int, observe: int, q: Floats,
         for b in range(len(total)):
             total[b] += weight * inside[b]
     for b in range(len(total)):
-        total[b] = min(total[b], 1.0)  # the weights add up to 1 but for rounding
+        total[b] = min(total[b], 1.0)  # rounding could exceed 1
     return total
 
 
@@ -133,7 +143,8 @@ def probability(numbers: Floats, places: Ints, at: int, observe: int, q: Floats,
 def add_jumped(
     numbers: Floats, places: Ints, at: int, observe: int, q: Floats, actions: int, reward: Floats, variance: Floats
 ) -> None:
-    """Add jumps to the reward of states q (C, B), and their uncertainty to its variance, (B,) each."""
+    """Add the jumps at index ``at`` to the rewards of states q (C, B), and the variance from their uncertain edges to
+    ``variance``, (B,) each."""
     jumps = matrix(numbers, places, at)
     free = np.ones(q.shape[1], dtype=np.bool_)
     for j in range(len(jumps)):
@@ -169,8 +180,17 @@ def judge(
     std: Floats,
     terminated: Bools,
 ) -> None:
-    """Apply learned regions to steps from q to q_next (N, C): jumps to ``reward`` (N,) and to its standard deviation,
-    the last column of ``std`` (N, O), and learned ends to ``terminated`` (N,). ``actions`` is F."""
+    """Apply learned regions to N steps, and change the results of these steps in place.
+
+    Args:
+        numbers, places: the tables.
+        q, q_next: coordinates before and after the steps, (N, C).
+        actions: number of action entries, F.
+        reward_std: whether the standard deviation of the reward is needed.
+        reward: (N,) rewards, to which jumps are added.
+        std: (N, O) standard deviations, of which the last column grows by uncertain edges.
+        terminated: (N,) overwritten if termination is learned.
+    """
     head = matrix(numbers, places, HEAD)
     observe = int(head[0, OBSERVE])
     for begin in range(0, len(q), BLOCK):

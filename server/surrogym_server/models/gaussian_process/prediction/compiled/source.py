@@ -1,4 +1,4 @@
-"""The step of a model as C99 source: ``step.c``, which is the same for all models, and the tables of this one."""
+"""The step of a model as C99 source: ``step.c``, which is the same for all models, and the tables of one model."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from surrogym_server.tensors import EDGE
 
 Floats = NDArray[np.float64]
 FIXED = ("step.c", "step.h")
-PER_LINE = 8  # numbers
-PROCESS = 3  # column of the place of a process, in the table of processes
+PER_LINE = 8  # numbers in a line of the source
+PROCESS = 3  # column, in the table of processes, with the index of a process's first matrix
 
 
 def step_source(definition: EnvironmentDefinition, tables: Tables) -> StepSource:
-    """Source of the step of a model with these tables (see ``tables_of`` in ``compiled.step``)."""
+    """Return the C source of the step of a model with these tables (see ``tables_of`` in ``compiled.step``)."""
     matrices = _matrices(tables)
     processes = {int(place) for place in _processes(matrices)}
     for process in processes:
-        for drawn in (KEPT, TURNED):  # which only drawn functions read
+        for drawn in (KEPT, TURNED):  # only sampled functions read these matrices
             matrices[process + drawn] = np.zeros((1, 0))
     inner = {process + place for process in processes for place in range(HEAD, TURNED + 1)}
     sizes = {
@@ -55,7 +55,7 @@ def _matrices(tables: Tables) -> list[Floats]:
 
 
 def _processes(matrices: Sequence[Floats]) -> Iterator[float]:
-    """Places of all processes: of outputs, and of classifiers in regions."""
+    """Yield the index of each process: of outputs, and of classifiers in regions."""
     head = matrices[layout.HEAD][0].astype(int)
     yield from matrices[head[layout.PROCESSES]][:, PROCESS]
     regions = [] if head[layout.JUMPS] == layout.NONE else [int(jump[1]) for jump in matrices[head[layout.JUMPS]]]

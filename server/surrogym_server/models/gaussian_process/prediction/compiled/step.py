@@ -1,4 +1,4 @@
-"""The step of a block of lanes, from coordinates and actions to next coordinates, rewards and ends."""
+"""Compiled step of a block of lanes: from coordinates and actions to next coordinates, rewards and terminations."""
 
 from __future__ import annotations
 
@@ -56,13 +56,19 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-CENTRE, NOISE, STAGE = range(3)  # of each column of outputs: constant, standard deviation of its noise, and its stage
-FIRST, LED, AFTER = range(3)  # stages: what reads (q, u), what reads the lead too, what reads the next state
+# Columns of the matrix of outputs: constant, standard deviation of the noise, and stage.
+CENTRE, NOISE, STAGE = range(3)
+# Stages of a prediction: outputs that read (q, u), those that also read the change of the leading coordinate, and a
+# reward that reads the next state.
+FIRST, LED, AFTER = range(3)
 STAGES = 3
 
 
 def tables_of(predictor: Predictor, ending: Region | None) -> Tables:
-    """Tables of a model and its environment, for ``step``."""
+    """Build the tables of a model and its environment, which ``step`` reads.
+
+    ``ending`` is the region in which episodes end, or None if termination is declared.
+    """
     definition, tables = predictor.definition, TablesBuilder()
     place = tables.reserve()
     head = dict.fromkeys(range(ENTRIES), float(NONE))
@@ -99,7 +105,7 @@ def tables_of(predictor: Predictor, ending: Region | None) -> Tables:
 
 
 def _add_outputs(tables: TablesBuilder, predictor: Predictor) -> tuple[int, int]:
-    """Add columns of outputs, and processes by stage. Returns their places."""
+    """Add a matrix of outputs, and one of processes with their stages, to the tables. Return their indices."""
     rows, processes = np.zeros((predictor._reward_column + 1, 3)), []
     begins = {one.column: one.span.start for group in predictor._groups if group for one in group.drawn}
     places = (*predictor._columns, predictor._reward_column)
@@ -124,10 +130,11 @@ def _add_outputs(tables: TablesBuilder, predictor: Predictor) -> tuple[int, int]
 def _encode_stage(
     numbers: Floats, places: Ints, head: Floats, stage: int, raw: Floats, arrived: Floats, mean: Floats, x: Floats
 ) -> None:
-    """Write the features that a stage reads, and no earlier stage has written, to x (d, B).
+    """Write the features that a stage reads, and that no earlier stage has written, to x (d, B).
 
-    The first stage reads coordinates and actions of raw (C + F + L, B). The second also reads the lead, which is put
-    behind them. The third reads the next state (C, B), which replaces the coordinates.
+    The first stage reads coordinates and actions from ``raw`` (C + F + L, B). The second also reads the next values of
+    the leading coordinates, which are written behind them. The third reads the next coordinates ``arrived`` (C, B),
+    which replace the coordinates in ``raw``.
     """
     size, lanes, observe = len(arrived), raw.shape[1], int(head[0, OBSERVE])
     width, begin, end = int(head[0, WIDTH]), 0, int(head[0, WIDTH])
@@ -149,8 +156,8 @@ def _encode_stage(
 
 @inlined
 def _grow(numbers: Floats, places: Ints, at: int, x: Floats, mean: Floats, spread: Floats) -> None:
-    """Multiply what an output has beyond its centre, and its standard deviation, (B,) each, by its amplitude at x (d,
-    B)."""
+    """Multiply an output's distance from its centre, and its standard deviation, (B,) each, by its amplitude at x (d,
+    B). ``at`` is the index of its rates."""
     rates, centre = matrix(numbers, places, at), matrix(numbers, places, at + 1)[0, 0]
     for b in range(len(mean)):
         amplitude = 1.0
@@ -176,7 +183,18 @@ def _predict_stage(
     mean: Floats,
     spread: Floats,
 ) -> None:
-    """Outputs of one stage at features x (d, B). If it has rows, ``known`` (B, columns) is added to the means."""
+    """Predict the outputs of one stage for B lanes, and write them to ``mean`` and ``spread``.
+
+    Args:
+        numbers, places: the tables.
+        head: first matrix of the tables.
+        stage: FIRST, LED or AFTER.
+        x: features (d, B).
+        noise, process, paths, known: as in ``step``, for these lanes.
+        stds, reward_std: whether standard deviations of transition outputs and of the reward are needed.
+        mean: (columns, B), of which the stage's rows are written.
+        spread: (O, B) standard deviations, of which the stage's rows are written.
+    """
     columns = matrix(numbers, places, int(head[0, OUTPUTS]))
     for column in range(len(columns)):
         if columns[column, STAGE] == stage:
@@ -207,7 +225,8 @@ def _predict_stage(
 
 @inlined
 def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floats, arrived: Floats) -> None:
-    """Next coordinates (C, B) of those in raw (C + F + L, B), after a change by mean (columns, B)."""
+    """Write to ``arrived`` (C, B) the next coordinates of those in ``raw`` (C + F + L, B) after changes ``mean``
+    (columns, B)."""
     size, lanes = arrived.shape
     for c in range(size):
         for b in range(lanes):
@@ -229,7 +248,7 @@ def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floa
 
 @inlined
 def _unwarp(warp: Floats, mean: Floats, spread: Floats) -> None:
-    """Convert means and standard deviations (B,) of a warped reward's targets to those of the reward, as ``Warp``
+    """Convert mean and standard deviation (B,) of a reward's logarithm to those of the reward, in place, as ``Warp``
     does."""
     for b in range(len(mean)):
         y, s = mean[b], spread[b]
@@ -239,7 +258,7 @@ def _unwarp(warp: Floats, mean: Floats, spread: Floats) -> None:
 
 @inlined
 def _ended(numbers: Floats, places: Ints, head: Floats, arrived: Floats) -> Bools:
-    """Whether the declared termination holds at coordinates (C, B), (B,)."""
+    """Return whether the declared termination holds at coordinates ``arrived`` (C, B), (B,)."""
     over = np.zeros(arrived.shape[1], dtype=np.bool_)
     if head[0, CONDITIONS] != NONE:
         holds = holding(numbers, places, int(head[0, CONDITIONS]), arrived)
@@ -283,12 +302,22 @@ def step(
     terminated: Bools,
     change: Floats,
 ) -> None:
-    """Compute steps from q (N, C) under u (N, F).
+    """Compute N steps, and write the results to the last five arrays.
 
-    If they have rows, ``noise`` (N, M) moves the outputs by latent standard deviations, ``process`` (N, M) moves them
-    by standard deviations of the learned noise, the outputs follow the functions ``paths`` (N, W), and ``known`` (N,
-    columns) is added to them. Results are written to ``q_next`` (N, C), ``reward`` (N,), ``std`` (N, O) as far as
-    requested, and ``terminated`` (N,). Changes before any limit are written to ``change`` (N, columns) if it has rows.
+    Args:
+        numbers, places: the tables.
+        q: coordinates (N, C).
+        u: actions (N, F).
+        noise: (N, M) latent standard deviations to add to the outputs, or (0, 0).
+        process: (N, M) standard deviations of the learned noise to add to the outputs, or (0, 0).
+        paths: (N, W) functions that the outputs follow, or (0, 0) for the mean.
+        known: (N, columns) mean of a prior to add to the outputs, or (0, 0).
+        stds, reward_std: whether standard deviations of transition outputs and of the reward are needed.
+        q_next: next coordinates (N, C).
+        reward: (N,).
+        std: (N, O) standard deviations, where needed.
+        terminated: (N,).
+        change: (N, columns) changes before any limit, or (0, 0) if they are not needed.
     """
     head, size, actions = matrix(numbers, places, HEAD), q.shape[1], u.shape[1]
     columns, leads = len(matrix(numbers, places, int(head[0, OUTPUTS]))), int(head[0, LEADS])
@@ -343,25 +372,30 @@ def step(
 
 
 NO_ROWS = np.zeros((0, 0))
-SPLIT = 4_000_000  # covariances of one call, some ms: more are computed in several threads
+SPLIT = 4_000_000  # with more covariances in a call, which take some ms, the call uses several threads
 
 
 @dataclass(frozen=True, eq=False)
 class StepsOfModel(ArraySteps):
-    """Steps of one model."""
+    """Compiled steps of one model."""
 
     definition: EnvironmentDefinition
     tables: Tables
     outputs: int
     has_regions: bool  # whether an ending or a jump of the reward is learned
-    points: int  # of all processes, mirror images included
-    prior: StepsOfModel | None  # its mean is added to the columns of ``uses``
-    uses: Floats  # (columns,) 1 for a column that uses the prior, else 0
+    points: int  # number of points of all processes, mirror images included
+    prior: StepsOfModel | None  # steps of the prior, whose mean is added to the columns of ``uses``
+    uses: Floats  # (columns,) 1 for a column to which the prior is added, 0 for the others
 
     @classmethod
     def of(cls, predictor: Predictor, ending: Region | None, prior: StepsOfModel | None) -> Self:
-        """Compile a model, given its compiled prior if it has one. ``ending`` is the region in which episodes end, if
-        that is learned."""
+        """Compile a model.
+
+        Args:
+            predictor: its outputs.
+            ending: region in which episodes end, or None if termination is declared.
+            prior: compiled steps of its prior, or None.
+        """
         regions = ending is not None or bool(predictor.jumps)
         points = sum(group.serving.exponents.shape[1] for group in predictor._groups if group)
         outputs, tables = len(predictor.transitions) + 1, tables_of(predictor, ending)
@@ -381,12 +415,12 @@ class StepsOfModel(ArraySteps):
         return self._steps(q, u, noise, process, paths, stds, reward_std, NO_ROWS)
 
     def _by_prior(self, prior: StepsOfModel, q: Floats, u: Floats) -> Floats:
-        """What the prior adds to each column for steps from q (N, C) under u (N, F), (N, columns)."""
+        """Return the prior's mean for those columns that use it, 0 in the others, at q (N, C) and u (N, F)."""
         added = np.empty((len(q), len(self.uses)))
         added[:, -1] = prior._steps(q, u, None, None, None, False, False, added).reward
         return added * self.uses
 
-    def _steps(  # eight parameters: those of a step, which numba takes one by one, and where to write changes
+    def _steps(  # eight parameters, because numba takes them one by one
         self,
         q: Floats,
         u: Floats,
@@ -397,7 +431,8 @@ class StepsOfModel(ArraySteps):
         reward_std: bool,
         change: Floats,
     ) -> ArrayTransition:
-        """Predict as ``__call__`` does. The changes before any limit go to ``change`` (N, columns) if it has rows."""
+        """Predict as ``__call__`` does, and write the changes before any limit to ``change`` (N, columns) if it has
+        rows."""
         count = len(q)
         moved = ArrayTransition(
             np.empty_like(q), np.empty(count), np.empty((count, self.outputs)), np.empty(count, dtype=np.bool_)
