@@ -50,7 +50,7 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
         ) from error
     except MALFORMED as error:
         raise InvalidInput(
-            f"expected a model file whose entries all have a valid type and size, got one with an invalid entry; {AGAIN}"
+            f"expected a model file whose entries have valid types and sizes, got one with an invalid entry; {AGAIN}"
         ) from error
 
 

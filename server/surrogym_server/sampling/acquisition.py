@@ -1,13 +1,13 @@
 """Acquisitions: criteria that value a query (eq. 12 and 13). One class for each criterion; packages may add their own.
 
-An acquisition values candidates, or predicted paths, with respect to one output of the model. Its laws:
+An acquisition rates candidates, or predicted paths, with respect to one output of the model. Its laws:
 
 - it is a pure function of its arguments and its settings: no state, no random numbers of its own;
-- it returns one value for each candidate (m,), or for each beginning of each path (b, T); only their order counts;
+- it returns one value for each candidate (m,), or for the first t steps of each path (b, T); only their order counts;
 - larger values are better, and every value is finite;
 - it does not change its arguments.
 
-``value_of`` and ``path_value_of`` call it, and raise if the values have another shape or are not finite.
+``value_of`` and ``path_value_of`` call the acquisition, and raise if its values break these laws.
 
 Its settings are the fields of a frozen dataclass: numbers, booleans and strings, as the specification holds them.
 """
@@ -35,11 +35,11 @@ GROUP = "surrogym.acquisitions"
 
 @dataclass(frozen=True)
 class CandidateView:
-    """View of m candidates that an acquisition reads, with respect to one output."""
+    """Properties of m candidates that an acquisition may use, with respect to one output."""
 
     model: DynamicsModel
     points: Points  # m states and actions
-    output: int  # number of the output, in the order of the definition
+    output: int  # index of the output, in the order of the definition
     tolerance: float  # tolerance of the output, in the output's unit
     std: Tensor  # (m,) latent standard deviation, in the output's unit, as if all pending queries had been answered
     distance: Tensor  # (m,) distance to the nearest query so far, in standard deviations of the sampling range
@@ -48,17 +48,17 @@ class CandidateView:
 
     @cached_property
     def variance_reduction(self) -> Tensor:
-        """Reduction of the weighted variance over the reference by an answer at each candidate, (m,); see
-        ``reads_reference``."""
+        """How much an answer at each candidate would reduce the weighted variance over the reference points, (m,). Only
+        available if the acquisition has ``reads_reference``."""
         return self._reduction()
 
 
 @dataclass(frozen=True)
 class PathView:
-    """View of b predicted paths of T steps that an acquisition reads, with respect to one output."""
+    """Properties of b predicted paths of T steps that an acquisition may use, with respect to one output."""
 
     tolerance: float  # tolerance of the output, in the output's unit
-    weight: Tensor  # (b, T) at least 0; depends on where the step lies and how well it can be predicted
+    weight: Tensor  # (b, T) at least 0; smaller where a step lies outside the ranges or is hard to predict
     _std: Callable[[], Tensor]
     _information: Callable[[], Tensor]
 
@@ -74,29 +74,28 @@ class PathView:
 
 
 class Acquisition(ABC):
-    """Criterion that values queries. It follows the invariants in this module's docstring."""
+    """Criterion that rates queries. Its laws are in this module's docstring."""
 
-    adaptive: ClassVar[bool] = True  # False: the whole budget is queried before the first fit
+    adaptive: ClassVar[bool] = True  # if False, the whole budget is queried before the first fit
     reads_reference: ClassVar[bool] = False  # whether it uses ``variance_reduction``
     reads_probability: ClassVar[bool] = False  # whether it uses ``log_probability``
 
     def check(self, definition: EnvironmentDefinition) -> None:  # noqa: B027  most take every environment
-        """Check that the settings fit the environment; called once, when a surrogate is registered, before any real
+        """Check that the settings fit the environment. Called once, when a surrogate is registered, before any real
         step.
 
         Raises:
-            ValueError: they don't fit; the message says what was expected and what came.
+            ValueError: the settings don't fit; the message says what was expected and what came.
         """
 
     @abstractmethod
     def value(self, candidates: CandidateView) -> Tensor:
-        """Value of a query at each of m candidates, (m,)."""
+        """Return the value of a query at each of m candidates, (m,)."""
 
     def path_value(self, paths: PathView) -> Tensor:
-        """Value of following each path up to each step, (b, T). It does not decrease along a path.
+        """Return the value of following each path up to each step, (b, T). It does not decrease along a path.
 
-        The default sums the information of the steps, each given those before it, whatever the criterion for candidates
-        is.
+        By default it is the information of the steps, each given the earlier ones, for any criterion for candidates.
         """
         return paths.information
 
@@ -141,12 +140,13 @@ class UncertaintyIndex(Acquisition):
 
 @dataclass(frozen=True)
 class LatinHypercube(Acquisition):
-    """Not adaptive: the whole budget is one Latin hypercube. Later queries fill the largest gaps."""
+    """Criterion of a design that is not adaptive: one Latin hypercube of the whole budget. Later queries fill the
+    largest gaps."""
 
     adaptive: ClassVar[bool] = False
 
     def value(self, candidates: CandidateView) -> Tensor:
-        return candidates.distance.nan_to_num()  # infinite before the first query
+        return candidates.distance.nan_to_num()  # the distance is infinite before the first query
 
 
 ACQUISITIONS: Registry[Acquisition] = Registry(
@@ -163,12 +163,13 @@ ACQUISITIONS: Registry[Acquisition] = Registry(
 
 
 def acquisition_of(choice: Choice) -> Acquisition:
-    """Return the acquisition with a name and settings. Raises ``InvalidSpec``."""
+    """Return the acquisition with a name and settings. Raises ``InvalidSpec`` if there is none."""
     return ACQUISITIONS.make(choice)
 
 
 def check_acquisition(definition: EnvironmentDefinition) -> None:
-    """Check that an acquisition exists, takes these settings, and fits the environment. Raises ``InvalidSpec``."""
+    """Raise ``InvalidSpec`` unless the definition's acquisition exists, takes its settings and fits the
+    environment."""
     choice = definition.design.acquisition
     acquisition = acquisition_of(choice)
     with guarded(f"acquisition {choice.name}", InvalidSpec):
@@ -176,14 +177,14 @@ def check_acquisition(definition: EnvironmentDefinition) -> None:
 
 
 def value_of(choice: Choice, candidates: CandidateView) -> Tensor:
-    """Return the acquisition's value of each of m candidates, (m,). Raises ``ChoiceFailed`` if it breaks the
-    invariants."""
+    """Return the acquisition's value of each of m candidates, (m,). Raises ``ChoiceFailed`` if the acquisition fails or
+    the values are not finite numbers of this shape."""
     return _criterion_values(choice, acquisition_of(choice).value, candidates, candidates.distance.shape)
 
 
 def path_value_of(choice: Choice, paths: PathView) -> Tensor:
-    """Return the acquisition's value of each beginning of b paths, (b, T). Raises ``ChoiceFailed`` if it breaks the
-    invariants."""
+    """Return the acquisition's value of the first t steps of each path, for each t, (b, T). Raises ``ChoiceFailed`` if
+    the acquisition fails or the values are not finite numbers of this shape."""
     return _criterion_values(choice, acquisition_of(choice).path_value, paths, paths.weight.shape)
 
 

@@ -34,8 +34,8 @@ def choose(
         candidates: points to choose from. If some are reserved, the first query is one of them.
         earlier: all queries so far, answered or not; no query close to one of them is chosen.
         unanswered: queries without an answer yet, which are treated as answered.
-        outputs: for each query, the number of the output that it is chosen for.
-        tolerances: (O,) in each output's unit.
+        outputs: for each query to choose, the index of the output that it should improve.
+        tolerances: (O,) tolerance of each output, in its unit.
 
     Returns:
         Indices of candidates; fewer than ``outputs`` if no distinct candidate is left.
@@ -76,15 +76,15 @@ def candidate_view(
     tolerance: float,
     distance: Tensor,
 ) -> CandidateView:
-    """Return the candidates as an acquisition sees them, for the output with number ``column``.
+    """Return the properties of the candidates that an acquisition uses, for one output.
 
     Args:
         model: the model of the round.
         candidates: m points.
-        column: number of the output, whose samples are not all equal.
+        column: index of the output, which must vary in the samples.
         outlook: predicted effect of answers on the variance of this output.
-        tolerance: of this output, in its unit.
-        distance: (m,) of each candidate to the nearest query so far.
+        tolerance: tolerance of this output, in its unit.
+        distance: (m,) distance of each candidate to the nearest query so far.
     """
     return CandidateView(
         model=model,
@@ -99,7 +99,8 @@ def candidate_view(
 
 
 def nearest(definition: EnvironmentDefinition, points: Points, earlier: Points) -> Tensor:
-    """Distance (m,) of each point to the nearest query so far, in standard deviations of the sampling range."""
+    """Return the distance (m,) of each point to the nearest earlier query, in standard deviations of the sampling
+    range; infinite if there is none."""
     if not len(earlier):
         return points.q.new_full((len(points),), torch.inf)
     return distances(definition, points, earlier).amin(1)

@@ -15,11 +15,9 @@ from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.latin_hypercube import random_points
 from surrogym_server.sampling.occupancy import log_occupancy
 
-MAX_CANDIDATES = 4_096  # most candidates of each kind, because memory holds their covariances with the reference
-REFERENCE = 256  # reference points of each kind: from the Monte Carlo set, and from visited states
-OCCUPIED = (
-    0.75  # weight of the visited states among the reference points; those from the whole sampling range have the rest
-)
+MAX_CANDIDATES = 4_096  # greatest number of candidates of each kind, which bounds the memory for covariances
+REFERENCE = 256  # number of reference points of each kind: from the Monte Carlo set, and from visited states
+OCCUPIED = 0.75  # weight of the visited states among the reference points; points of the whole range have the rest
 
 
 @dataclass(frozen=True)
@@ -29,16 +27,16 @@ class Candidates:
     points: Points  # m candidates
     log_p: Tensor  # (m,) logarithm of the input probability P_i (eq. 11); 0 if the acquisition does not use it
     reference: Points  # r reference points
-    weights: Tensor  # (r,) share of each reference point in their mean variance; they add up to 1
-    reserved: Tensor | None = None  # (m,) bool: candidates to query first, near an ending or a peak of the reward
+    weights: Tensor  # (r,) weight of each reference point in the mean variance; the weights add up to 1
+    reserved: Tensor | None = None  # (m,) bool: candidates to query first, near a termination or a peak of the reward
 
 
 def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, rng: np.random.Generator) -> Candidates:
     """Build candidates from the Monte Carlo set, m ``points``, and from visited states (v, C) under random actions.
 
-    The visited states are needed because few points of a set over the whole range lie where a policy goes. The
-    reference is the Monte Carlo set, mixed with visited states if there are any. Visited states outside the sampling
-    range are left out: with a wrong model a policy can reach states to which the real system should not be set.
+    Few points of a set over the whole range lie where a policy goes, so visited states are added. The reference points
+    are those of the Monte Carlo set, mixed with visited states if there are any. Visited states outside the sampling
+    range are left out: with a wrong model a policy can reach states to which the real system must not be set.
     """
     states = None if states is None else states[model.definition.in_range(states)]
     points = points[:MAX_CANDIDATES]
@@ -56,7 +54,7 @@ def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, r
 
 
 def with_reserved(candidates: Candidates, points: Points) -> Candidates:
-    """Add k candidates, each with the largest probability of all, and reserve only these."""
+    """Add k points to the candidates, each with the largest probability of all, and reserve only these."""
     log_p = torch.cat([candidates.log_p, candidates.log_p.max().expand(len(points))])
     points_of_all = Points.joined([candidates.points, points])
     reserved = torch.arange(len(points_of_all)) >= len(candidates.points)
@@ -64,10 +62,10 @@ def with_reserved(candidates: Candidates, points: Points) -> Candidates:
 
 
 def input_probability(model: DynamicsModel, points: Points, states: Tensor | None) -> Tensor:
-    """Logarithm of the input probability P_i (eq. 11) at m points, from visited states (v, C): (m,).
+    """Return the logarithm of the input probability P_i (eq. 11) at m points, (m,), given visited states (v, C).
 
-    Without visited states every point is equally likely, or the density of the predicted next states takes their
-    place, as the definition says.
+    Without visited states it is 0, or the density of the model's predicted next states if the definition's
+    ``input_probability`` is "predicted".
     """
     definition = model.definition
     if states is not None and len(states):
@@ -79,7 +77,7 @@ def input_probability(model: DynamicsModel, points: Points, states: Tensor | Non
 
 
 def under_random_actions(definition: EnvironmentDefinition, states: Tensor, rng: np.random.Generator) -> Points:
-    """Pair states (v, C) with random actions from the action space."""
+    """Return states (v, C), each with a random action from the action space."""
     return Points(states, random_points(definition, len(states), rng)[1])
 
 

@@ -19,28 +19,28 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.prequential import PrequentialScores
 from surrogym_server.sampling.regions import Region, regions_of
 
-SUREST = 1e9  # larger ratios of tolerance to standard deviation are clipped to this one
+SUREST = 1e9  # upper limit of the ratio of tolerance to standard deviation
 
 
 @dataclass(frozen=True)
 class OutputConfidence:
-    """How well a model knows one output, and what limits it."""
+    """How well a model knows one output, and what limits its knowledge."""
 
-    confidence_index: float
-    confidence_index_paper: float
-    coverage: float  # share of the set whose standard deviation is below the tolerance
+    confidence_index: float  # mean certainty over the Monte Carlo set (eq. 8)
+    confidence_index_paper: float  # the paper's index, with a tolerance of 1 in the output's unit
+    coverage: float  # share of the Monte Carlo set where the standard deviation is below the tolerance
     leave_one_out_error: float | None  # root mean square, in the output's unit; None if the model does not offer it
     leave_one_out_within_one: float | None  # share of the samples within one predictive standard deviation
-    leave_one_out_within_two: float | None
+    leave_one_out_within_two: float | None  # share of the samples within two predictive standard deviations
     noise: float = 0.0  # standard deviation of a single step's noise that real steps confirm, in the output's unit
     sensor_noise: float = 0.0  # standard deviation of one measurement, if most of the noise is the sensor's
     past: float = 0.0  # share of the squared errors that earlier steps explain: a dead time or a hidden state
-    region: Region | None = None  # where most of the model uncertainty is
-    prequential: PrequentialScores | None = None  # scores of predictions made before learning from the sample
+    region: Region | None = None  # part of the sampling range with most of the model uncertainty
+    prequential: PrequentialScores | None = None  # scores of predictions of samples before the model learned from them
 
 
 def stds(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:
-    """Latent standard deviation of every output, the reward last, at q (m, C) and u (m, F): (m, O)."""
+    """Return the latent standard deviation of every output, the reward last, at q (m, C) and u (m, F): (m, O)."""
     transition = model.transition(q, u, stds=True, reward_std=True)
     require_shapes(model, transition, q, stds=True)
     assert transition.std is not None
@@ -49,26 +49,28 @@ def stds(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:
 
 
 def certainty(std: Tensor, tolerance: Tensor | float) -> Tensor:
-    """Certainty C_m = Phi(tau / sigma) (eq. 9); 1 if sigma is 0."""
+    """Return the certainty C_m = Phi(tau / sigma) (eq. 9) for standard deviations sigma; 1 if sigma is 0."""
     index: Tensor = torch.special.ndtr(tolerance / std)
     return index
 
 
 def log_model_uncertainty(std: Tensor, tolerance: Tensor | float) -> Tensor:
-    """Logarithm of the model uncertainty, log U_m = log Phi(-tau / sigma) (eq. 10); finite also if sigma is 0."""
+    """Return log U_m = log Phi(-tau / sigma), the logarithm of the model uncertainty (eq. 10); finite also if sigma is
+    0."""
     log_uncertainty: Tensor = torch.special.log_ndtr(-(tolerance / std).clamp_max(SUREST))
     return log_uncertainty
 
 
 def log_uncertainty_index(log_model_uncertainty: Tensor, log_probability: Tensor) -> Tensor:
-    """Logarithm of the paper's uncertainty index U (eq. 12), from those of U_m and P_i."""
+    """Return the logarithm of the paper's uncertainty index U (eq. 12), from those of U_m and P_i."""
     return log_model_uncertainty + log_probability
 
 
 def confidences_of(
     model: DynamicsModel, points: Points, std: Tensor, tolerances: Sequence[float]
 ) -> list[OutputConfidence]:
-    """Confidence of every output (O,) from its standard deviations (m, O) over the points of the Monte Carlo set."""
+    """Return the confidence of every output (O,), from its standard deviations (m, O) at the points of the Monte Carlo
+    set."""
     able = offers(model, LeaveOneOut)
     errors = [None] * len(tolerances) if able is None else able.leave_one_out()
     doubt = log_model_uncertainty(std, std.new_tensor(tolerances)).exp()
@@ -78,7 +80,8 @@ def confidences_of(
 
 
 def confidence(std: Tensor, tolerance: float, errors: LeaveOneOutErrors | None) -> OutputConfidence:
-    """Confidence of one output, from standard deviations (m,) over the Monte Carlo set and leave-one-out errors."""
+    """Return the confidence of one output, from its standard deviations (m,) over the Monte Carlo set and its
+    leave-one-out errors."""
     return OutputConfidence(
         float(certainty(std, tolerance).mean()),
         float(certainty(std, 1.0).mean()),

@@ -1,4 +1,4 @@
-"""Find the initial queries of a design that a log makes unnecessary. Pure."""
+"""Search for those initial queries of a design that a log makes unnecessary."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ Bools = NDArray[np.bool_]
 
 
 def covered(definition: EnvironmentDefinition, q: Array, u: Array, logged_q: Array, logged_u: Array) -> Bools:
-    """Whether a log makes each of m queries unnecessary, (m,) bool.
+    """Return which of m queries a log makes unnecessary, (m,) bool.
 
-    It does if a logged step lies nearer to the query than half the distance to the nearest other query.
+    These are the queries to which a logged step is nearer than half the distance to the nearest other query.
 
     Distances are measured over states and actions, in widths of the sampling range, angles around the circle. Two
     discrete actions are 1 apart. A single query counts as covered by any log.

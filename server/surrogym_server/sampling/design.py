@@ -42,7 +42,7 @@ from surrogym_server.sampling.tolerances import frozen_tolerances
 from surrogym_shared.nouns import Query
 from surrogym_shared.states import Verdict
 
-FEW_POINTS = 500  # points above which only one Latin hypercube is made, because comparing all pairs takes much memory
+FEW_POINTS = 500  # with more points only one Latin hypercube is drawn, because comparing pairs takes much memory
 
 
 @dataclass(frozen=True)
@@ -51,14 +51,14 @@ class Decision:
 
     model: DynamicsModel
     confidences: tuple[OutputConfidence, ...]  # (O,) one for each output
-    tolerances: tuple[float, ...]  # (O,) of the confidences: declared or default ones, widened by confirmed noise
-    state: DesignState  # for the next round
+    tolerances: tuple[float, ...]  # (O,) tolerances of the confidences: declared or default, widened by confirmed noise
+    state: DesignState  # what the next round needs
     verdict: Verdict
-    queries: tuple[Query, ...]  # the next queries
+    queries: tuple[Query, ...]  # queries of the next round
 
 
 def initial_queries(definition: EnvironmentDefinition, budget: int) -> tuple[Query, ...]:
-    """Return the queries before the first fit, with at most ``budget`` real steps in all.
+    """Return the queries before the first fit, with at most ``budget`` real steps in total.
 
     They are a Latin hypercube, or random rollouts if the environment can't be set to any state.
     """
@@ -86,9 +86,10 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         request: budget and target of the design, and its queries without an answer.
 
     Raises:
-        InvalidInput, NumericalFailure: from ``Learner.learn``.
-        PluginFailed: the family of models raised another error, or its model can't be used.
-        ChoiceFailed: the acquisition returned values of a wrong shape, or that are not finite.
+        InvalidInput: too few samples to learn from.
+        NumericalFailure: the fit fails on these samples.
+        PluginFailed: code of the model family raised another error, or its model breaks the rules of ``models.port``.
+        ChoiceFailed: the acquisition returned values of a wrong shape, or values that are not finite.
     """
     # Lines 3, 4 and 12: fit the processes of all outputs, transitions and reward, to all samples.
     fit = learn(definition, samples, state.warm, request.prior)
@@ -119,7 +120,7 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         tested_at = state.tested_at if verdict == "ready" else 0
     continues = verdict == "continue" or testing
 
-    # Line 8, "for each process with CI < target": the numbers of these outputs, the least confident first; if there is
+    # Line 8, "for each process with CI < target": the indices of these outputs, the least confident first; if there is
     # none, the least confident output alone.
     outputs = below_target(judgement.confidences, request.target)
 
@@ -160,7 +161,7 @@ def _verdict_with(queries: tuple[Query, ...], round: Round) -> Verdict:
 
 
 def _lacks_excursion(definition: EnvironmentDefinition, samples: Samples, state: DesignState) -> bool:
-    """Whether a ready design has snapshots, and no sample has come since its last excursion was planned."""
+    """Return whether a ready design has snapshots, and no sample has come since its last excursion was planned."""
     if not definition.snapshots or definition.design.stopping != "tested_confidence":
         return False
     return not state.tested_at or len(samples) <= state.tested_at

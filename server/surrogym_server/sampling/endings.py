@@ -13,17 +13,17 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import RewardEdges, offers
 from surrogym_server.models.port import DynamicsModel
 
-FRONTIER = 0.1  # widths of the range of the states so far; states less far outside are not worth a query
-DOUBT = 0.005  # acceptable mean probability, over the candidates, that the model is wrong about an ending
+FRONTIER = 0.1  # states closer than this to the range of earlier states, in widths of it, are not worth a query
+DOUBT = 0.005  # acceptable mean probability, over the candidates, that the model is wrong about a termination
 
 
 def ending(model: DynamicsModel, samples: Samples, points: Points) -> Tensor | None:
-    """Whether each of m candidates is reserved for a query about the end of episodes, (m,) bool; None if none is.
+    """Return which of m candidates are reserved for a query about the end of episodes, (m,) bool; None if none is.
 
-    With a declared termination these are the points predicted to end an episode, until a sample has ended one. With a
-    learned termination they are the most doubtful points, until little doubt is left, and then the points farthest
-    beyond the states known to be non-terminal, where another end may lie. If the reward jumps, the points at which the
-    side of the jump is doubtful are added.
+    With a declared termination: the points predicted to end an episode, until a sample has ended one; then those at
+    which the side of a jump of the reward is doubtful. With a learned termination: the points at which it is most
+    doubtful, until little doubt is left; then those with a doubtful jump; then those farthest beyond the states known
+    to be non-terminal, where another termination may lie.
     """
     q_next = model.transition(points.q, points.u).q_next
     if not model.definition.learns_termination:
@@ -39,16 +39,15 @@ def ending(model: DynamicsModel, samples: Samples, points: Points) -> Tensor | N
 
 
 def in_doubt(model: DynamicsModel, q_next: Tensor) -> Tensor:
-    """Probability that the model is wrong about an ending at q_next (m, C), (m,); 0 if termination is declared."""
+    """Return the probability that the model is wrong about a termination at q_next (m, C), (m,); 0 if it is
+    declared."""
     probability = model.termination_probability(q_next)
     return probability.minimum(1 - probability)
 
 
 def edge_in_doubt(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Tensor:
-    """Probability (m,) that the model is wrong about the side of an edge of the reward: the largest over all edges.
-
-    The steps lead from q (m, C) to q_next (m, C).
-    """
+    """Return the probability that the model is wrong about the side of an edge of the reward, (m,), for steps from
+    q (m, C) to q_next (m, C). Of several edges, the largest probability counts."""
     doubt = q.new_zeros(len(q))
     for of_one in _edge_doubts(model, q, q_next):
         doubt = doubt.maximum(of_one)
@@ -56,7 +55,8 @@ def edge_in_doubt(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Tensor:
 
 
 def _edges(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor | None:
-    """Whether each candidate is among those at which the side of an edge of the reward is most doubtful, (m,) bool."""
+    """Return which candidates are those with the most doubtful side of an edge of the reward, (m,) bool; None if no
+    edge is in doubt."""
     for doubt in _edge_doubts(model, points.q, q_next):
         if float(doubt.mean()) > DOUBT:
             return doubt >= 0.5 * doubt.max()
@@ -64,7 +64,7 @@ def _edges(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor | Non
 
 
 def _edge_doubts(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Iterator[Tensor]:
-    """For each edge of the reward, the probability (m,) that the model is wrong about the side of m points."""
+    """Return an iterator over the edges of the reward: the probability (m,) that the model is wrong about the side."""
     edged = offers(model, RewardEdges)
     return iter(()) if edged is None else edged.reward_edge_doubts(q, q_next)
 
@@ -75,10 +75,11 @@ def _predicted(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor |
 
 
 def unexplored(definition: EnvironmentDefinition, states: Tensor, q: Tensor) -> Tensor:
-    """How far states q (m, C) lie outside of the range of the states so far (n, C): (m,).
+    """Return how far states q (m, C) lie outside of the range of earlier states (n, C), where an unknown termination
+    may lie: (m,).
 
-    An unknown ending may lie there. The result is the sum over both ends of every moving coordinate, in widths of that
-    range.
+    The result is the sum over both ends of every moving coordinate, in widths of that range; 1 if there are no earlier
+    states.
     """
     columns = list(definition.moving)
     if not len(states):

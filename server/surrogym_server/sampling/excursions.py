@@ -21,26 +21,41 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.rollouts import Sequences, best_rollout, predict_paths
 from surrogym_shared.nouns import Query, Vector
 
-FAR = 0.5  # standard deviations of the sampling range between the end of an excursion and the nearest sample
-LONGEST = 16  # most actions of an excursion
+FAR = 0.5  # least distance from an excursion's end to all samples, in standard deviations of the sampling range
+LONGEST = 16  # greatest number of actions of an excursion
 
 
 def excursion(
     model: DynamicsModel, samples: Tensor, snapshots: Mapping[str, Vector], longest: int, rng: np.random.Generator
 ) -> Query:
-    """Plan the shortest sequence whose predicted state gets at least the distance ``FAR`` away from all ``samples``,
-    which are states (n, C).
+    """Plan the shortest sequence whose predicted state gets at least the distance ``FAR`` away from all samples.
 
-    If none does, the sequence that leads farthest is planned. It begins at a reset or at one of the snapshots, which
-    have coordinates (C,) by name."""
+    If no sequence gets so far, plan the one that leads farthest.
+
+    Args:
+        model: the model.
+        samples: states (n, C) of all samples.
+        snapshots: coordinates (C,) of each snapshot by name. The sequence begins at one of these or at a reset.
+        longest: greatest number of actions.
+        rng: source of random sequences.
+    """
     longest = min(longest, LONGEST, model.definition.max_rollout or 1)
     return best_rollout(model.definition, partial(_reach, model, samples), longest, snapshots, rng)
 
 
 def _reach(model: DynamicsModel, samples: Tensor, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
-    """Rate sequences (k, T, F), each from s equally likely states (k, s, C): the values, (k,), and the lengths, (k,).
+    """Rate sequences of actions by how far they lead away from the samples.
 
-    A sequence that gets ``FAR`` is rated above all that don't, and above longer ones.
+    A sequence that gets ``FAR`` away is rated above all that don't, and above longer ones.
+
+    Args:
+        model: the model.
+        samples: states (n, C) of all samples.
+        starts: equally likely first states of each of k sequences, (k, s, C).
+        sequences: actions (k, T, F).
+
+    Returns:
+        Value (k,) and best length (k,) of each sequence.
     """
     count, lanes = starts.shape[:2]
     paths = predict_paths(model, starts.flatten(0, 1), torch.from_numpy(sequences).repeat_interleave(lanes, 0))
@@ -49,12 +64,12 @@ def _reach(model: DynamicsModel, samples: Tensor, starts: Tensor, sequences: Seq
     away = (away.reshape(paths.running.shape) * paths.running).reshape(count, lanes, -1).mean(1)
     farthest = away.max(1)
     reached = away >= FAR
-    first = reached.double().argmax(1)  # argmax of equal values is the first
+    first = reached.double().argmax(1)  # the first step that reaches FAR, because argmax returns the first of equals
     value = torch.where(reached.any(1), FAR + away.shape[1] - first, farthest.values)
     return value, torch.where(reached.any(1), first, farthest.indices) + 1
 
 
 def _state_distances(definition: EnvironmentDefinition, a: Tensor, b: Tensor) -> Tensor:
-    """Distances of states a (m, C) and b (n, C), in standard deviations of the sampling range, (m, n)."""
+    """Return the distances of states a (m, C) and b (n, C), in standard deviations of the sampling range, (m, n)."""
     still = (Points(q, q.new_zeros(len(q), definition.action.size)) for q in (a, b))
     return distances(definition, *still)

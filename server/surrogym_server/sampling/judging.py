@@ -1,4 +1,4 @@
-"""Judge a model: confidence per output, the verdict that follows, and the candidates for the next queries."""
+"""Judgement of a model: confidence of each output, the verdict that follows, and candidates for the next queries."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from surrogym_shared.states import Verdict
 class Judgement:
     """Judgement of a model: confidences, tolerances, verdict, and candidates for the next queries."""
 
-    confidences: tuple[OutputConfidence, ...]  # (O,)
-    widened_tolerances: tuple[float, ...]  # (O,) of the confidences: the tolerances, widened by confirmed noise
-    verdict: Verdict  # on this model, whatever the verdicts of earlier rounds
+    confidences: tuple[OutputConfidence, ...]  # (O,) confidence of each output
+    widened_tolerances: tuple[float, ...]  # (O,) tolerances of the confidences, widened by confirmed noise
+    verdict: Verdict  # verdict on this model alone, whatever the verdicts of earlier rounds
     candidates: Candidates  # points from which the next queries are chosen
 
 
@@ -92,7 +92,7 @@ def judge_model(
 
 
 def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
-    """Draw the Monte Carlo set of eq. 8, the same in every round: coordinates (m, C), actions (m, F)."""
+    """Draw the Monte Carlo set of eq. 8, the same in every round: coordinates (m, C) and actions (m, F)."""
     rng = generator_for(definition, "monte carlo")
     return going_on(definition, *random_points(definition, definition.design.monte_carlo, rng), rng)
 
@@ -105,12 +105,19 @@ def judge(
     request: Request,
     settled: bool = True,
 ) -> Verdict:
-    """Decide whether the design continues.
+    """Decide whether the design continues, is ready, or has spent its budget.
 
     Under ``tested_confidence`` a design is ready only if its confidence index has reached the target, its leave-one-out
     errors are known and within the tolerances, the end of episodes is known, and enough adaptive queries were answered:
-    half as many as initial ones. Logged samples count as initial ones, not as adaptive ones, because nobody chose them
-    to disprove the model.
+    half as many as initial ones. Logged samples count as initial ones, because nobody chose them to disprove the model.
+
+    Args:
+        definition: the environment, with the settings of its design.
+        confidences: confidence of each output, (O,).
+        tolerances: tolerance of each output, (O,).
+        samples: number of samples.
+        request: budget and target of the design.
+        settled: whether no doubt is left about terminations and peaks of the reward.
     """
     initial, cost = definition.design.initial, request.cost(samples)
     sure = all(c.confidence_index >= request.target for c in confidences)
@@ -126,13 +133,14 @@ def judge(
 
 
 def agrees(confidence: OutputConfidence, tolerance: float) -> bool:
-    """Whether the leave-one-out error of an output is known and within the tolerance."""
+    """Return whether the leave-one-out error of an output is known and within the tolerance."""
     limit = SLACK * tolerance if confidence.noise else tolerance
     return confidence.leave_one_out_error is not None and confidence.leave_one_out_error <= limit
 
 
 def below_target(confidences: Sequence[OutputConfidence], target: float) -> list[int]:
-    """Numbers of the outputs below the target, the least confident first; without any, the least confident one."""
+    """Return the indices of the outputs below the target, the least confident first; if there is none, the index of the
+    least confident output."""
     index = [confidence.confidence_index for confidence in confidences]
     order = sorted(range(len(index)), key=index.__getitem__)
     return [i for i in order if index[i] < target] or order[:1]
@@ -144,6 +152,12 @@ def verdict_with_history(judgement: Judgement, state: DesignState, request: Requ
     A design that was ready stays ready, unless a person has asked for more or later steps contradict the model: a fit
     to more steps may lower the confidence index a little although the model had predicted all of them. A design that
     has ended takes no further real steps because of audits or logs.
+
+    Args:
+        judgement: judgement of the present model.
+        state: result of the previous round.
+        request: budget and target of the design.
+        conditions: conditions of the present round; compared with those under which the design ended.
     """
     if judgement.verdict in ("ready", "from_log"):
         return judgement.verdict
@@ -156,7 +170,7 @@ def verdict_with_history(judgement: Judgement, state: DesignState, request: Requ
 
 
 def _asks_more(now: Conditions, before: Conditions | None) -> bool:
-    """Whether a person has changed the budget or the target, or reduced a tolerance, since the design ended."""
+    """Return whether a person has changed the budget or the target, or reduced a tolerance, since the design ended."""
     if before is None:
         return True
     smaller = any(new < old for new, old in zip(now.tolerances, before.tolerances, strict=True))
@@ -164,9 +178,9 @@ def _asks_more(now: Conditions, before: Conditions | None) -> bool:
 
 
 def _contradicted(judgement: Judgement, request: Request) -> bool:
-    """Whether the errors of an output exceed its tolerance.
+    """Return whether the recent prediction errors of an output exceed its tolerance.
 
-    They are the errors of the predictions of the latest steps, or the leave-one-out errors if there are none.
+    They are the errors of predictions of the latest steps, or the leave-one-out errors if there are no such steps.
     """
     surprises = request.surprises
     for i, (confidence, tolerance) in enumerate(zip(judgement.confidences, judgement.widened_tolerances, strict=True)):

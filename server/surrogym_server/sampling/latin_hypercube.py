@@ -11,7 +11,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 
 Array = NDArray[np.float64]
-REDRAWS = 100
+REDRAWS = 100  # greatest number of times that points in terminated states are drawn again
 
 
 def latin_hypercube(
@@ -38,7 +38,7 @@ def random_points(definition: EnvironmentDefinition, count: int, rng: np.random.
 def going_on(
     definition: EnvironmentDefinition, q: Tensor, u: Tensor, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Replace points q (n, C), u (n, F) at which the declared termination holds by random ones at which it does not.
+    """Replace those of the points q (n, C), u (n, F) at which the declared termination holds by random other points.
 
     No episode passes through a terminated state, so a query there would teach nothing. If the termination holds in the
     whole range, the points stay.
@@ -53,7 +53,8 @@ def going_on(
 
 
 def from_unit(definition: EnvironmentDefinition, p: Tensor) -> tuple[Tensor, Tensor]:
-    """Map probabilities p (n, C + F) in [0, 1) to coordinates and actions."""
+    """Map probabilities p (n, C + F) in [0, 1) to coordinates (n, C) and actions (n, F) of the sampling
+    distributions."""
     size = len(definition.coordinates)
     q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(definition.coordinates)], -1)
     action, u = definition.action, p[:, size:]
@@ -64,7 +65,8 @@ def from_unit(definition: EnvironmentDefinition, p: Tensor) -> tuple[Tensor, Ten
 
 
 def _unit_hypercube(count: int, dimensions: int, rng: np.random.Generator, nvec: tuple[int, ...]) -> Array:
-    """Points (count, dimensions) in [0, 1); the last columns are discrete actions, each in the middle of its share."""
+    """Draw points (count, dimensions) in [0, 1), stratified in each column. The last columns are discrete actions with
+    ``nvec`` values each, in the middle of the share of their value."""
     cells = np.stack([rng.permutation(count) for _ in range(dimensions)], 1)
     points = (cells + rng.random((count, dimensions))) / count
     for column, n in enumerate(nvec, start=dimensions - len(nvec)):

@@ -1,4 +1,4 @@
-"""Find declared limits at which many samples end.
+"""Search for declared limits at which many samples end.
 
 A limit cuts the change of a coordinate off, so such samples say little about the dynamics.
 """

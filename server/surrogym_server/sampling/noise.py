@@ -22,19 +22,19 @@ from surrogym_server.environment.samples import Samples, increments, preceding, 
 from surrogym_server.models.abilities import LearnedNoise, LeaveOneOut, offers
 from surrogym_server.models.port import DynamicsModel
 
-ENOUGH = 3  # degrees of freedom of the repeats that noise needs to count as established
+ENOUGH = 3  # least degrees of freedom of the repeats with which noise can be confirmed
 STAGES = (1, ENOUGH, 6, 9)  # degrees of freedom of the repeats at which they are tested
 LEVEL = 0.01  # significance level of each test
-NEGLIGIBLE = 0.5  # noise of this share of the tolerance is confirmed by mistake with probability ``LEVEL`` at most
+NEGLIGIBLE = 0.5  # true noise below this share of the tolerance is confirmed with probability ``LEVEL`` at most
 AT_MOST = 3.0  # learned noise above this multiple of the repeats' noise is misfit of the model
-SLACK = 1.25  # factor by which few samples may raise a leave-one-out error above the noise
+SLACK = 1.25  # greatest credible ratio of a leave-one-out error to the noise, as the samples may be few
 
 
 @dataclass(frozen=True)
 class Repeats:
     """Pooled differences between results of the same step."""
 
-    degrees: int  # degrees of freedom: samples less distinct steps
+    degrees: int  # degrees of freedom: number of samples less number of distinct steps
     std: Tensor  # (O,) standard deviation of one result, in each output's unit
 
 
@@ -54,10 +54,11 @@ def repeats(model: DynamicsModel, samples: Samples) -> Repeats:
 
 
 def _conditions(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """What may determine the result of each of n steps, (n, d): its state and action, and those of the step before.
+    """Return what may determine the result of each of n steps, (n, d): its state and action, and those of the step
+    before.
 
-    The first step of an episode has zeros for the step before. An environment that can be set to any state remembers no
-    step before.
+    The first step of an episode has zeros for the step before. An environment that can be set to any state does not
+    remember an earlier step, so there the state and action suffice.
     """
     now = torch.cat([samples.q, samples.u], -1)
     if definition.max_rollout is None:
@@ -68,9 +69,9 @@ def _conditions(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Tensor:
-    """Standard deviation of the noise of each output that repeated steps confirm, in the output's unit, (O,).
+    """Return the standard deviation of each output's noise that repeated steps confirm, in the output's unit, (O,).
 
-    It is 0 if repeats confirm no noise, or if the noise is below the tolerance.
+    It is 0 if repeats confirm no noise, or if the noise is below the output's tolerance.
     """
     model_noise, limits = _model_noise(model, tolerances)
     differences = repeats(model, samples)
@@ -108,13 +109,14 @@ def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float
 
 
 def _confirmed(differences: Repeats, limits: Tensor) -> Tensor:
-    """Whether repeats show that each output's noise exceeds ``NEGLIGIBLE`` times its limit (O,), (O,) bool."""
+    """Return whether repeats show that each output's noise exceeds ``NEGLIGIBLE`` times its limit (O,): (O,) bool."""
     bound = (NEGLIGIBLE * limits).square() * float(scipy.special.chdtri(differences.degrees, LEVEL))
     return differences.degrees * differences.std.square() > bound
 
 
 def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
-    """Whether each leave-one-out error is larger than tolerance (O,) and noise (O,) together explain, (O,) bool."""
+    """Return whether each leave-one-out error exceeds what tolerance (O,) and noise (O,) explain together, (O,)
+    bool."""
     able = offers(model, LeaveOneOut)
     if able is None:
         return torch.zeros_like(noise, dtype=torch.bool)
@@ -123,7 +125,7 @@ def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
 
 
 def _refuted(differences: Repeats, model_noise: Tensor) -> Tensor:
-    """Whether repeats show that most of each output's learned noise (O,) is misfit of the model, (O,) bool."""
+    """Return whether repeats show that most of each output's learned noise (O,) is misfit of the model, (O,) bool."""
     bound = (model_noise / AT_MOST).square() * float(scipy.special.chdtri(differences.degrees, 1 - LEVEL))
     return differences.degrees * differences.std.square() <= bound
 
@@ -135,13 +137,13 @@ def widened_by(noise: Tensor, tolerances: Sequence[float]) -> tuple[float, ...]:
 
 
 def _possible(model: DynamicsModel, limits: Tensor) -> Tensor:
-    """Largest noise that explains the samples as well as the noise that the model has learned, (O,)."""
+    """Return the largest noise (O,) that explains the samples as well as the noise that the model has learned."""
     able = offers(model, LearnedNoise)
     return torch.zeros_like(limits) if able is None else torch.tensor(able.possible_noise, dtype=limits.dtype)
 
 
 def _model_noise(model: DynamicsModel, tolerances: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Standard deviation of the noise that a model has learned, and the tolerances, as tensors (O,)."""
+    """Return the standard deviation of the noise that a model has learned, and the tolerances, as tensors (O,)."""
     limits = torch.tensor(list(tolerances), dtype=torch.float64)
     able = offers(model, LearnedNoise)
     if able is None:

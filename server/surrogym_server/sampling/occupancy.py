@@ -15,11 +15,14 @@ from surrogym_server.environment.definition import CoordinateDefinition, Environ
 from surrogym_server.environment.distributions import scaling
 
 FLOOR = 0.1  # share of the uniform density in the mixture
-BLOCK = 2**17  # kernel values computed at once, so that they stay in a core's cache
+BLOCK = 2**17  # number of kernel values computed at once, so that they stay in a core's cache
 
 
 def log_occupancy(definition: EnvironmentDefinition, states: Tensor, q: Tensor, floor: float = FLOOR) -> Tensor:
-    """log P_i at q (m, C) given visited states (v, C): log of density over uniform density, (m,)."""
+    """Return log P_i at q (m, C): the logarithm of the density of visited states (v, C) over a uniform density, (m,).
+
+    ``floor`` is the share of the uniform density that is mixed in.
+    """
     count, moving = len(states), len(definition.moving)
     bandwidth = count ** (-1 / (moving + 4))
     densities = []
@@ -33,7 +36,8 @@ def log_occupancy(definition: EnvironmentDefinition, states: Tensor, q: Tensor, 
 
 
 def _log_kernel(coordinate: CoordinateDefinition, at: Tensor, states: Tensor, bandwidth: float) -> Tensor:
-    """Log density (m, v) of one coordinate at m points under a kernel at each of v states, over the uniform one."""
+    """Return the log density of one coordinate at m points under a kernel at each of v states, less that of a uniform
+    density, (m, v)."""
     difference = at[:, None] - states[None]
     if coordinate.kind == "angle":
         spread = _circular_std(states)

@@ -1,4 +1,4 @@
-"""Outlook: the predicted effect of further queries on a model's variance, by the model or by distances."""
+"""Outlook: the effect of further queries on a model's variance, predicted by the model itself or from distances."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def outlook_of(
 ) -> tuple[OutputOutlook | None, ...]:
     """Return the predicted effect of answers at m candidates on the variance at r reference points, for every output.
 
-    The ``unanswered`` queries count as answered.
+    Queries in ``unanswered`` are treated as answered.
     """
     if (able := offers(model, Lookahead)) is not None:
         return able.outlook(candidates, reference, unanswered)
@@ -29,7 +29,7 @@ def outlook_of(
 
 
 def path_outlook(model: DynamicsModel, steps: PredictedSteps, column: int) -> PathOutlook | None:
-    """Return the predicted information of steps along b paths of T steps, for the output with number ``column``."""
+    """Return the predicted information of steps along b paths of T steps, for the output with index ``column``."""
     if (able := offers(model, Lookahead)) is not None:
         return able.along(steps, column)
     spread = stds(model, steps.flat.q, steps.flat.u)[:, column].reshape(steps.q.shape[:-1])
@@ -44,7 +44,7 @@ def as_if_answered(model: DynamicsModel, steps: PredictedSteps) -> DynamicsModel
 
 @dataclass(frozen=True)
 class NearbyAnswers(OutputOutlook):
-    """Predicted effect of further answers by distances alone, for models that can't predict it.
+    """Effect of further answers predicted from distances alone, for models that can't predict it themselves.
 
     Two points at distance d, in standard deviations of the sampling range, have the correlation exp(-d^2 / 2). An
     answer removes all variance at its point.
@@ -53,15 +53,15 @@ class NearbyAnswers(OutputOutlook):
     definition: EnvironmentDefinition
     candidates: Points  # m candidates
     reference: Points  # r reference points
-    own: Tensor  # (m,) variance at each candidate, as if the queries before were answered
-    there: Tensor  # (r,) variance at each reference point, as if these queries were answered
+    own: Tensor  # (m,) variance at each candidate, as if all queries so far were answered
+    there: Tensor  # (r,) variance at each reference point, as if all queries so far were answered
     learns: Tensor  # (m,) bool: whether a model learns from a step at the candidate, because its lags are known
 
     @classmethod
     def of(
         cls, model: DynamicsModel, candidates: Points, reference: Points, unanswered: Points
     ) -> tuple[NearbyAnswers, ...]:
-        """Build the outlook of every output (O,). The ``unanswered`` queries count as answered."""
+        """Build the outlook of every output (O,), with the ``unanswered`` queries treated as answered."""
         own, there = (stds(model, points.q, points.u).square() for points in (candidates, reference))
         definition, learns = model.definition, torch.ones(len(candidates), dtype=torch.bool)
         outputs = (
@@ -82,7 +82,7 @@ class NearbyAnswers(OutputOutlook):
         return self.answered(self.candidates[index : index + 1])
 
     def answered(self, query: Points) -> NearbyAnswers:
-        """Return the outlook that follows when one more query is answered."""
+        """Return the outlook after an answer to one more query."""
         own, there = (
             _removed_share(self.definition, points, query)[:, 0] for points in (self.candidates, self.reference)
         )
@@ -91,7 +91,10 @@ class NearbyAnswers(OutputOutlook):
 
 @dataclass(frozen=True)
 class IndependentSteps(PathOutlook):
-    """Predicted information along paths, as if steps were independent: I(t) = 1/2 sum log(1 + (w sigma / tau)^2)."""
+    """Information along paths as if steps were independent: I(t) = 1/2 sum log(1 + (w sigma / tau)^2).
+
+    For models that can't predict the effect of further steps themselves.
+    """
 
     spread: Tensor  # (b, T) latent standard deviation at each step, in the output's unit
     learns: Tensor  # (b, T) bool: whether a model learns from the step, because its lags are known
@@ -105,5 +108,5 @@ class IndependentSteps(PathOutlook):
 
 
 def _removed_share(definition: EnvironmentDefinition, points: Points, queries: Points) -> Tensor:
-    """Share of the variance at m points that the answer to each of k queries removes, (m, k)."""
+    """Return the share of the variance at m points that the answer to each of k queries removes, (m, k)."""
     return (-distances(definition, points, queries).square()).exp()
