@@ -33,7 +33,7 @@ def register(app: typer.Typer) -> None:
 
 @dataclass(frozen=True)
 class Faults:
-    """Options of what a controller does when a measurement is missing or wrong."""
+    """Options for what a controller does when a measurement is missing or wrong."""
 
     fallback: Annotated[
         list[float] | None,
@@ -58,10 +58,13 @@ class Faults:
     ] = None
 
     def choices(self, period: float | None) -> Choices:
-        """Return the choices.
+        """Return the options as settings of a controller.
+
+        Args:
+            period: seconds of one step; None takes that of the specification.
 
         Raises:
-            CommandError: a range has another form.
+            CommandError: an option ``--range`` has not the form NAME=LOW:HIGH.
         """
         from surrogym_trainer.deployment.controller import Choices
 
@@ -71,7 +74,7 @@ class Faults:
 
 @dataclass(frozen=True)
 class Checking:
-    """Options of the check."""
+    """Options of ``surrogym deploy`` for the check that a controller acts as its policy does."""
 
     check: Annotated[
         bool,
@@ -91,11 +94,11 @@ class Checking:
 
     @contextmanager
     def comparison(self, target: Target, controller: Controller, policy: LocalPolicy) -> Iterator[Comparison | None]:
-        """Start the controller, and open the environment. Real steps are entered at the end, also after a fault.
-        Without ``--check``, yield None.
+        """Context with the running controller beside its policy in an environment; None without ``--check``. Its real
+        steps are reported to the server at the end, also after an error.
 
         Raises:
-            CommandError: nothing runs the target, or no environment is known.
+            CommandError: the target can't run on this machine, or no environment is given.
             CannotCompile: there is no C compiler.
             ModuleNotFoundError: a package that runs the target is missing.
         """
@@ -126,10 +129,10 @@ class Checking:
 
     @contextmanager
     def _episode(self, policy: LocalPolicy) -> Iterator[Episode]:
-        """Open the original environment, or the virtual one if none is named.
+        """Context with the original environment of ``--env``, or with the virtual environment without this option.
 
         Raises:
-            PolicyMisfit: the policy is for another environment.
+            PolicyMisfit: the policy was trained for another environment.
         """
         from surrogym.cli.opening import opener_for_policy
         from surrogym_client.transport.http_surrogate import HttpSurrogate
@@ -151,7 +154,7 @@ class Checking:
             yield episode
 
     def run(self, comparison: Comparison, output: Output) -> Checked:
-        """Run the episodes."""
+        """Run the episodes of the check, and return their comparison."""
         from surrogym_shared.terminal import progress, say
         from surrogym_trainer.evaluation.evaluator import FIRST_SEED
 
@@ -164,7 +167,7 @@ class Checking:
             raise
 
     def stored(self, checked: Checked, target: str, controller: Controller, card: PolicyCard) -> StoredCheck:
-        """Return the check as a file has it."""
+        """Return the result of a check in the form that is written to a file."""
         from surrogym_trainer.policies.controller_check import StoredCheck
 
         return StoredCheck(
@@ -184,8 +187,8 @@ class Checking:
 
 @dataclass(frozen=True)
 class LocalPolicy:
-    """A policy's file on this machine, its card, and the options of the command. ``given`` is the specification of
-    --spec."""
+    """A policy's file on this machine, its card, and the options of the command. ``given`` is the specification from
+    the option --spec, or None."""
 
     path: Path
     card: PolicyCard
@@ -204,7 +207,7 @@ class LocalPolicy:
         return self.reading.load(self.path, self.card)
 
     def enter(self, comparison: Comparison) -> None:
-        """Enter the real steps of a check into the surrogate's ledger."""
+        """Report the real steps of a check to the server, as steps of the surrogate."""
         from surrogym.cli.evaluate import enter_steps, ledger_of
 
         server, token = self.service.server, self.service.token_for(self.context)
@@ -297,10 +300,10 @@ def _local(
     service: Service,
     output: Output,
 ) -> Iterator[LocalPolicy]:
-    """Yield a policy file. A stored policy is downloaded for as long as the command runs.
+    """Context with a policy's file on this machine. A policy on the server is downloaded for the time of the context.
 
     Raises:
-        CommandError: the policy was trained for another specification than the surrogate's, and none is given.
+        CommandError: the policy was trained for another specification than the surrogate's, and --spec is missing.
     """
     from tempfile import TemporaryDirectory
 
@@ -328,7 +331,8 @@ def _local(
 
 
 def _warning(policy: str, card: PolicyCard) -> str:
-    """Say why the policy's promise is not trusted, and how to test it. An audit takes a file, not a stored policy."""
+    """Return a warning that a policy's promise is not trusted, with the commands that test it. An audit needs a file,
+    so the commands first download a stored policy."""
     from shlex import quote
 
     stored = "@" in policy and not Path(policy).is_file()
@@ -343,7 +347,7 @@ def _warning(policy: str, card: PolicyCard) -> str:
 
 
 def _range(text: str) -> tuple[str, tuple[float, float]]:
-    """Parse ``name=low:high``."""
+    """Parse a range of a sensor given as ``name=low:high``. Raises ``CommandError`` for another form."""
     from surrogym.cli.errors import CommandError
 
     name, _, ends = text.partition("=")

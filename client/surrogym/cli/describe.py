@@ -40,9 +40,9 @@ def command(
     from surrogym.cli.printing import prints_aside, unregistered
     from surrogym_shared.terminal import say
 
-    del as_json  # a specification is JSON in any case
+    del as_json  # the output is always JSON
     with unregistered(lambda: 0, "nothing was described or registered"), prints_aside():
-        from surrogym_sampler.original.describing import describe  # it may take seconds
+        from surrogym_sampler.original.describing import describe  # this import may take seconds
 
         description = describe(environment, steps, seed)
     typer.echo(description.text())

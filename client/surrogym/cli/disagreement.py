@@ -63,7 +63,7 @@ class Differences:
         return self.learn > 0 or self.learn_all
 
     def check(self, settings: EvaluationSettings) -> None:
-        """Refuse to learn from an environment that was changed on purpose, and options that contradict each other.
+        """Check that the options don't contradict each other, and that no model learns from a changed environment.
 
         Raises:
             CommandError: ``--learn`` or ``--learn-all`` was given together with ``--perturb``, or with each other, or
@@ -84,8 +84,8 @@ class Differences:
             )
 
     def learning(self, surrogate: str | None, server: str | None, token: str | None) -> Learning | None:
-        """Ask the server for the surrogate that is to learn from the steps, before the first one is taken. Returns None
-        if none is to learn. Errors as of ``learning_of``."""
+        """Return the surrogate that will learn from the real steps, after a check on the server; None without --learn
+        and --learn-all. Raises the errors of ``learning_of``."""
         from surrogym.cli.learning import learning_of
 
         if not self.learns:
@@ -105,10 +105,21 @@ class Differences:
         *,
         quiet: bool,
     ) -> Differing | None:
-        """Compare the real steps of the episodes with the surrogate's model, and send ``steps`` if it is to learn.
+        """Compare the real steps of an evaluation with a surrogate's model, and send steps from which it learns.
 
-        With ``--learn-all`` the steps are sent first, and whether or not there is a model to compare with. Returns None
-        if nobody asked and the promise was kept, or if the steps can't be compared and none was sent.
+        With ``--learn-all`` all steps are sent, even if there is no model yet. Returns None if no option requests a
+        comparison and the promise was kept, or if the steps can't be compared and none was sent.
+
+        Args:
+            surrogate: name of the surrogate; None: there is nothing to compare with.
+            server: address of the server; None takes the default.
+            token: bearer token for the server.
+            result: the episodes.
+            settings: settings of the evaluation.
+            promise: promise of the policy, if the episodes judge it.
+            steps: steps to send; None to send none.
+            imagining: imagines episodes of the policy, to find effects of errors on its return.
+            quiet: whether remarks are hidden.
         """
         from surrogym.cli.errors import sentence
         from surrogym.cli.options import connect
@@ -144,18 +155,18 @@ class Differences:
 
 
 def left(promise: Promise | None, result: Evaluation) -> bool:
-    """Whether the mean return lies outside the promise's interval."""
+    """Whether the mean return of an evaluation lies outside the interval of the promise; False without a promise."""
     return promise is not None and not promise.low <= result.returns.mean() <= promise.high
 
 
 def missed(promise: Promise | None, result: Evaluation) -> bool:
-    """Whether the mean return is below the promise's interval."""
+    """Whether the mean return of an evaluation lies below the interval of the promise; False without a promise."""
     return promise is not None and bool(result.returns.mean() < promise.low)
 
 
 @dataclass(frozen=True)
 class Imagining:
-    """How to imagine episodes of the policy that was evaluated."""
+    """What is needed to imagine episodes of the evaluated policy: the policy, its card, token and seed."""
 
     load: Callable[[], Predict]
     card: PolicyCard
@@ -163,7 +174,8 @@ class Imagining:
     seed: int = 0
 
     def changes(self, api: Api, view: SurrogateView, shifted: Systematic, weights: Any) -> Any:
-        """Compute by how much errors of the model of ``view`` change the imagined return, see ``changes_of``."""
+        """Return the changes of the imagined return that systematic errors of the model of ``view`` cause. The other
+        arguments are those of ``changes_of``."""
         from surrogym.cli.audit import session_of
         from surrogym_client.transport import HttpSurrogate
         from surrogym_trainer.evaluation.consequences import EFFECT_STARTS, changes_of
@@ -177,7 +189,8 @@ class Imagining:
 
 
 def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, imagining: Imagining) -> Differing | None:
-    """Compare steps with the model. Returns None without a model, or if the model has other coordinates."""
+    """Compare the real steps of an evaluation with a surrogate's model. Returns None if there is no model, or if it has
+    other coordinates."""
     import numpy as np
 
     from surrogym_trainer.evaluation.comparing import Disagreements, compared, disagreements, steady, steps_of
@@ -192,7 +205,7 @@ def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, imag
     if not steps:
         return Differing(Disagreements(0, (), {}), first_seed, changed=result.varied, left_out=left_out)
     beside = compared(api, view.spec, view, steps)
-    takes_residual = view.spec.preset.moves == "coordinates"  # moved observations take none
+    takes_residual = view.spec.preset.moves == "coordinates"  # a model that moves observations takes no residual
     changes = partial(imagining.changes, api, view) if takes_residual else None
     effects, share = effects_of(view.spec, beside, changes)
     explaining = tuple(steps[i] for i in np.argsort(-share).tolist() if share[i] > 0)
@@ -201,14 +214,14 @@ def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, imag
 
 
 def _not_compared(first_seed: int, why: str) -> Differing:
-    """Return no disagreements, because no step was compared."""
+    """Return a result without disagreements, because no step was compared, with the reason (``why``)."""
     from surrogym_trainer.evaluation.comparing import Disagreements
 
     return Differing(Disagreements(0, (), {}), first_seed, without=why)
 
 
 def _await_model(server: str | None, token: str | None, surrogate: str, seconds: float, *, quiet: bool) -> None:
-    """Wait until the server has fitted a model to all samples. If that takes too long or fails, say so."""
+    """Wait until the server has fitted a model to all samples. If that fails or takes too long, print the reason."""
     from surrogym.cli.options import connect
     from surrogym_client.errors import SurrogymClientError
     from surrogym_client.surrogates.waiting import DesignUnfinished, wait_for_model, words_of_design
@@ -230,19 +243,19 @@ def _await_model(server: str | None, token: str | None, surrogate: str, seconds:
 
 @dataclass(frozen=True)
 class Differing:
-    """Steps at which reality and the model disagree.
+    """Result of comparing real steps with the model.
 
     Attributes:
-        found: the steps.
-        first_seed: reset seed of the first episode; each further episode has the next one.
+        found: the real steps that differ from the model.
+        first_seed: reset seed of the first episode; each further episode has the next seed.
         learned: number of steps that were added to the surrogate's samples.
-        all_steps: whether these are all steps, and not only those at which the two disagree.
+        all_steps: whether all real steps were added, and not only those that differ.
         changed: names of the constants that changed within an episode.
-        left_out: number of steps within which one of them changed. They are not compared, because a model keeps
+        left_out: number of steps in which such a constant changed. They are not compared, because the model keeps
             constants.
-        without: why no step was compared; empty if steps were.
-        effects: outputs that are wrong in all steps together.
-        broken: whether the return is below the promise.
+        without: reason why no step was compared; empty if steps were compared.
+        effects: outputs with an error that only all steps together show.
+        broken: whether the mean return is below the promise.
     """
 
     found: Disagreements
@@ -256,7 +269,8 @@ class Differing:
     broken: bool = False
 
     def in_words(self, spec: EnvironmentSpec | None) -> list[str]:
-        """Return one line about all steps, one for each of the worst episodes, and one for each of the worst steps."""
+        """Describe the result: a line about all steps, a line for each of the worst episodes, and for each of the worst
+        steps."""
         from surrogym_trainer.evaluation.comparing import SHOWN
 
         found = self.found
@@ -280,7 +294,7 @@ class Differing:
         return [*lines, *self._together(), *self._left_out(), *self._learned()]
 
     def _none(self) -> list[str]:
-        """Say that no single step differs. That alone is no answer where the return is below the promise."""
+        """Return lines for a comparison in which no single step differs, also if the return is below the promise."""
         none = f"none of {self.found.compared} real steps differs from the model by more than the model's uncertainty"
         if not self.broken:
             return [] if self.effects else [none]
@@ -292,13 +306,13 @@ class Differing:
         ]
 
     def _together(self) -> list[str]:
-        """Describe the outputs that are wrong in all steps together. Nothing if there are none."""
+        """Return lines about the outputs with an error that only all steps together show; empty if there is none."""
         if not self.effects:
             return []
         return [f"{self.found.compared} real steps together:", *(f"  {one.words()}" for one in self.effects)]
 
     def as_json(self) -> dict[str, Any]:
-        """Return all disagreements as JSON."""
+        """Return the result of the comparison as values that JSON can represent."""
         counts = self.found.by_episode()
         return {
             "compared": self.found.compared,
@@ -324,7 +338,7 @@ class Differing:
         }
 
     def _left_out(self) -> list[str]:
-        """Say how many steps were not compared. Nothing if all were."""
+        """Return a line with the number of steps that were not compared; empty if all were compared."""
         if not self.left_out:
             return []
         steps = "1 real step, in which" if self.left_out == 1 else f"{self.left_out} real steps, in each of which"
@@ -332,7 +346,7 @@ class Differing:
         return [f"not compared: {steps} {names} changed, because the model keeps it constant"]
 
     def _learned(self) -> list[str]:
-        """Say from how many steps the model learns. Nothing without any."""
+        """Return a line with the number of steps that the model learns from; empty if there are none."""
         if not self.learned:
             return []
         which = "real steps" if self.all_steps else "of these steps"

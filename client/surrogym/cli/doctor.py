@@ -85,7 +85,7 @@ def command(
 
 
 def _of_environment(env: str, given: EnvironmentSpec | None, step_limit: float, history: int) -> Iterator[Finding]:
-    """Check an environment. What it prints goes to standard error."""
+    """Yield the findings of the checks of an environment. Output of the environment goes to standard error."""
     from surrogym.cli.printing import found_aside, prints_aside
     from surrogym_sampler.diagnosis.doctor import environment
     from surrogym_sampler.original.loading import isolated
@@ -100,7 +100,10 @@ def _of_environment(env: str, given: EnvironmentSpec | None, step_limit: float, 
 
 
 def _described(env: str) -> tuple[EnvironmentSpec | None, list[Finding]]:
-    """Draft the specification of an environment that has none, by real steps. None if it has one or fails."""
+    """Draft a specification for an environment without one, by real steps, and return it with findings about it.
+
+    The specification is None if the environment has its own, or if the draft failed.
+    """
     from surrogym_sampler.diagnosis.doctor import NEEDS, Finding
     from surrogym_sampler.original.describing import describe
     from surrogym_sampler.original.errors import OriginalError

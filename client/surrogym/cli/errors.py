@@ -6,15 +6,15 @@ import errno
 
 from surrogym_client.runtime.ways_out import missing
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # from a file that is open: such an error does not have its name
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # errors of writing to an open file, which don't have its name
 
 
 class CommandError(Exception):
-    """A command can't do its work. ``str(error)`` is the sentence to show."""
+    """A command can't do its work. ``str(error)`` is the message for the user."""
 
 
 def sentence(error: Exception) -> str | None:
-    """Return the sentence for an error that a person can act on; None for a defect of the program."""
+    """Return the message for an error that a user can act on; None for a defect of the program."""
     from pydantic import ValidationError
 
     from surrogym_client.environments.pictures import NotRenderable
@@ -45,7 +45,7 @@ def sentence(error: Exception) -> str | None:
 
 
 def invalid(error: Exception) -> str:
-    """Describe the first validation error of a model, with its place."""
+    """Describe the first fault of pydantic's validation error, with the path of the wrong entry."""
     from pydantic import ValidationError
 
     from surrogym_shared.faults import first_fault

@@ -104,7 +104,7 @@ class Episodes:
 
 @dataclass(frozen=True)
 class Keeping:
-    """Options of what is kept of the episodes."""
+    """Options for storing the results of an evaluation: a video beside the policy, and the episodes on the server."""
 
     video: Annotated[
         bool,
@@ -189,13 +189,13 @@ def command(
 
 
 def _named(env: str | None, card: PolicyCard) -> str:
-    """The name of the environment in which the episodes ran."""
+    """Return the name of the environment in which the episodes ran; empty if it is not known."""
     return env or (card.spec.environment if card.spec else "")
 
 
 def _elsewhere(env: str | None, card: PolicyCard, promise: Promise | None) -> list[str]:
-    """Say that the episodes ran in another environment than the policy's own, whose promise is not judged there.
-    Nothing if they did not, or if the policy's own is not known."""
+    """Return a remark if the episodes ran in another environment than the one that the policy was trained for, so that
+    they don't judge its promise; empty if not, or if that environment is not known."""
     from surrogym_shared.environments import is_name, is_same
 
     own = card.spec.environment if card.spec else ""
@@ -209,8 +209,8 @@ def _elsewhere(env: str | None, card: PolicyCard, promise: Promise | None) -> li
 
 
 def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Evaluation) -> list[str]:
-    """Say that actions were changed, that episodes had another limit, or which constants changed within an episode.
-    Nothing if none of these is true, or without a promise for these starts."""
+    """Return a remark why the episodes don't judge the promise: actions were changed at random, episodes had another
+    time limit, or constants changed within an episode. Empty if they judge it, or without a promise."""
     from surrogym_trainer.evaluation.reporting import has_other_limit
 
     if settings.explore:
@@ -229,7 +229,7 @@ def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Eval
 
 
 def _unseeded(reports: Sequence[tuple[Controller, Evaluation]]) -> list[str]:
-    """Say that seeds repeat no start. Nothing if they do."""
+    """Return a remark if the environment ignores the seeds of resets; empty if the seeds repeat the starts."""
     if all(result.seeded for _, result in reports):
         return []
     others = ", so these controllers did not run the same starts" if len(reports) > 1 else ""
@@ -237,7 +237,7 @@ def _unseeded(reports: Sequence[tuple[Controller, Evaluation]]) -> list[str]:
 
 
 def _repeated(result: Evaluation) -> list[str]:
-    """Say that the episodes were equal, so that a person takes fewer. Nothing if they differ, or are too few."""
+    """Return a remark if all episodes were equal, so that one is enough; empty if they differ, or are too few."""
     from surrogym_trainer.evaluation.evaluator import FEW_EQUAL
 
     if len(result.returns) < FEW_EQUAL or not result.equal:
@@ -274,7 +274,16 @@ def _reports(
     settings: EvaluationSettings,
     policy: Path,
 ) -> list[tuple[Controller, Evaluation]]:
-    """Run the episodes of each controller, and enter their real steps into the ledger."""
+    """Run the episodes of each controller, report their real steps, and return each controller with its result.
+
+    Args:
+        controllers: functions that load the controllers, by their kind.
+        trained_for: specification that the policy was trained for.
+        run: runs the episodes of one controller.
+        enter: reports real steps and episodes, with a note, to the server.
+        settings: settings of the evaluation.
+        policy: file of the policy.
+    """
     from surrogym_shared.words import counted
 
     reports: list[tuple[Controller, Evaluation]] = []
@@ -340,7 +349,7 @@ def _run(
     *,
     quiet: bool,
 ) -> Evaluation:
-    """Run the episodes. Their real steps are entered into the ledger even if they fail or are interrupted."""
+    """Run the episodes of one controller. If they fail or are interrupted, report the real steps taken so far."""
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_sampler.original.errors import EvaluationFailed
     from surrogym_shared.terminal import progress, say
@@ -370,9 +379,9 @@ def _telling(update: Update, episodes: int) -> Progress:
 
 
 def ledger_of(surrogate: str | None, server: str | None, card: PolicyCard, policy: Path, *, quiet: bool) -> str | None:
-    """Return the name of the surrogate whose ledger counts the real steps; None if no server may be contacted.
+    """Return the name of the surrogate to which the real steps are reported; None if no server may be contacted.
 
-    An address that only the policy's card names is never contacted, unless it is the default one of this machine.
+    An address that only the policy's card names is never contacted, unless it is this machine's default address.
     """
     from surrogym_client.transport.connection import DEFAULT_URL
     from surrogym_shared.terminal import say
@@ -398,7 +407,7 @@ def enter_steps(
     *,
     quiet: bool,
 ) -> None:
-    """Enter the real steps into the ledger. If the server does not answer, say so and keep the evaluation's result."""
+    """Report real steps to the server, as steps of a surrogate. If the server does not answer, only print a remark."""
     from surrogym.cli.options import connect
     from surrogym_client.errors import SurrogymClientError
     from surrogym_shared.terminal import say

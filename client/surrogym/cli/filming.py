@@ -24,9 +24,10 @@ def film(
     *,
     quiet: bool,
 ) -> Path | None:
-    """Write a video of the best, median and worst episode beside the policy, in the place of an older one.
+    """Write a video of the best, median and worst episode beside the policy, and return its path.
 
-    No trouble with pictures may spoil an evaluation: the terminal then shows the reason, and the result is None.
+    An older video is replaced. If no video can be made, the reason is printed, and the result is None, because a video
+    must not spoil an evaluation.
     """
     from surrogym_client.environments.pictures import NotRenderable
     from surrogym_shared.terminal import progress, say
@@ -41,7 +42,7 @@ def film(
     except NotRenderable as error:
         say(f"no video: {error}", quiet=quiet)
         return None
-    except Exception as error:  # one's own environment may raise anything when it is opened or drawn
+    except Exception as error:  # a user's environment may raise any exception
         say(f"no video: {type(error).__name__}: {error}", quiet=quiet)
         return None
     for form in FORMS:
@@ -53,8 +54,8 @@ def film(
 
 
 def _spec(env: str | None, card: PolicyCard, opener: Callable[[], Episode]) -> EnvironmentSpec:
-    """Return the specification of what is drawn. One's own environment, which may be a machine, is not opened for it if
-    the card has one."""
+    """Return the specification of the environment to draw. If the policy's card has it, a user's own environment, which
+    may be a machine, is not opened for it."""
     from surrogym_sampler.original.loading import is_own
 
     if env is not None and is_own(env) and card.spec is not None:

@@ -30,11 +30,11 @@ class Service:
     token_file: TokenFile = None
 
     def token_for(self, context: typer.Context) -> str | None:
-        """Return the bearer token. Raises as ``token_from``."""
+        """Return the bearer token for the server; None without one. Raises the errors of ``token_from``."""
         return token_from(context, self.token, self.token_file)
 
     def connect(self, context: typer.Context, wait: float = 0.0, *, quiet: bool = False) -> Api:
-        """Connect to the server, and wait up to ``wait`` seconds until it answers. Raises as ``connect``."""
+        """Connect to the server, and wait up to ``wait`` seconds until it answers. Raises ``SurrogymClientError``."""
         return connect(self.server, self.token_for(context), wait, quiet=quiet)
 
 
@@ -46,7 +46,7 @@ class Output:
     quiet: Quiet = False
 
     def give(self, result: dict[str, Any], words: Callable[[], str]) -> None:
-        """Print the result as JSON, or as text."""
+        """Print the result of a command: ``result`` as JSON, or the text that ``words`` returns."""
         from surrogym_shared.terminal import give
 
         give(result, words, as_json=self.as_json, quiet=self.quiet)
@@ -65,20 +65,19 @@ class PolicyReading:
     trust_policy: TrustPolicy = False
 
     def load(self, policy: Path, card: PolicyCard) -> Predict:
-        """Load the policy as a function of observations. Raises as ``load_policy``."""
+        """Load the policy as a function of observations. Raises the errors of ``load_policy``."""
         from surrogym_trainer.policies.files import load_policy
 
         return load_policy(policy, self.algorithm or card.algorithm, trust=self.trust_policy)
 
 
 def add(app: typer.Typer, name: str, command: Callable[..., None]) -> None:
-    """Add a command to an app. Each parameter whose type is a group of options becomes these options, in their
-    order."""
+    """Add a command to an app. A parameter whose type is a dataclass of options becomes one option for each field."""
     app.command(name)(ungrouped(command))
 
 
 def ungrouped(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with the options of its groups as separate parameters, which typer can read."""
+    """Return the command with a separate parameter for each field of its dataclasses of options, as typer needs it."""
     asked = inspect.signature(command, eval_str=True).parameters.values()
     groups: dict[str, Any] = {one.name: one.annotation for one in asked if is_dataclass(one.annotation)}
     flat = [option for parameter in asked for option in _flattened(parameter)]
@@ -96,10 +95,10 @@ def ungrouped(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _require_finite(given: dict[str, Any]) -> None:
-    """Refuse options that are no finite numbers: "nan" passes every range.
+    """Check that all numbers among the options are finite, because NaN passes every range check.
 
     Raises:
-        BadParameter: naming the option.
+        BadParameter: an option is NaN or infinite; the error names it.
     """
     for name, value in given.items():
         if isinstance(value, float) and not math.isfinite(value):

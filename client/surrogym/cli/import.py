@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import SurrogateView
 
-SHOWN = 5  # rejected rows to print; the file of rejected rows has all of them
+SHOWN = 5  # most rejected rows to print; the file of rejected rows has all of them
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def command(
 
 
 def _require_outputs(file: Path, log: OfLogs) -> None:
-    """Raise ``UnusableLog`` if a file to write is one to read, or can't be written."""
+    """Raise ``UnusableLog`` if an output file is also an input file of the command, or can't be written."""
     from surrogym_sampler.logs.outputs import rejected_file, require_outputs, require_picture
 
     require_outputs(
@@ -195,7 +195,7 @@ def _import_log(context: typer.Context, file: Path, log: OfLogs, wait: float, se
 
 
 def _draw(log: ReadLog, file: Path) -> None:
-    """Draw the coverage of a log."""
+    """Draw to a file how much of the sampling range a log covers."""
     from surrogym_trainer.report.coverage import coverage_of
     from surrogym_trainer.report.figures import draw_coverage
 
@@ -203,7 +203,7 @@ def _draw(log: ReadLog, file: Path) -> None:
 
 
 def _following(context: typer.Context, log: OfLogs, imported: Imported, view: SurrogateView | None) -> str:
-    """Return the last line of the output, with the next step."""
+    """Return the last line of the command's output, which advises on the next step."""
     name = imported.surrogate
     unpaid = log.to is None and log.spec is None and imported.log.roles.reward is None
     if unpaid and log.draft is None:
@@ -225,8 +225,8 @@ def _following(context: typer.Context, log: OfLogs, imported: Imported, view: Su
 
 
 def _again(context: typer.Context, log: OfLogs) -> str:
-    """Return the command line that repeats this import and stores the log. It reads the drafted specification, as
-    edited."""
+    """Return the command line that imports the log again and stores it, with the drafted specification that the user
+    may have edited."""
     without = ["token", "as_json", "quiet", "register", *(["draft"] if log.draft is not None else [])]
     drafted = "" if log.draft is None else f" --spec {shlex.quote(str(log.draft))}"
     if drafted:
@@ -272,7 +272,8 @@ def _as_json(imported: Imported, view: SurrogateView | None) -> dict[str, Any]:
 
 
 def _covered(log: ReadLog) -> dict[str, float]:
-    """Share of cells that the log has visited, for each pair of columns."""
+    """Return the share of the cells of a grid that the log has visited, for each pair of coordinates or action
+    entries."""
     from surrogym_trainer.report.coverage import coverage_of
 
     coverage = coverage_of(log.spec, log.steps.q, log.steps.u)
@@ -326,6 +327,6 @@ def _specified(spec: EnvironmentSpec, notes: tuple[str, ...]) -> list[str]:
 
 
 def _origin(ledger: dict[str, int]) -> str:
-    """Return the ledger of the server that the file comes from, as text."""
+    """Describe the counts of real steps on the server that a file was exported from; empty without any."""
     steps = ", ".join(f"{count} {purpose}" for purpose, count in ledger.items() if count)
     return f" (there {steps})" if steps else ""

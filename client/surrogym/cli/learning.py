@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Learning:
-    """A surrogate that exists and is to learn from real steps that are not taken yet.
+    """A surrogate that will learn from the real steps of an evaluation.
 
     Attributes:
-        surrogate: its name.
-        option: the option that asked for it, for messages.
-        spec: the surrogate's specification.
-        server: address of its server; None is the default one.
+        surrogate: name of the surrogate.
+        option: command-line option that requests the learning, for messages.
+        spec: specification of the surrogate.
+        server: address of its server; None is the default address.
     """
 
     surrogate: str
@@ -35,11 +35,11 @@ class Learning:
     server: str | None = None
 
     def checked(self, opener: Callable[[], Episode]) -> Callable[[], Episode]:
-        """Return a function that opens an episode, and refuses one whose steps the surrogate can't learn from. It does
-        so before the first reset.
+        """Return ``opener`` with a check, before the first reset, that the surrogate can learn from an episode's steps.
 
         Raises:
-            CommandError: the environment has other coordinates than the surrogate, or another kind of action.
+            CommandError: raised by the returned function, if the environment has other coordinates than the surrogate,
+                or another kind of action.
         """
 
         def opened() -> Episode:
@@ -70,7 +70,7 @@ class Learning:
 
 
 def learning_of(option: str, surrogate: str | None, server: str | None, token: str | None) -> Learning:
-    """Ask the server for a surrogate that is to learn from real steps, before the first one is taken.
+    """Return a surrogate that will learn from real steps, after a check on the server, before any step is taken.
 
     Raises:
         CommandError: no surrogate is named, or ``--learn`` was given and the surrogate has no model to compare with.
@@ -93,16 +93,17 @@ def learning_of(option: str, surrogate: str | None, server: str | None, token: s
 
 @dataclass
 class Steps:
-    """Real steps that were taken, on their way to the samples of a surrogate.
+    """Real steps that are being sent to a surrogate.
 
     Attributes:
         learning: the surrogate.
         samples: the steps.
-        file: where they lie until the server has stored all of them; None without steps, or if no file can be written.
+        file: file with the steps until the server has stored all of them; None without steps, or if no file can be
+            written.
         stored: number of steps that the server has confirmed.
-        new: number of those that it did not have before.
-        waiting: whether there are steps that it has not confirmed.
-        fault: why it has not.
+        new: number of confirmed steps that the server did not have before.
+        waiting: whether there are steps that the server has not confirmed.
+        fault: error that prevented the confirmation; empty without one.
     """
 
     learning: Learning
@@ -114,7 +115,7 @@ class Steps:
     fault: str = ""
 
     def choose(self, samples: Sequence[NewSample]) -> None:
-        """Send only these of the steps. Raises ``OSError`` if they can't be written to the file."""
+        """Replace the steps to send by ``samples``, also in the file. Raises ``OSError`` if it can't be written."""
         from surrogym_trainer.evaluation.keeping import as_logged, rewrite_steps
 
         self.samples = as_logged(self.learning.spec, samples)
@@ -125,7 +126,7 @@ class Steps:
         """Add the steps to the surrogate's samples, and remove their file once the server has confirmed all.
 
         Raises:
-            SurrogymClientError: the server has not confirmed all; the file stays.
+            SurrogymClientError: the server has not confirmed all steps; the file remains.
         """
         if self.samples:
             api.add_samples(self.learning.surrogate, "evaluate", self.samples, purpose="logged", stored=self._count)
@@ -134,14 +135,15 @@ class Steps:
             self.file.unlink(missing_ok=True)
 
     def require_stored(self) -> None:
-        """Raise ``CommandError`` with the file and the command that sends it if the server has not confirmed all."""
+        """Raise ``CommandError`` if the server has not confirmed all steps. It names the file, and the command that
+        sends it."""
         from surrogym.cli.errors import CommandError
 
         if self.waiting:
             raise CommandError(self.in_words())
 
     def in_words(self) -> str:
-        """Say how many steps are stored, where all of them are, and which command sends them."""
+        """Describe how many steps are stored, which file has all of them, and which command sends it."""
         count = f"{self.stored:,} of {len(self.samples):,} real steps are known to be stored"
         said = f"{self.learning.option}: {self.fault}; {count}" if self.fault else f"{self.learning.option}: {count}"
         if self.file is None:
@@ -157,8 +159,10 @@ class Steps:
 
 @contextmanager
 def kept(learning: Learning | None, policy: Path, result: Evaluation, *, quiet: bool) -> Iterator[Steps | None]:
-    """Keep the steps of an evaluation in a file beside the policy until they are sent. If anything goes wrong before
-    that, even Ctrl-C, say where they are. Gives None if no surrogate is to learn from them."""
+    """Context that keeps the steps of an evaluation in a file beside the policy until they are sent.
+
+    After an error or Ctrl-C, it prints where the steps are. Yields None if no surrogate learns from the steps.
+    """
     from surrogym_shared.terminal import say
     from surrogym_trainer.evaluation.keeping import write_steps
 
@@ -180,7 +184,8 @@ def kept(learning: Learning | None, policy: Path, result: Evaluation, *, quiet: 
 
 
 def _learnable(spec: EnvironmentSpec, result: Evaluation, *, quiet: bool) -> list[NewSample]:
-    """Return the steps that a model can learn from. Say how many have numbers that no server stores."""
+    """Return the steps of an evaluation that a model can learn from. Print how many are left out because of numbers
+    that are not finite or too large."""
     from surrogym_shared.terminal import say
     from surrogym_shared.words import counted
     from surrogym_trainer.evaluation.comparing import as_samples, steady, steps_of

@@ -15,12 +15,17 @@ if TYPE_CHECKING:
 def opener_for_policy(
     env: str | None, given: EnvironmentSpec | None, card: PolicyCard, *, quiet: bool
 ) -> Callable[[], Episode]:
-    """Return a function that opens an episode, as ``opener_of``. A specification that the policy does not fit is
-    refused before anything is opened.
+    """Return a function that opens an episode for a policy, after a check of the specification.
+
+    Args:
+        env: name of the original environment; None takes the one that the policy was trained for.
+        given: specification of the environment from --spec; None takes its own.
+        card: card of the policy.
+        quiet: whether remarks are hidden.
 
     Raises:
-        PolicyMisfit: the policy was trained for another specification than the given one.
-        UnknownEnvironment: there is no such environment. If the policy is for another one, the message says so first.
+        PolicyMisfit: the policy was trained for another specification than ``given``.
+        UnknownEnvironment: there is no such environment. The message also names the policy's environment, if another.
     """
     from surrogym_sampler.original.errors import UnknownEnvironment
     from surrogym_sampler.original.fitting import check_policy, meant_in_words
@@ -39,8 +44,8 @@ def opener_for_policy(
 def opener_of(
     env: str | None, given: EnvironmentSpec | None, card: PolicyCard, *, quiet: bool
 ) -> Callable[[], Episode]:
-    """Return a function that opens an episode. An environment named by a card alone is opened only if it is Gymnasium's
-    own, because a module would run code.
+    """Return a function that opens an episode. An environment that only a policy's card names is opened only if it is
+    Gymnasium's own, because the name of a module would run unknown code.
     """
     from surrogym.cli.errors import CommandError
     from surrogym_sampler.original.episodes import open_episode
@@ -60,8 +65,8 @@ def opener_of(
 
 
 def _limited(noted: EnvironmentSpec, name: str, *, quiet: bool) -> EnvironmentSpec:
-    """Shorten the environment's time limit to that of the card. A card can't lengthen it, as this would cost real
-    steps."""
+    """Return the card's specification with a time limit no longer than the environment's own. A longer limit would cost
+    real steps that the user did not request."""
     from surrogym_sampler.original.loading import own_time_limit
     from surrogym_shared.terminal import say
 
@@ -78,7 +83,7 @@ def _limited(noted: EnvironmentSpec, name: str, *, quiet: bool) -> EnvironmentSp
 
 
 def _bins(spec: EnvironmentSpec | None) -> int | None:
-    """Number of values of each continuous action that the policy chooses from; None without discretisation."""
+    """Return the number of values of each continuous action that a policy chooses from; None without discretisation."""
     from surrogym_shared.spec import BoxAction
 
     action = None if spec is None else spec.action

@@ -21,15 +21,16 @@ SHOWN = (
     "warning: --token shows the token in the list of processes; SURROGYM_TOKEN, --token-file or SURROGYM_TOKEN_FILE "
     "keep it out of there"
 )
-NAMES = (  # of environments, in the help of every command that opens one
+NAMES = (  # forms of names of environments, in the help of every command that opens one
     "a Gymnasium id, package:Id-v0, dm_control:DOMAIN-TASK, pcgym:MODEL, pcgym:FILE.json, fmu:PLANT.fmu or "
     "package.module:factory"
 )
-QUICK = 1.0  # seconds a person waits for a server that is not there
+QUICK = 1.0  # longest time in seconds to wait for a server that may not be running
 
 
 def names_of_surrogates(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Complete a surrogate's name in the shell. Empty if no server answers within a second."""
+    """Return the surrogates whose names begin with ``incomplete``, for completion in the shell. Empty if no server
+    answers within a second."""
     from surrogym_client.errors import SurrogymClientError
     from surrogym_client.transport.api import Api
     from surrogym_client.transport.connection import Retries, Timeouts, token_in
@@ -87,7 +88,7 @@ Tolerances = Annotated[
     ),
 ]
 StepLimit = Annotated[float, typer.Option(min=0.001, help="Seconds that one real step, or one reset, may take.")]
-DESCRIBED = ("real_steps", "resets", "found", "asked", "specification")  # entries of what surrogym describe writes
+DESCRIBED = ("real_steps", "resets", "found", "asked", "specification")  # entries in the output of surrogym describe
 
 
 def connect(server: str | None, token: str | None, wait: float = 0.0, *, quiet: bool = False) -> Api:
@@ -95,7 +96,7 @@ def connect(server: str | None, token: str | None, wait: float = 0.0, *, quiet: 
     waits for.
 
     Raises:
-        SurrogymClientError: no server answered in time, or what answered is not a Surrogym server.
+        SurrogymClientError: no server answered in time, or the answer is not that of a Surrogym server.
     """
     from surrogym_client.errors import ServerUnreachable
     from surrogym_client.transport.api import Api
@@ -117,7 +118,7 @@ def token_from(context: typer.Context, token: str | None, file: Path | None) -> 
     Warns on the terminal if other users of the machine can read the token.
 
     Raises:
-        CommandError: both options are on the command line.
+        CommandError: --token and --token-file are both on the command line.
         UnusableToken: the file does not contain a token.
     """
     from surrogym.cli.errors import CommandError
@@ -166,7 +167,7 @@ def _waiting(words: str, *, quiet: bool) -> Iterator[None]:
 
 
 def given_here(context: typer.Context, name: str) -> bool:
-    """Whether an option is on this command line. A value from the environment does not count."""
+    """Whether an option was given on the command line, and not by an environment variable or its default."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
 
@@ -191,7 +192,7 @@ def typed(context: typer.Context, without: Sequence[str] = ()) -> str:
 
 @dataclass(frozen=True)
 class SpecContent:
-    """What a file of a specification contains.
+    """Content of a file with a specification.
 
     Attributes:
         spec: the specification.
@@ -205,13 +206,13 @@ class SpecContent:
 
 
 def read_spec(path: Path | None) -> EnvironmentSpec | None:
-    """Read a specification from its file, or from the output of ``surrogym describe``. Errors as of
-    ``read_spec_file``."""
+    """Read a specification from a file, which may be the output of ``surrogym describe``; None for None. Raises the
+    errors of ``read_spec_file``."""
     return None if path is None else read_spec_file(path).spec
 
 
 def read_spec_file(path: Path) -> SpecContent:
-    """Read a file of a specification once, because it may be a pipe.
+    """Read a file with a specification. It is read only once, because it may be a pipe.
 
     Raises:
         OSError: the file can't be read.
@@ -274,7 +275,7 @@ def read_tolerances(given: list[str]) -> dict[str, float]:
 
 
 def require_known(algorithm: str) -> str:
-    """Return the registered name of a policy search. An unknown one is refused before any work begins.
+    """Return the registered spelling of the name of a policy search.
 
     Raises:
         CommandError: no policy search has this name.

@@ -69,14 +69,14 @@ def _row(name: str, policy: PolicyView) -> tuple[str, ...]:
 
 
 def _real(evaluation: EvaluationView | None) -> str:
-    """Real episodes, and whether the promise is about others."""
+    """Describe the mean return of an evaluation, and whether it had other starts than the promise; "-" without one."""
     if evaluation is None:
         return "-"
     return words_of_mean(evaluation) + ("" if evaluation.declared else "; the promise is for others")
 
 
 def words_of_mean(evaluation: EvaluationView) -> str:
-    """A mean return with its interval."""
+    """Describe the mean return of an evaluation with its 95 % interval."""
     interval = evaluation.mean_interval
     about = "" if interval is None else f" ({interval.low:.4g} to {interval.high:.4g})"
     return f"{evaluation.mean:.4g}{about}"

@@ -31,7 +31,7 @@ class PolicyGroup(TyperGroup):
     default = SHOW
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the command of the first word, or ``show`` if that word names a policy."""
+        """Return the subcommand that the first argument names, or ``show`` if this argument names a policy."""
         named = bool(args) and args[0] not in self.commands and not args[0].startswith("-")
         return super().resolve_command(ctx, [self.default, *args] if named else args)
 
@@ -175,13 +175,14 @@ def delete(context: typer.Context, policy: Named, *, service: Service, output: O
 
 
 def parsed(policy: str) -> tuple[str, str]:
-    """Split ``NAME@WHICH`` into surrogate and version. The version is ``latest`` if the text has none."""
+    """Split ``NAME@WHICH`` into the surrogate's name and the policy's version or alias; ``latest`` without ``@``."""
     name, _, which = policy.partition("@")
     return name, which or "latest"
 
 
 def stored_card(api: Api, name: str, which: str) -> tuple[PolicyDetail, PolicyCard]:
-    """Return a policy that the server stores, and its card, with the specification if it is still the surrogate's."""
+    """Return a policy that the server stores, and its card. If the policy was trained for the surrogate's present
+    specification, the card has it."""
     found, spec = api.policies.get(name, which), api.surrogate(name).spec
     return found, _card(name, found, spec if found.differs is None else None)
 

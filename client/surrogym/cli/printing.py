@@ -1,4 +1,4 @@
-"""Prints of environments, kept out of a command's own output, and their attempts to end it."""
+"""Keep the output of environments out of a command's own output, and handle their attempts to end the program."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 @contextmanager
 def prints_aside() -> Iterator[None]:
-    """While this is entered, what Python code of an environment prints goes to standard error.
+    """Context in which output of Python code, such as an environment's, goes to standard error.
 
     Raises:
-        CommandError: an environment called ``sys.exit`` where nothing else tells of it, such as while it was closed.
+        CommandError: an environment called ``sys.exit``, such as while it was closed.
     """
     from surrogym.cli.errors import CommandError
     from surrogym_sampler.original.errors import sentence
@@ -30,12 +30,12 @@ def prints_aside() -> Iterator[None]:
 
 @contextmanager
 def unregistered(steps: Callable[[], int], what: str) -> Iterator[None]:
-    """Context that says after Ctrl-C how many real steps a description took, and what did not come of it. It raises the
-    interruption again.
+    """Context that prints, after Ctrl-C, how many real steps a description of an environment took, and raises Ctrl-C
+    again.
 
     Args:
-        steps: gives the real steps of a description that has ended.
-        what: what was not done, such as "nothing was registered".
+        steps: returns the real steps of a description that has ended.
+        what: end of the printed sentence, such as "nothing was registered".
     """
     from surrogym_shared.terminal import say
 
@@ -49,7 +49,7 @@ def unregistered(steps: Callable[[], int], what: str) -> Iterator[None]:
 
 
 def found_aside(findings: Iterator[Finding]) -> Iterator[Finding]:
-    """Return the findings; what an environment prints while one is made goes to standard error."""
+    """Yield the findings. Output of an environment while a finding is made goes to standard error."""
     while True:
         with prints_aside():
             finding = next(findings, None)

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 LOOK_SECONDS = 1.0
 OTHER = "surrogate:"  # prefix of the name of another surrogate
-LEAST = 2  # real steps
-LACKING = 0.01  # of the changes: with a larger error, calibrated values are not those of the plant
+LEAST = 2  # least number of real steps from which a prior is calibrated
+LACKING = 0.01  # error, as a share of the changes, from which calibrated values may not be those of the plant
 
 
 def register(app: typer.Typer) -> None:
@@ -112,15 +112,15 @@ def command(
 
 @dataclass(frozen=True)
 class _Target:
-    """The surrogate that gets a prior."""
+    """A surrogate whose prior the command sets, with its view at the start of the command."""
 
     api: Api
     calls: PriorCalls
     view: SurrogateView
 
     def follow(self, prior: ServerPrior, update: Update) -> tuple[PriorView, SurrogateView]:
-        """Set the prior as soon as the initial queries are answered, and anew whenever it has changed, until the design
-        ends. Returns the prior and the surrogate."""
+        """Set the prior once the initial queries are answered, and again whenever calibration changes it, until the
+        design ends. Returns the prior and the surrogate."""
         from surrogym.cli.errors import CommandError
         from surrogym_client.surrogates.waiting import share_of_design, words_of_design
 
@@ -145,7 +145,8 @@ class _Target:
             time.sleep(LOOK_SECONDS)
 
     def fitted(self, after: int, update: Update) -> SurrogateView:
-        """Return the surrogate after the fit that a new prior makes due; at once if there is nothing to fit to."""
+        """Wait for the fit that follows a new prior, and return the surrogate; at once if it has too few samples.
+        ``after`` is the number of the round before this fit."""
         view = self.api.surrogate(self.view.name)
         while view.samples >= LEAST and view.round <= after and view.phase != "failed" and not _asked(view):
             update(None, "a model is being fitted")
@@ -181,7 +182,8 @@ def _is_model(source: str) -> bool:
 
 
 def _file_of(api: Api, source: str) -> bytes | None:
-    """Return the file of another surrogate; None if the source is a simulator."""
+    """Return the content of another surrogate's file, from the server or from disk; None if the source is a
+    simulator."""
     from surrogym.cli.errors import CommandError
     from surrogym.files import SUFFIX, existing
     from surrogym_client.surrogates.transfer import export_surrogate
@@ -195,14 +197,14 @@ def _file_of(api: Api, source: str) -> bytes | None:
 
 
 def _has_ended(view: SurrogateView, fitted: int) -> bool:
-    """Whether a design has ended with a fit after the round ``fitted``."""
+    """Whether a design has ended, with no open queries, and with a fit after the round number ``fitted``."""
     from surrogym_shared.states import COMPLETED
 
     return view.phase in COMPLETED and view.round > fitted and not _asked(view)
 
 
 def _asked(view: SurrogateView) -> int:
-    """Number of queries that wait for a sampler, or for its answer."""
+    """Return the number of queries that wait for a sampler, or for a sampler's answer."""
     return view.queries.pending + view.queries.leased
 
 
@@ -225,7 +227,7 @@ def _give(output: Output, view: SurrogateView, stored: PriorView) -> None:
 
 
 def words_of_prior(about: PriorAbout) -> list[str]:
-    """Describe what a prior was made from, a line each."""
+    """Return lines that describe what a prior was made from: its source, its parameters, and its error."""
     lines = [f"prior: {about.source}"]
     if about.parameters and about.error is not None and about.error > LACKING:
         lines.append("  it lacks something, or the plant has noise: the values below may stand for what it lacks")
@@ -241,7 +243,7 @@ def words_of_prior(about: PriorAbout) -> list[str]:
 
 
 def _uses(view: SurrogateView) -> list[str]:
-    """Say which outputs use the prior."""
+    """Return a line that lists which outputs use the prior; empty without a model."""
     if view.fidelity is None:
         return []
     uses = [one.name for one in view.fidelity.outputs if one.structure.startswith("prior + ")]

@@ -10,8 +10,8 @@ def push_or_say(
 ) -> int | None:
     """Store a policy and its waiting evaluations on the server, and return its version.
 
-    An unreachable server must not spoil a training or an evaluation. Nothing is raised then: the terminal shows the
-    error and the command that stores the policy later, and the result is None.
+    An unreachable server must not spoil a training or an evaluation. So an error of the server is only printed, with
+    the command that stores the policy later, and the result is None.
     """
     from surrogym.cli.options import connect
     from surrogym_client.errors import SurrogymClientError

@@ -36,7 +36,7 @@ def register(app: typer.Typer) -> None:
 
 @dataclass(frozen=True)
 class DesignChoices:
-    """Options that replace parts of the environment's own specification; None keeps a part."""
+    """Options that replace entries of the environment's own specification; None keeps an entry."""
 
     preset: Annotated[
         PresetName | None,
@@ -166,7 +166,10 @@ def command(
 def _sorted_out(
     environment: str | None, file: Path | None, env: str | None, name: str | None, spec: Path | None
 ) -> tuple[str | None, str | None, Path | None]:
-    """Return the environment, the surrogate's name and the specification file, from either form of the command line."""
+    """Return the environment, the surrogate's name and the specification file, from the arguments of the command.
+
+    The first argument is the environment. With ``--env`` or a file as the second argument, it is the surrogate's name.
+    """
     from surrogym.cli.errors import CommandError
 
     if file is not None:
@@ -184,7 +187,8 @@ def _sorted_out(
 
 
 def _lacks_specification(environment: str) -> bool:
-    """Whether an environment has to be described. A name that can't be opened is an error without a server too."""
+    """Whether an environment has no built-in specification, so that one has to be drafted. Raises an error if the
+    environment can't be opened."""
     from surrogym.cli.printing import prints_aside
     from surrogym_sampler.original.adapters import open_simulator
     from surrogym_sampler.original.loading import has_specification
@@ -197,15 +201,16 @@ def _lacks_specification(environment: str) -> bool:
 
 
 def _key(name: str, described: bytes) -> str:
-    """Return the key of a described file's steps, so that registering it twice counts them once."""
+    """Return the idempotency key for reporting the real steps of a description, so that registering the same file twice
+    counts them once."""
     return hashlib.sha256(name.encode() + b"\n" + described).hexdigest()[:32]
 
 
 def _require_free(api: Api, name: str) -> None:
-    """Check that no surrogate has this name, before a description takes real steps for it.
+    """Check that no surrogate has this name, before the description of its environment takes real steps.
 
     Raises:
-        CommandError: there is one.
+        CommandError: a surrogate has this name.
     """
     from surrogym.cli.errors import CommandError
     from surrogym_client.errors import UnknownSurrogate
@@ -219,7 +224,7 @@ def _require_free(api: Api, name: str) -> None:
 
 
 def _described(environment: str, *, quiet: bool) -> tuple[EnvironmentSpec, int]:
-    """Draft a specification, and return it with the number of real steps that were taken."""
+    """Draft an environment's specification by real steps. Return it with the number of these steps."""
     from surrogym.cli.printing import prints_aside
     from surrogym_sampler.original.describing import describe
     from surrogym_shared.terminal import say
@@ -232,7 +237,7 @@ def _described(environment: str, *, quiet: bool) -> tuple[EnvironmentSpec, int]:
 
 
 def default_name(environment: str) -> str:
-    """Derive a surrogate's name from an environment's, without the version: ``Pendulum-v1`` becomes ``pendulum``."""
+    """Derive a surrogate's name from an environment's name: ``Pendulum-v1`` becomes ``pendulum``."""
     plain = re.sub(r"-v\d+$", "", environment.rpartition(":")[2])
     return re.sub(r"[^a-z0-9._-]+", "-", plain.lower()).strip("-._")[:64] or "surrogate"
 
@@ -258,8 +263,8 @@ def _specification(environment: str | None, spec: EnvironmentSpec | None, **choi
 
 
 def _opened_by(environment: str, spec: EnvironmentSpec) -> EnvironmentSpec:
-    """Return the specification with the name that opens its environment in place of free text, so that the commands
-    that are suggested later contain it."""
+    """Return the specification with the environment's name in place of free text about it, so that commands that are
+    suggested later can contain the name."""
     from surrogym_sampler.original.executables import is_executable
     from surrogym_shared.environments import is_name
 
@@ -285,6 +290,6 @@ def _words(view: SurrogateView, environment: str) -> str:
     if awaits_log(view):
         return f"{registered}; {words_of_no_log(view.name)}"
     start = sample_command(view.name, view.environment)
-    if environment:  # its name was typed here
+    if environment:  # the user gave its name on the command line
         start = f"surrogym sample {view.name}" + ("" if is_known(environment) else f" --env {shlex.quote(environment)}")
     return f"{registered}, budget of {view.budget} real steps, target {view.target:g}; next: {start}"

@@ -54,7 +54,7 @@ def command(
         from surrogym_trainer.report.known import collect, cuts_of
 
         known = collect(api, surrogate, policy, controller)
-        shown, lacking = cuts_of(api, known)  # if maps can't be computed, the page shows all stored data without them
+        shown, lacking = cuts_of(api, known)  # maps of the model, and the reason if they can't be computed
         update(0.3, "drawing")
         from surrogym_trainer.report.files import write
         from surrogym_trainer.report.page import page

@@ -59,7 +59,7 @@ TimeLimit = Annotated[
 
 @dataclass(frozen=True)
 class SnapshotOptions:
-    """What the sampler keeps of the states that it visits."""
+    """Options for the snapshots of visited states that a sampler keeps."""
 
     snapshots: Annotated[
         Path | None,
@@ -156,7 +156,7 @@ def _sample_here(api: Api, plan: SamplerPlan, output: Output) -> None:
                 tell(Line(line_of(query, outcome, error), bool(error)))
 
         def ended(phase: Phase) -> None:
-            if not plan.settings.until_done:  # otherwise the result follows at once
+            if not plan.settings.until_done:  # with --until-done, the command prints its result now
                 say(_words_of_end(plan.surrogate, phase), quiet=output.quiet)
 
         sampler = Sampler(api, plan.surrogate, environment, plan.settings, report, ended)
@@ -170,7 +170,7 @@ def _sample_here(api: Api, plan: SamplerPlan, output: Output) -> None:
 
 
 def _require_shared(asked: EnvironmentSpec, settings: SamplerSettings) -> None:
-    """Refuse several samplers that can't return to each other's snapshots."""
+    """Raise ``CommandError`` if several samplers need snapshots, but have no folder to share them."""
     from surrogym.cli.errors import CommandError
 
     if asked.snapshots and settings.snapshots is None:
@@ -197,7 +197,7 @@ def _sample_on_ray(api: Api, plan: SamplerPlan, cluster: RayOptions, output: Out
 
 
 def _named(env: str | None, program: str | None) -> str | None:
-    """Return the environment's name, from either option."""
+    """Return the name of the environment from the options --env or --exec. Raises ``CommandError`` if both are given."""
     from surrogym.cli.errors import CommandError
     from surrogym_sampler.original.executables import name_of
 
@@ -209,8 +209,9 @@ def _named(env: str | None, program: str | None) -> str | None:
 def _environment(
     env: str | None, given: EnvironmentSpec | None, asked: EnvironmentSpec
 ) -> tuple[str, EnvironmentSpec | None]:
-    """Return the environment's name, and the specification that replaces its own. The server's choice is trusted only
-    for Gymnasium's own ids, because a module or a program would run code.
+    """Return the name of the environment to open, and the specification that replaces its own, or None.
+
+    A name from the server (``asked``) is only opened if it is a Gymnasium id, because others would run unknown code.
     """
     from surrogym.cli.errors import CommandError
     from surrogym_sampler.original.loading import is_known, is_own
@@ -223,7 +224,7 @@ def _environment(
 
 
 def _words_of_consent(name: str) -> str:
-    """Say why an environment's name from a server is not enough, and with which option it is opened."""
+    """Return the error message that an environment's name from a server is not opened, with the option to open it."""
     from surrogym_sampler.original.executables import is_executable
     from surrogym_sampler.original.loading import env_option
     from surrogym_shared.environments import is_name
@@ -241,7 +242,8 @@ def _words_of_consent(name: str) -> str:
 
 @contextmanager
 def _telling(api: Api, surrogate: str, *, quiet: bool) -> Iterator[Tell | None]:
-    """Show progress: one bar for the design on a terminal, or a line for each query otherwise."""
+    """Context that shows progress: a bar for the design on a terminal, otherwise a line for each query. Yields the
+    function that shows a line; None if ``quiet``."""
     from surrogym_shared.terminal import progress, say
 
     if quiet or not sys.stderr.isatty():
@@ -252,7 +254,7 @@ def _telling(api: Api, surrogate: str, *, quiet: bool) -> Iterator[Tell | None]:
         def tell(line: Line) -> None:
             if line.is_error:
                 say(line.text)
-            with suppress(SurrogymClientError):  # the sampler itself handles a server that is away for a moment
+            with suppress(SurrogymClientError):  # the sampler itself retries while the server does not answer
                 view = api.surrogate(surrogate)
                 update(share_of_design(view), words_of_design(view))
 
@@ -265,7 +267,7 @@ def _telling(api: Api, surrogate: str, *, quiet: bool) -> Iterator[Tell | None]:
 
 
 def _without_queries(view: SurrogateView, output: Output, *, until_done: bool) -> bool:
-    """Say that the design has no queries until a log is imported. Returns whether the command has done its work."""
+    """Print a remark if the design has no queries until a log is imported. Returns whether the command ends now."""
     from surrogym_client.surrogates.phases import awaits_log, words_of_no_log
     from surrogym_sampler.queries.settings import SamplerReport
     from surrogym_shared.terminal import say

@@ -15,7 +15,7 @@ from surrogym.cli.errors import CommandError
 if TYPE_CHECKING:
     from surrogym_sampler.queries.on_ray import Line, RaySamplers, SamplerPlan
 
-ROOM_SECONDS = 30.0  # after which samplers that have not begun are mentioned
+ROOM_SECONDS = 30.0  # time after which a remark mentions samplers that have not started
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class RayOptions:
 
 
 def samplers_on_ray(options: RayOptions, plan: SamplerPlan) -> RaySamplers:
-    """Start the samplers.
+    """Connect to a Ray cluster, and start samplers in it.
 
     Raises:
         NoCluster: Ray or its cluster can't be used.
-        CommandError: the resources or the file can't be used.
+        CommandError: the options for resources or for the runtime environment can't be used.
     """
     from surrogym_client.runtime.ray_cluster import connect
     from surrogym_sampler.queries.on_ray import RaySamplers
@@ -74,7 +74,14 @@ def samplers_on_ray(options: RayOptions, plan: SamplerPlan) -> RaySamplers:
 def run_samplers(
     samplers: RaySamplers, time_limit: float | None, tell: Callable[[Line], None], say: Callable[[str], None]
 ) -> None:
-    """Wait until all samplers have ended, and stop them at the time limit (s) or at Ctrl-C."""
+    """Wait until all samplers have ended. Stop them after ``time_limit`` seconds, or at Ctrl-C.
+
+    Args:
+        samplers: running samplers in a Ray cluster.
+        time_limit: seconds; None for no limit.
+        tell: called with each answered query.
+        say: called with remarks for the terminal.
+    """
     begun, told = time.monotonic(), False
     try:
         while True:
@@ -101,7 +108,7 @@ def run_samplers(
 
 
 def _reason(lacking: dict[str, float]) -> str:
-    """Return why samplers wait for free resources, and what to do about it."""
+    """Return the end of a remark about waiting samplers: the free resources that they lack, and what to do about it."""
     from surrogym_sampler.queries.on_ray import amounts
 
     if not lacking:
@@ -111,15 +118,15 @@ def _reason(lacking: dict[str, float]) -> str:
 
 
 def result_of(samplers: RaySamplers) -> dict[str, Any]:
-    """Return the result for ``--json``."""
+    """Return the result of the command for its option ``--json``."""
     return {**asdict(samplers.report()), "restarts": samplers.restarts, "errors": samplers.errors}
 
 
 def resources_of(given: str) -> dict[str, float]:
-    """Read ``CPU=1,robot=1``.
+    """Parse resources of a Ray cluster given as text, such as ``CPU=1,robot=1``.
 
     Raises:
-        CommandError: it is not a list of names with amounts of 0 or more.
+        CommandError: the text is not a list of names with amounts of 0 or more.
     """
     found: dict[str, float] = {}
     for part in given.split(","):
@@ -134,7 +141,7 @@ def resources_of(given: str) -> dict[str, float]:
 
 
 def read_runtime_env(path: Path) -> dict[str, Any]:
-    """Read a runtime environment. Raises ``CommandError`` if the file does not contain one."""
+    """Read Ray's runtime environment from a YAML or JSON file. Raises ``CommandError`` if the file has another form."""
     import yaml
 
     try:

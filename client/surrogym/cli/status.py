@@ -57,7 +57,7 @@ def command(
     form: Form = "json" if as_json else "short" if quiet else "words"
     with service.connect(context) as api:
         look = partial(_all, api, form) if surrogate is None else partial(_one, api, surrogate, form)
-        seen = look()  # an unknown name or a wrong address ends the command here, also with --watch
+        seen = look()  # an unknown name or a wrong address is an error here, also with --watch
         if watching:
             watch(partial(_patiently, look, as_json))
         else:
@@ -82,7 +82,7 @@ def _one(api: Api, name: str, form: Form) -> str:
 
 
 def _prior(api: Api, name: str) -> list[str]:
-    """Lines of the prior, if there is one or the design waits for one."""
+    """Return lines about the prior of a surrogate; empty if it has no prior and does not wait for one."""
     from surrogym.cli.prior import words_of_prior
     from surrogym_client.transport.priors import PriorCalls
 
@@ -95,7 +95,7 @@ def _prior(api: Api, name: str) -> list[str]:
 
 
 def _untrusted(name: str, policies: Sequence[PolicyView]) -> list[str]:
-    """Lines of the newest policy and of those with an alias, if their promise is not trusted."""
+    """Return a line for the newest policy, and for each policy with an alias, whose promise is not trusted."""
     shown = [one for number, one in enumerate(policies) if one.trusted is False and (one.aliases or number == 0)]
     named = [", ".join([f"{name}@{one.version}", *one.aliases]) for one in shown]
     return [f"policy {words}: not trusted: {one.reason}" for words, one in zip(named, shown, strict=True)]
@@ -177,13 +177,13 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
 
 
 def _period(view: SurrogateView) -> str:
-    """The declared sampling period, with a comma before it; empty without one."""
+    """Return the declared sampling period as the end of a sentence, ", a step every 0.1 s"; empty without one."""
     period = view.spec.sampling_period
     return "" if period is None else f", a step every {period:g} s"
 
 
 def _steps(seen: SurrogateSummary) -> str:
-    """Real steps of the budget, and logged steps, which don't count towards it."""
+    """Describe the number of real steps of the budget, and of logged steps, which don't count towards it."""
     ledger = seen.ledger
     taken = f"{ledger.total} of {seen.budget}" if seen.budget or ledger.total else ""
     logged = f"{ledger.logged} logged" if ledger.logged else ""
@@ -191,7 +191,7 @@ def _steps(seen: SurrogateSummary) -> str:
 
 
 def _hint(view: SurrogateView) -> str | None:
-    """Return what a person has to do next, if nothing proceeds without them."""
+    """Return the next step if the surrogate waits for an action of the user; else None."""
     from surrogym_client.surrogates.phases import awaits_log, words_of_no_log
     from surrogym_sampler.original.loading import sample_command
 
@@ -216,7 +216,7 @@ def _judged(output: OutputFidelity) -> tuple[str | float | None, ...]:
 
 
 def _predicted(outputs: Sequence[OutputFidelity]) -> list[str]:
-    """Table of the samples that were predicted before the model learned from them; empty without any."""
+    """Return a table about the samples that were predicted before the model learned from them; empty without any."""
     from surrogym.cli.columns import columns
 
     rows = [

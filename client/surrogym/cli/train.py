@@ -108,7 +108,7 @@ def command(
 
 
 def _settings(search: SearchOptions, session: SessionOptions, start: StartOptions, log: LogOptions) -> TrainSettings:
-    """Return the settings of the training. Errors that can be found without a server are raised here."""
+    """Return the settings of the training from the options. Raises errors that can be found without a server."""
     from surrogym_trainer.training import TrainSettings
 
     given = session.fields()
@@ -128,7 +128,7 @@ def _settings(search: SearchOptions, session: SessionOptions, start: StartOption
 
 
 def _import(settings: TrainSettings, *, quiet: bool) -> None:
-    """Import the packages of the policy search, and show on the terminal what takes the time."""
+    """Import the packages of the policy search, which may take seconds, and show the progress on the terminal."""
     from surrogym_shared.terminal import on_interrupt, progress
     from surrogym_trainer.training.search import SEARCHES, name_of
 
@@ -139,7 +139,13 @@ def _import(settings: TrainSettings, *, quiet: bool) -> None:
 
 @contextmanager
 def _keeping(write_card: Callable[[TrainResult], object], asked: str) -> Iterator[None]:
-    """After Ctrl-C or a polite kill, say what was saved and how to continue. A saved policy gets its card."""
+    """Context that, after Ctrl-C or SIGTERM, writes the card of a saved policy, and prints what was saved and how to
+    continue.
+
+    Args:
+        write_card: writes the card of the policy.
+        asked: arguments of the command, for the advice.
+    """
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_shared.terminal import say
     from surrogym_trainer.training.settings import TrainingInterrupted
@@ -159,7 +165,7 @@ def _keeping(write_card: Callable[[TrainResult], object], asked: str) -> Iterato
 
 
 def _words_of_sessions(view: SurrogateView) -> str:
-    """Warn of another training of the surrogate, which may be running."""
+    """Return a warning about open sessions of the surrogate, which may belong to another running training."""
     from surrogym_shared.words import counted
 
     are = "is" if view.sessions == 1 else "are"
@@ -172,9 +178,13 @@ def _words_of_sessions(view: SurrogateView) -> str:
 def _trainable(
     surrogate: str, server: str | None, token: str | None, wait: float, settings: TrainSettings, *, quiet: bool
 ) -> tuple[EnvironmentSpec, str]:
-    """Wait until the surrogate's design has ended, and return its specification and the server's URL.
+    """Return the specification of a surrogate that has a model, and the server's URL.
 
-    With ``wait``, the packages of the policy search are imported in the meantime.
+    If ``wait`` is above 0, wait up to so many seconds for the server, the surrogate and the end of its design, and
+    import the packages of the policy search in the meantime.
+
+    Raises:
+        CommandError: the surrogate has no model yet.
     """
     from surrogym.cli.errors import CommandError
     from surrogym_client.surrogates.phases import COMPLETED
@@ -210,7 +220,7 @@ def _trainable(
 
 
 def _words_without_model(view: SurrogateView) -> str:
-    """Say what to do about a surrogate that has no model yet: wait, or get samples for one."""
+    """Return the error message for a surrogate without a model, with advice: to wait, or how to get samples."""
     from surrogym_sampler.original.loading import sample_command
 
     missing = f"{view.name!r} has no model yet, its phase is {view.phase}"
@@ -224,7 +234,8 @@ def _words_without_model(view: SurrogateView) -> str:
 
 @contextmanager
 def _recording(path: Path | None, curve: list[CurvePoint], update: Update) -> Iterator[Record]:
-    """Show progress, collect the training curve, and append it to a file that other processes can watch."""
+    """Context of a training's progress. Yields a function that shows it, adds a point to ``curve``, and appends a line
+    to the file ``path``, which other processes can watch."""
     from surrogym_shared.wire import CurvePoint
     from surrogym_trainer.training.course import Course
     from surrogym_trainer.training.words import words_of
@@ -284,7 +295,7 @@ def _train(
 
 
 def _waiting(update: Update) -> Callable[[SurrogateView], None]:
-    """Show a round's real steps while a sampler takes them. The progress bar keeps the training's position."""
+    """Return a function that shows what the training waits for while a sampler takes a round's real steps."""
     from surrogym_client.surrogates.waiting import words_of_waiting
     from surrogym_sampler.original.loading import sample_command
 
@@ -301,7 +312,7 @@ def _write_card(
     seed: int,
     curve: list[CurvePoint],
 ) -> dict[str, Any]:
-    """Write the policy's card beside it, and return the result as JSON."""
+    """Write the policy's card beside its file, and return the result as values that JSON can represent."""
     from surrogym_trainer.policies.card import write_card
     from surrogym_trainer.training.cards import card_of
 

@@ -51,7 +51,7 @@ class SearchOptions:
     seed: Annotated[int, typer.Option(min=0, help="Seed of the policy and of the virtual environment.")] = 0
 
     def hyperparameters(self) -> dict[str, Any]:
-        """Parse ``--set``. A value is read as JSON, or as text if it is not valid JSON."""
+        """Return the hyperparameters of ``--set`` by name. Values are parsed as JSON, or are text if that fails."""
         from surrogym.cli.errors import CommandError
 
         found: dict[str, Any] = {}
@@ -135,7 +135,7 @@ class SessionOptions:
         """Return the options that were given, by the names of ``OpenSession``.
 
         Raises:
-            CommandError: an option needs another variant.
+            CommandError: an option of particles was given with another variant than ``probabilistic``.
         """
         from surrogym.cli.errors import CommandError
         from surrogym_shared.wire import OF_PARTICLES
@@ -204,7 +204,7 @@ class StartOptions:
         one.
 
         Raises:
-            UnusablePolicy: the file can't be a policy, or its card is none.
+            UnusablePolicy: the file is not a policy, or its card can't be read.
             FileNotFoundError: there is no such file.
         """
         from surrogym_trainer.policies.files import card_of_policy
@@ -249,7 +249,7 @@ class LoopOptions:
 
 @dataclass(frozen=True)
 class LogOptions:
-    """Options of where the training's curves and the policy go."""
+    """Options for where the curves of the training and the policy are stored."""
 
     log: Annotated[
         Log | None,
@@ -271,10 +271,12 @@ class LogOptions:
     progress_file: Annotated[Path | None, typer.Option(hidden=True, help="Write progress as JSON lines.")] = None
 
     def tracker(self, algorithm: str | None) -> Tracker | None:
-        """Return the tracker: as chosen, or TensorBoard if its folder is given or the algorithm is one that logs.
+        """Return the tracker of the training's curves; None for no tracker.
+
+        Without ``--log``, it is TensorBoard if its folder is given, or if the algorithm is of Stable-Baselines3.
 
         Args:
-            algorithm: registered name of the search; None if it was not chosen.
+            algorithm: registered name of the policy search; None if none was chosen.
         """
         from surrogym_trainer.training.search import ALGORITHMS
 

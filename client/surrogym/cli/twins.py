@@ -11,19 +11,26 @@ if TYPE_CHECKING:
 
     from surrogym.cli.groups import Service
 
-ENTRY_POINTS = "surrogym.twins"  # functions of the server's package that write a surrogate's file for other programs
+ENTRY_POINTS = "surrogym.twins"  # group of entry points with which the server's package writes a surrogate as an FMU
 FILE = ".surrogate"  # ending of a surrogate's file
 
 
 def is_surrogate(name: str) -> bool:
-    """Return whether a name is that of a surrogate or its file. A policy is another file, or has a version."""
+    """Whether a name refers to a surrogate or to its file, and not to a policy: another file, or a name with ``@``."""
     return name.endswith(FILE) or not (Path(name).is_file() or "@" in name or Path(name).suffix)
 
 
 def write_twin(
     context: typer.Context, surrogate: str, out: Path, period: float | None, service: Service
 ) -> dict[str, Any]:
-    """Write the FMU of a surrogate of the server, or of a file, into a folder, and describe it.
+    """Write a surrogate as an FMU into the folder ``out``, and return a description of the FMU as JSON values.
+
+    Args:
+        context: context of the command.
+        surrogate: name of a surrogate on the server, or its exported file.
+        out: a new or empty folder.
+        period: seconds of one step; None takes that of the specification.
+        service: options of the server.
 
     Raises:
         CommandError: the extra ``server`` is missing, the surrogate can't be written, or the folder has other files.
@@ -51,7 +58,7 @@ def write_twin(
         written = write(content, path, period)
     except OSError:
         raise
-    except Exception as error:  # the server's errors, whose classes the client does not know
+    except Exception as error:  # errors of the server's package, whose classes the client does not import
         if made and not there:
             out.rmdir()
         raise CommandError(str(error)) from error
@@ -59,7 +66,7 @@ def write_twin(
 
 
 def in_words(twin: dict[str, Any]) -> str:
-    """Describe the FMU in a sentence."""
+    """Describe a written FMU in a sentence, from the values that ``write_twin`` returned."""
     (path,) = twin["files"]
     native = f"native code for {twin['binary']}" if twin["binary"] else "its sources alone, as no C compiler is here"
     return f"{path}: an FMU of FMI 3.0 with {native}"

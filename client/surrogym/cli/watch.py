@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from surrogym_trainer.evaluation.comparing import StepOfEpisode
     from surrogym_trainer.watching.watcher import Alarm, Watcher
 
-SHOWN = 8  # most rows to show that can't be used
+SHOWN = 8  # most unusable rows to print
 
 
 def register(app: typer.Typer) -> None:
@@ -104,7 +104,7 @@ def command(
 
 
 def _logs(log: Path, mapping: Path | None, spec: EnvironmentSpec, *, follow: bool) -> Iterator[ReadLog]:
-    """Return a log once, or its latest rows again and again."""
+    """Yield the log once, or with ``follow`` or from standard input, repeatedly with its latest rows."""
     from surrogym_trainer.watching.logs import chunks_of_file, chunks_of_stream, read_growing, read_once
 
     if str(log) == "-":
@@ -115,16 +115,16 @@ def _logs(log: Path, mapping: Path | None, spec: EnvironmentSpec, *, follow: boo
 
 
 class _Seen:
-    """What was read of a log so far."""
+    """Rows of a log that were read so far: the steps of the last reading, and unusable rows."""
 
     def __init__(self) -> None:
-        self.steps: list[StepOfEpisode] = []  # that are new
-        self.rejected: dict[int, str] = {}  # by line
+        self.steps: list[StepOfEpisode] = []  # usable steps of the last reading
+        self.rejected: dict[int, str] = {}  # reason for each unusable row so far, by its line
         self.notes: tuple[str, ...] = ()
         self._line = 0
 
     def add(self, read: ReadLog) -> None:
-        """Take the rows of a log that come after those before."""
+        """Add the rows of a reading of the log that come after the rows of the readings before."""
         from surrogym_shared.words import has
         from surrogym_trainer.watching.logs import impossible, steps_after
 
@@ -138,7 +138,7 @@ class _Seen:
 
 
 def _watched(watcher: Watcher, steps: list[StepOfEpisode], update: Update, rejected: int) -> Alarm | None:
-    """Compare steps up to a drift or their end."""
+    """Compare steps with the model. Return the alarm at the first drift; None if there is none in these steps."""
     from surrogym_trainer.watching.watcher import BATCH
 
     for first in range(0, len(steps), BATCH):
@@ -150,7 +150,8 @@ def _watched(watcher: Watcher, steps: list[StepOfEpisode], update: Update, rejec
 
 
 def _withdrawn(watcher: Watcher, version: int, alarm: Alarm) -> PolicyView:
-    """Report a drift to the server. If that fails, the drift is shown with the error."""
+    """Report a drift to the server, which withdraws the policy's promise. If that fails, print the drift, and raise the
+    error."""
     from surrogym_client.errors import SurrogymClientError
     from surrogym_shared.terminal import say
 

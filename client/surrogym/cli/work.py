@@ -102,7 +102,8 @@ def _environment(
     *,
     quiet: bool,
 ) -> Environment | None:
-    """Return the environment to evaluate in, after a check that it fits the surrogate; None if there is none."""
+    """Return the environment for evaluations, after a check that it fits the surrogate; None if the worker only
+    trains."""
     from surrogym.cli.opening import opener_of
     from surrogym_sampler.original.loading import is_known
     from surrogym_sampler.queries.query_limits import check_environment
@@ -123,7 +124,7 @@ def _environment(
 
 
 def _with_reference(environment: Environment | None, reference: str | None) -> Environment | None:
-    """Return the environment with the loader of a reference controller, which is loaded once to check it.
+    """Return the environment with a function that loads the reference controller, after a check that it can be loaded.
 
     Raises:
         CommandError, OriginalError, UnusablePolicy: there is no such controller, or no environment for it.

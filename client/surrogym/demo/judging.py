@@ -20,12 +20,12 @@ from surrogym_trainer.evaluation.uncontrolled import baseline, default_baseline
 from surrogym_trainer.policies.card import read_card
 from surrogym_trainer.policies.files import load_policy
 
-COMPARED = 20  # starts that are run without the policy as well
+COMPARED = 20  # number of starts that are also run without the policy
 
 
 @dataclass(frozen=True)
 class Part:
-    """Real episodes from some starts, and the controller that acted in them."""
+    """Part of an evaluation: real episodes of one controller, and the settings of their starts."""
 
     controller: Controller
     settings: EvaluationSettings
@@ -34,13 +34,13 @@ class Part:
 
 @dataclass(frozen=True)
 class Judgement:
-    """Results of an evaluation. ``also`` is from the task's other starts, None without any. ``without`` is without the
-    policy, from the first of the declared starts."""
+    """Results of a policy's evaluation in a demo: from the declared starts (``real``), from the task's other starts
+    (``also``, or None), and without the policy, from the first declared starts (``without``)."""
 
     real: Part
     also: Part | None
     without: Part
-    reached: bool  # the task's target
+    reached: bool  # whether the results reach the target of the task
 
     @property
     def parts(self) -> list[Part]:
@@ -48,12 +48,12 @@ class Judgement:
 
     @property
     def results(self) -> tuple[Evaluation, Evaluation | None, Evaluation]:
-        """The results of the policy, of the other starts, and without the policy."""
+        """Results of the policy, of the policy from the task's other starts (or None), and without the policy."""
         return self.real.result, None if self.also is None else self.also.result, self.without.result
 
     @property
     def steps(self) -> int:
-        """Real steps taken."""
+        """Number of real steps of all episodes."""
         return sum(part.result.steps for part in self.parts)
 
     @property
@@ -62,7 +62,7 @@ class Judgement:
 
 
 def judge(settings: DemoSettings, policy: Path, *, quiet: bool) -> Judgement:
-    """Evaluate a policy file."""
+    """Evaluate a policy file by real episodes of the demo's task, also without the policy, for comparison."""
     task, starts = settings.demo_task, settings.demo_task.also
     plain = EvaluationSettings(episodes=settings.episodes)
     with progress("evaluate", quiet=quiet) as update:
@@ -86,7 +86,7 @@ def judge(settings: DemoSettings, policy: Path, *, quiet: bool) -> Judgement:
 
 
 def episodes_of(settings: DemoSettings) -> Callable[[], Episode]:
-    """Opens episodes of the original environment."""
+    """Return a function that opens an episode of the demo's original environment."""
     name, spec = settings.demo_task.environment, settings.judged_by()
     return partial(open_episode, name, spec, partial(make, name, spec=spec))
 

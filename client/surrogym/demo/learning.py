@@ -31,23 +31,23 @@ from surrogym_trainer.training.words import words_of
 
 LEDGER = ("initial", "adaptive", "total", "unresolved", "audit")
 PATIENCE_SECONDS = 3_600.0
-REPORT = "report.html"  # in the run folder
-LOOK_SECONDS = 1.0  # each poll costs the server a little of the trainer's time
+REPORT = "report.html"  # name of the report in the run folder
+LOOK_SECONDS = 1.0  # time between polls of the server, each of which slows the training a little
 
 
 @dataclass(frozen=True)
 class Learned:
-    """A trained policy and what it cost.
+    """A trained policy, with the real steps and the time that it took.
 
     Attributes:
-        policy: its file.
-        real_queries: numbers of real steps: initial, adaptive, their total, unresolved, and those of audits.
-        seconds: duration of each phase, by its name.
+        policy: file of the policy.
+        real_queries: numbers of real steps by kind: initial, adaptive, total, unresolved, and of audits.
+        seconds: duration of each phase, by the phase's name.
         confidence_index, fidelity, phase: state of the surrogate; None for a policy trained without a surrogate.
     """
 
     policy: Path
-    real_queries: dict[str, int]  # initial, adaptive, total of these, unresolved, and of audits
+    real_queries: dict[str, int]
     seconds: dict[str, float]
     confidence_index: float | None = None
     fidelity: dict[str, Any] | None = None
@@ -55,7 +55,7 @@ class Learned:
 
 
 class SurrogateRun:
-    """One run: a server, a sampler and a trainer, phase by phase."""
+    """A run of the demo with three processes: a server, a sampler and a trainer."""
 
     def __init__(self, settings: DemoSettings, folder: Path, children: Children, *, quiet: bool) -> None:
         self._settings = settings
@@ -67,7 +67,8 @@ class SurrogateRun:
             self._api = Api(self._serve(), token="", retries=Retries(seconds=10.0))
 
     def learn(self) -> Learned:
-        """Run the design and the training. The trainer starts early, so that it imports during the design."""
+        """Run the design and the training. The trainer starts early, so that it imports its packages during the
+        design."""
         self._employ_sampler()
         trainer = self._employ_trainer()
         with self._timed("design"):
@@ -89,8 +90,8 @@ class SurrogateRun:
         )
 
     def keep(self, judgement: Judgement) -> None:
-        """Enter the evaluation into the ledger, store its episodes with the policy, and write specification, samples
-        and, unless unwanted, pictures."""
+        """Report the evaluation's real steps, store its episodes with the policy on the server, and write
+        specification, samples and, if requested, pictures into the run folder."""
         name = self._settings.task
         self._api.report_steps(name, judgement.steps, episodes=judgement.episodes, note="demo")
         compared = min(part.settings.episodes for part in judgement.parts)
@@ -137,7 +138,7 @@ class SurrogateRun:
         if steps := self._settings.description_steps:
             self._api.report_steps(self._settings.task, steps, note="description")
         named = self._settings.demo_task.environment
-        own = ["--env", named] if ":" in named else []  # the sampler does not import a module that only a server names
+        own = ["--env", named] if ":" in named else []  # a sampler imports a module only if --env names it
         self._children.start("sampler", "surrogym", ["sample", *self._common, *own])
 
     def _employ_trainer(self) -> Child:
@@ -157,7 +158,7 @@ class SurrogateRun:
             self._wait_for_design(update)
 
     def _wait_for_design(self, update: Callable[[float, str], None], after_round: int = 0) -> SurrogateView:
-        """Wait until the design has asked its last query, or until it is past a round."""
+        """Wait until the design has ended after more rounds than ``after_round``, and return the surrogate."""
 
         def look(view: SurrogateView) -> None:
             self._children.check()
@@ -197,7 +198,7 @@ class SurrogateRun:
 
 
 def read_curve(path: Path) -> list[dict[str, Any]]:
-    """The trainer's progress so far. An unfinished line is left for the next call."""
+    """Return the trainer's progress so far, one dictionary for each complete line of its progress file."""
     if not path.exists():
         return []
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
@@ -205,14 +206,14 @@ def read_curve(path: Path) -> list[dict[str, Any]]:
 
 
 def later_imports(settings: DemoSettings) -> tuple[str, ...]:
-    """Modules that evaluation and pictures will need."""
+    """Return the names of the modules that the evaluation and the pictures will need."""
     by_sb3 = settings.search in ALGORITHMS
     pictures = ["surrogym.demo.pictures"] if settings.pictures else []
     return (*(["stable_baselines3"] if by_sb3 else []), *pictures)
 
 
 def _warm_up(modules: Sequence[str]) -> None:
-    """Import modules while the program waits."""
-    with suppress(ImportError):  # the code that needs it reports the error
+    """Import modules in advance, while the program waits for the training."""
+    with suppress(ImportError):  # the code that uses the module reports the error
         for module in modules:
             import_module(module)

@@ -32,7 +32,7 @@ def draw_all(
 
 
 def draw_learning(curve: Sequence[dict[str, Any]]) -> Figure:
-    """Imagined return over virtual steps."""
+    """Draw the imagined return over the virtual steps of the training."""
     known = [(line["steps"], line["imagined_return"]) for line in curve if line["imagined_return"] is not None]
     figure, axes = _one("virtual steps", "imagined return of an episode", "training in the surrogate")
     axes.plot([steps for steps, _ in known], [value for _, value in known])
@@ -48,8 +48,7 @@ def draw_returns(result: Evaluation) -> Figure:
 
 
 def draw_rollout(spec: EnvironmentSpec, result: Evaluation) -> Figure:
-    """Draw the real episode of the median return: coordinates, and the action. Half of all episodes had a higher
-    return."""
+    """Draw the coordinates and actions of the real episode with the median return over its steps."""
     at = result.ranked()["median"]
     trace = result.traces[at]
     actions = trace.action.shape[1]

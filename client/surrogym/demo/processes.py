@@ -28,7 +28,7 @@ class RunFailed(SurrogymClientError):
 
 @dataclass(frozen=True)
 class Child:
-    """One process and its log."""
+    """One child process of a demo, and its log file."""
 
     name: str
     process: subprocess.Popen[bytes]
@@ -41,20 +41,20 @@ class Child:
             raise RunFailed(f"the {self.name} ended with exit code {code}: {self.last_words()} (log: {self.log})")
 
     def last_words(self) -> str:
-        """The last line that it has written."""
+        """Return the last line that the process has written to its log."""
         lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return lines[-1] if lines else "no output"
 
 
 class Children:
-    """Operating-system processes of one run. Leaving the context stops them all, also after an error or Ctrl-C."""
+    """Child processes of one run. Leaving the context stops all of them, also after an error or Ctrl-C."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._children: list[Child] = []
 
     def start(self, name: str, module: str, arguments: Sequence[str]) -> Child:
-        """Start ``python -m module``; its output goes to a log in the run folder."""
+        """Start ``python -m module`` as a child process, with a log in the run folder."""
         log = self._folder / f"{name}.log"
         with log.open("wb") as file:
             process = subprocess.Popen(
@@ -70,7 +70,7 @@ class Children:
         return child
 
     def check(self) -> None:
-        """Raise ``RunFailed`` if any of them has failed."""
+        """Raise ``RunFailed`` if any child process has failed."""
         for child in self._children:
             child.check()
 
@@ -80,8 +80,8 @@ class Children:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Ask every group to stop, newest first, and each after the one before, so that none loses its server while it
-        saves its work. Then make sure that all have stopped."""
+        """Stop all child processes, one after the other, the newest first, so that none loses the server while it saves
+        its work. Kill those that have not ended in time."""
         deadline = time.monotonic() + STOPPING_SECONDS
         for child in reversed(self._children):
             _signal(child, signal.SIGTERM)
@@ -93,10 +93,10 @@ class Children:
 
 
 def await_file(child: Child, path: Path) -> str:
-    """Wait for a file that a child writes when it is ready, and return its content.
+    """Wait for the file that a child process writes when it is ready, and return the file's content.
 
     Raises:
-        RunFailed: the child ended instead, or took too long.
+        RunFailed: the child process ended before, or took too long.
     """
     deadline = time.monotonic() + STARTING_SECONDS
     while not path.exists():
@@ -107,12 +107,13 @@ def await_file(child: Child, path: Path) -> str:
 
 
 def _signal(child: Child, number: signal.Signals) -> None:
-    """Signal the child's whole group, which may still exist after the child itself has ended."""
+    """Send a signal to the process group of a child, which may still exist after the child itself has ended."""
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(child.process.pid, number)
 
 
 def _environment() -> dict[str, str]:
-    """The environment without settings of another server; one thread each, as the processes share the cores."""
+    """Return the environment variables of a child process: without Surrogym's settings, and with one thread, because
+    the processes share the cores."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
     return {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", **kept}

@@ -14,6 +14,7 @@ from surrogym_client.surrogates.phases import IN_WORDS
 from surrogym_trainer.evaluation.evaluator import Evaluation
 from surrogym_trainer.policies.card import PolicyCard, read_card
 
+# Settings of a training that differ between runs of the same kind, and don't count as its configuration.
 BY_RUN = (
     "seed",
     "start_from",
@@ -21,13 +22,13 @@ BY_RUN = (
     "tensorboard_log",
     "total_steps",
     "tracker",
-)  # differ between runs of one kind
+)
 
 
 def metrics_of(
     settings: DemoSettings, learned: Learned, judgement: Judgement, seconds: dict[str, float]
 ) -> dict[str, Any]:
-    """Every number of one run, JSON-able."""
+    """Return all results and settings of one run, as values that JSON can represent."""
     card, real, also, without = read_card(learned.policy), *judgement.results
     return {
         "task": settings.task,
@@ -68,7 +69,7 @@ def metrics_of(
 
 
 def table(metrics: dict[str, Any], folder: Path) -> str:
-    """The result for a person, two columns."""
+    """Return the results of a run as a text table of two columns, for people."""
     returns, index = metrics["real_return"], metrics["confidence_index"]
     design = IN_WORDS.get(metrics["phase"], metrics["phase"])
     rows = [
@@ -130,7 +131,7 @@ def _without(metrics: dict[str, Any]) -> tuple[str, str]:
 
 
 def _real_steps(metrics: dict[str, Any]) -> str:
-    """The real steps that something was learned from: design, description and audit."""
+    """Describe the real steps that the run learned from: those of the design, of the description, and of audits."""
     real = metrics["real_queries"]
     others = {"description": metrics["description_steps"], "audit": _audit_steps(metrics)}
     parts = [str(real["total"]), *(f"{steps} for the {name}" for name, steps in others.items() if steps)]
@@ -144,7 +145,7 @@ def _audit_steps(metrics: dict[str, Any]) -> int:
 
 
 def _promise(metrics: dict[str, Any]) -> list[tuple[str, str]]:
-    """The promise at the handover; empty if the policy was learned in the original environment."""
+    """Return the rows about the policy's promise; empty if the policy was learned in the original environment."""
     promise = metrics["promise"]
     if promise is None:
         return []
@@ -171,7 +172,7 @@ def _share(value: float | None) -> str:
 
 
 def _number(value: float | None) -> str:
-    """A return in readable form: small ones keep their digits."""
+    """Format a return: with one decimal, or three digits if it is below 10 in size."""
     if value is None:
         return "-"
     return f"{value:.1f}" if abs(value) >= 10 else f"{value:.3g}"
