@@ -52,7 +52,8 @@ class Query(nouns.Query):
 
     id: int
     purpose: Literal["initial", "adaptive"]
-    design: str = field(default="", repr=False)  # id of the design; designs may have queries that are else equal
+    # Id of the design that made the query, because designs with equal specifications begin with equal queries.
+    design: str = field(default="", repr=False)
 
 
 class CalibratedPrior(Protocol):

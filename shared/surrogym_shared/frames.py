@@ -207,7 +207,7 @@ def read_reply(content: bytes) -> Reply:
     return _read(_REPLY, content)
 
 
-# Requests
+# Build requests from arrays, and read arrays from requests
 
 
 def reset_request(seq: int | None, seed: int | Sequence[int] | None, mask: Bools | None) -> ResetRequest:
@@ -312,7 +312,7 @@ def until_of(request: PolicyRequest, shape: Shape) -> Bools | None:
     return None if request.until is None else _array("until", _checked("until", request.until), BOOL, (shape.lanes,))
 
 
-# Replies
+# Build replies from results, and read results from replies
 
 
 def reset_reply(seq: int, result: ResetResult) -> ResetReply:
@@ -455,7 +455,7 @@ def _final(step: Step | PolicyReply, shape: Shape) -> tuple[Array, Array]:
     return lanes, _own("final_observation", step.final_observation, FLOAT32, (count, shape.observation))
 
 
-# Arrays
+# Convert arrays to bytes, and bytes to arrays
 
 
 def _size(space: ActionSpace) -> int:

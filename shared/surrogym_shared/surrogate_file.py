@@ -31,7 +31,7 @@ MAX_FILE_BYTES = 256 * 1024 * 1024
 MAX_HEADER_BYTES = 16 * 1024 * 1024
 LENGTH_BYTES = 8
 METADATA = "__metadata__"
-OWN = "surrogate"  # key of the metadata that is not the model's
+OWN = "surrogate"  # key of the metadata about the surrogate, beside the model's metadata
 SAMPLES = "samples."
 LOGGED = "logged"  # array that marks samples from a log; absent in a file without such samples
 DTYPES: dict[str, np.dtype[Any]] = {"F64": np.dtype("<f8"), "BOOL": np.dtype("?")}
@@ -76,7 +76,7 @@ class SurrogateFile:
     spec: EnvironmentSpec
     model: bytes
     samples: RealSamples
-    tolerances: dict[str, float] = field(default_factory=dict)  # errors of outputs that are too small to matter
+    tolerances: dict[str, float] = field(default_factory=dict)  # by output: an error that is too small to matter
     ledger: dict[str, int] = field(default_factory=dict)  # counts of real steps by purpose, on the exporting server
     predictions: list[list[list[float]]] = field(
         default_factory=list

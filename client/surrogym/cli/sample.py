@@ -197,7 +197,7 @@ def _sample_on_ray(api: Api, plan: SamplerPlan, cluster: RayOptions, output: Out
 
 
 def _named(env: str | None, program: str | None) -> str | None:
-    """Return the name of the environment from the options --env or --exec. Raises ``CommandError`` if both are given."""
+    """Return the name of the environment from the option --env or --exec. Raises ``CommandError`` if both are given."""
     from surrogym.cli.errors import CommandError
     from surrogym_sampler.original.executables import name_of
 

@@ -79,7 +79,7 @@ class Api:
         """Close the sockets. A later call opens new ones."""
         self.connection.close()
 
-    # Service
+    # Routes of the server itself
 
     def health(self) -> wire.Health:
         """Check that a Surrogym server of this protocol answers.
@@ -117,7 +117,7 @@ class Api:
         parse(wire.Ready, content, "/readyz")
         return self.health()
 
-    # Surrogates
+    # Routes of surrogates
 
     def create_surrogate(self, name: str, spec: EnvironmentSpec) -> wire.CreatedSurrogate:
         """Register an original environment under a name.
@@ -168,7 +168,7 @@ class Api:
         """
         self.connection.send("DELETE", routes.surrogate(name))
 
-    # Queries
+    # Routes of queries
 
     def claim(
         self,
@@ -262,7 +262,7 @@ class Api:
         """List all queries so far, each with its state, attempts and last error."""
         return self._get(wire.QueryList, f"{routes.surrogate(name)}/queries").queries
 
-    # Samples and the ledger
+    # Routes of snapshots, samples, and counts of real steps
 
     def snapshots(self, name: str) -> list[wire.SnapshotView]:
         """Return the snapshots that samplers hold, oldest first."""
@@ -351,7 +351,7 @@ class Api:
         body = wire.Improve(queries=queries, checkpoint=checkpoint, idempotency_key=idempotency_key or new_key())
         return self._post(wire.ImprovedSurrogate, f"{routes.surrogate(name)}/improve", body)
 
-    # Models
+    # Routes of models
 
     def session_coordinates(self, session: str) -> list[list[float]]:
         """Return the coordinates of each lane of a session, (N, C)."""
@@ -409,21 +409,21 @@ class Api:
         reply = self.connection.send("POST", route, data, media_type=_MODEL_FILE, repeatable=False)
         return parse(wire.ModelView, reply, route)
 
-    # Policies
+    # Routes of policies
 
     @property
     def policies(self) -> PolicyCalls:
         """Methods for the routes of policies."""
         return PolicyCalls(self.connection)
 
-    # Jobs
+    # Routes of jobs
 
     @property
     def jobs(self) -> JobCalls:
         """Methods for the routes of jobs."""
         return JobCalls(self.connection)
 
-    # Events
+    # Route of events
 
     def events(self, name: str, after: int | None = None) -> Iterator[wire.Event]:
         """Iterate over the events of a surrogate without end. A broken stream continues after the last event received.

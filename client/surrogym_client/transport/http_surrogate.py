@@ -88,7 +88,8 @@ class HttpSurrogate:
         self.transport: Transport = transport
         self._form: Form = JsonForm() if transport == "json" else BinaryForm()
         self._live: dict[str, _Live] = {}
-        self._upgrade_after = math.inf if self.connection.proxied else 0.0  # time without a stream
+        # Until this time, as of time.monotonic, requests are sent over HTTP, and no stream is opened.
+        self._upgrade_after = math.inf if self.connection.proxied else 0.0
         self._streamed = False  # whether any stream has returned an answer
         self._spec: EnvironmentSpec | None = None
 
@@ -295,9 +296,8 @@ class HttpSurrogate:
                     self._avoid_stream(_UPGRADE_PAUSE_SECONDS)
                 raise
             except TimeoutError:
-                if (
-                    not self._streamed
-                ):  # a proxy passes the upgrade but no messages: a repeat over the stream would time out too
+                if not self._streamed:
+                    # A proxy opened the stream, but passes no messages, so later requests would time out too.
                     self._avoid_stream(math.inf)
                 raise
             return answer

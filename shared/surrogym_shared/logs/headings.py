@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 UNIT = re.compile(
     r"""^(?P<name>.*?\S)\s*(?:
-        \[(?P<square>(?!\d+\])[^\[\]]*)\]      # time [s], but not action[0]
-        | \((?P<round>(?!\d+\))[^()]*)\)       # time (s)
-        | \s/\s*(?P<slash>[^\s/]+)             # T / K
-        | \sin\s(?P<words>\S+)                 # time in s
+        \[(?P<square>(?!\d+\])[^\[\]]*)\]      # such as time [s], but not action[0]
+        | \((?P<round>(?!\d+\))[^()]*)\)       # such as time (s)
+        | \s/\s*(?P<slash>[^\s/]+)             # such as T / K
+        | \sin\s(?P<words>\S+)                 # such as time in s
     )$""",
     re.VERBOSE,
 )

@@ -35,7 +35,7 @@ from surrogym_shared.logs.table import Cells, Table
 from surrogym_shared.words import listed
 
 BY = "episodes by "  # prefix of the name of a column of episode numbers that was derived from another column
-STARTS = ("is_first", "episode_start", "episode_starts")  # columns that mark the first step in RLDS and SB3
+STARTS = ("is_first", "episode_start", "episode_starts")  # columns that mark an episode's first step
 INDEX = {"index", "step", "steps", "timestep", "row", "line"}  # words in the names of columns that number rows
 # Whole names of columns that number rows.
 COUNTERS = {"sample", "frame", "tick", "counter", "count", "number", "no", "nr", "id", "i", "k", "n"}
