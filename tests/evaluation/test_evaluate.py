@@ -188,7 +188,7 @@ def test_exploration_spreads_by_its_share_of_half_the_range():
     rng, spec = np.random.default_rng(0), original.make("Pendulum-v1").spec()
     changed = np.array([explored(spec, np.array([0.5]), 0.1, rng)[0] for _ in range(4_000)])
     assert changed.std() == pytest.approx(0.2, rel=0.05)
-    with pytest.raises(ValueError, match="explore to be from 0 to 1, got 2"):
+    with pytest.raises(ValueError, match="explore to be a share from 0 to 1, got 2"):
         EvaluationSettings(explore=2)
 
 

@@ -13,7 +13,7 @@ from surrogym_trainer.policies.card import PolicyCard, UnusablePolicy, require_c
 def test_a_file_that_is_no_card_is_not_replaced(content: str, tmp_path: Path) -> None:
     other = tmp_path / "tank.json"
     other.write_text(content)
-    with pytest.raises(UnusablePolicy, match=r"tank\.json, which is no card: choose another file"):
+    with pytest.raises(UnusablePolicy, match=r"tank\.json, which is not a card: choose another name"):
         require_card_or_none(tmp_path / "tank.zip")
     assert other.read_text() == content
 

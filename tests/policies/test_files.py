@@ -249,8 +249,8 @@ def test_a_policy_that_would_inflate_is_refused(tmp_path: Path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"net_arch": {"pi": [100_000, 100_000], "vf": [1]}}, "expected weights for layers of 10000"),
-        ({"action_space": {"kind": "discrete", "n": 10**9}}, "expected weights for layers of "),
+        ({"net_arch": {"pi": [100_000, 100_000], "vf": [1]}}, "expected the file to have 10000"),
+        ({"action_space": {"kind": "discrete", "n": 10**9}}, "weights for its described layers, got at most "),
         ({"net_arch": {"pi": [7], "vf": [1]}}, "size mismatch|Missing key"),
         ({"policy": "Magic"}, "policy"),
         ({"extra": 1}, "extra"),

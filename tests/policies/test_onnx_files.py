@@ -98,8 +98,8 @@ def looping() -> onnx.ModelProto:
 @pytest.mark.parametrize(
     ("made", "said"),
     [
-        (inflated, "expected at most 67108864 numbers in the arrays of 1024 observations, got 40000"),
-        (multiplied, "expected at most 67108864 numbers in the arrays of 1024 observations, got "),
+        (inflated, "expected at most 67108864 numbers in the arrays for 1024 observations, got 40000"),
+        (multiplied, "expected at most 67108864 numbers in the arrays for 1024 observations, got "),
         (of_unknown_shape, "expected sizes of the array 'zeros' that follow from those of the input, got"),
         (claiming, "expected sizes of the array 'zeros' that follow from those of the input, got"),
         (of_another_file, "expected all arrays inside the file, got 'bias' in another one"),

@@ -1,4 +1,7 @@
-"""Put the errors that real steps have shown into the model, and compute a policy's imagined return again."""
+"""The effect on a policy's imagined return of the model errors that real steps have shown.
+
+Shapes: n steps, O outputs, P inputs, K rows of weights, each for one possible error of the model.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +20,10 @@ from surrogym_trainer.evaluation.imagined import imagine
 from surrogym_trainer.evaluation.systematic import Inputs, Region, Systematic, region
 from surrogym_trainer.policies.predict import Predict
 
-DRAWS = 64  # of errors that the steps support
-STARTS = 4  # virtual episodes under each of them
-CERTAIN = 0.9  # probability from which on an output counts as shifted
-EFFECT_STARTS = 32  # virtual episodes under the errors of a single output
+DRAWS = 64  # number of sampled errors that agree with the steps
+STARTS = 4  # number of virtual episodes under each sampled error
+CERTAIN = 0.9  # probability above which an output counts as shifted
+EFFECT_STARTS = 32  # number of virtual episodes under the errors of a single output
 
 Array = NDArray[np.float64]
 
@@ -35,7 +38,7 @@ def changes_of(
     weights: Array,
     starts: int = STARTS,
 ) -> Array:
-    """Return by how much the policy's mean return changes, (K,), if the model errs by ``weights`` (K, O, 1 + P).
+    """Return the changes (K,) of the policy's mean return if the model errs by ``weights`` (K, O, 1 + P).
 
     The episodes with and without the errors have the same starts and the same noise, and follow the model's mean.
 
@@ -67,13 +70,13 @@ def changes_of(
 
 @dataclass(frozen=True)
 class Effect:
-    """An output that is wrong in all steps together.
+    """An error of an output that all steps share, and its effect.
 
     Attributes:
-        output: its name.
+        output: the output's name.
         error: mean of real minus predicted values, in the output's unit.
-        region: range of an input in which it is worst; None if it is much the same everywhere.
-        change: by how much the errors change the imagined return; None if that was not computed.
+        region: range of an input in which the error is largest; None if it is much the same everywhere.
+        change: change of the imagined return by the error; None if it was not computed.
     """
 
     output: str
@@ -82,7 +85,7 @@ class Effect:
     change: float | None
 
     def words(self) -> str:
-        """Describe the effect in a sentence."""
+        """Return the effect as a sentence."""
         where = ""
         if (at := self.region) is not None:
             where = f", {at.error:+.3g} where {at.name} is between {at.low:.4g} and {at.high:.4g}"
@@ -93,16 +96,18 @@ class Effect:
 def effects_of(
     spec: EnvironmentSpec, compared: Compared, change: Callable[[Systematic, Array], Array] | None
 ) -> tuple[list[Effect], Array]:
-    """Find the outputs that are wrong in all steps together, the costliest first.
+    """Find the outputs whose errors have a part that all steps share, those with the largest effect on the return
+    first.
 
     Args:
         spec: specification of the environment.
         compared: the real steps with their predictions.
-        change: computes by how much weights (K, O, 1 + P) change the return, (K,); None leaves that open.
+        change: computes the changes (K,) of the return by weights (K, O, 1 + P); None leaves the changes out.
 
     Returns:
-        the effects, and how much each step has of them: the sum of its errors that they explain, each divided by what
-        the model claims (n,).
+        The effects, and the contribution of each step to them (n,): the sum of its errors that they explain, each
+            divided by
+        the error on left-out samples.
     """
     shifted = compared.together(spec, Inputs.over(spec, compared.states, compared.actions))
     weights, outputs = shifted.expected(), np.flatnonzero(shifted.chances > CERTAIN).tolist()

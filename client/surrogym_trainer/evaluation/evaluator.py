@@ -1,4 +1,4 @@
-"""Evaluate a policy in the original environment, by real episodes that are counted."""
+"""The evaluation of a policy by real episodes in the original environment, whose steps are counted."""
 
 from __future__ import annotations
 
@@ -22,23 +22,28 @@ from surrogym_shared.wire import TraceRank
 from surrogym_trainer.policies.predict import Acting, PerEpisode
 
 Array = NDArray[np.float64]
-Progress = Callable[[float, int], None]  # arguments: share done in [0, 1], number of episodes that terminated
+# Called with the share of the work that is done, in [0, 1], and the number of episodes that terminated.
+Progress = Callable[[float, int], None]
 
 FIRST_SEED = 10_000
-FEW_EQUAL = 3  # episodes that are compared; if they are equal, the evaluation says so
-EXPLORING = 1  # part of the seed of random changes of actions
-ROUNDING = 1e-6  # share of its range by which a constant may change within an episode
+FEW_EQUAL = 3  # number of first episodes that are compared; if they are equal, a remark says so
+EXPLORING = 1  # part of the seed of the random changes of actions
+ROUNDING = 1e-6  # share of its range by which a constant may change within an episode and still count as constant
 
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """Settings of an evaluation: how many episodes, from which starts, in which environment.
+    """Settings of an evaluation: number of episodes, their starts, and changes of the environment.
 
-    ``wide`` starts anywhere in the sampling range. ``start_scale`` widens the declared starts about their middle by
-    this factor. ``perturb`` is the standard deviation of random factors on physical attributes. ``explore`` changes the
-    actions at random, see ``explored``. ``parallel`` is the number of instances of the environment that are open at
-    once; None takes one for each episode if the environment declares that it runs in parallel, and a single one
-    otherwise.
+    Attributes:
+        episodes: number of episodes.
+        first_seed: reset seed of the first episode; each further one adds 1.
+        wide: whether to start anywhere in the sampling range.
+        start_scale: factor that widens the declared starts about their middle.
+        perturb: standard deviation of random factors on physical attributes.
+        explore: size of random changes of the actions, see ``explored``.
+        parallel: number of instances of the environment that are open at once. None takes one for each episode if the
+            environment declares that it runs in parallel, and a single one otherwise.
     """
 
     episodes: int = 100
@@ -51,47 +56,50 @@ class EvaluationSettings:
 
     def __post_init__(self) -> None:
         if self.episodes < 1 or (self.parallel is not None and self.parallel < 1):
-            raise ValueError(f"expected at least 1 episode and 1 instance, got {self.episodes} and {self.parallel}")
+            raise ValueError(
+                f"expected at least 1 for episodes and for parallel, got {self.episodes} and {self.parallel}"
+            )
         if self.wide and self.start_scale != 1:
-            raise ValueError("expected either starts over the whole range or scaled starts, got both")
+            raise ValueError("expected either wide or start_scale, got both: leave one out")
         if not 0 <= self.explore <= 1:
-            raise ValueError(f"expected explore to be from 0 to 1, got {self.explore}")
+            raise ValueError(f"expected explore to be a share from 0 to 1, got {self.explore}")
 
     @property
     def declared(self) -> bool:
-        """Whether episodes are those of the policy from the specification's starts, in the environment as it is."""
+        """Whether the episodes start as declared, in the unchanged environment, with unchanged actions of
+        the policy."""
         return not self.wide and self.start_scale == 1 and not self.perturb and not self.explore
 
 
 @dataclass(frozen=True)
 class Trace:
-    """One episode, step by step."""
+    """The record of one episode, step by step."""
 
     coordinates: Array  # (T + 1, C)
     action: Array  # (T, F)
     reward: Array  # (T,)
-    terminated: bool = False  # at its last step
+    terminated: bool = False  # whether its last step terminated it
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Result of N real episodes."""
+    """The result of N real episodes."""
 
     returns: Array  # (N,)
     lengths: NDArray[np.int64]  # (N,)
-    success: NDArray[np.bool_] | None  # (N,); None where the specification has no criterion
-    traces: tuple[Trace, ...]  # of every episode
-    varied: tuple[str, ...] = ()  # constants of the specification that changed within an episode
-    limit: int | None = None  # most steps of an episode, by the specification or by an end of the environment's own
+    success: NDArray[np.bool_] | None  # (N,); None if the specification has no success criterion
+    traces: tuple[Trace, ...]  # one for each episode
+    varied: tuple[str, ...] = ()  # names of constants of the specification that changed within an episode
+    limit: int | None = None  # largest number of steps in an episode, by the specification or by the environment itself
     seeded: bool = True  # whether a second reset with the first seed began in the same state
 
     @property
     def trace(self) -> Trace:
-        """Trace of the first episode."""
+        """The trace of the first episode."""
         return self.traces[0]
 
     def ranked(self) -> dict[TraceRank, int]:
-        """Return the numbers of the best, the median and the worst episode by return. In few episodes they may
+        """Return the indices of the best, the median and the worst episode by return. In few episodes they may
         coincide."""
         order = np.argsort(self.returns, kind="stable")
         return {"best": int(order[-1]), "median": int(order[(len(order) - 1) // 2]), "worst": int(order[0])}
@@ -103,7 +111,7 @@ class Evaluation:
 
     @property
     def equal(self) -> bool:
-        """Whether several episodes are equal in every number, so that one of them would have shown as much."""
+        """Whether all of several episodes are equal in every number, so that one would have been enough."""
         return len(self.traces) > 1 and all(_is_equal(self.trace, other) for other in self.traces[1:])
 
     @property
@@ -111,7 +119,7 @@ class Evaluation:
         return None if self.success is None else float(self.success.mean())
 
     def summary(self) -> dict[str, Any]:
-        """Return statistics of the return, and every episode, as JSON."""
+        """Return statistics of the returns, and the return of every episode, as a JSON object."""
         return {
             "mean": float(self.returns.mean()),
             "iqm": interquartile_mean(self.returns),
@@ -131,14 +139,14 @@ class Evaluation:
 
 
 def _is_equal(one: Trace, other: Trace) -> bool:
-    """Whether two episodes are equal in every number."""
+    """Return whether two episodes are equal in every number."""
     return one.terminated == other.terminated and all(
         np.array_equal(getattr(one, name), getattr(other, name)) for name in ("coordinates", "action", "reward")
     )
 
 
 class EvaluationInterrupted(KeyboardInterrupt):
-    """Ctrl-C interrupted an evaluation after ``steps`` real steps had begun."""
+    """Ctrl-C interrupted an evaluation; ``steps`` is the number of real steps begun by then."""
 
     def __init__(self, steps: int) -> None:
         super().__init__()
@@ -160,8 +168,8 @@ def evaluate(
     steps, a second Ctrl-C at once. Every instance is closed in any case.
 
     Args:
-        policy: function from observations (N, D) to actions, or a controller that also gets the numbers of
-            the episodes.
+        policy: function from observations (N, D) to actions, or a controller that also gets the numbers of the
+            episodes.
         open_episode: opens one instance of the environment.
         settings: number of episodes, their starts and the environment's perturbation.
         progress: called after every step.
@@ -169,9 +177,9 @@ def evaluate(
         trained_for: specification that the policy was trained for, such as that of its card. The environment must fit.
 
     Returns:
-        returns and successes of each episode, in the order of their seeds. The number of instances has an effect only
-            if
-        the policy answers a batch of observations differently from single ones, usually in the last bits.
+        The returns and successes of the episodes, in the order of their seeds. The number of instances has an effect
+            only
+        if the policy answers a batch of observations differently from single ones, usually in the last bits.
 
     Raises:
         PolicyMisfit: the policy was trained for another environment, which was then not even reset; or it gave actions
@@ -197,10 +205,10 @@ def _open(
     instances: ExitStack,
     trained_for: EnvironmentSpec | None,
 ) -> list[Episode]:
-    """Open as many instances as may be open at once, at most one for each episode. ``instances`` closes them.
+    """Open as many instances as may be open at once, at most one for each episode. ``instances`` will close them.
 
     Raises:
-        PolicyMisfit: the environment is another one than ``trained_for``. One instance was opened.
+        PolicyMisfit: the environment does not fit ``trained_for``; one instance was opened.
     """
 
     def open_one() -> Episode:
@@ -216,19 +224,19 @@ def _open(
 
 
 def interquartile_mean(values: Array) -> float:
-    """Mean of the middle half of the values (n,)."""
+    """Return the mean of the middle half of the values (n,)."""
     cut = len(values) // 4
     return float(np.sort(values)[cut : len(values) - cut].mean())
 
 
 @dataclass
 class _Tally:
-    """Running sums of one episode, which begins at the present state of ``episode``."""
+    """The running sums of one episode, which begins at the current state of ``episode``."""
 
-    number: int  # from 0, in the order of the seeds
+    number: int  # number of the episode, from 0, in the order of the seeds
     episode: Episode
     moment: Moment
-    rng: np.random.Generator  # of the exploration
+    rng: np.random.Generator  # random numbers of the exploration
     total: float = 0.0
     length: int = 0
     held: int = 0  # number of last steps in a row that met the success criterion
@@ -247,12 +255,12 @@ class _Tally:
 
     @property
     def trace(self) -> Trace:
-        """The episode so far, with at least one step."""
+        """The episode so far, which must have at least one step."""
         ended = self.moment.terminated
         return Trace(np.stack(self.path), np.stack(self.actions), np.array(self.rewards), ended)
 
     def step(self, action: Array) -> None:
-        """Take one real step."""
+        """Take one real step, and add it to the sums."""
         self.moment = moment = self.episode.step(action)
         self.total += moment.reward
         self.length += 1
@@ -263,7 +271,8 @@ class _Tally:
 
 
 class _Run:
-    """Runs episodes in the order of their seeds, each as soon as an instance is free."""
+    """An evaluation that is running: episodes begin in the order of their seeds, each as soon as an
+    instance is free."""
 
     def __init__(
         self,
@@ -273,7 +282,7 @@ class _Run:
         remark: Callable[[str], None] | None,
     ) -> None:
         self.settings = settings
-        self.begun = 0  # real steps begun, including interrupted and failed ones
+        self.begun = 0  # number of real steps begun, including interrupted and failed ones
         self._seeded = True
         self._policy = policy
         self._progress = progress
@@ -281,7 +290,7 @@ class _Run:
         self._tallies: list[_Tally] = []
 
     def on(self, instances: Sequence[Episode], between_steps: Callable[[], None]) -> Evaluation:
-        """Run all episodes."""
+        """Run all episodes in these instances; ``between_steps`` is called after each step of all."""
         free, running = list(instances), list[_Tally]()
         while running or len(self._tallies) < self.settings.episodes:
             running += self._begin(free)
@@ -317,7 +326,7 @@ class _Run:
             tally.step(explored(tally.episode.spec, action, share, tally.rng) if share else action)
 
     def _actions(self, running: Sequence[_Tally]) -> Array:
-        """Return the policy's actions (N, F)."""
+        """Return the policy's actions (N, F) for the N running episodes."""
         observations = np.stack([tally.moment.observation for tally in running]).astype(np.float32)
         try:
             return decode_actions(running[0].episode.spec, self._act(running, observations), len(running))
@@ -330,7 +339,7 @@ class _Run:
         return self._policy(observations)
 
     def _look_for_equal_ones(self) -> None:
-        """Say that the first episodes are equal, while it can still save real steps."""
+        """Report that the first episodes are equal, while stopping can still save real steps."""
         over = [tally for tally in self._tallies if tally.over]
         if self._remark is None or len(over) < FEW_EQUAL or len(self._tallies) == self.settings.episodes:
             return
@@ -360,20 +369,20 @@ def _start(episode: Episode, settings: EvaluationSettings, index: int) -> Moment
 
 
 def _reset(episode: Episode, settings: EvaluationSettings) -> Array | None:
-    """Reset with the first seed, once more than there are episodes, and return the coordinates (C,). None where no
-    reset chooses the start."""
+    """Reset once more than there are episodes, with the first seed, and return the coordinates (C,); None if the starts
+    are not chosen by a reset."""
     if settings.wide or settings.start_scale != 1:
         return None
     return episode.reset(settings.first_seed).coordinates
 
 
 def _same_start(spec: EnvironmentSpec, one: Array, other: Array) -> bool:
-    """Whether two starts are equal but for rounding."""
+    """Return whether two starts are equal, apart from rounding."""
     return all(abs(b - a) <= ROUNDING * span(c) for c, a, b in zip(spec.coordinates, one, other, strict=True))
 
 
 def _limit(tallies: Sequence[_Tally]) -> int | None:
-    """The time limit of the episodes: the specification's, or a shorter one that the environment kept by itself."""
+    """Return the time limit of the episodes: the specification's, or a shorter one that the environment itself has."""
     declared = tallies[0].episode.spec.time_limit
     own = [t.length for t in tallies if t.moment.truncated and t.length < t.limit]
     return min(own) if own else declared
@@ -393,7 +402,7 @@ def _account(tallies: Sequence[_Tally]) -> Evaluation:
 
 
 def span(coordinate: Coordinate) -> float:
-    """Width of a coordinate's sampling range."""
+    """Return the width of a coordinate's sampling range."""
     low, high = limits(coordinate.sampling)
     return high - low
 
@@ -415,7 +424,7 @@ def _holds(spec: EnvironmentSpec, coordinates: Array) -> bool:
 
 
 def _succeeds(success: Success, tally: _Tally) -> bool:
-    """Whether the episode meets every criterion that the specification has."""
+    """Return whether the episode meets every criterion of ``success``."""
     return (
         (not success.hold or tally.held >= success.hold_steps)
         and (success.min_steps is None or tally.length >= success.min_steps)

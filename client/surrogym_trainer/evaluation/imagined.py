@@ -1,4 +1,4 @@
-"""Run policies in the surrogate without training: imagined returns, and statistics of observations."""
+"""Runs of policies in the surrogate without training: imagined returns, and statistics of observations."""
 
 from __future__ import annotations
 
@@ -16,20 +16,22 @@ from surrogym_shared.acting import ActingPolicy
 from surrogym_shared.network import Network, bounds_of, counts_of
 from surrogym_shared.port import PolicyPort, PolicyRollout, StepResult, SurrogatePort
 
-DECLARED = {"start_box": 0.0, "start_visited": 0.0}  # all episodes begin as declared
-WHOLE = {**DECLARED, "trust": None}  # a shortened episode would earn more if rewards are costs
-PAID_OUTSIDE = DECLARED  # an episode that leaves the trusted range gets a penalty for its missing steps
+DECLARED = {"start_box": 0.0, "start_visited": 0.0}  # session options with which all episodes begin as declared
+# without a trust limit, because a shortened episode would earn more if rewards are costs
+WHOLE = {**DECLARED, "trust": None}
+# with the trust limit, because an episode that leaves the trusted range gets a penalty for its missing steps
+PAID_OUTSIDE = DECLARED
 STATISTICS_LANES = 1_024
-STEPS_AT_ONCE = 1_000  # steps of an imagined episode in one reply; an episode may be longer
+STEPS_AT_ONCE = 1_000  # largest number of steps in one reply; an episode may be longer
 
 
 @dataclass(frozen=True)
 class Imagined:
-    """Result of whole virtual episodes."""
+    """The result of whole virtual episodes."""
 
-    returns: NDArray[np.float64]  # (episodes,) undiscounted, any penalty included
-    penalty_share: float  # size of the penalty as a share of the reward's size
-    episode_penalty: float | None  # mean penalty of an episode; None in a session without a penalty
+    returns: NDArray[np.float64]  # (episodes,) undiscounted returns, less any penalty
+    penalty_share: float  # sum of the penalties as a share of the sum of absolute rewards
+    episode_penalty: float | None  # mean penalty of an episode; None if the session has no penalty
 
 
 def imagined_returns(
@@ -39,7 +41,7 @@ def imagined_returns(
     seed: int | Sequence[int],
     **options: Any,
 ) -> NDArray[np.float64]:
-    """Return the returns (episodes,) of ``imagine``.
+    """Return the returns (episodes,) of virtual episodes, as ``imagine`` does.
 
     The imagined return of a policy is their mean: from the declared starts, without exploration.
     """
@@ -85,7 +87,7 @@ def imagine(
 
 
 class _Sums:
-    """Sums over the first episode of each lane so far."""
+    """The sums of returns and penalties over the first episode of each lane so far."""
 
     def __init__(self, episodes: int) -> None:
         self.returns, self.penalties = np.zeros(episodes), np.zeros(episodes)
@@ -104,7 +106,7 @@ class _Sums:
 
 
 class _Rewards(NamedTuple):
-    """Rewards of T steps, (T, N) each."""
+    """The rewards of T steps in N lanes (T, N): as paid, without a penalty, and whether the episode ended."""
 
     reward: NDArray[np.floating[Any]]
     mean: NDArray[np.floating[Any]]
@@ -119,7 +121,7 @@ class _Rewards(NamedTuple):
 def _stepped(
     lanes: Lanes, predict: Callable[[NDArray[Any]], NDArray[Any]], seed: int | Sequence[int]
 ) -> Iterator[_Rewards | None]:
-    """Step until all first episodes have ended. Returns None if the session was lost."""
+    """Take steps one by one, and yield their rewards; None if the session was lost."""
     observation = lanes.reset(seed).observation
     while True:
         step = lanes.step(predict(observation))
@@ -128,7 +130,7 @@ def _stepped(
 
 
 def _rolled(lanes: Lanes, policy: ActingPolicy, seed: int | Sequence[int], sums: _Sums) -> Iterator[_Rewards | None]:
-    """Take as many steps as an episode has in one request. Returns None if the session was lost."""
+    """Take many steps in each request, and yield their rewards; None if the session was lost."""
     acting, limit = ActingLanes(lanes), lanes.port.spec().time_limit or LONGEST_EPISODE
     acting.reset(seed)
     while True:
@@ -137,8 +139,8 @@ def _rolled(lanes: Lanes, policy: ActingPolicy, seed: int | Sequence[int], sums:
 
 
 def _as_arrays(predict: Callable[[NDArray[Any]], NDArray[Any]], port: SurrogatePort) -> ActingPolicy | None:
-    """Return the policy in the form of arrays, with which the surrogate's side can act; None if it has no such form
-    or acts within other bounds."""
+    """Return the policy in the form of arrays, so that it can act inside the surrogate; None if it has no such form or
+    acts within other bounds."""
     if not isinstance(predict, Network) or not isinstance(port, PolicyPort):
         return None
     spec = port.spec()
@@ -148,7 +150,7 @@ def _as_arrays(predict: Callable[[NDArray[Any]], NDArray[Any]], port: SurrogateP
     try:
         return ActingPolicy.of(predict)
     except ValueError:
-        return None  # several policies at once, or a policy beyond the limits
+        return None  # the network contains several policies, or is larger than the surrogate accepts
 
 
 def _added(sums: NDArray[np.float64], rows: NDArray[np.floating[Any]]) -> NDArray[np.float64]:

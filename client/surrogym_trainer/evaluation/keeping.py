@@ -1,4 +1,4 @@
-"""Real steps of an evaluation in a file, until a server has stored them. ``surrogym import`` reads such a file."""
+"""Storage of an evaluation's real steps in a file until a server has them. ``surrogym import`` reads such a file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from surrogym_trainer.evaluation.comparing import StepOfEpisode
 
 
 def is_storable(step: StepOfEpisode) -> bool:
-    """Whether a server can store the numbers of a step."""
+    """Return whether a server can store the numbers of a step."""
     numbers = np.array([*step.coordinates, *step.action, *step.next_coordinates, step.reward])
     return bool((np.abs(numbers) <= MAX_MEASURED).all())
 
@@ -26,16 +26,17 @@ def is_storable(step: StepOfEpisode) -> bool:
 def as_logged(spec: EnvironmentSpec, samples: Sequence[NewSample]) -> list[NewSample]:
     """Return steps in the form in which an import would send them: with wrapped angles.
 
-    The server knows a log by the numbers of its steps. So steps that it has stored are duplicates in an import, to the
-    last bit. Equal steps all stay, because each was taken.
+    The server recognises the steps of a log by their numbers, to the last bit. So steps that it has stored already
+    count as duplicates in an import. Equal steps within the list are all kept, because each was taken.
     """
     angles = [i for i, coordinate in enumerate(spec.coordinates) if coordinate.kind == "angle"]
     return [_with_wrapped(angles, sample) for sample in samples]
 
 
 def write_steps(policy: Path, spec: EnvironmentSpec, samples: Sequence[NewSample]) -> Path:
-    """Write steps to a new file beside a policy, such as ``policy.steps.npz``. If the folder can't be written to, the
-    file lies in the working directory. A file that exists is never replaced, because it has steps of its own.
+    """Write steps to a new file beside a policy, such as ``policy.steps.npz``, and return its path. If the folder can't
+    be written to, the file is written to the working directory. An existing file is never replaced, because it
+    contains other steps.
 
     Raises:
         OSError: neither folder can be written to.
@@ -48,8 +49,8 @@ def write_steps(policy: Path, spec: EnvironmentSpec, samples: Sequence[NewSample
 
 
 def rewrite_steps(file: Path, spec: EnvironmentSpec, samples: Sequence[NewSample]) -> None:
-    """Replace the steps in a file that ``write_steps`` wrote. Raises ``OSError`` if that fails; the file then stays as
-    it was."""
+    """Replace the steps in a file that ``write_steps`` wrote. Raises ``OSError`` if that fails; the file then stays
+    unchanged."""
     part = file.with_suffix(".part")
     part.write_bytes(_content(spec, samples))
     os.replace(part, file)

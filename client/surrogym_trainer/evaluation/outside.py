@@ -1,6 +1,6 @@
-"""Measure how much of a policy's way lies where a log has no data. Pure.
+"""Measurement of how many of a policy's states are far from the data of a log. All functions are pure.
 
-Shapes: n logged steps, m steps of the way, C coordinates, F action entries.
+Shapes: n logged steps, m steps of the policy, C coordinates, F action entries.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.evaluation.audit import on_one_scale
 
-USUAL = 0.99  # quantile of the distances from each logged step to its nearest one, as the log's own spacing
-FARTHER = 2.0  # a step is outside if no logged step is within this many times that distance
-LITTLE = 0.05  # share of a way that may lie outside
-MOST = 2_000  # most logged steps, and most steps of the way, to compare
-AT_ONCE = 256  # rows of a table of distances
+USUAL = 0.99  # quantile of the distances between neighbouring logged steps, which is the log's own spacing
+FARTHER = 2.0  # a step is outside if no logged step is within this multiple of the log's spacing
+LITTLE = 0.05  # share of the policy's steps that may lie outside without a warning
+MOST = 2_000  # largest number of logged steps, and of steps of the policy, to compare
+AT_ONCE = 256  # number of rows in a table of distances, which limits memory
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Outside:
-    """How far a policy's way leaves a log.
+    """The part of a policy's steps that is far from a log.
 
     Attributes:
-        share: share of the way's steps that are far from every logged one.
-        name: the coordinate that leaves the log in at least half of these steps; empty if there is none.
+        share: share of the policy's steps that are far from every logged one.
+        name: the coordinate that leaves the range of the log in at least half of these steps; empty if there is none.
         way: its smallest and largest value in these steps.
         log: its smallest and largest logged value.
     """
@@ -43,7 +43,7 @@ class Outside:
         return self.share > LITTLE
 
     def words(self) -> str:
-        """Describe in a sentence where the way leaves the log."""
+        """Return a sentence about the part of the policy's steps that is outside the log."""
         where = ""
         if self.name:
             where = (
@@ -54,7 +54,7 @@ class Outside:
 
 
 def outside_of(spec: EnvironmentSpec, q: Array, u: Array, way_q: Array, way_u: Array) -> Outside:
-    """Compare a policy's way with a log.
+    """Compare the states and actions of a policy with a log.
 
     Args:
         spec: specification of the environment.
@@ -76,7 +76,9 @@ def outside_of(spec: EnvironmentSpec, q: Array, u: Array, way_q: Array, way_u: A
     worst = int(np.argmax(beyond))
     share = float(far.mean())
     if beyond[worst] < far.sum() / 2:
-        return Outside(share)  # no single coordinate leaves the log: a gap, several coordinates together, or the action
+        # no single coordinate leaves the log's range, so the cause is a gap, several coordinates together, or the
+        # action
+        return Outside(share)
     values = passed_q[far, worst]
     ends = (float(values.min()), float(values.max()))
     return Outside(share, spec.coordinate_names[worst], ends, (float(low[worst]), float(high[worst])))
@@ -88,7 +90,8 @@ def _thinned(count: int) -> NDArray[np.intp]:
 
 
 def _nearest(points: Array, to: Array, *, itself: bool = False) -> Array:
-    """Distance from each point to the nearest of ``to``, (points,). With ``itself`` both are the same points."""
+    """Return the distance (points,) from each point to the nearest of ``to``; ``itself`` means that both are the same
+    points."""
     found = np.empty(len(points))
     for first in range(0, len(points), AT_ONCE):
         rows = points[first : first + AT_ONCE]

@@ -1,4 +1,4 @@
-"""The promise: the interval of the return that the surrogate predicts for a policy."""
+"""The promise: the interval in which the surrogate expects a policy's mean real return."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from surrogym_trainer.evaluation.imagined import imagine
 from surrogym_trainer.policies.evidence import Promise
 from surrogym_trainer.policies.predict import Predict
 
-FUNCTIONS = 32  # drawn from the posterior
-STARTS = 8  # starts along each function
+FUNCTIONS = 32  # number of functions drawn from the posterior
+STARTS = 8  # number of episodes along each function
 EVALUATION_STARTS = 100  # number of real starts whose mean return is promised
 LOW, HIGH = 0.05, 0.95
-UNNOTICED = 0.02  # share of the policy's gain: an audit does not notice errors that change the return by less
-NORMAL_POINTS = 201  # quantiles of a normal distribution, at equal probabilities
+UNNOTICED = 0.02  # share of the policy's gain; an audit does not notice errors that change the return by less
+NORMAL_POINTS = 201  # number of quantiles that represent a normal distribution
 
 Array = NDArray[np.float64]
 
@@ -48,19 +48,20 @@ def promise_of(
     options = {name: value for name, value in (session or {}).items() if name not in left_out}
     options |= {"variant": "pathwise", "functions": FUNCTIONS, "penalty": 0.0}
     returns = imagine(port, predict, FUNCTIONS * STARTS, seed, **options).returns
-    return interval(returns.reshape(STARTS, FUNCTIONS), floor)  # lane i follows function i modulo FUNCTIONS
+    # environment i of the session follows function i modulo FUNCTIONS
+    return interval(returns.reshape(STARTS, FUNCTIONS), floor)
 
 
 def interval(returns: Array, floor: float | None = None) -> Promise:
-    """Compute the promise from episodes' returns, (starts, functions).
+    """Compute the promise from the returns (starts, functions) of virtual episodes.
 
     The functions' mean returns also differ by chance, because each is over a few starts. So they are shrunk towards
     their common mean until their variance is what the functions alone explain (one-way analysis of variance). Then the
     uncertainty of 100 real starts, and that of the virtual starts, is added.
 
-    All functions share the errors of the model's form: a kink is smooth in each of them. So an error of the return that
-    an audit does not notice is allowed for: ``UNNOTICED`` of the gain over ``floor``, as the 5 % and 95 % quantiles of
-    a normal distribution. No mean return lies beyond the returns of single episodes.
+    All functions share the errors of the model's form: for example, a kink is smooth in each of them. So an error of
+    the return that an audit does not notice is added: ``UNNOTICED`` of the gain over ``floor``, as the 5 % and 95 %
+    quantiles of a normal distribution. The mean return is limited to the range of the single episodes' returns.
     """
     parts = _parts(returns)
     starts, functions = returns.shape
@@ -72,10 +73,10 @@ def interval(returns: Array, floor: float | None = None) -> Promise:
 
 
 class _Parts(NamedTuple):
-    """Variation of returns, split into that of functions and that of starts."""
+    """The variation of returns, split into that between functions and that between starts."""
 
-    functions: Array  # (functions,) mean returns, with the variance that the functions explain
-    within: float  # standard deviation between starts of the returns along one function
+    functions: Array  # (functions,) mean returns, shrunk to the variance that the functions explain
+    within: float  # standard deviation between starts, of the returns along one function
 
 
 def _parts(returns: Array) -> _Parts:

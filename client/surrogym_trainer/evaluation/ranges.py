@@ -1,4 +1,4 @@
-"""Find the end of a sampling range that a policy's way passes often. Pure."""
+"""Search for an end of a sampling range that a policy often exceeds. All functions are pure."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.spec.coordinates import Coordinate, limits
 from surrogym_trainer.policies.evidence import RangeLeft
 
-LITTLE = 0.05  # share of a way that may lie beyond an end
-MOST_UNTESTABLE = 0.2  # share of a way that may lie beyond what the original environment can be set to
+LITTLE = 0.05  # share of a policy's states that may lie beyond an end without a warning
+# share of a policy's states to which the original environment may be unable to be set, without a warning
+MOST_UNTESTABLE = 0.2
 SIDES: tuple[Side, ...] = ("lower", "upper")
 
 Array = NDArray[np.float64]
 
 
 def range_left(spec: EnvironmentSpec, q: Array) -> RangeLeft | None:
-    """Return the end that most states q (m, C) of a way are beyond; None if at most ``LITTLE`` of them are.
+    """Return the end of a sampling range that most of a policy's states q (m, C) exceed; None if at most ``LITTLE`` of
+    them exceed any.
 
-    Angles have no end, and constants and lags follow from the rest.
+    Angles have no ends, and constants and lags follow from the other coordinates.
     """
     found = [_left(coordinate, values, side) for coordinate, values in _with_ends(spec, q) for side in SIDES]
     worst = max(found, key=lambda one: one.share, default=None)
@@ -28,9 +30,12 @@ def range_left(spec: EnvironmentSpec, q: Array) -> RangeLeft | None:
 
 
 def untestable(spec: EnvironmentSpec, q: Array) -> tuple[str, float] | None:
-    """Return the coordinate that most states q (m, C) of a way have beyond what the original environment can be set to,
-    and their share: no audit can test these states. None if at most ``MOST_UNTESTABLE`` of the states are such, or if
-    the environment can't be set to any state. Coordinates as for ``range_left``."""
+    """Return the coordinate that most often prevents the original environment from being set to a policy's states q (m,
+    C), and the share of these states, which no audit can test.
+
+    None if the share is at most ``MOST_UNTESTABLE``, or if the environment can't be set to any state. Angles, constants
+    and lags are left out.
+    """
     if spec.query == "rollout":
         return None
     found = [(coordinate.name, _beyond(coordinate.settable, values)) for coordinate, values in _with_ends(spec, q)]
@@ -39,7 +44,7 @@ def untestable(spec: EnvironmentSpec, q: Array) -> tuple[str, float] | None:
 
 
 def _with_ends(spec: EnvironmentSpec, q: Array) -> list[tuple[Coordinate, Array]]:
-    """Return the coordinates that have ends, each with its values (m,)."""
+    """Return the coordinates whose sampling range has ends, each with its values (m,)."""
     return [(c, q[:, i]) for i, c in enumerate(spec.coordinates) if c.kind == "linear" and c.moves]
 
 

@@ -1,4 +1,4 @@
-"""Controllers of reference: what a policy has to beat, such as the controller in use today."""
+"""Reference controllers, with which a policy is compared, such as the controller in use today."""
 
 from __future__ import annotations
 
@@ -12,22 +12,23 @@ from surrogym_sampler.original.loading import load_factory
 from surrogym_trainer.policies.predict import PerEpisode
 
 Controller = Callable[[NDArray[np.float64]], Any]
-"""An observation (D,) to an action: a number, or (F,)."""
+"""A function from an observation (D,) to an action: a number, or (F,)."""
 
 
 class Reference(PerEpisode):
-    """A controller written by hand.
+    """A controller written by a person.
 
-    Each episode has a controller of its own, so that one with a memory, such as an integral part, begins anew.
+    Each episode has a controller of its own, so that one with a memory, such as an integral part, starts afresh.
     """
 
     def __init__(self, make: Callable[[], Controller]) -> None:
-        """``make`` gives the controller of an episode."""
+        """Set the function ``make``, which makes the controller of an episode."""
         self._make = make
         self._controllers: dict[int, Controller] = {}
 
     def actions(self, episodes: Sequence[int], observations: NDArray[np.float32]) -> NDArray[Any]:
-        """Return actions (N, F). Controllers of episodes that are over are forgotten."""
+        """Return actions (N, F) for observations (N, D) of N episodes. Controllers of episodes that are not among them
+        are dropped."""
         known = self._controllers
         self._controllers = {number: known[number] if number in known else self._make() for number in episodes}
         rows = zip(episodes, observations.astype(np.float64), strict=True)

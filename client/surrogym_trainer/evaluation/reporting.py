@@ -1,6 +1,7 @@
-"""Convert real episodes to the form that the server stores: every return, and a few traces.
+"""Conversion of real episodes to the form that the server stores: every return, and a few traces (episodes step by
+step).
 
-One trace is paired: it is from the same start for every controller in the comparison.
+One of the traces is the paired one: it has the same start for every controller that is compared.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from surrogym_shared import wire
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
 
-MAX_POINTS = 2_000  # most steps of a stored trace; longer ones are cut
-MAX_NUMBERS = 30_000  # most numbers of a trace: a request of at most 4 MiB has four traces
+MAX_POINTS = 2_000  # largest number of steps in a stored trace; longer traces are cut
+MAX_NUMBERS = 30_000  # largest number of numbers in a trace, so that four traces fit in a request of 4 MiB
 
 
 def as_reported(
@@ -27,7 +28,7 @@ def as_reported(
     controller: wire.Controller = "policy",
     paired: int = 0,
 ) -> wire.AddEvaluation:
-    """Convert an evaluation to a request.
+    """Convert an evaluation to the request that stores it.
 
     Args:
         result: the episodes.
@@ -35,8 +36,8 @@ def as_reported(
         key: idempotency key, so that the same evaluation is stored once.
         environment: name of the environment in which the episodes ran; empty for the surrogate's own.
         trained_for: specification that the policy was trained for, if it is known.
-        controller: what chose the actions.
-        paired: number of the episode to compare, see ``paired_start``.
+        controller: kind of the controller that chose the actions.
+        paired: index of the episode to compare, see ``paired_start``.
     """
     shown: dict[wire.TraceRank, int] = {"paired": paired, **result.ranked()}
     return wire.AddEvaluation(
@@ -55,24 +56,26 @@ def as_reported(
 
 
 def is_promised(settings: EvaluationSettings, result: Evaluation, trained_for: EnvironmentSpec | None) -> bool:
-    """Whether episodes are of the kind that a promise is for: declared starts, constants that stay, and the time limit
-    of the policy's specification."""
+    """Return whether episodes are of the kind to which a promise applies: declared starts, unchanged constants, and the
+    time limit of the policy's specification."""
     return settings.declared and not result.varied and not has_other_limit(result, trained_for)
 
 
 def has_other_limit(result: Evaluation, trained_for: EnvironmentSpec | None) -> bool:
-    """Whether the episodes had another time limit than the specification of the policy."""
+    """Return whether the episodes had another time limit than the specification that the policy was trained for."""
     return trained_for is not None and result.limit != trained_for.time_limit
 
 
 def paired_start(result: Evaluation, among: int) -> int:
-    """Return which of the first ``among`` starts to compare: the one from which the policy had its median return."""
+    """Return the index of the start to compare: of the first ``among`` episodes, the one in which the policy had its
+    median return."""
     order = np.argsort(result.returns[:among], kind="stable")
     return int(order[(len(order) - 1) // 2])
 
 
 def words_of(settings: EvaluationSettings, varied: Sequence[str] = ()) -> str:
-    """Describe the starts, the environment's perturbation, and constants that ``varied`` within an episode."""
+    """Return a description of the starts, of the environment's perturbation, and of constants that ``varied`` within an
+    episode."""
     starts = "declared starts"
     if settings.wide:
         starts = "starts anywhere in the sampling range"
@@ -91,7 +94,7 @@ def _note(settings: EvaluationSettings, result: Evaluation, trained_for: Environ
 
 
 def _trace(rank: wire.TraceRank, seed: int, trace: Trace) -> wire.EpisodeTrace:
-    numbers = np.shape(trace.coordinates)[1] + np.shape(trace.action)[1] + 1  # of a step
+    numbers = np.shape(trace.coordinates)[1] + np.shape(trace.action)[1] + 1  # numbers in one step
     steps = min(len(trace.reward), MAX_POINTS, MAX_NUMBERS // numbers)
     return wire.EpisodeTrace(
         rank=rank,

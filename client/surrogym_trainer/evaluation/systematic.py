@@ -1,4 +1,4 @@
-"""Test the errors of real steps together: do they have a part that all of them share? Pure.
+"""A joint test of the errors of real steps: do they have a part that all steps share? All functions are pure.
 
 A model can be right in each single step, within its tolerance, and wrong in all of them by the same amount. A return
 sums such errors up. So the signed errors e (n,) of an output are compared under two hypotheses:
@@ -9,8 +9,8 @@ sums such errors up. So the signed errors e (n,) of an output are compared under
 - ``shifted``: e ~ N(0, s^2 (V + t^2 A)), where A is 1 1' (the same error everywhere) or F F' (an error that depends on
   where the step is), and t has one of the sizes ``SIZES``, all as likely.
 
-The scale s is that of the errors on the policy's way, where they may be much smaller than over the whole range. It is
-unknown, with the conjugate prior of ``DEGREES`` degrees of freedom at c, and integrated out.
+The scale s is that of the errors in states that the policy visits, where they may be much smaller than over the whole
+range. It is unknown, with the conjugate prior of ``DEGREES`` degrees of freedom at c, and integrated out.
 
 The evidence is the mean over outputs, forms and sizes of the likelihood ratio. For a right model its expectation is 1,
 also if steps are added one after the other. So it exceeds 1 / a at any time with probability a at most (Ville's
@@ -36,17 +36,18 @@ from numpy.typing import NDArray
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import Residual
 
-SIZES = tuple(2.0**i for i in range(-1, 6))  # of a shared error, in standard deviations of the others
-DEGREES = 0.1  # of freedom, of the prior of the errors' scale: it hardly says more than that the scale is unknown
-FARTHEST = 3.0  # deviations to which a standardised input is limited, as in a session
-LEAST = 1e-3  # of the tolerance: least error that a model may claim on left-out samples
-PARTS = 3  # ranges of one input, of equal numbers of steps, in which the mean error is looked at
+# possible sizes of a shared error, in standard deviations of the other errors
+SIZES = tuple(2.0**i for i in range(-1, 6))
+DEGREES = 0.1  # degrees of freedom of the prior of the errors' scale; so few leave the scale almost unknown
+FARTHEST = 3.0  # standard deviations to which a standardised input is clipped, as in a session
+LEAST = 1e-3  # smallest error on left-out samples that a model may have in the test, as a share of the tolerance
+PARTS = 3  # number of ranges of an input, with equal numbers of steps, whose mean errors are compared
 
 Array = NDArray[np.float64]
 
 
 def columns(spec: EnvironmentSpec, q: Array, u: Array) -> Array:
-    """States q (m, C), with cosine and sine in place of angles, and actions u (m, F), as columns (m, P)."""
+    """Return states q (m, C) and actions u (m, F) as columns (m, P); an angle becomes its cosine and sine."""
     found: list[Array] = []
     for index, coordinate in enumerate(spec.coordinates):
         column = q[:, index : index + 1]
@@ -56,46 +57,51 @@ def columns(spec: EnvironmentSpec, q: Array, u: Array) -> Array:
 
 
 class Inputs(NamedTuple):
-    """How inputs are standardised: by their mean and standard deviation over a policy's way."""
+    """The standardisation of inputs, by their mean and standard deviation over the states that a policy visits."""
 
     centre: Array  # (P,)
     scale: Array  # (P,)
 
     @classmethod
     def over(cls, spec: EnvironmentSpec, q: Array, u: Array) -> Self:
-        """Take mean and standard deviation of states q (m, C) and actions u (m, F)."""
+        """Return the standardisation by mean and standard deviation of states q (m, C) and actions u (m, F)."""
         at = columns(spec, q, u)
         spread = at.std(0)
         return cls(at.mean(0), np.where(spread > 1e-9 * (1 + np.abs(at).max(0)), spread, 1.0))
 
     def at(self, spec: EnvironmentSpec, q: Array, u: Array) -> Array:
-        """Standardised inputs with a constant, (n, 1 + P)."""
+        """Return standardised inputs with a constant, (n, 1 + P), for states q (n, C) and actions u (n, F)."""
         x = ((columns(spec, q, u) - self.centre) / self.scale).clip(-FARTHEST, FARTHEST)
         joined: Array = np.concatenate([np.ones((len(x), 1)), x], 1)
         return joined
 
     def residual(self, weights: Array) -> Residual:
-        """The option of a session for weights (K, O, 1 + P)."""
+        """Return the session option that adds errors with weights (K, O, 1 + P) to the model."""
         return Residual(centre=self.centre.tolist(), scale=self.scale.tolist(), weights=weights.tolist())
 
 
 class _Form(NamedTuple):
-    """One way in which an output may be wrong: prior variances of its weights (1 + P,), and how well it explains the
+    """One form that an output's error may have: prior variances of its weights (1 + P,), and how well it explains the
     errors."""
 
     variances: Array
-    evidence: float  # likelihood ratio to ``right``
-    mean: Array  # (1 + P,) of the weights, given the errors
-    root: Array  # (1 + P, 1 + P) square root of their covariance
+    evidence: float  # likelihood ratio to the hypothesis that the model is right
+    mean: Array  # (1 + P,) posterior mean of the weights
+    root: Array  # (1 + P, 1 + P) square root of the weights' posterior covariance
 
     @classmethod
     def of(cls, errors: Array, x: Array, variances: Array) -> Self:
-        """Explain errors (n,) at inputs x (n, 1 + P). Both are whitened: without a shared part, the covariance of the
-        errors is the identity, times an unknown factor. With one it is I + x diag(variances) x', whose inverse and
-        determinant follow from matrices of the size of the weights (Woodbury)."""
+        """Explain errors (n,) by inputs x (n, 1 + P) with weights of these prior variances.
+
+        Both are whitened: without a shared part, the covariance of the errors is the identity, times an unknown factor.
+        With one it is I + x diag(variances) x', whose inverse and determinant follow from matrices of the size of the
+        weights (Woodbury).
+        """
         scales, n = np.sqrt(variances), len(errors)
         precision = np.eye(len(scales)) + scales[:, None] * (x.T @ x) * scales
-        covariance = scales[:, None] * np.linalg.solve(precision, np.diag(scales))  # of the weights
+        covariance = scales[:, None] * np.linalg.solve(
+            precision, np.diag(scales)
+        )  # posterior covariance of the weights
         score = x.T @ errors
         right = DEGREES + float(errors @ errors)
         wrong = max(right - float(score @ covariance @ score), DEGREES)
@@ -107,12 +113,12 @@ class _Form(NamedTuple):
 
 @dataclass(frozen=True)
 class Systematic:
-    """What all errors of real steps share.
+    """The result of the joint test: the part of the errors that all real steps share.
 
     Attributes:
         names: names of the outputs, (O,).
-        inputs: how inputs are standardised.
-        forms: of each output, the ways in which it may be wrong.
+        inputs: the standardisation of the inputs.
+        forms: for each output, the forms that its error may have.
     """
 
     names: tuple[str, ...]
@@ -121,7 +127,7 @@ class Systematic:
 
     @property
     def evidence(self) -> float:
-        """Evidence against a right model; at most 1 / a of right models ever exceed a."""
+        """The evidence against a right model; for a share of at most 1 / a of right models it ever exceeds a."""
         return float(np.mean(self._by_output))
 
     @cached_property
@@ -130,14 +136,16 @@ class Systematic:
 
     @cached_property
     def chances(self) -> Array:
-        """Probability (O,) that each output is shifted, if one in two models has a single one that is."""
+        """The probability (O,) that each output is shifted, if a priori every second model has a single
+        shifted output."""
         odds: Array = self._by_output / len(self.names)
         return odds / (1 + odds)
 
     def draws(self, count: int, rng: np.random.Generator, wrong: NDArray[np.bool_] | None = None) -> Array:
-        """Draw weights (count, O, 1 + P) that the errors support; those of an output that is right are 0.
+        """Draw weights (count, O, 1 + P) of the shared error from their posterior; those of an output that is right are
+        0.
 
-        None of the outputs that are ``wrong`` (O,) is right: their errors have shown it by their size.
+        Outputs that are ``wrong`` (O,) are always shifted, because the size of their errors has shown it.
         """
         size = len(self.inputs.centre) + 1
         weights = np.zeros((count, len(self.names), size))
@@ -150,7 +158,8 @@ class Systematic:
         return weights
 
     def expected(self) -> Array:
-        """Mean weights (O, 1 + P) of the outputs that are shifted more likely than not; the others' are 0."""
+        """Return the mean weights (O, 1 + P) of the outputs that are more likely shifted than not; the
+        others' are 0."""
         size = len(self.inputs.centre) + 1
         weights = np.zeros((len(self.names), size))
         for o in np.flatnonzero(self.chances > 0.5).tolist():
@@ -162,14 +171,14 @@ class Systematic:
 def systematic(
     names: Sequence[str], errors: Array, deviations: Array, claimed: Array, inputs: Inputs, x: Array
 ) -> Systematic:
-    """Test errors (n, O) together.
+    """Test whether errors (n, O) have a part that all steps share.
 
     Args:
         names: names of the outputs, (O,).
         errors: real minus predicted values (n, O).
         deviations: predicted standard deviations of the function (n, O).
         claimed: error (O,) of the model on left-out samples, which includes the noise.
-        inputs: how inputs are standardised.
+        inputs: the standardisation of the inputs.
         x: standardised inputs of the steps with a constant, (n, 1 + P).
     """
     constant = np.eye(x.shape[1])[0]
@@ -187,7 +196,7 @@ def systematic(
 
 
 class Region(NamedTuple):
-    """Range of one input in which an output errs most, with the mean error there."""
+    """The range of one input in which an output's error is largest, with the mean error there."""
 
     name: str
     low: float
@@ -196,11 +205,12 @@ class Region(NamedTuple):
 
 
 def region(names: Sequence[str], values: Array, errors: Array) -> Region | None:
-    """Return where the mean of errors (n,) differs most from that of the other steps, beyond four standard errors.
+    """Return the range of one input in which the mean of errors (n,) differs most from that of the other steps, by more
+    than four standard errors; None if there is none.
 
     Args:
-        names: names of the columns, (P,).
-        values: value of each column at the steps, (n, P).
+        names: names of the inputs, (P,).
+        values: value of each input at the steps, (n, P).
         errors: real minus predicted values (n,).
     """
     best, found = 4.0, None

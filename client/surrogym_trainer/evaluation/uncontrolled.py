@@ -1,6 +1,6 @@
 """Baselines without a policy: always the same action, or random ones.
 
-A policy's return means little by itself. The return without a policy, from the same starts, shows what the policy adds.
+The return of a baseline from the same starts shows how much of a policy's return is due to the policy.
 """
 
 from __future__ import annotations
@@ -26,7 +26,12 @@ def default_baseline(spec: EnvironmentSpec) -> Controller:
 
 
 def baseline(spec: EnvironmentSpec, controller: Controller, seed: int = 0) -> Predict:
-    """Return a function of observations (N, D) that ignores them.
+    """Return a policy that ignores its observations (N, D).
+
+    Args:
+        spec: specification of the environment.
+        controller: ``zero`` for an action of zero, ``random`` for random actions.
+        seed: seed of the random actions.
 
     Raises:
         ValueError: the controller is unknown, or ``zero`` for an environment without an action of zero.
@@ -34,7 +39,7 @@ def baseline(spec: EnvironmentSpec, controller: Controller, seed: int = 0) -> Pr
     if controller == "random":
         return _random(spec, np.random.default_rng(seed))
     if controller != "zero":
-        raise ValueError(f"expected zero or random, got {controller}")
+        raise ValueError(f"expected the controller zero or random, got {controller}")
     if default_baseline(spec) != "zero":
         raise ValueError(
             "the environment's actions do not include zero, so the controller zero can't act: compare with random "

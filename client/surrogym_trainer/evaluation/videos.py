@@ -1,6 +1,6 @@
-"""Videos of real episodes: the best, the median and the worst beside each other, drawn from their states.
+"""Videos of real episodes: the best, the median and the worst side by side, drawn from their recorded states.
 
-No real step is taken for them. A frame is (height, width, 3) uint8.
+No real step is taken for a video. A frame is (height, width, 3) uint8.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 
 Form = Literal["mp4", "gif"]
 FORMS: tuple[Form, ...] = ("mp4", "gif")
-PANEL = 240  # pixels of width of one episode
-LINE, TEXT = 20, 13  # pixels of height of a line, and of its text
-MOST_FRAMES = 600  # of a video: longer episodes are shown faster
-GIF_FRAMES_PER_SECOND = 10  # a GIF of all frames has six times the size of an MP4
+PANEL = 240  # width of one episode's picture in pixels
+LINE, TEXT = 20, 13  # height of a line and of its text in pixels
+MOST_FRAMES = 600  # largest number of frames in a video; longer episodes are shown faster
+GIF_FRAMES_PER_SECOND = 10  # a GIF with all frames would be six times as large as an MP4
 INK, PAPER = (23, 32, 42), (255, 255, 255)
 
 
 @dataclass(frozen=True)
 class Video:
-    """The content of a video file, and its form."""
+    """A video file: its format, and its content."""
 
     form: Form
     content: bytes
@@ -43,27 +43,27 @@ class Video:
 
 @dataclass(frozen=True)
 class _Panel:
-    """One episode, and what is written above it."""
+    """One episode of a video, and its heading."""
 
     title: str
     trace: Trace
 
     def at(self, step: int) -> int:
-        """Return the step to draw: an episode that is over stays at its end."""
+        """Return the index of the state to draw at a step; after the episode's end it is the last state."""
         return min(step, len(self.trace.coordinates) - 1)
 
 
 def record(spec: EnvironmentSpec, original: str | None, result: Evaluation, caption: str) -> Video:
-    """Draw the best, the median and the worst of some real episodes.
+    """Make a video of the best, the median and the worst of some real episodes.
 
     Args:
         spec: specification of the environment.
         original: name of the environment; ``package.module:factory`` needs a method ``picture``.
         result: the episodes.
-        caption: a line for the foot of the video, such as which starts it shows.
+        caption: a line for the foot of the video, such as the kind of starts.
 
     Raises:
-        NotRenderable: the environment has no picture, or what a video needs is not installed.
+        NotRenderable: the environment can't be drawn, or a package that a video needs is not installed.
     """
     try:
         import PIL  # noqa: F401
@@ -74,13 +74,13 @@ def record(spec: EnvironmentSpec, original: str | None, result: Evaluation, capt
         fps = max(1, renderer.frames_per_second)
         try:
             return Video("mp4", _mp4(_frames(renderer, panels, caption, 1), fps))
-        except (ImportError, RuntimeError, OSError):  # no ffmpeg for this machine, or one that fails
+        except (ImportError, RuntimeError, OSError):  # ffmpeg is missing on this machine, or fails
             every = max(1, round(fps / GIF_FRAMES_PER_SECOND))
             return Video("gif", _gif(_frames(renderer, panels, caption, every), every / fps))
 
 
 def _frames(renderer: Renderer, panels: list[_Panel], caption: str, every: int) -> Iterator[Image]:
-    """All episodes side by side, one frame for each ``every`` steps, or fewer in long episodes."""
+    """Yield frames with all episodes side by side, one for each ``every`` steps, or fewer in long episodes."""
     steps = max(len(panel.trace.coordinates) for panel in panels)
     faster = math.ceil(steps / MOST_FRAMES)
     words = caption if faster == 1 else f"{caption}; one of {faster} steps is shown"
@@ -103,7 +103,7 @@ def _scaled(picture: Picture) -> Image:
 
 
 def _composed(drawn: list[Image], headings: list[str], caption: str) -> Image:
-    """Panels with their headings and the caption. Sides are even numbers, as MP4 needs them."""
+    """Return a frame of pictures with their headings and the caption. Its sides are even numbers, as MP4 requires."""
     from PIL import Image, ImageDraw, ImageFont
 
     height = max(picture.height for picture in drawn) + 2 * LINE
@@ -124,7 +124,8 @@ def _mp4(frames: Iterator[Image], fps: int) -> bytes:
     first = next(frames)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "video.mp4"
-        web: Any = ["-movflags", "+faststart", "-pix_fmt", "yuv420p"]  # plays in browsers, from its first bytes on
+        # settings with which browsers can play the file before it is loaded completely
+        web: Any = ["-movflags", "+faststart", "-pix_fmt", "yuv420p"]
         writer = imageio_ffmpeg.write_frames(
             str(path), first.size, fps=fps, macro_block_size=2, output_params=web, ffmpeg_log_level="error"
         )
@@ -137,7 +138,8 @@ def _mp4(frames: Iterator[Image], fps: int) -> bytes:
 
 
 def _gif(frames: Iterator[Image], seconds: float) -> bytes:
-    """Plays once: what moves for longer and can't be stopped disturbs a reader."""
+    """Encode frames, each shown for ``seconds``, as a GIF that plays once, because an endless animation disturbs a
+    reader."""
     from PIL.Image import Palette
 
     first, *rest = (frame.convert("P", palette=Palette.ADAPTIVE, colors=64) for frame in frames)

@@ -1,4 +1,4 @@
-"""The card beside a policy's file: what the policy was trained for, and with which result."""
+"""The card beside a policy's file: what the policy was trained for, with which settings and results."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class UnusablePolicy(SurrogymClientError):
 
 
 class NotedAddress(RootModel[str]):
-    """Address of a server that a file names.
+    """The address of a server that a file contains.
 
-    It is not a ``str``, so that no code connects to it by mistake. Only a person chooses the address that receives a
+    It is not a ``str``, so that no code connects to it by mistake: only a person chooses the address that receives a
     token.
     """
 
@@ -36,12 +36,12 @@ class NotedAddress(RootModel[str]):
 
 
 class PolicyCard(BaseModel):
-    """Card of a policy: what it was trained for, its settings and its results.
+    """The card of a policy: what it was trained for, its settings and its results.
 
-    It is stored in a JSON file of the same name beside the policy.
+    It is stored beside the policy in a JSON file of the same name.
     """
 
-    model_config = ConfigDict(extra="ignore", frozen=True)  # the file has fields that are not read here
+    model_config = ConfigDict(extra="ignore", frozen=True)  # newer versions may write further fields
 
     algorithm: str = DEFAULT_ALGORITHM
     surrogate: SurrogateName | None = None
@@ -49,17 +49,17 @@ class PolicyCard(BaseModel):
     spec: EnvironmentSpec | None = None
     seed: int | None = None
     virtual_steps: int | None = None
-    model: str = ""  # hash of the samples of the model that the promise is of
+    model: str = ""  # hash of the samples of the model that the promise comes from
     seconds: float | None = None
     imagined_return: float | None = None
     visited_confidence: tuple[float | None, ...] = ()
-    untrained: float | None = None  # imagined return of a network that has learned nothing
+    untrained: float | None = None  # imagined return of an untrained network
     promise: Promise | None = None
     audit: Audit | None = None
-    trusted: bool | None = None  # None: the promise was not judged
-    reason: str = ""  # why the promise is trusted, or not
+    trusted: bool | None = None  # whether the promise is supported; None if it was not judged
+    reason: str = ""  # why the promise is trusted or not
     curve: tuple[CurvePoint, ...] = ()  # training curve
-    networks: int = 1  # networks of the last training
+    networks: int = 1  # number of networks in the last training
     settings: dict[str, Any] = Field(default_factory=dict)
     versions: dict[str, str] = Field(default_factory=dict)
 
@@ -70,10 +70,10 @@ def card_path(policy: Path) -> Path:
 
 
 def require_card_or_none(policy: Path) -> None:
-    """Refuse a path whose card would replace another kind of file, such as a specification.
+    """Raise an error if the card of a policy would replace another kind of file, such as a specification.
 
     Raises:
-        UnusablePolicy: there is a JSON file of this name that is no card.
+        UnusablePolicy: a JSON file with the card's name exists and is not a card.
     """
     path = card_path(policy)
     if not path.exists():
@@ -83,16 +83,18 @@ def require_card_or_none(policy: Path) -> None:
     except (ValueError, TypeError, RecursionError):
         known = False
     if not known:
-        raise UnusablePolicy(f"the card of {policy} would replace {path}, which is no card: choose another file")
+        raise UnusablePolicy(
+            f"the card of {policy} would replace {path}, which is not a card: choose another name for the policy"
+        )
 
 
 def write_card(policy: Path, card: PolicyCard) -> None:
-    """Write the card beside the policy."""
+    """Write the card of a policy to the JSON file beside it."""
     card_path(policy).write_text(card.model_dump_json(indent=2) + "\n", encoding="utf-8")
 
 
 def read_card(policy: Path) -> PolicyCard:
-    """Read the card of a policy. Without a card, return an empty one.
+    """Read the card of a policy; the result is an empty card if there is none.
 
     Raises:
         UnusablePolicy: the card is invalid, or has more than ``MAX_CARD_BYTES``.
@@ -106,7 +108,8 @@ def read_card(policy: Path) -> PolicyCard:
         content = file.read(MAX_CARD_BYTES + 1)
     if len(content) > MAX_CARD_BYTES:
         raise UnusablePolicy(
-            f"{card_path(policy)} is not the card of a policy: expected at most {MAX_CARD_BYTES} bytes; get it anew"
+            f"{card_path(policy)} is not the card of a policy: expected at most {MAX_CARD_BYTES} bytes; download it "
+            "again"
         )
     try:
         return PolicyCard.model_validate_json(content)

@@ -1,4 +1,4 @@
-"""What a check of a deployed controller has found, as a file in the controller's folder."""
+"""The result of a check of a deployed controller, as a file in the controller's folder."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ Count = Annotated[int, Field(ge=0, le=10**12)]
 
 
 class UnusableCheck(SurrogymClientError):
-    """The folder has no check of this policy."""
+    """The folder has no valid check of this policy's controller."""
 
 
 class StoredCheck(BaseModel):
-    """A check of a controller beside its policy, over the same starts."""
+    """The result of a controller and of its policy from the same starts."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
@@ -40,7 +40,7 @@ class StoredCheck(BaseModel):
 
 
 def write_check(folder: Path, check: StoredCheck) -> Path:
-    """Write a check into the folder of its controller, and return the file."""
+    """Write a check into the folder of its controller, and return the file's path."""
     path = folder / FILE
     path.write_text(check.model_dump_json(indent=2) + "\n", encoding="utf-8")
     return path
@@ -50,7 +50,7 @@ def read_check(folder: Path, policy: str) -> StoredCheck:
     """Read the check of a policy's controller.
 
     Args:
-        folder: of the controller.
+        folder: the controller's folder.
         policy: SHA-256 of the policy's file.
 
     Raises:
@@ -71,7 +71,12 @@ def read_check(folder: Path, policy: str) -> StoredCheck:
     try:
         check = StoredCheck.model_validate_json(content)
     except ValidationError as error:
-        raise UnusableCheck(f"{path} is not the check of a controller: {first_fault(error)}") from error
+        raise UnusableCheck(
+            f"{path} is not the check of a controller: {first_fault(error)}; run surrogym deploy --check"
+        ) from error
     if check.policy != policy:
-        raise UnusableCheck(f"expected {path} to be of the report's policy, got the check of another one")
+        raise UnusableCheck(
+            f"expected {path} to be a check of the report's policy, got one of another policy: run surrogym deploy "
+            "--check"
+        )
     return check

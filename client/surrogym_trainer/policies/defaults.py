@@ -1,14 +1,14 @@
-"""Defaults of policies and their training, for all libraries. Importing this needs no torch."""
+"""Default settings of policies and their training, for all libraries. Importing this module does not import torch."""
 
-HIDDEN = 32  # units of the one layer of the paper's actor
-WIDER = (64, 64)  # replaces the paper's, whose return on Pendulum is lower by 20
+HIDDEN = 32  # units of the single layer of the paper's actor
+WIDER = (64, 64)  # units of the layers of the default actor; the paper's has a return that is lower by 20 on Pendulum
 CRITIC = (64, 64)
 EXPLORATION = 0.5  # initial standard deviation of a continuous action, as a share of half its range
-LANES = 128  # lanes of a session for an on-policy algorithm
+LANES = 128  # number of environments in a session of an on-policy algorithm
 LEARNING_RATE = 3e-3
 LAST_RATE = 0.02  # final learning rate, as a share of the initial one
 
 
 def decaying(remaining: float) -> float:
-    """Learning rate of PPO, given the share of the training that remains."""
+    """Return PPO's learning rate, given the share of the training that remains."""
     return LEARNING_RATE * max(remaining, LAST_RATE)

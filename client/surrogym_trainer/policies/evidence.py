@@ -1,4 +1,4 @@
-"""Evidence for a policy, as its card has it: a promise, and an audit."""
+"""The evidence for a policy that its card contains: a promise, and an audit."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from surrogym_shared.kinds import Side
 
 
 class Promise(BaseModel):
-    """Interval of the mean return over 100 real starts, as the surrogate predicts it.
+    """The interval in which the surrogate expects the mean return over 100 real starts.
 
-    It is a distribution over starts, and over functions that agree with the samples.
+    The expectation is a distribution over starts, and over functions that agree with the samples.
 
     Attributes:
         median: median of this distribution.
@@ -30,14 +30,14 @@ class Promise(BaseModel):
 
 
 class RangeLeft(BaseModel):
-    """Where a policy's way leaves the sampling range, so that the design requested no real step there.
+    """The end of a sampling range that a policy's states exceed most often. The design took no samples beyond it.
 
     Attributes:
         coordinate: name of the coordinate.
-        side: the end of the range that the way passes.
+        side: whether it is the lower or the upper end.
         end: value of this end.
-        share: share of the way's states beyond it.
-        farthest: the state farthest beyond it.
+        share: share of the policy's states beyond it.
+        farthest: the value farthest beyond it.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -50,23 +50,23 @@ class RangeLeft(BaseModel):
 
 
 class Audit(BaseModel):
-    """Result of an audit.
+    """The result of an audit: real steps on the policy's states, compared with the model.
 
     Attributes:
         steps: number of real steps.
-        elsewhere: how many of them were taken in gaps of the samples, off the policy's way.
-        episodes: number of whole episodes that the steps are of; 0 if they are single steps or a part of an episode.
+        elsewhere: number of those that were taken in gaps of the samples, in states that the policy does not visit.
+        episodes: number of whole episodes that the steps form; 0 if they are single steps or a part of an episode.
         untested: share of the policy's states that are far from every step of the audit, if states can't be set.
         unanswered: number of further queries, at which the original environment failed.
-        untestable: a coordinate that many of the policy's states have beyond what the original environment can be set
-            to, and the share of these states; None if they are few.
-        passed: whether the promise stands.
+        untestable: the coordinate that most often prevents the original environment from being set to the policy's
+            states, and the share of these states; None if they are few.
+        passed: whether the promise is supported.
         faults: what was wrong, one sentence each; empty if the audit passed.
         errors: root mean square of the prediction errors of each output, in the output's unit.
         expected: the errors that the model expected, in the same form.
         before: promise before the audit.
         after: promise of the model that has learned from the audit's steps.
-        range_left: where the policy's way leaves the sampling range most often; None if it hardly does.
+        range_left: the end of a sampling range that the policy exceeds most often; None if it hardly exceeds any.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")

@@ -29,8 +29,8 @@ from surrogym_trainer.policies.files import load_learner
 from surrogym_trainer.policies.onnx_files import from_onnx
 from surrogym_trainer.policies.predict import Predict
 
-CHECKS = 1_000  # random observations on which both forms are compared
-TOLERANCE = 1e-5  # largest difference, as a share of an action's range
+CHECKS = 1_000  # number of random observations on which policy and export are compared
+TOLERANCE = 1e-5  # largest difference of actions, as a share of their range
 Form = Callable[[ExportedProgram], bytes]
 
 
@@ -39,7 +39,7 @@ class NotExportable(SurrogymClientError):
 
 
 class MostProbable(nn.Module):
-    """Most probable action of a Stable-Baselines3 policy, equal to its ``predict``."""
+    """The most probable action of a Stable-Baselines3 policy as a torch module; it equals the policy's ``predict``."""
 
     low: Tensor
     high: Tensor
@@ -63,7 +63,7 @@ class MostProbable(nn.Module):
 
 
 class ArrayNetwork(nn.Module):
-    """Torch module of a ``Network`` of arrays. It computes in float64, as the network does."""
+    """A ``Network`` of arrays as a torch module. It computes in float64, as the network does."""
 
     mean: Tensor
     deviation: Tensor
@@ -102,10 +102,10 @@ def export_policy(policy: Path, out: Path, algorithm: str, *, trust: bool = Fals
         policy: policy file from ``surrogym train`` or Stable-Baselines3.
         out: file to write.
         algorithm: name of the Stable-Baselines3 class; a network of arrays needs none.
-        trust: unpickle the policy's objects, which runs any code that is in them.
+        trust: whether to unpickle the policy's objects, which runs any code that is in them.
 
     Raises:
-        NotExportable: another ending, or actions that differ.
+        NotExportable: ``out`` has another ending, or the actions differ.
         UnusablePolicy: the file is not a policy of the algorithm, or it needs ``trust``.
         ModuleNotFoundError: ONNX needs the extra ``export``.
     """
@@ -127,10 +127,10 @@ def export_policy(policy: Path, out: Path, algorithm: str, *, trust: bool = Fals
 
 
 def to_onnx(program: ExportedProgram) -> bytes:
-    """Convert the program to ONNX.
+    """Convert a ``torch.export`` program to ONNX.
 
     Raises:
-        ModuleNotFoundError: the extra ``export`` is missing.
+        ModuleNotFoundError: the extra ``export`` is not installed.
     """
     import onnx  # noqa: F401  said to be missing before torch says that its own converter is
     import onnxscript  # noqa: F401
@@ -177,22 +177,23 @@ def _difference(ours: Predict, theirs: Predict, size: int) -> float:
     expected, got = ours(observations), theirs(observations)
     if expected.shape != got.shape:
         raise NotExportable(
-            f"expected the file to give actions of shape {expected.shape}, got {got.shape}: use the policy's "
+            f"expected the exported file to give actions of shape {expected.shape}, got {got.shape}: use the policy's "
             "zip file instead"
         )
     largest = float(np.abs(expected.astype(np.float64) - got).max())
     bound = TOLERANCE * max(float(np.ptp(expected)), 1.0) if expected.dtype.kind == "f" else 0.0
     if not largest <= bound:
         raise NotExportable(
-            f"expected the file to give the policy's actions, got actions that differ by up to {largest:g}"
+            f"expected the exported file to give the policy's actions, got actions that differ by up to {largest:g}: "
+            "use the policy's zip file instead"
         )
     return largest
 
 
 @contextmanager
 def _quietly() -> Iterator[None]:
-    """Silence warnings of the exporters. Also turn off the checks of distributions, whose numbers are unknown in an
-    export."""
+    """Silence warnings of the exporters, and turn off torch's checks of distributions, which fail in an export because
+    no numbers are known."""
     checked = torch.distributions.Distribution._validate_args
     logging.disable(logging.WARNING)
     torch.distributions.Distribution.set_default_validate_args(False)

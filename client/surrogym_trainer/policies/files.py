@@ -1,4 +1,4 @@
-"""Read policy files without running code from them: those of Stable-Baselines3, networks of arrays, and ONNX."""
+"""Readers of policy files that run no code from them: those of Stable-Baselines3, networks of arrays, and ONNX."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ from surrogym_trainer.policies.predict import Predict
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-BUFFERLESS = {"n_envs": 1, "n_steps": 1, "buffer_size": 1}  # a policy that only acts needs no memory for experience
-FAMILIES = ("PPO", "SAC", "TD3", "DQN")  # of networks; A2C has PPO's, DDPG has TD3's
+# settings that save memory, because a policy that only acts stores no experience
+BUFFERLESS = {"n_envs": 1, "n_steps": 1, "buffer_size": 1}
+FAMILIES = ("PPO", "SAC", "TD3", "DQN")  # algorithms with different networks; A2C has PPO's, DDPG has TD3's
 ONNX = ".onnx"
 
 
 def require_policy(path: Path) -> None:
-    """Refuse a file that can't be a policy, by its first bytes, before anything is done for it.
+    """Raise an error if a file can't be a policy, judged by its first bytes, before any other work.
 
     Raises:
         UnusablePolicy: it is neither a ZIP file nor called ``.onnx``.
@@ -46,7 +47,12 @@ def require_policy(path: Path) -> None:
 
 
 def card_of_policy(path: Path) -> PolicyCard:
-    """Read the card of a file that may be a policy. Raises as ``require_policy`` and ``read_card``."""
+    """Read the card of a file, after a check that the file may be a policy.
+
+    Raises:
+        UnusablePolicy: the file can't be a policy, or its card is invalid.
+        FileNotFoundError: there is no such file.
+    """
     require_policy(path)
     return read_card(path)
 
@@ -59,7 +65,7 @@ def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM, *, trust: bool =
         path: file from ``surrogym train``, ``Network.save`` or ``surrogym export-policy``; or, with ``trust``, from
             ``save`` of a Stable-Baselines3 algorithm.
         algorithm: name of the Stable-Baselines3 class; a network of arrays and ONNX need none.
-        trust: unpickle a policy's objects, which runs any code that is in them.
+        trust: whether to unpickle the policy's objects, which runs any code that is in them.
 
     Raises:
         UnusablePolicy: the algorithm is unknown, the file is not one of its policies, it needs ``trust``, or it learned
@@ -97,7 +103,7 @@ def load_learner(
     Args:
         path: file from ``save_policy``; or, with ``trust``, from ``save`` of the algorithm.
         algorithm: name of its class.
-        trust: unpickle its objects, which runs any code that is in them.
+        trust: whether to unpickle its objects, which runs any code that is in them.
         changes: environment, seed and hyperparameters that replace the saved ones; the algorithm can only learn with an
             environment.
 
@@ -115,7 +121,7 @@ def load_learner(
 
 
 def _normalisation(path: Path, model: BaseAlgorithm) -> Normalisation | None:
-    """How the policy's observations are normalised; None if they are not."""
+    """Return the normalisation of a policy's observations; None if they are not normalised."""
     if not is_normalised(model):
         return None
     if not statistics_path(path).is_file():
@@ -124,7 +130,7 @@ def _normalisation(path: Path, model: BaseAlgorithm) -> Normalisation | None:
 
 
 def read_learner(path: Path, algorithm: str, trust: bool, changes: dict[str, Any]) -> BaseAlgorithm:
-    """Load an algorithm from its file. Arguments and errors as of ``load_learner``."""
+    """Load an algorithm of Stable-Baselines3 from its file. Arguments and errors are those of ``load_learner``."""
     import stable_baselines3
 
     kind = getattr(stable_baselines3, algorithm.upper(), None)
@@ -135,7 +141,9 @@ def read_learner(path: Path, algorithm: str, trust: bool, changes: dict[str, Any
     except UnusablePolicy:
         raise
     except pickle.UnpicklingError as error:
-        raise UnusablePolicy(f"{path}: expected weights that are numbers, got other pickled objects") from error
+        raise UnusablePolicy(
+            f"{path}: expected weights that are numbers, got other pickled objects: save the policy again"
+        ) from error
     except Exception as error:  # a malformed file can raise anything
         if changes:
             read_learner(path, algorithm, trust, {})
@@ -147,12 +155,12 @@ def read_learner(path: Path, algorithm: str, trust: bool, changes: dict[str, Any
 
 
 def _fits(algorithm: str, path: Path, trust: bool) -> bool:
-    """Whether a file is a policy of an algorithm of Stable-Baselines3."""
+    """Return whether a file is a policy of an algorithm of Stable-Baselines3."""
     import stable_baselines3
 
     try:
         _loaded(getattr(stable_baselines3, algorithm), path, trust, BUFFERLESS)
-    except Exception:  # as in read_learner
+    except Exception:  # a malformed file can raise anything
         return False
     return True
 
@@ -181,7 +189,7 @@ def load_network(path: Path) -> Network:
     """Load a network of arrays.
 
     Raises:
-        UnusablePolicy: the file is none.
+        UnusablePolicy: the file is not a network of arrays.
     """
     try:
         return Network.load(path)

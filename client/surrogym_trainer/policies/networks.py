@@ -1,8 +1,9 @@
-"""Policy networks for Stable-Baselines3: the paper's (section 4), with one hidden layer of 32; by default two of 64.
+"""Policy networks for Stable-Baselines3: the paper's (section 4) with one hidden layer of 32 units, and the default one
+with two of 64.
 
 Continuous actions: tanh after each layer, the output scaled to the action bounds. Discrete actions: ReLU, and a softmax
 for each dimension; ``deterministic=True`` takes the most probable action. Both standardise observations by fixed
-statistics, so that a saved policy needs nothing else.
+statistics, so that a saved policy needs no other file.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ __all__ = [
 
 
 class Standardise(BaseFeaturesExtractor):
-    """Layer that computes (observation - mean) / standard deviation with fixed mean and standard deviation, (D,)
+    """A layer that computes (observation - mean) / standard deviation, with a fixed mean and standard deviation, (D,)
     each."""
 
     mean: Tensor
@@ -56,7 +57,7 @@ class Standardise(BaseFeaturesExtractor):
 
 
 class Bounded(nn.Module):
-    """Layer that scales the tanh of its input to the action bounds."""
+    """A layer that scales the tanh of its input to the action bounds."""
 
     centre: Tensor
     reach: Tensor
@@ -73,7 +74,7 @@ class Bounded(nn.Module):
 
 
 class PaperPolicy(ActorCriticPolicy):
-    """The paper's actor, with a critic that only training needs."""
+    """The paper's actor, with a critic that is only used in training."""
 
     def __init__(
         self,

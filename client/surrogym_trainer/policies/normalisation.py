@@ -1,7 +1,7 @@
-"""Statistics with which Stable-Baselines3's ``VecNormalize`` normalised the observations of a policy.
+"""The statistics with which Stable-Baselines3's ``VecNormalize`` normalised the observations of a policy.
 
-The policy's own file lacks them. They are read from a file of arrays beside it, because those of ``VecNormalize.save``
-are pickled.
+The policy's own file lacks them. They are read from a file of arrays beside it, because the file of
+``VecNormalize.save`` is pickled.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ ENDING = ".vecnormalize.npz"
 
 
 def is_normalised(model: BaseAlgorithm) -> bool:
-    """Whether a policy of another program learned in a ``VecNormalize``: Stable-Baselines3 then also keeps the original
-    observation. ``surrogym train`` normalises rewards only, and leaves it out of its files."""
+    """Return whether a policy learned with observations that ``VecNormalize`` normalised: then Stable-Baselines3 also
+    stores the original observation. ``surrogym train`` normalises only rewards, and removes that entry from its
+    files."""
     return getattr(model, "_last_original_obs", None) is not None
 
 
@@ -33,7 +34,7 @@ def statistics_path(policy: Path) -> Path:
 
 
 def missing_statistics(policy: Path) -> UnusablePolicy:
-    """The error for a policy whose statistics are not known, with the way out."""
+    """Return the error for a policy without a file of its statistics, with the code that writes one."""
     arrays = "mean=env.obs_rms.mean, var=env.obs_rms.var, epsilon=env.epsilon, clip=env.clip_obs"
     return UnusablePolicy(
         f"{policy} learned in a VecNormalize, whose statistics are not in the file: expected them in "
@@ -43,20 +44,22 @@ def missing_statistics(policy: Path) -> UnusablePolicy:
 
 
 class Normalisation:
-    """Normalise observations as ``VecNormalize`` does: (o - mean) / sqrt(var + epsilon), clipped to +-clip."""
+    """The normalisation of observations as in ``VecNormalize``: (o - mean) / sqrt(var + epsilon), clipped to +-clip."""
 
     def __init__(self, path: Path) -> None:
-        """Read the statistics. Raises ``UnusablePolicy`` if the file does not hold them."""
+        """Read the statistics from a file. Raises ``UnusablePolicy`` if the file does not contain them."""
         try:
             with np.load(path, allow_pickle=False) as file:
                 self.mean, variance, epsilon, self.clip = (
                     np.asarray(file[name], dtype=np.float64) for name in ("mean", "var", "epsilon", "clip")
                 )
         except (OSError, ValueError, KeyError) as error:
-            raise UnusablePolicy(f"{path}: expected the arrays mean, var, epsilon and clip ({error})") from error
+            raise UnusablePolicy(
+                f"{path}: expected the arrays mean, var, epsilon and clip ({error}): write the file again"
+            ) from error
         self.spread = np.sqrt(variance + epsilon)
 
     def __call__(self, observations: Floats) -> Floats:
-        """Return normalised observations (N, D)."""
+        """Return the normalised observations (N, D)."""
         scaled = (observations - self.mean) / self.spread
         return np.clip(scaled, -self.clip, self.clip).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Load a policy in ONNX as a function of observations. Its memory is bounded from the file's shapes before anything
+"""Loading of a policy in ONNX as a function of observations. Its memory is bounded by the file's shapes before anything
 runs."""
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from surrogym_client.errors import SurrogymClientError
 from surrogym_trainer.policies.predict import Predict
 
-MAX_BYTES = 256 * 1024 * 1024  # largest file
-LANES = 1_024  # most observations in one call of the network; more are split
-MAX_NUMBERS = 64 * 1024 * 1024  # most numbers in all arrays of one call together, the weights included
+MAX_BYTES = 256 * 1024 * 1024  # largest size of a file
+LANES = 1_024  # largest number of observations in one call of the network; more are split
+MAX_NUMBERS = 64 * 1024 * 1024  # largest number of numbers in all arrays of one call together, including the weights
 INPUT, OUTPUT = "observation", "action"
 
 
@@ -25,16 +25,23 @@ class UnusableOnnx(SurrogymClientError):
 
 
 def load_onnx(path: Path) -> Predict:
-    """Load a policy from its file. Raises as ``from_onnx``, and ``OSError`` if the file can't be read."""
+    """Load a policy from its ONNX file.
+
+    Raises:
+        OSError: the file can't be read.
+        ModuleNotFoundError: the extra ``export`` is not installed.
+        UnusableOnnx: the file is not a policy, or is too large.
+    """
     with path.open("rb") as file:
         return from_onnx(file.read(MAX_BYTES + 1))
 
 
 def from_onnx(content: bytes) -> Predict:
-    """Turn an ONNX model into a function of observations. No Python code in it is run, and no other file is read.
+    """Convert the bytes of an ONNX model to a function of observations. No Python code in it is run, and no other file
+    is read.
 
     Raises:
-        ModuleNotFoundError: the extra ``export`` is missing.
+        ModuleNotFoundError: the extra ``export`` is not installed.
         UnusableOnnx: the model is not a policy, or is larger than ``MAX_BYTES`` or ``MAX_NUMBERS`` allow.
     """
     import onnxruntime
@@ -62,19 +69,22 @@ def _check(content: bytes) -> None:
     import onnx
 
     if len(content) > MAX_BYTES:
-        raise ValueError(f"expected at most {MAX_BYTES} bytes")
+        raise ValueError(f"expected at most {MAX_BYTES} bytes: export a smaller network")
     model = onnx.load_model_from_string(content)
     _check_self_contained(model)
     _for_lanes(model.graph)
     inferred = onnx.shape_inference.infer_shapes(model, strict_mode=True, data_prop=True)
     numbers = _numbers(inferred.graph)
     if numbers > MAX_NUMBERS:
-        raise ValueError(f"expected at most {MAX_NUMBERS} numbers in the arrays of {LANES} observations, got {numbers}")
+        raise ValueError(
+            f"expected at most {MAX_NUMBERS} numbers in the arrays for {LANES} observations, got {numbers}: export a "
+            "smaller network"
+        )
 
 
 def _check_self_contained(model: Any) -> None:
-    """Refuse models that read another file, and parts without shapes of their own: subgraphs, functions, sparse
-    arrays."""
+    """Raise ``ValueError`` if a model reads another file, or has parts without shapes of their own: subgraphs,
+    functions, sparse arrays."""
     import onnx
 
     if model.functions:
@@ -85,9 +95,12 @@ def _check_self_contained(model: Any) -> None:
     for message in _messages(model):
         match message:
             case onnx.TensorProto(data_location=onnx.TensorProto.EXTERNAL):
-                raise ValueError(f"expected all arrays inside the file, got {message.name!r} in another one")
+                raise ValueError(
+                    f"expected all arrays inside the file, got {message.name!r} in another one: export it without "
+                    "external data"
+                )
             case onnx.SparseTensorProto():
-                raise ValueError("expected dense arrays, got a sparse one")
+                raise ValueError("expected dense arrays, got a sparse one: export the policy without sparse arrays")
             case onnx.GraphProto() if message is not model.graph:
                 raise ValueError(
                     "expected one graph, got a loop or a branch in it: export the policy without control flow"
@@ -95,7 +108,7 @@ def _check_self_contained(model: Any) -> None:
 
 
 def _messages(message: Any) -> Iterator[Any]:
-    """Iterate over all messages within a protobuf message, at any depth."""
+    """Yield all messages within a protobuf message, at any depth."""
     for field, value in message.ListFields():
         if field.message_type is not None:
             for inner in value if field.is_repeated else [value]:
@@ -104,7 +117,8 @@ def _messages(message: Any) -> Iterator[Any]:
 
 
 def _for_lanes(graph: Any) -> None:
-    """Fix the number of observations, and remove the shapes that the file claims. They are inferred instead."""
+    """Set the number of observations to a fixed one, and remove the shapes that the file claims, so that they are
+    inferred."""
     weights = {array.name for array in graph.initializer}
     inputs = [given for given in graph.input if given.name not in weights]
     if [given.name for given in inputs] != [INPUT] or len(inputs[0].type.tensor_type.shape.dim) != 2:
@@ -116,7 +130,7 @@ def _for_lanes(graph: Any) -> None:
 
 
 def _numbers(graph: Any) -> int:
-    """Count the numbers in all arrays of a graph whose shapes have been inferred."""
+    """Return the number of numbers in all arrays of a graph whose shapes have been inferred."""
     known = {value.name: value.type.tensor_type for value in (*graph.input, *graph.value_info, *graph.output)}
     weights = sum(math.prod(map(int, array.dims)) for array in graph.initializer)
     made = [name for node in graph.node for name in node.output if name]

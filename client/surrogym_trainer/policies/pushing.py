@@ -1,4 +1,5 @@
-"""Send a policy and its evaluations to the server. Evaluations that can't be sent wait beside the policy's file."""
+"""Upload of a policy and its evaluations to the server. Evaluations that can't be sent are stored beside the policy's
+file."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ from surrogym_shared.faults import first_fault
 from surrogym_trainer.policies.card import PolicyCard, UnusablePolicy, read_card
 
 MAX_WAITING_BYTES = 64 * 1024 * 1024
-MAX_VIDEO_BYTES = 32 * 1024 * 1024  # of a file on the server
+MAX_VIDEO_BYTES = 32 * 1024 * 1024  # largest size of a file on the server
 VIDEOS: tuple[wire.PolicyForm, ...] = ("mp4", "gif")
 CURVE_POINTS = 200
 _WAITING = TypeAdapter(list[wire.AddEvaluation])
@@ -32,37 +33,37 @@ class Pushed:
     surrogate: str
     policy: wire.PushedPolicy
     evaluations: int
-    refused: str = ""  # why the server did not take the video
+    refused: str = ""  # why the server refused the video; empty if it did not
 
 
 def thinned(curve: Sequence[wire.CurvePoint]) -> tuple[wire.CurvePoint, ...]:
-    """Reduce a curve to at most ``CURVE_POINTS`` evenly chosen points, including its last."""
+    """Return at most ``CURVE_POINTS`` evenly chosen points of a curve, including the last."""
     every = max(1, -(-len(curve) // CURVE_POINTS))
     return tuple(curve[(len(curve) - 1) % every :: every]) if curve else ()
 
 
 def keep(policy: Path, evaluation: wire.AddEvaluation) -> None:
-    """Write an evaluation to a file beside the policy, where it waits for ``push``."""
+    """Add an evaluation to the file beside the policy from which ``push`` will send it."""
     _write(policy, [*_read(policy), evaluation])
 
 
 def waiting_path(policy: Path) -> Path:
-    """Return the path of the evaluations that the server does not have yet."""
+    """Return the path of the file with the evaluations that have not been sent to the server yet."""
     return policy.with_suffix(".evaluations.json")
 
 
 def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
-    """Send a policy's file and card, and the evaluations and the video beside it. Repeating it is harmless.
+    """Send a policy's file and card, and the evaluations and the video beside it. Repeating the call changes nothing.
 
     Args:
-        api: the server.
+        api: the connection to the server.
         policy: the policy's file.
         surrogate: surrogate that the policy belongs to; None takes the card's.
 
     Raises:
         UnusablePolicy: no surrogate is known, the file has an unknown form, or the server does not accept the card.
         SpecConflict: the policy was made for other observations or actions than the surrogate's.
-        SurrogymClientError: the server can't be reached, or refuses; everything stays as it was.
+        SurrogymClientError: the server can't be reached, or refuses the request; the files beside the policy stay.
     """
     card, form = read_card(policy), _form(policy)
     name = surrogate or card.surrogate
@@ -85,7 +86,7 @@ def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
 
 
 def _push_video(api: Api, name: str, sent: wire.PushedPolicy, policy: Path) -> str:
-    """Send the video beside a policy, unless the server has it; returns why it was refused, if it was."""
+    """Send the video beside a policy, unless the server has it. Returns why it was refused; empty if it was not."""
     for form in VIDEOS:
         path = policy.with_suffix(f".{form}")
         if not path.is_file():
@@ -104,7 +105,7 @@ def _push_video(api: Api, name: str, sent: wire.PushedPolicy, policy: Path) -> s
 
 
 def as_pushed(card: PolicyCard) -> wire.PushedCard:
-    """Return a card without the server's address in it, which is private."""
+    """Return a card in the form that is sent, without the server's address, which is private."""
     return wire.PushedCard.model_validate(card.model_dump(mode="json", exclude={"server", "curve"}))
 
 

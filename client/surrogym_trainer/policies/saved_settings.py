@@ -1,6 +1,6 @@
 """Settings and counters that a policy's file may set on an algorithm of Stable-Baselines3.
 
-Stable-Baselines3 makes every entry of a file an attribute of the algorithm, even methods. Only the entries here are
+Stable-Baselines3 makes every entry of a file an attribute of the algorithm, even a method. Only the entries here are
 accepted, each of its type. All others are ignored, and the algorithm's defaults apply.
 """
 
@@ -16,14 +16,13 @@ MAX_EXPERIENCE_BYTES = 2 * 1024**3
 Count = Annotated[int, Field(ge=0, le=2**53)]
 Positive = Annotated[int, Field(ge=1, le=2**53)]
 Batch = Annotated[int, Field(ge=1, le=2**20)]
-Passes = Annotated[
-    int, Field(ge=-1, le=10_000)
-]  # passes over the experience, or gradient steps; -1 for as many as environment steps
+# Passes over the experience, or gradient steps; -1 means as many as environment steps.
+Passes = Annotated[int, Field(ge=-1, le=10_000)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class ReplaySettings(BaseModel):
-    """Accepted keywords of the replay buffer. The others follow from the algorithm's settings."""
+    """The accepted settings of the replay buffer; its other settings follow from those of the algorithm."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, strict=True)
 
@@ -31,7 +30,7 @@ class ReplaySettings(BaseModel):
 
 
 class PolicySettings(BaseModel):
-    """Accepted entries of a policy's file, by the names of the algorithm's attributes. None or absent means the
+    """The accepted entries of a policy's file, named as the algorithm's attributes. None or a missing entry means the
     default."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, strict=True, allow_inf_nan=False)
@@ -44,19 +43,19 @@ class PolicySettings(BaseModel):
     sde_sample_freq: Annotated[int, Field(ge=-1)] | None = None
     use_sde_at_warmup: bool | None = None
     stats_window_size: Annotated[Batch | None, Field(alias="_stats_window_size")] = None
-    # experience
+    # Settings of the stored experience.
     n_steps: Positive | None = None
     buffer_size: Positive | None = None
     optimize_memory_usage: bool | None = None
     replay_buffer_kwargs: ReplaySettings | None = None
     batch_size: Batch | None = None
-    # PPO and A2C
+    # Settings of PPO and A2C.
     n_epochs: Annotated[int, Field(ge=1, le=10_000)] | None = None
     gae_lambda: Share | None = None
     vf_coef: float | None = None
     normalize_advantage: bool | None = None
     target_kl: float | None = None
-    # SAC, TD3, DDPG and DQN
+    # Settings of SAC, TD3, DDPG and DQN.
     ent_coef: float | Annotated[str, Field(pattern=r"^auto(_[0-9.e+-]+)?$", max_length=32)] | None = None
     target_entropy: float | None = None
     learning_starts: Count | None = None
@@ -70,7 +69,7 @@ class PolicySettings(BaseModel):
     exploration_final_eps: Share | None = None
     exploration_fraction: Share | None = None
     exploration_rate: Share | None = None
-    # progress
+    # Counters of the training's progress.
     num_timesteps: Count | None = None
     total_timesteps: Annotated[Count | None, Field(alias="_total_timesteps")] = None
     steps_at_start: Annotated[Count | None, Field(alias="_num_timesteps_at_start")] = None
@@ -81,22 +80,26 @@ class PolicySettings(BaseModel):
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """Return the attributes that the file sets on the algorithm, by name."""
+        """The attributes that the file sets on the algorithm, by name."""
         return self.model_dump(by_alias=True, exclude_none=True)
 
     def require_memory(
         self, num_envs: int, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
     ) -> None:
-        """Check that the experience for learning fits ``MAX_EXPERIENCE_BYTES``.
+        """Check that the experience for learning fits in ``MAX_EXPERIENCE_BYTES``.
 
         Raises:
             ValueError: the experience needs more memory.
         """
-        numbers = 2 * _size(observation_space) + _size(action_space) + 4  # rewards, ends, values and the like
+        # 4 for the reward, the end, the value and the like
+        numbers = 2 * _size(observation_space) + _size(action_space) + 4
         steps = max(self.buffer_size or 0, (self.n_steps or 0) * num_envs)
         if (needed := 4 * numbers * steps) > MAX_EXPERIENCE_BYTES:
             asked = f"n_steps={self.n_steps}, buffer_size={self.buffer_size}, {num_envs} lanes"
-            raise ValueError(f"expected at most {MAX_EXPERIENCE_BYTES} bytes of experience, got {needed} ({asked})")
+            raise ValueError(
+                f"expected at most {MAX_EXPERIENCE_BYTES} bytes of experience, got {needed} ({asked}): lower these "
+                "settings"
+            )
 
 
 def _size(space: spaces.Space[Any]) -> int:

@@ -1,7 +1,7 @@
-"""Description of a policy as data, from which a policy of ``surrogym train`` is rebuilt without unpickling.
+"""A description of a policy as data, from which a policy of ``surrogym train`` is rebuilt without unpickling.
 
 Stable-Baselines3 pickles what JSON can't represent: spaces, classes, schedules. The file of a policy gets an entry that
-describes them, and reading rebuilds them from it. Weights are read as plain numbers. Nothing is unpickled.
+describes these objects, and reading rebuilds them from it. Weights are read as plain numbers. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from surrogym_trainer.policies.networks import PaperPolicy, Standardise
 from surrogym_trainer.policies.saved_settings import PolicySettings
 
 ENTRY = "surrogym-policy.json"
-MAX_BYTES = 256 * 1024 * 1024  # largest contents of a file
+MAX_BYTES = 256 * 1024 * 1024  # largest total size of a file's entries
 WEIGHTS = ".pth"
 PICKLED = ":serialized:"
 DECAYING = "decaying"
@@ -44,18 +44,19 @@ EXTRACTOR = {"features_extractor_class", "features_extractor_kwargs"}
 OPTIMIZER = {"optimizer_class", "optimizer_kwargs"}
 DESCRIBED = EXTRACTOR | OPTIMIZER | {"net_arch", "n_critics", "use_sde"}
 NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
-REMADE = (  # Stable-Baselines3 makes these when it builds the algorithm, and when learning begins
+# Attributes that Stable-Baselines3 makes itself, when it builds the algorithm or begins to learn.
+REMADE = (
     *("lr_schedule", "exploration_schedule", "rollout_buffer_class", "replay_buffer_class"),
     *("_last_obs", "_last_original_obs", "_last_episode_starts", "ep_info_buffer", "ep_success_buffer"),
 )
-VARIABLES = {"log_ent_coef"}  # SAC's
+VARIABLES = {"log_ent_coef"}  # names of tensors outside of the network: SAC's entropy coefficient
 IDLE = {"learning_rate": 0.0, "clip_range": 0.2, "clip_range_vf": None, "train_freq": 1, "action_noise": None}
 
 Layers = Annotated[list[Annotated[int, Field(ge=1)]], Field(max_length=64)]
 
 
 class PickledObjects(ValueError):
-    """The file contains pickled objects without a description. ``names`` lists them."""
+    """The file contains pickled objects without a description; ``names`` lists them."""
 
     def __init__(self, names: list[str]) -> None:
         super().__init__(names)
@@ -63,8 +64,11 @@ class PickledObjects(ValueError):
 
 
 class Structure(BaseModel):
-    """Description of what Stable-Baselines3 needs besides the weights. The last four fields are for learning only;
-    None means not described."""
+    """A description of everything besides the weights that Stable-Baselines3 needs for a policy.
+
+    ``learning_rate``, ``clip_range``, ``clip_range_vf`` and ``train_freq`` are only needed for learning; None means not
+    described.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -75,14 +79,15 @@ class Structure(BaseModel):
     net_arch: Layers | dict[Literal["pi", "vf", "qf"], Layers]
     n_critics: Annotated[int, Field(ge=1, le=8)] | None = None
     use_sde: bool | None = None
-    rmsprop: dict[Literal["alpha", "eps", "weight_decay"], float] | None = None  # A2C's optimizer; others have Adam
+    # settings of A2C's optimizer; other algorithms have Adam
+    rmsprop: dict[Literal["alpha", "eps", "weight_decay"], float] | None = None
     learning_rate: Literal["decaying"] | None = None
     clip_range: float | None = None
     clip_range_vf: float | None = None
     train_freq: tuple[int, Literal["step", "episode"]] | None = None
 
     def objects(self) -> dict[str, Any]:
-        """Attributes of the algorithm that the description contains."""
+        """Return the attributes of the algorithm that the description contains, by name."""
         chosen = {
             "features_extractor_class": Standardise,
             "net_arch": self.net_arch,
@@ -105,7 +110,7 @@ class Structure(BaseModel):
 
     @property
     def weights(self) -> int:
-        """Number of weights that a network with the described layers needs at least, without biases."""
+        """Smallest number of weights, without biases, of a network with the described layers."""
         inputs, arch = len(self.observation_space.low), self.net_arch
         parts = {"pi": arch} if isinstance(arch, list) else dict(arch)
         actor, others = parts.pop("pi", []), parts.values()
@@ -116,7 +121,8 @@ class Structure(BaseModel):
 def save(learner: BaseAlgorithm, path: Path) -> None:
     """Save a policy as ``learner.save`` does, and add the description if the policy can be described."""
     file = io.BytesIO()
-    learner.save(file, exclude=["_last_original_obs"])  # by which ``normalisation`` tells policies of other programs
+    # the module normalisation recognises policies of other programs by this entry
+    learner.save(file, exclude=["_last_original_obs"])
     if (structure := describe(learner)) is not None:
         with zipfile.ZipFile(file, "a") as archive:
             archive.writestr(ENTRY, structure.model_dump_json())
@@ -124,7 +130,7 @@ def save(learner: BaseAlgorithm, path: Path) -> None:
 
 
 def describe(learner: BaseAlgorithm) -> Structure | None:
-    """Describe a policy made by ``surrogym train``; None for any other."""
+    """Return the description of a policy made by ``surrogym train``; None for any other policy."""
     kwargs, kind = learner.policy_kwargs, type(learner.policy)
     if POLICIES.get(kind.__name__) is not kind or set(kwargs) - DESCRIBED:
         return None
@@ -153,12 +159,12 @@ def describe(learner: BaseAlgorithm) -> Structure | None:
 def read(path: Path, *, num_envs: int, replaced: set[str]) -> tuple[io.BytesIO, dict[str, Any]]:
     """Read a policy's file without its pickled objects, and rebuild these from the description.
 
-    Both results are arguments for ``load`` of a Stable-Baselines3 algorithm: the file, and ``custom_objects``.
+    The results are arguments for ``load`` of a Stable-Baselines3 algorithm: the file, and ``custom_objects``.
 
     Args:
         path: file from ``save``.
-        num_envs: number of environments on which the algorithm continues to learn; 0 if it only acts, which leaves out
-            the objects that only learning needs.
+        num_envs: number of environments in which the algorithm will continue to learn; 0 if it only acts, which leaves
+            out the objects that only learning needs.
         replaced: attributes that the caller sets, so that the file's are not needed.
 
     Raises:
@@ -179,7 +185,8 @@ def read(path: Path, *, num_envs: int, replaced: set[str]) -> tuple[io.BytesIO, 
     settings = _settings(data, {*objects, *pickled, *NEEDED})
     if num_envs and structure is not None:
         settings.require_memory(num_envs, objects["observation_space"], objects["action_space"])
-    placeholders = dict.fromkeys(({*pickled} - replaced) | {*NEEDED})  # load replaces them by the objects
+    # `load` replaces these placeholders by the objects
+    placeholders = dict.fromkeys(({*pickled} - replaced) | {*NEEDED})
     data = {"verbose": 0, **settings.attributes, **placeholders}
     weights = {name: _plain(content) for name, content in entries.items() if name.endswith(WEIGHTS)}
     _require_variables(weights.get("pytorch_variables" + WEIGHTS))
@@ -201,20 +208,25 @@ def _entry(entries: Mapping[str, bytes], name: str) -> bytes:
 
 
 def _plain(weights: bytes) -> bytes:
-    """Repack the zip that ``torch.save`` wrote, so that torch only inflates what was counted here."""
+    """Return the zip that ``torch.save`` wrote without compression, after a check of its size, so that torch inflates
+    nothing."""
     return stored(read_entries(weights, len(weights)))
 
 
 def _require_weights(structure: Structure, file: bytes) -> None:
-    """Refuse layers that are far larger than the weights in the file: they would fill the memory before torch
-    compares them."""
+    """Raise ``ValueError`` if the described layers are far larger than the weights in the file: they would fill the
+    memory before torch compares them."""
     came = len(file) // np.dtype(np.float32).itemsize
     if structure.weights > came:
-        raise ValueError(f"expected weights for layers of {structure.weights} numbers, got {came} numbers at most")
+        raise ValueError(
+            f"expected the file to have {structure.weights} weights for its described layers, got at most {came}: "
+            "save the policy again"
+        )
 
 
 def _require_variables(file: bytes | None) -> None:
-    """Refuse unknown tensors, because Stable-Baselines3 sets each one wherever in the algorithm its name points to."""
+    """Raise ``ValueError`` if a file has unknown tensors, because Stable-Baselines3 sets each one wherever in the
+    algorithm its name points to."""
     found = {} if file is None else torch.load(io.BytesIO(file), map_location="cpu", weights_only=True)
     if unknown := {*(found or {})} - VARIABLES:
         raise ValueError(f"expected no variables but {', '.join(VARIABLES)}, got {', '.join(map(str, unknown))}")
@@ -235,7 +247,7 @@ def _outputs(action: BoxSpace | DiscreteSpace | MultiDiscreteSpace) -> int:
 
 
 def _wire(given: Space[Any]) -> BoxSpace | DiscreteSpace | MultiDiscreteSpace | None:
-    """Return the space as data; None if it can't be rebuilt exactly."""
+    """Return a space as data; None if it can't be rebuilt exactly."""
     described: BoxSpace | DiscreteSpace | MultiDiscreteSpace
     match given:
         case spaces.Box(shape=(_,)):

@@ -1,4 +1,4 @@
-"""The controller beside other controllers, from the same starts."""
+"""The section of the report that compares the controller with other controllers, from the same starts."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ SHORT_NAMES = {"zero": "no controller", "random": "random actions", "reference":
 
 @dataclass(frozen=True)
 class Comparison:
-    """Mean returns of two controllers from the same starts.
+    """The mean returns of two controllers from the same starts.
 
     Attributes:
         starts: number of these starts.
         mine, theirs: mean return of the policy and of the other controller.
-        gain: 95 % interval of the difference; None where single episodes are not known.
+        gain: 95 % interval of the difference; None if the returns of single episodes are not known.
     """
 
     starts: int
@@ -36,12 +36,13 @@ class Comparison:
 
     @property
     def shown(self) -> bool:
-        """Whether the interval excludes that there is no difference."""
+        """Whether the interval of the difference excludes 0."""
         return self.gain is not None and (self.gain.low > 0 or self.gain.high < 0)
 
 
 def compare(real: EvaluationDetail, other: EvaluationDetail) -> Comparison | None:
-    """Compare like with like: the first starts, which both ran. None if their returns are not known."""
+    """Compare the mean returns of two controllers over the first starts, which both ran; None if their returns are not
+    known."""
     count = min(real.episodes, other.episodes)
     if min(len(real.returns), len(other.returns)) >= count:
         mine, theirs = real.returns[:count], other.returns[:count]
@@ -52,7 +53,7 @@ def compare(real: EvaluationDetail, other: EvaluationDetail) -> Comparison | Non
 
 
 def in_short(real: EvaluationDetail, other: EvaluationDetail) -> str:
-    """The comparison in a sentence."""
+    """Return the comparison with another controller as a sentence."""
     found, name = compare(real, other), ACTING[other.controller]
     if found is None:
         return f"With {name}, {counted(other.episodes, 'episode')} earned {number(other.mean)} on average."
@@ -61,7 +62,7 @@ def in_short(real: EvaluationDetail, other: EvaluationDetail) -> str:
 
 
 def beside(known: Known) -> str:
-    """The section, as HTML."""
+    """Return the section as HTML."""
     real, title = known.real, "With and without the controller"
     if real is None:
         return section(title, paragraph("There is nothing to compare yet."))
@@ -73,7 +74,7 @@ def beside(known: Known) -> str:
 
 
 def _gained(real: EvaluationDetail, other: EvaluationDetail) -> str:
-    """The difference in return from another controller."""
+    """Return sentences about the difference in return from another controller."""
     found, name = compare(real, other), ACTING[other.controller]
     if found is None:
         return (
@@ -107,7 +108,8 @@ def _difference(found: Comparison) -> str:
 
 
 def _from_one_start(known: Known, real: EvaluationDetail, others: Sequence[EvaluationDetail]) -> str:
-    """One episode of each from the same state; nothing where those are not known."""
+    """Return a picture of one episode of each controller from the same state, as HTML; empty if such episodes are not
+    known."""
     pairs = [(_paired(real), "with the controller"), *((_paired(one), SHORT_NAMES[one.controller]) for one in others)]
     shown = [(name, trace) for trace, name in pairs if trace is not None]
     if len(shown) < 2 or len({trace.seed for _, trace in shown}) > 1:

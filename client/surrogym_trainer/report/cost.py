@@ -1,4 +1,4 @@
-"""The part of the report about real steps: each purpose has a line, and the lines add up to the total."""
+"""The section of the report about real steps: each purpose has a line, and the lines add up to the total."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ACTING: dict[Controller, str] = {
 
 
 def cost(known: Known) -> str:
-    """The section, as HTML."""
+    """Return the section as HTML."""
     ledger, policy = known.view.ledger, known.policy
     counted = [(name, count) for name, count in purposes(known) if count]
     rows = [*counted, ("all together", sum(count for _, count in counted))]
@@ -40,7 +40,7 @@ def cost(known: Known) -> str:
 
 
 def purposes(known: Known) -> list[tuple[str, int]]:
-    """Every real step once, by its purpose. Steps that were recorded before are left out."""
+    """Return the number of real steps by purpose, each step once. Steps of logs are left out."""
     ledger = known.view.ledger
     return [
         ("learning the model: the first ones, spread over the declared ranges", ledger.initial),
@@ -52,7 +52,7 @@ def purposes(known: Known) -> list[tuple[str, int]]:
 
 
 def tests(known: Known) -> list[tuple[str, int]]:
-    """The real steps of all episodes."""
+    """Return the number of real steps in all evaluation episodes, by controller and starts."""
     own = [] if known.policy is None else known.policy.evaluations
     lines = [
         (f"{counted(one.episodes, 'episode')} with {ACTING[one.controller]}, {starts_of(one)}", one.steps)
@@ -65,7 +65,7 @@ def tests(known: Known) -> list[tuple[str, int]]:
 
 
 def plan(view: SurrogateView) -> str:
-    """The planned and the taken steps of learning, in words."""
+    """Return sentences about the planned and the taken steps for learning the model."""
     taken, first, allowed = view.ledger.total, view.spec.design.budget, view.budget
     if not allowed:
         return "No real step was planned for learning the model: it was learned from recorded ones."
@@ -80,7 +80,7 @@ def plan(view: SurrogateView) -> str:
 
 
 def _ended(view: SurrogateView, taken: int, allowed: int) -> str:
-    """The reason why learning ended."""
+    """Return a sentence about why learning ended; empty if it has not."""
     if view.phase == "ready" and taken < allowed:
         return "The rest was not needed, because the model was known well enough."
     if view.phase == "over_budget":

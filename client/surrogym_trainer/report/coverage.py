@@ -1,4 +1,4 @@
-"""Coverage of a log: every pair of its states and actions, in cells.
+"""The coverage of a log: how often it visits the cells of a grid over each pair of states and actions.
 
 Shapes: n steps, K columns (states, then actions).
 """
@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 
-CELLS = 10  # along a side
-MOST_COLUMNS = 8  # largest number that keeps a picture readable
+CELLS = 10  # number of cells along each side of a grid
+MOST_COLUMNS = 8  # largest number of columns with which a picture is readable
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """How often a log visited each cell of each pair of columns.
+    """The number of steps of a log in each cell of a grid over each pair of columns.
 
     Attributes:
-        names: of the columns, (K,).
-        ends: (K, 2) smallest and largest value of each column's range.
-        counts: for each pair of columns, (CELLS, CELLS), the first column across.
+        names: names of the columns, (K,).
+        ends: smallest and largest value of each column's range, (K, 2).
+        counts: for each pair of columns, the steps in each cell (CELLS, CELLS); the first index is of the first column.
     """
 
     names: tuple[str, ...]
@@ -35,16 +35,16 @@ class Coverage:
     counts: dict[tuple[int, int], NDArray[np.int64]]
 
     def share(self, pair: tuple[int, int]) -> float:
-        """The share of a pair's cells that the log has visited."""
+        """Return the share of a pair's cells that the log has visited."""
         return float((self.counts[pair] > 0).mean())
 
     @property
     def emptiest(self) -> tuple[int, int]:
-        """The pair with the smallest share."""
+        """The pair of columns with the smallest share of visited cells."""
         return min(self.counts, key=self.share)
 
     def words(self) -> str:
-        """The emptiest pair, in a sentence."""
+        """Return a sentence about the pair of columns with the smallest share of visited cells."""
         first, second = (self.names[i] for i in self.emptiest)
         return (
             f"coverage: at least {100 * self.share(self.emptiest):.0f} % of the cells of every two columns hold steps, "
@@ -53,7 +53,7 @@ class Coverage:
 
 
 def coverage_of(spec: EnvironmentSpec, q: Array, u: Array) -> Coverage:
-    """Count the steps of a log, states q (n, C) and actions u (n, F), over the ranges of its specification."""
+    """Count the steps of a log, states q (n, C) and actions u (n, F), in cells over the ranges of its specification."""
     action = spec.action
     names = [*spec.coordinate_names, *(f"action {i}" if action.size > 1 else "action" for i in range(action.size))]
     if isinstance(action, BoxAction):
@@ -73,7 +73,7 @@ def _counted(values: Array, ends: Array) -> NDArray[np.int64]:
 
 
 def columns_shown(names: Sequence[str]) -> list[int]:
-    """The columns that fit into a picture: the first coordinates, followed by the actions."""
+    """Return the indices of the columns that fit into a picture: the first coordinates, followed by the actions."""
     count = len(names)
     actions = [i for i, name in enumerate(names) if name.startswith("action")]
     states = [i for i in range(count) if i not in actions][: max(MOST_COLUMNS - len(actions), 1)]

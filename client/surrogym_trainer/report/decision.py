@@ -1,6 +1,6 @@
-"""The first part of the report, for decisions: cost, result, prediction, doubts, and what to do next.
+"""The first part of the report, for decisions: cost, result, prediction, doubts, and recommended next steps.
 
-A section with missing data says what is missing, and shows the rest.
+A section with missing data names what is missing, and shows the rest.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ RETURN = "The return of an episode is the sum of its rewards. Higher is better."
 
 
 def decision(known: Known, cuts: Sequence[Cut]) -> str:
-    """All sections of this part, as HTML."""
+    """Return all sections of this part as HTML; ``cuts`` are the maps of the model's uncertainty."""
     parts = [
         _in_short(known),
         cost(known),
@@ -53,7 +53,7 @@ def decision(known: Known, cuts: Sequence[Cut]) -> str:
 
 
 def _in_short(known: Known) -> str:
-    """The result in at most four sentences."""
+    """Return the result in at most four sentences, as HTML."""
     view, real = known.view, known.real
     if known.policy is None:
         said = f"There is a model of {view.name} from {steps(view.ledger.total)}, and no controller yet."
@@ -73,7 +73,7 @@ def _in_short(known: Known) -> str:
 
 
 def _meanings(known: Known) -> list[str]:
-    """The words of the summary that a reader may not know, each in a sentence."""
+    """Return a sentence about each word of the summary that a reader may not know."""
     success = known.view.spec.success
     said = [original(known.view.environment), RETURN]
     said.append(NO_CRITERION if success is None else criterion(success))
@@ -99,7 +99,7 @@ def _result(known: Known) -> str:
 
 
 def _best_to_worst(known: Known, real: EvaluationDetail) -> str:
-    """The picture of three episodes; nothing where they are not known."""
+    """Return the picture of the best, median and worst episode, as HTML; empty if their traces are not known."""
     returns = {"best": real.most, "median": real.median, "worst": real.least}
     traces = {trace.rank: trace for trace in real.traces}
     shown = [(f"{rank}, return {number(value)}", traces[rank]) for rank, value in returns.items() if rank in traces]
@@ -112,7 +112,8 @@ def _best_to_worst(known: Known, real: EvaluationDetail) -> str:
 
 
 def _further(known: Known) -> str:
-    """The policy's other real episodes, such as those in other environments; nothing without any."""
+    """Return a table of the policy's other real episodes, such as those in other environments, as HTML; empty if there
+    are none."""
     evaluations = [] if known.policy is None else known.policy.evaluations
     shown = None if known.real is None else known.real.id
     others = [one for one in evaluations if one.controller == "policy" and one.id != shown]
@@ -123,7 +124,7 @@ def _further(known: Known) -> str:
 
 
 def _video(known: Known) -> str:
-    """The video of the best, the median and the worst episode; nothing where there is none."""
+    """Return the video of the best, median and worst episode, as HTML; empty if there is none."""
     if known.video is None:
         return ""
     alt = "Video: the best, the median and the worst real episode beside each other"
@@ -151,7 +152,7 @@ def _unsure(known: Known, cuts: Sequence[Cut]) -> str:
 
 
 def _of_allowed(output: OutputFidelity) -> str:
-    """The typical error as a share of the tolerance."""
+    """Return the typical error of an output as a share of its tolerance, in words."""
     error = output.leave_one_out_error
     if error is None:
         return "-"
@@ -160,7 +161,7 @@ def _of_allowed(output: OutputFidelity) -> str:
 
 
 def _on_maps(cuts: Sequence[Cut]) -> str:
-    """The part of the maps on which the model is unsure."""
+    """Return a sentence about the share of the maps on which the model is unsure."""
     parts = [float((cut.uncertainty > 1).mean()) for cut in cuts]
     where = "with the other coordinates and the action in the middle of their ranges"
     if not any(parts):

@@ -1,4 +1,4 @@
-"""Untested points, and the next steps, in plain sentences. Each sentence follows from stored data."""
+"""The sections of the report about untested points and next steps. Each sentence follows from stored data."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from surrogym_trainer.report.known import PREFERRED, Known
 from surrogym_trainer.report.prediction import outcome_of
 from surrogym_trainer.report.wording import starts_of
 
-FEW = 30  # episodes; fewer give an unreliable average
+FEW = 30  # number of episodes below which an average is unreliable
 
 
 def tested(known: Known) -> str:
-    """The starts and machines with which the controller was tested, in a sentence; empty without real episodes."""
+    """Return a sentence about the starts and machines with which the controller was tested; empty without real
+    episodes."""
     evaluations = [] if known.policy is None else known.policy.evaluations
     most: dict[str, int] = {}
     for one in evaluations:
@@ -25,7 +26,7 @@ def tested(known: Known) -> str:
 
 
 def untested(known: Known) -> list[str]:
-    """Points that the real episodes do not cover."""
+    """Return sentences about what the real episodes do not cover."""
     policy, real = known.policy, known.real
     if policy is None:
         return ["Everything: there is no controller yet."]
@@ -51,7 +52,7 @@ def untested(known: Known) -> list[str]:
 
 
 def next_steps(known: Known) -> list[str]:
-    """Recommended next steps, the most urgent first."""
+    """Return recommended next steps, the most urgent first."""
     view, policy, real = known.view, known.policy, known.real
     name = view.name
     if policy is None:
@@ -84,12 +85,13 @@ def next_steps(known: Known) -> list[str]:
 
 
 def _where(known: Known) -> str:
-    """The option that names the environment, where the policy's card can't."""
+    """Return the option that names the environment, if the policy's card can't be used for that."""
     return env_option(known.view.environment)
 
 
 def _tests(known: Known, policy: PolicyView, real: EvaluationView, run: str) -> list[str]:
-    """Tests in reality that are still missing; ``run`` is the command of an evaluation."""
+    """Return the tests in reality that are still missing, with their commands; ``run`` is the command of an
+    evaluation."""
     found = []
     if real.episodes < FEW:
         found.append(f"Run more episodes: {run} --episodes {FEW}")
@@ -106,13 +108,13 @@ def _tests(known: Known, policy: PolicyView, real: EvaluationView, run: str) -> 
 
 
 def _other_starts(policy: PolicyView) -> bool:
-    """Whether the policy was tested from starts outside the declared ones."""
+    """Return whether the policy was tested from starts outside the declared ones."""
     own = [one.note for one in policy.evaluations if one.controller == "policy"]
     return any("anywhere" in note or "times as far" in note for note in own)
 
 
 def _other_machines(policy: PolicyView) -> bool:
-    """Whether the policy was tested in another environment than its own, or in a changed one."""
+    """Return whether the policy was tested in an environment other than its own, or in a changed one."""
     own = [one for one in policy.evaluations if one.controller == "policy"]
     return any(not one.own or "changed by" in one.note for one in own)
 
