@@ -11,7 +11,7 @@ the past, that of the model included.
 
 Noise of the process is independent of the past. An error e of a sensor falsifies the end of one step and the start of
 the next: r_t = e_{t+1} - a e_t. The past contains e_t - a e_{t-1} at best, which explains at most a quarter of r_t.
-Earlier changes would explain more of it, so they are left out. An explained share above ``EXPLAINED`` is not noise.
+Earlier changes would explain more of it, so they are left out. If the share exceeds ``EXPLAINED``, it is not noise.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from surrogym_server.environment.samples import Samples, increments, preceding
 from surrogym_server.models.abilities import AtSamples, LeaveOneOut, SampledFunctions, offers
 from surrogym_server.models.port import DynamicsModel
 
-EXPLAINED = 0.5  # least explained share of the squared error that counts
-PAIRS = 3  # least number of consecutive steps for each coefficient of a regression
+EXPLAINED = 0.5  # least explained share of the squared error that counts as the influence of the past
+PAIRS = 3  # least number of pairs of consecutive steps for each coefficient of a regression
 DEPTHS = (1, 3)  # numbers of earlier actions to try; a longer dead time is not found
-MOST = 400  # most samples in a test, because its time grows with their third power
+MOST = 400  # greatest number of samples in a test, because its time grows with their third power
 RIDGE = 1e-6  # ridge of the regressions, relative to the variance of the inputs
 
 
 def owed_to_past(model: DynamicsModel, samples: Samples, limits: Sequence[float]) -> tuple[float, ...]:
-    """Share of each output's squared error that earlier steps of the episode explain, (O,).
+    """Return the share of each output's squared error that earlier steps of the episode explain, (O,).
 
-    The share is 0 if it would be below ``EXPLAINED``, if the error is within the limit (O,), or if there are too few
-    consecutive steps.
+    The share is 0 if it would be below ``EXPLAINED``, if the error is within the output's limit, or if there are too
+    few consecutive steps.
     """
     definition, able, errors = model.definition, offers(model, SampledFunctions), offers(model, LeaveOneOut)
     nothing = (0.0,) * len(definition.outputs)
@@ -57,37 +57,43 @@ def owed_to_past(model: DynamicsModel, samples: Samples, limits: Sequence[float]
 
 
 def pairs_lacking(definition: EnvironmentDefinition, samples: Samples) -> int:
-    """Number of consecutive steps that ``owed_to_past`` needs in addition to those of the samples."""
+    """Return how many more pairs of consecutive steps ``owed_to_past`` needs than the samples contain."""
     state, size, changes = _state(definition, samples.q[:1]).shape[1], samples.u.shape[1], len(definition.moving)
     enough = PAIRS * (state + size + changes + DEPTHS[0] * size + 1)
     return max(0, enough - int((preceding(definition, samples) >= 0).sum()))
 
 
 def _state(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Coordinates of n states, with the cosine and the sine in the place of each angle."""
+    """Return the coordinates of n states q (n, C), with cosine and sine in place of each angle."""
     turning = torch.tensor([c.kind == "angle" for c in definition.coordinates])
     return torch.cat([q[:, ~turning], q[:, turning].cos(), q[:, turning].sin()], -1)
 
 
 def _past(u: Tensor, change: Tensor, follows: Tensor, depth: int) -> tuple[Tensor, Tensor]:
-    """Change of state in the step before each of n samples, and ``depth`` earlier actions, (n, d); also whether
-    ``depth`` steps come before the sample, (n,)."""
+    """Return what came before each of n samples, (n, d), and whether all of it is known, (n,) bool.
+
+    Args:
+        u: actions (n, F).
+        change: change of the state in each sample, (n, M).
+        follows: (n,) index of the sample of the step before, -1 if there is none.
+        depth: number of earlier actions, which follow the change of the step before in the result.
+    """
     place, complete, columns = torch.arange(len(follows)), torch.ones(len(follows), dtype=torch.bool), [change[follows]]
     for _ in range(depth):
-        place = follows[place]  # -1 for a row without a step before it
+        place = follows[place]  # -1 for a row that has no step before it
         complete &= place >= 0
         columns.append(u[place])
     return torch.cat(columns, -1), complete
 
 
 def _explained_share(at: AtSamples, now: Tensor, past: Tensor, complete: Tensor) -> float:
-    """Share of an output's squared error at n samples that their past explains in addition to state and action.
+    """Return the share of an output's squared error at n samples that their past explains beyond state and action.
 
     Args:
-        at: the model's residuals of the output.
+        at: the output's process at the samples.
         now: (n, e) state and action.
         past: (n, d) earlier change and actions.
-        complete: (n,) whether the past of a sample is known; the other samples are left out.
+        complete: (n,) whether the past of a sample is known; samples without it are not used.
     """
     some = complete[at.rows]
     x, y, r = now[at.rows][some], at.targets[some], _residuals(at)[some]
@@ -100,7 +106,7 @@ def _explained_share(at: AtSamples, now: Tensor, past: Tensor, complete: Tensor)
 
 
 def _left_out(x: Tensor, y: Tensor) -> float:
-    """Sum of the squared leave-one-out errors of a linear regression of y (n,) on x (n, d)."""
+    """Return the sum of the squared leave-one-out errors of a linear regression of y (n,) on x (n, d)."""
     spread = x.std(0)
     z = torch.cat([torch.ones_like(y)[:, None], (x - x.mean(0)) / torch.where(spread > 0, spread, 1.0)], -1)
     hat = z @ torch.linalg.solve(z.T @ z + RIDGE * len(z) * torch.eye(z.shape[1], dtype=z.dtype), z.T)
@@ -108,7 +114,7 @@ def _left_out(x: Tensor, y: Tensor) -> float:
 
 
 def _residuals(at: AtSamples) -> Tensor:
-    """Leave-one-out errors (k,): each target less its prediction from all others."""
+    """Return the leave-one-out errors (k,) of an output's process: each target less its prediction from the others."""
     noisy = at.covariance + at.noise_variance * torch.eye(len(at.targets), dtype=at.covariance.dtype)
     inverse = torch.linalg.inv(noisy)
     residuals: Tensor = (inverse @ at.targets) / inverse.diagonal()

@@ -1,9 +1,9 @@
 """Search for the highest reward of an environment that pays almost nowhere, by optimism about unknown rewards.
 
 Such a reward is known well in nearly the whole range, where it is 0 and does not matter. So the uncertainty index does
-not find the place that pays, which lies between the points of any set spread over the range. Instead the highest
-promise (``RewardPeaks.promise``) is climbed from the best candidates, and the place is queried until it was reached and
-its reward is known to the reward's tolerance.
+not find the place that pays, which lies between the points of any set spread over the range. Instead the search climbs
+from the best candidates to the highest optimistic score (``RewardPeaks.promise``). The place found is queried until its
+reward is known to the reward's tolerance.
 """
 
 from __future__ import annotations
@@ -18,14 +18,12 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import RewardPeaks, offers
 from surrogym_server.models.port import DynamicsModel
 
-CLIMBERS, TRIES, CLIMBS = 16, 16, 24  # points that climb, random steps of each in one iteration, and iterations
+CLIMBERS, TRIES, CLIMBS = 16, 16, 24  # numbers of climbing points, of random steps of each per iteration, of iterations
 WIDEST = 0.25  # standard deviation of the first iteration's random steps, as a share of the sampling range
 SHRINK = 0.75  # factor of the random steps' length from one iteration to the next
-NOTHING = torch.finfo(
-    torch.float32
-).tiny  # smallest reward that counts: trainers compute in float32, in which a smaller one is 0
-UNMET = 0.1  # share of the range of rewards by which a prediction above all samples is clearly above them
-NEW = 0.01  # share of the sampling range: a point nearer to a sample than this counts as queried
+NOTHING = torch.finfo(torch.float32).tiny  # trainers compute in float32, in which a smaller reward counts as 0
+UNMET = 0.1  # a predicted reward is clearly above all samples if it exceeds them by this share of the range of rewards
+NEW = 0.01  # a point nearer to a sample than this share of the sampling range counts as queried
 
 
 def highest(
@@ -54,12 +52,12 @@ def highest(
 
 
 def _least(samples: Samples) -> float:
-    """Smallest difference of rewards that counts; a trainer's float32 can't distinguish smaller ones."""
+    """Return the smallest difference of rewards that counts; a trainer's float32 can't distinguish smaller ones."""
     return max(NOTHING, torch.finfo(torch.float32).eps * float(samples.reward.abs().max()))
 
 
 def _unknown(model: DynamicsModel, samples: Samples, points: Points, tolerance: float) -> Tensor:
-    """Whether the reward at each of m points deserves a query, (m,) bool.
+    """Return whether the reward at each of m points deserves a query, (m,) bool.
 
     It does if it is not known to the tolerance, or if it is predicted to be clearly above the reward of every sample.
     While no sample has a reward that a trainer can distinguish from 0, every point does.
@@ -72,7 +70,7 @@ def _unknown(model: DynamicsModel, samples: Samples, points: Points, tolerance: 
 
 
 def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Points, rng: np.random.Generator) -> Points:
-    """Climb from the best of m points to points of higher promise, and return these, the highest first.
+    """Climb from the best of m points to points of a higher optimistic reward, and return these, the highest first.
 
     Each climber tries random steps, whose length decreases, and takes the best one.
     """
@@ -95,12 +93,12 @@ def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Point
 
 
 def _over(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Whether the declared termination holds at q (m, C), (m,). A query there would teach nothing, so none is made."""
+    """Return whether the declared termination holds at q (m, C), (m,) bool. A query there would teach nothing."""
     return q.new_zeros(len(q), dtype=torch.bool) if definition.learns_termination else definition.terminated(q)
 
 
 def _in_space(definition: EnvironmentDefinition, points: Tensor) -> Tensor:
-    """Round the numbers of discrete actions in points (m, C + F)."""
+    """Round discrete actions in points (m, C + F) to whole numbers; other points are returned unchanged."""
     return (
         torch.cat([points[:, : len(definition.coordinates)], points[:, len(definition.coordinates) :].round()], 1)
         if definition.action.nvec
@@ -109,7 +107,7 @@ def _in_space(definition: EnvironmentDefinition, points: Tensor) -> Tensor:
 
 
 def _limits(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
-    """Lower and upper ends of the ranges of all coordinates and action entries, (C + F,) each."""
+    """Return the lower and upper ends of the ranges of all coordinates and action entries, (C + F,) each."""
     action = definition.action
     ranges = [(c.sampling.low, c.sampling.high) for c in definition.coordinates]
     ranges += [(0.0, n - 1.0) for n in action.nvec] or list(zip(action.low, action.high, strict=True))
@@ -118,7 +116,7 @@ def _limits(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
 
 
 def _distance(definition: EnvironmentDefinition, samples: Samples, points: Points) -> Tensor:
-    """Distance (m,) of the states of m points to the nearest sample's state, in widths of the sampling range."""
+    """Return the distance (m,) from each of m points to the nearest sample's state, in widths of the sampling range."""
     low, high = _limits(definition)
     width = (high - low)[: points.q.shape[1]].clamp_min(1e-12)
     return torch.cdist(points.q / width, samples.q / width).amin(1)

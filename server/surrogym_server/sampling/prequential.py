@@ -1,4 +1,4 @@
-"""Prequential scores: each new sample is predicted by the last model before the next one learns from it.
+"""Prequential scores: each new sample is predicted by the last model before the next model learns from it.
 
 References: A. P. Dawid (1984), Journal of the Royal Statistical Society A 147(2), for the principle; T. Gneiting, A. E.
 Raftery (2007), Journal of the American Statistical Association 102(477), eq. 43, for the interval score.
@@ -20,8 +20,8 @@ from surrogym_server.environment.samples import Samples, increments, saturated
 from surrogym_server.models.abilities import LearnedNoise, offers
 from surrogym_server.models.port import DynamicsModel
 
-LEVELS = (0.5, 0.8, 0.9)
-LATEST = 20  # predictions that are kept for each output
+LEVELS = (0.5, 0.8, 0.9)  # probabilities of the central prediction intervals
+LATEST = 20  # greatest number of predictions that are kept for each output
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Prediction:
     std: float  # predictive standard deviation, with the noise of a single step
 
 
-Predictions = tuple[tuple[Prediction, ...], ...]  # for each output (O,) its predictions, the oldest first
+Predictions = tuple[tuple[Prediction, ...], ...]  # the predictions of each output (O,), the oldest first
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,13 @@ class PrequentialScores:
 
     predictions: int
     within_50: float  # share of the samples in the central 50 % interval, or within the tolerance
-    within_80: float
-    within_90: float
+    within_80: float  # share of the samples in the central 80 % interval, or within the tolerance
+    within_90: float  # share of the samples in the central 90 % interval, or within the tolerance
     interval_score: float  # mean over 90 % intervals, each at least as wide as the tolerance; in units of the tolerance
 
 
 def scores_of(predictions: Sequence[Prediction], tolerance: float) -> PrequentialScores | None:
-    """Score the predictions of one output; None if there are none."""
+    """Return the scores of one output's predictions; None if there are none."""
     if not predictions:
         return None
     error = torch.tensor([p.error for p in predictions], dtype=torch.float64)
@@ -59,12 +59,13 @@ def scores_of(predictions: Sequence[Prediction], tolerance: float) -> Prequentia
 
 
 def half_width(level: float) -> float:
-    """Half the width of the central interval that contains a standard normal number with probability ``level``."""
+    """Return half the width of the central interval that holds a standard normal number with probability ``level``."""
     return NormalDist().inv_cdf((1 + level) / 2)
 
 
 def interval_score(low: Tensor, high: Tensor, value: Tensor, level: float) -> Tensor:
-    """Interval score (m,), eq. 43, of central prediction intervals from ``low`` to ``high`` (m,). Lower is better."""
+    """Return the interval score (m,), eq. 43, of central prediction intervals from ``low`` to ``high`` (m,) with
+    probability ``level``, for true values (m,). Lower is better."""
     missed = (low - value).clamp_min(0) + (value - high).clamp_min(0)
     return high - low + 2 / (1 - level) * missed
 
@@ -107,13 +108,14 @@ def from_pairs(pairs: Sequence[Sequence[Sequence[float]]]) -> Predictions:
 
 
 def _noise(model: DynamicsModel, like: Tensor) -> Tensor:
-    """Standard deviation of the noise of a single step, as the model has learned it, (O,)."""
+    """Return the standard deviation of a single step's noise that the model has learned, (O,); 0 if it learns none."""
     able = offers(model, LearnedNoise)
     return like.new_zeros(like.shape[1]) if able is None else like.new_tensor(able.noise_stds)
 
 
 def _reward_std_by_state(model: DynamicsModel, samples: Samples) -> Tensor:
-    """Standard deviation (m,) of the reward because the next state is uncertain; 0 if the reward does not depend on it.
+    """Return the standard deviation (m,) of the reward due to the uncertain next state; 0 if the reward does not depend
+    on it.
 
     First order: the root sum of squares of the reward's changes when each output moves by one standard deviation.
     """

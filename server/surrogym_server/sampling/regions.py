@@ -1,4 +1,4 @@
-"""Where a model is uncertain about an output: a range of one coordinate or action entry.
+"""Search for the region where a model is uncertain about an output: a range of one coordinate or action entry.
 
 Of all ranges of all inputs, the chosen one has the largest difference between its share of the doubt and its share of
 the Monte Carlo points (Youden's index). If that difference is small, the doubt is spread, and there is no region.
@@ -17,33 +17,33 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 
 LEAST_GAIN = 0.5  # least difference between the share of the doubt and the share of the points in a region
-LEAST_DOUBT = 1e-12  # mean model uncertainty below which there is no doubt
+LEAST_DOUBT = 1e-12  # mean model uncertainty below which no region is searched
 
 
 @dataclass(frozen=True)
 class Region:
-    """A range of one input. An end that is None is open."""
+    """Range of one input. An end that is None is open."""
 
     input: str  # name of the coordinate, or of the action entry
     low: float | None
     high: float | None
-    outside: bool  # the region is what lies outside of low to high; then neither is None
-    share: float  # share of all doubt that lies in the region
+    outside: bool  # whether the region is what lies outside of low to high; then both are numbers
+    share: float  # share of the total model uncertainty that lies in the region
 
 
 def regions_of(
     definition: EnvironmentDefinition, points: Points, doubt: Tensor, names: Sequence[str] = ()
 ) -> tuple[Region | None, ...]:
-    """Find the region of each output.
+    """Find the region with most of each output's uncertainty.
 
     Args:
-        definition: names the inputs.
-        points: the Monte Carlo set, m of them.
+        definition: gives the names of the coordinates.
+        points: the m points of the Monte Carlo set.
         doubt: model uncertainty 1 - C of each output, (m, O).
-        names: of the action's entries; if empty, they are called ``action`` or ``action 1``, ``action 2``...
+        names: names of the action's entries; if empty, they are called ``action`` or ``action 1``, ``action 2``...
 
     Returns:
-        one for each output; None where there is no doubt, or where no single input separates it.
+        One region for each output; None if there is no doubt, or if no single input separates it.
     """
     entries = points.u.shape[1]
     actions = names or (["action"] if entries == 1 else [f"action {i + 1}" for i in range(entries)])
@@ -62,7 +62,8 @@ def _region(inputs: Tensor, doubt: Tensor, names: Sequence[str]) -> Region | Non
 
 
 def _ranges(values: Tensor, share: Tensor, name: str) -> list[tuple[float, Region]]:
-    """The range of an input with the most doubt for its size, and the one with the least, each with its gain."""
+    """Return the range of an input with the most doubt for its size, and the complement of the one with the least, each
+    with its gain."""
     ordered, order = values.sort(stable=True)
     last = torch.cat([ordered[1:] != ordered[:-1], torch.tensor([True])])  # a range may not separate equal values
     doubt = torch.cat([torch.zeros(1, dtype=share.dtype), share[order].cumsum(0)[last]])
@@ -72,9 +73,17 @@ def _ranges(values: Tensor, share: Tensor, name: str) -> list[tuple[float, Regio
 
 
 def _range(gain: Tensor, doubt: Tensor, values: Tensor, name: str, *, outside: bool) -> tuple[float, Region]:
-    """Find the interval of an input over which the cumulative ``gain`` (d + 1,) rises most.
+    """Find the interval of an input over which the cumulative ``gain`` (d + 1,) rises most, or its complement.
 
-    ``values`` (d,) are distinct and sorted. Returns the rise and the region.
+    Args:
+        gain: share of the doubt less share of the points, cumulated over the values.
+        doubt: (d + 1,) cumulative share of the doubt.
+        values: (d,) distinct values of the input, sorted.
+        name: name of the input.
+        outside: whether the region is what lies outside the interval.
+
+    Returns:
+        The rise, and the region.
     """
     lowest, at = gain.cummin(0)
     end = int((gain - lowest).argmax())

@@ -1,4 +1,4 @@
-"""Action sequences for an environment that can't be set to any state: first random ones, then planned in the model.
+"""Action sequences for an environment that can't be set to any state: first random, then planned in the model.
 
 A sequence begins at a reset, or at a snapshot: a state to which the environment can return.
 
@@ -30,13 +30,14 @@ from surrogym_server.sampling.outlook import as_if_answered, path_outlook
 from surrogym_shared.nouns import Query, Vector
 
 STARTS = 6  # number of start states, drawn at random, from which each sequence is predicted
-POPULATION = 48  # action sequences compared at once
-ELITE = 12  # number of the best sequences, of which the next generation has variations
-GENERATIONS = 3  # populations of a search, the random first one included
-DOUBTFUL = 0.25  # least chance of an ending for which a rollout is planned
+POPULATION = 48  # number of action sequences that are compared at once
+ELITE = 12  # number of the best sequences, whose variations form the next population
+GENERATIONS = 3  # number of populations in a search, the random first one included
+DOUBTFUL = 0.25  # least chance of finding an unknown termination for which a rollout is planned
 
 Sequences = NDArray[np.float64]  # k sequences of T actions, (k, T, F)
-# Rates k sequences, each from s equally likely start states (k, s, C): their values and best lengths, (k,) each.
+# Function that rates k sequences, each from s equally likely start states (k, s, C): it returns their values and best
+# lengths, (k,) each.
 Worth = Callable[[Tensor, Sequences], tuple[Tensor, Tensor]]
 
 
@@ -44,32 +45,32 @@ Worth = Callable[[Tensor, Sequences], tuple[Tensor, Tensor]]
 class Aim:
     """Objective and limits of a planned action sequence: which outputs to learn about, and where it may lead."""
 
-    columns: Sequence[int]  # numbers of the model's outputs about which the sequence should give information
+    columns: Sequence[int]  # indices of the outputs about which the sequence should give information
     tolerances: Sequence[float]  # (O,) tolerance of every output, in its unit
-    longest: int  # most actions in the sequence
+    longest: int  # greatest number of actions in the sequence
     snapshots: Mapping[str, Vector] = field(default_factory=dict)  # states at which a sequence may begin, by name
     states: Tensor | None = None  # (v, C) states that policies visited; their density weights the information
-    ending: bool = False  # a sequence that meets an unknown ending, or an edge of the reward, has priority
-    ended: bool = False  # some sample has ended an episode, so that a declared ending counts as known
+    ending: bool = False  # whether a sequence that meets an unknown termination or reward edge has priority
+    ended: bool = False  # whether a sample has ended an episode, so that a declared termination counts as known
 
 
 @dataclass(frozen=True)
 class Paths:
-    """Paths of the predicted mean state: b lanes over T steps."""
+    """Predicted paths of the mean state: b paths of T steps."""
 
     q: Tensor  # (b, T, C) states before each step
     u: Tensor  # (b, T, F) actions
     q_next: Tensor  # (b, T, C) states after each step
     running: Tensor  # (b, T) 1 for steps of a running episode, 0 after its end
-    ended: Tensor  # (b, T) 1 from the step on that ends the episode, 0 before
-    drift: Tensor  # (b, T) variance of the mean path before the step, in units of that of the sampling range
+    ended: Tensor  # (b, T) 1 from the step that ends the episode, 0 before
+    drift: Tensor  # (b, T) predictive variance summed over the steps before, in variances of the sampling range
 
 
 def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random.Generator) -> tuple[Query, ...]:
-    """Draw random sequences of 1, 2, 3, ... actions, with ``steps`` actions in all.
+    """Draw random sequences of 1, 2, 3, ... actions, with ``steps`` actions in total.
 
-    Each sequence repeats its actions for a different number of steps, so that the states spread. First steps from which
-    a model does not learn, because lags are not known yet, come in addition.
+    Each sequence holds its actions for a different number of steps, so that the states spread. First steps from which a
+    model does not learn, because lags are not known yet, come in addition.
     """
     rollouts: list[Query] = []
     while steps > definition.unknown_steps:
@@ -82,7 +83,7 @@ def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random
 def plan_round(
     model: DynamicsModel, aim: Aim, steps: int, unanswered: Sequence[Query], rng: np.random.Generator
 ) -> list[Query]:
-    """Plan action sequences with ``steps`` real steps in all.
+    """Plan action sequences with ``steps`` real steps in total.
 
     Each sequence is planned as if the earlier ones and the unanswered queries had been answered.
     """
@@ -134,7 +135,7 @@ def _search(
 ) -> tuple[NDArray[np.float64], int, float]:
     """Search for the best sequence (T, F) from any of k origins, each with s equally likely states (k, s, C).
 
-    Returns the sequence, the number of its origin, and its value.
+    Return the sequence, the index of its origin, and its value.
     """
     sequences = random_sequences(definition, population, longest, rng)
     places = np.resize(rng.permutation(len(origins)), population)
@@ -155,7 +156,7 @@ def as_if_done(
 ) -> DynamicsModel:
     """Condition the model on a rollout along its predicted path: variances shrink, means stay.
 
-    If the rollout's snapshot is not among ``snapshots``, the path begins at a reset.
+    If the query's snapshot is not among ``snapshots``, the path begins at a reset.
     """
     start = start_points(model.definition, 1, rng)
     if (at := snapshots.get(query.snapshot or "")) is not None:
@@ -188,7 +189,7 @@ def random_sequences(definition: EnvironmentDefinition, count: int, length: int,
 
 
 def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Paths:
-    """Predict the path of the mean state from each start (b, C) under actions (b, T, F)."""
+    """Predict the path of the mean state from each start (b, C) under action sequences (b, T, F)."""
     spread = [scaling(c.sampling)[1] for c in (model.definition.coordinates[i] for i in model.definition.moving)]
     q, running, drift = starts, starts.new_ones(len(starts)), starts.new_zeros(len(starts))
     steps: list[tuple[Tensor, ...]] = []
@@ -203,7 +204,8 @@ def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Path
 
 
 def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
-    """The acquisition's value of each path up to each step, (b, T), summed over the outputs in ``aim.columns``."""
+    """Return the acquisition's value of each path up to each step, (b, T), summed over the outputs in
+    ``aim.columns``."""
     acquisition = model.definition.design.acquisition
     weight = _weights(model.definition, aim, paths)
     total = torch.zeros_like(weight)
@@ -215,14 +217,15 @@ def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
 
 
 def _view(output: PathOutlook, weight: Tensor, tolerance: float) -> PathView:
-    """Return paths, whose steps have the weights (b, T), as an acquisition sees them for one output."""
+    """Return the properties of paths that an acquisition uses, for one output; ``weight`` (b, T) is that of each
+    step."""
     return PathView(tolerance, weight, lambda: output.std, lambda: output.information(weight, tolerance))
 
 
 def _worth(model: DynamicsModel, aim: Aim, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
-    """Rate the sequences (k, T, F), each from s equally likely states (k, s, C), by their best beginning.
+    """Rate the sequences (k, T, F), each from s equally likely states (k, s, C), by their best first part.
 
-    Returns the value per expected real step of that beginning, (k,), and its length, (k,).
+    Return the value per expected real step of that part, (k,), and its length, (k,).
     """
     count, lanes = starts.shape[:2]
     actions = torch.from_numpy(sequences).repeat_interleave(lanes, 0)
@@ -236,9 +239,9 @@ def _worth(model: DynamicsModel, aim: Aim, starts: Tensor, sequences: Sequences)
 
 
 def _endings(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
-    """Probability (b, T) that, up to a step, the model is wrong about an ending or about the side of a reward's edge.
+    """Return the probability that, up to a step, the model is wrong about a termination or a reward edge, (b, T).
 
-    If ends are declared and no sample has ended, it is 1 from the step on at which a path ends.
+    If termination is declared and no sample has ended, it is 1 from the step at which a path ends.
     """
     q, q_next = paths.q.flatten(0, 1), paths.q_next.flatten(0, 1)
     doubt = in_doubt(model, q_next).maximum(edge_in_doubt(model, q, q_next)).reshape(paths.running.shape)
@@ -247,7 +250,7 @@ def _endings(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
 
 
 def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tensor:
-    """Weight of each step of each path in the value of a plan, (b, T).
+    """Return the weight of each step of each path in the value of a plan, (b, T).
 
     With snapshots the weight also contains the sampling density at the state. Otherwise plans could lead ever farther
     away, to states that hardly matter for the verdict.
@@ -263,14 +266,15 @@ def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tenso
 
 
 def vary(definition: EnvironmentDefinition, sequences: Sequences, rng: np.random.Generator) -> None:
-    """Change each sequence (k, T, F) in place: one random stretch of it gets a new constant action."""
+    """Change each sequence (k, T, F) in place: a random stretch of it gets a new constant action."""
     for sequence in sequences:
         first, last = sorted(rng.integers(sequence.shape[0] + 1, size=2))
         sequence[first : last + 1] = _random_actions(definition, 1, rng)
 
 
 def _random_actions(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Random actions (count, F). Half of the continuous entries are at a limit, because such actions reach farthest."""
+    """Draw random actions (count, F). Half of the continuous entries are at a limit, because such actions reach
+    farthest."""
     action = definition.action
     if action.nvec:
         return rng.integers(action.nvec, size=(count, action.size)).astype(np.float64)

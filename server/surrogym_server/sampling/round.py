@@ -1,4 +1,4 @@
-"""One round of the design, as the rules that choose its queries see it."""
+"""One round of the design, in the form in which the rules that choose its queries use it."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Round:
     samples: Samples
     request: Request
     judgement: Judgement
-    tolerances: tuple[float, ...]  # (O,) declared or default ones, not widened by noise
-    outputs: list[int]  # numbers of the outputs to query for, the least confident first; at least one
-    continues: bool  # the round may spend what the budget has left; otherwise it may take ``request.extra`` steps
-    testing: bool  # the design is ready, but an excursion tests its model first
+    tolerances: tuple[float, ...]  # (O,) declared or default tolerances, not widened by noise
+    outputs: list[int]  # indices of the outputs to query for, the least confident first; at least one
+    continues: bool  # whether the round may spend the rest of the budget; if not, it may take ``request.extra`` steps
+    testing: bool  # whether the design is ready but for an excursion that tests its model
 
     @property
     def definition(self) -> EnvironmentDefinition:
@@ -34,12 +34,12 @@ class Round:
 
     @property
     def cost(self) -> int:
-        """Real steps that count towards the budget."""
+        """Number of real steps that count towards the budget."""
         return self.request.cost(len(self.samples))
 
     @property
     def room(self) -> int:
-        """Real steps that the budget has left, after those that unanswered queries may take."""
+        """Number of real steps that the budget has left, less those that unanswered queries may take."""
         return max(0, self.request.budget - self.cost - self.request.pending_steps)
 
     @property
@@ -54,5 +54,5 @@ class Round:
         return self.continues and design.stopping == "tested_confidence" and enough
 
     def generator(self) -> np.random.Generator:
-        """Return a new random generator for this round's rollouts; each call returns the same numbers."""
+        """Return a new random generator for this round's rollouts; every call returns the same stream of numbers."""
         return generator_for(self.definition, f"rollouts {self.number}")

@@ -8,5 +8,6 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 
 
 def generator_for(definition: EnvironmentDefinition, purpose: str) -> np.random.Generator:
-    """Return a new random generator for a purpose. The same seed and purpose give the same numbers."""
+    """Return a new random generator for a purpose, such as `initial`. The same seed and purpose give the same
+    numbers."""
     return np.random.default_rng([definition.design.seed, *purpose.encode()])

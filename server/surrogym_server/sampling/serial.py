@@ -27,11 +27,11 @@ from surrogym_server.environment.samples import Samples, preceding
 from surrogym_server.models.abilities import AtSamples, LearnedNoise, SampledFunctions, offers
 from surrogym_server.models.port import DynamicsModel
 
-FEWEST = 12  # fewest pairs of consecutive steps for a test
-MOST = 256  # most samples in a test, because its time grows with their third power
+FEWEST = 12  # least number of pairs of consecutive steps for a test
+MOST = 256  # greatest number of samples in a test, because its time grows with their third power
 CRITICAL = 5.41  # upper 2 % point of chi-squared with one degree of freedom: the one-sided test has level 1 %
-MAINLY = 0.5  # noise counts as the sensor's if at least this share of it comes from the sensor
-SHARES = torch.linspace(0, 1, 21, dtype=torch.float64)
+MAINLY = 0.5  # least share of the noise from the sensor for which the noise counts as the sensor's
+SHARES = torch.linspace(0, 1, 21, dtype=torch.float64)  # values of the share to try; see the module's formula
 FACTORS = torch.logspace(-0.6, 0.6, 9, dtype=torch.float64)  # values of c to try; see the module's formula
 CARRIED = 1.25  # safety factor on an estimated standard deviation, because the slopes are those of a model
 DIFFERENCE = 1e-4  # step of the numerical derivatives, as a share of a coordinate's sampling range
@@ -39,18 +39,18 @@ DIFFERENCE = 1e-4  # step of the numerical derivatives, as a share of a coordina
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Noise of one output's sensor."""
+    """Estimated noise of one output's sensor."""
 
     share: float  # share of the noise's variance that comes from the sensor
     std: float  # standard deviation of one measurement, in the output's unit
-    step: float  # standard deviation of all noise of a single step
+    step: float  # standard deviation of a single step's noise from all sources, in the output's unit
 
 
 def sensor_noise(model: DynamicsModel, samples: Samples, limits: Sequence[float]) -> tuple[SensorNoise | None, ...]:
-    """Noise of the sensor of each output (O,).
+    """Estimate the noise of the sensor of each output (O,).
 
-    None for an output whose learned noise is below its limit (O,), or whose consecutive steps don't show that most of
-    that noise comes from the sensor.
+    The entry is None for an output whose learned noise is below its limit (O,), or whose consecutive steps don't show
+    that most of that noise comes from the sensor.
     """
     definition, able = model.definition, offers(model, SampledFunctions)
     follows = preceding(definition, samples)
@@ -73,10 +73,10 @@ def sensor_noise(model: DynamicsModel, samples: Samples, limits: Sequence[float]
 def noise_of_sensors(
     model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoise | None], limits: Sequence[float]
 ) -> Tensor:
-    """Standard deviation of the part of each output's noise that comes from the sensors, (O,), in the output's unit.
+    """Return the standard deviation of the part of each output's noise that comes from sensors, (O,), in its unit.
 
-    It is the noise of the output's own sensor. An output without one has the noise that errors in the measured start of
-    a step cause. A value below the limit (O,) is returned as 0.
+    It is the noise of the output's own sensor. An output without a noisy sensor has the noise that errors in the
+    measured start of a step cause. A value below the limit (O,) is returned as 0.
     """
     if not any(sensors):
         return torch.zeros(len(sensors), dtype=torch.float64)
@@ -87,7 +87,7 @@ def noise_of_sensors(
 
 
 def _carried(model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoise | None]) -> Tensor:
-    """Standard deviation of each output (O,) that errors in the measured start of a step cause, over the samples."""
+    """Return the standard deviation of each output (O,) that errors in the measured start of a step cause."""
     variance = torch.zeros(len(sensors), dtype=torch.float64)
     for index, sensor in zip(model.definition.moving, sensors, strict=False):
         if sensor is not None:
@@ -96,17 +96,19 @@ def _carried(model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoi
 
 
 def _model_noise(model: DynamicsModel) -> Tensor:
-    """Standard deviation of the noise that the model has learned for each output, (O,)."""
+    """Return the standard deviation of the noise that the model has learned for each output, (O,)."""
     able = offers(model, LearnedNoise)
     result = [0.0] * len(model.definition.outputs) if able is None else able.noise_stds
     return torch.tensor(result, dtype=torch.float64)
 
 
 def _sensor_noise(at: AtSamples, follows: Tensor, slope: Tensor) -> SensorNoise | None:
-    """Test for noise of the sensor of one output; None if the test does not show it.
+    """Test for noise of the sensor of one output; return None if the test does not show it.
 
-    Sample i begins where sample ``follows[i]`` ended (-1: none did). ``slope`` (n,) is the derivative of the next
-    value of the output's coordinate by its present value.
+    Args:
+        at: the output's process at its samples.
+        follows: sample i begins where sample ``follows[i]`` ended; -1 if no sample did.
+        slope: (n,) derivative of the next value of the output's coordinate over its present value.
     """
     slope = slope[at.rows]
     pattern = sensor_pattern(slope, _among(follows, at.rows))
@@ -118,14 +120,14 @@ def _sensor_noise(at: AtSamples, follows: Tensor, slope: Tensor) -> SensorNoise 
 
 
 def _among(follows: Tensor, rows: Tensor) -> Tensor:
-    """Restrict ``follows`` to a selection of rows, and renumber it by their positions in the selection."""
+    """Restrict ``follows``, the index of the sample before each sample, to the samples ``rows``, and renumber it."""
     places = torch.full((len(follows) + 1,), -1)  # the last entry answers -1, which stands for no step before
     places[rows] = torch.arange(len(rows))
     return places[follows[rows]]
 
 
 def sensor_pattern(slope: Tensor, follows: Tensor) -> Tensor:
-    """Correlation pattern S (n, n) that noise of a sensor causes between consecutive steps; see the module.
+    """Return the correlation pattern S (n, n) that sensor noise causes between consecutive steps; see the module.
 
     Step i begins where step ``follows[i]`` ended, -1 for none, and has the slope ``slope[i]``.
     """
@@ -138,13 +140,14 @@ def sensor_pattern(slope: Tensor, follows: Tensor) -> Tensor:
 def best_share(y: Tensor, function: Tensor, noise: float, pattern: Tensor) -> tuple[float, float, float]:
     """Fit the share of the noise that comes from the sensor, by maximum likelihood.
 
-    Returns the share, the factor c, and twice the difference between its log likelihood and that of share 0.
-
     Args:
-        y: (n,) targets, of mean 0.
-        function: (n, n) their covariance without noise.
+        y: (n,) targets with mean 0.
+        function: (n, n) covariance of the targets without noise.
         noise: variance of the noise of one step.
-        pattern: S.
+        pattern: S (n, n), from ``sensor_pattern``.
+
+    Returns:
+        The share, the factor c, and twice the gain in log likelihood over a share of 0.
     """
     likelihoods = torch.stack(
         [
@@ -171,12 +174,12 @@ def _log_likelihood(y: Tensor, covariance: Tensor) -> Tensor:
 
 
 def _slopes(model: DynamicsModel, samples: Samples, column: int, index: int) -> Tensor:
-    """Derivative of a coordinate's next value by its present value, at the samples, (n,)."""
+    """Return the derivative of a coordinate's next value over its present value, at the samples, (n,)."""
     return 1 + _differences(model, samples, index)[:, column]
 
 
 def _differences(model: DynamicsModel, samples: Samples, index: int) -> Tensor:
-    """Derivatives of all outputs by one coordinate, at the samples, (n, O)."""
+    """Return the derivatives of all outputs over one coordinate, at the samples, (n, O)."""
     sampling = model.definition.coordinates[index].sampling
     step = torch.zeros_like(samples.q)
     step[:, index] = DIFFERENCE * max(sampling.high - sampling.low, 1e-12)

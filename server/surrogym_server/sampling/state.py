@@ -1,4 +1,4 @@
-"""Inputs of a round of the design: the state that the last round returned, and the request for this one."""
+"""Inputs of a round of the design: the state that the previous round returned, and the request for this one."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from surrogym_shared.nouns import Query, Vector
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions under which a design has ended. If they change, it may begin again. O outputs."""
+    """Conditions under which a design has ended. If they change, the design may continue. O outputs."""
 
-    cost: float  # real steps that count towards the budget
-    budget: float  # limit of these real steps
+    cost: float  # number of real steps that count towards the budget
+    budget: float  # greatest number of these real steps
     target: float  # confidence index to reach
-    tolerances: tuple[float, ...]  # (O,) declared or default ones
+    tolerances: tuple[float, ...]  # (O,) declared or default tolerances
 
     def to_list(self) -> list[float]:
-        """Return the conditions as JSON has them, in one list."""
+        """Return the conditions as one list, for JSON."""
         return [float(self.cost), float(self.budget), self.target, *self.tolerances]
 
     @classmethod
@@ -40,14 +40,12 @@ class DesignState:
     """State that one round passes to the next. It can be stored as JSON."""
 
     round: int = 0
-    defaults: DefaultTolerances = field(default_factory=DefaultTolerances)  # for outputs without a declared one
-    warm: dict[str, NDArray[np.float64]] = field(
-        default_factory=dict
-    )  # arrays of the last fit, from which the next one starts
+    defaults: DefaultTolerances = field(default_factory=DefaultTolerances)  # for outputs without a declared tolerance
+    warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # warm start for the next fit
     ended_under: Conditions | None = None  # conditions when the design ended; None while it continues
     ended_as: str = ""  # the verdict with which the design ended; "" while it continues
-    predictions: Predictions = ()  # of the latest samples, by the models that had not learned from them
-    tested_at: int = 0  # number of samples when an excursion was planned to test a ready model; 0 without one
+    predictions: Predictions = ()  # predictions of the latest samples by models that had not learned from them
+    tested_at: int = 0  # number of samples when an excursion was planned to test a ready model; 0 without an excursion
 
     def to_json(self) -> dict[str, Any]:
         warm = {key: array.tolist() for key, array in self.warm.items()}
@@ -75,18 +73,18 @@ class DesignState:
 
 @dataclass(frozen=True)
 class Request:
-    """Input of a round.
+    """What a round of the design is asked to do.
 
-    Pending queries, open or set aside, are treated as answered. Their steps are reserved (``Round.room`` subtracts
-    them, ``cost`` does not count them), so that a design whose queries all fail comes to an end. They count in the
-    acquisition, so that the next queries go elsewhere. Queries that the
-    environment refused count in the acquisition alone, because no real step was taken.
+    Pending queries are treated as answered. Their steps are reserved: ``Round.room`` subtracts them although ``cost``
+    does not count them, so that a design whose queries all fail comes to an end. The acquisition counts them too, so
+    that the next queries go elsewhere. Queries that the environment refused only count in the acquisition, because no
+    real step was taken.
     """
 
-    budget: int
-    target: float
-    pending: tuple[Query, ...] = ()
-    refused: tuple[Query, ...] = ()
+    budget: int  # greatest number of real steps of the design
+    target: float  # confidence index to reach
+    pending: tuple[Query, ...] = ()  # queries without an answer, which may still come or were set aside
+    refused: tuple[Query, ...] = ()  # queries that the environment refused
     extra: int = 0  # real steps to choose even if the design has ended
     states: Tensor | None = None  # (v, C) states that policies visited
     snapshots: Mapping[str, Vector] = field(default_factory=dict)  # coordinates (C,) of each snapshot, by its name
@@ -94,11 +92,11 @@ class Request:
     audited: int = 0  # number of the samples that are steps of audits
     unlearned: int = 0  # real steps that are not among the samples, because their lags were not known
     open: int = 0  # real steps of the pending queries that may still be answered
-    prior: DynamicsModel | None = None  # model of what is known beforehand
-    surprises: Predictions = ()  # predictions, by the last model, of the samples that are new in this round
+    prior: DynamicsModel | None = None  # model of earlier knowledge, such as one of a simulator
+    surprises: Predictions = ()  # predictions of this round's new samples by the previous model
 
     def cost(self, samples: int) -> int:
-        """Number of real steps that count towards the budget, of a design that has this number of samples.
+        """Return the number of real steps that count towards the budget of a design that has this many samples.
 
         Samples of logs and audits don't count. Steps whose lags were not known do count, although they are not among
         the samples.
@@ -116,7 +114,7 @@ class Request:
         return sum(query.steps for query in self.pending)
 
     def is_mostly_refused(self, cost: float) -> bool:
-        """Whether the design should end, because as many steps were refused as its budget and ``cost`` have together.
+        """Return whether the design should end because as many steps were refused as ``cost`` and budget together.
 
         ``cost`` is the number of real steps that count. Without this limit, a design whose queries are all refused
         would never end.

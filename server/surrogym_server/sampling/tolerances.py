@@ -1,9 +1,9 @@
 """Default tolerances: 5 % of each output's standard deviation over the initial design, within bounds.
 
-They are frozen after the first round, so that a design does not change its own goal. A size estimated from few samples
-can be wrong in two ways: it may be mere rounding, or the samples may have missed everything of interest. So sizes have
-a floor, and a tolerance is computed again when later samples cover a far larger range. The initial design of an
-environment with snapshots stays near the resets, so there a tolerance grows with the samples' standard deviation.
+Default tolerances are frozen after the first round, so that a design does not change its own goal. A size estimated
+from few samples can be wrong in two ways: it may be rounding, or the samples may have missed everything of interest. So
+sizes have a floor, and a tolerance is computed again when later samples cover a far larger range. The initial design of
+an environment with snapshots stays near the resets, so there a tolerance grows with the samples' standard deviation.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.samples import Samples, increments
 
-TOLERANCE = 0.05  # default, as a share of the output's standard deviation over the initial design
+TOLERANCE = 0.05  # default tolerance, as a share of the output's standard deviation over the initial design
 FLOOR = 1e-9  # increments below this share of a coordinate's standard deviation over its range are rounding errors
-NOTHING = 1e-3  # share of the later range: a smaller range of the first samples says nothing about the size
+NOTHING = 1e-3  # a first range of targets below this share of the later range was too small to define a tolerance
 
 
 def sizes_of(definition: EnvironmentDefinition, samples: Samples) -> list[float]:
-    """Size of each output (O,): its standard deviation over the samples, or its absolute mean if it never varied."""
+    """Return the size of each output (O,): its standard deviation over the samples, or its absolute mean if it never
+    varied."""
     targets = _targets(definition, samples)
     spread, mean = targets.std(0, correction=0), targets.mean(0).abs()
     return torch.where(spread > 0, spread, torch.where(mean > 0, mean, 1.0)).tolist()
 
 
 def default_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]) -> tuple[float, ...]:
-    """Default tolerance (O,) of outputs of these sizes (O,): 5 % of the size, or 1 in the unit, as in the paper."""
+    """Return the default tolerances (O,) of outputs of these sizes (O,): 5 % of the size, or 1 for `raw` tolerances."""
     if definition.design.tolerance == "raw":
         return (1.0,) * len(sizes)
     floors = _floors(definition)
@@ -40,21 +41,21 @@ def default_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]
 
 @dataclass(frozen=True)
 class DefaultTolerances:
-    """Default tolerances of a design: of all O outputs, also of those that have a declared one, which replaces it."""
+    """Default tolerances of all O outputs of a design; for an output with a declared tolerance they are not used."""
 
     values: tuple[float, ...] = ()  # (O,) in each output's unit; empty before the first round
-    ranges: tuple[float, ...] = ()  # (O,) ranges of the targets that the values were computed from
+    ranges: tuple[float, ...] = ()  # (O,) ranges of the targets from which the values were computed
 
 
 def frozen_tolerances(
     definition: EnvironmentDefinition, samples: Samples, before: DefaultTolerances
 ) -> DefaultTolerances:
-    """Return the default tolerances of a round: those of the round before, unless they have to change.
+    """Return the default tolerances of a round: those of the previous round, ``before``, unless they have to change.
 
     They are computed from the samples in the first round, and again for an output whose range of targets has grown by
     a factor of more than 1 / ``NOTHING``. With snapshots they are computed in each round, and never become smaller.
-    States of older designs have no ranges; their tolerances stay. Rewards of terminating steps are left out, because
-    the reward's process does not model them. A pure function, so that a repeated round gives the same result.
+    Tolerances that were stored without ranges don't change. Rewards of terminating steps are left out, because the
+    reward's process does not model them.
     """
     sizes, ranges = sizes_of(definition, samples), _ranges(definition, samples)
     current = default_tolerances(definition, sizes)
@@ -68,14 +69,17 @@ def frozen_tolerances(
 
 
 def _later(last: tuple[float, float], new: tuple[float, float], *, grows: bool) -> tuple[float, float]:
-    """Choose between the ``last`` tolerance and range of an output and the ``new`` ones, computed from all samples."""
+    """Return the ``last`` tolerance and range of an output, or the ``new`` ones if the range has grown far.
+
+    With ``grows`` the larger tolerance is returned.
+    """
     if new[1] * NOTHING > last[1]:
         return new
     return max(last, new) if grows else last
 
 
 def _ranges(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
-    """Largest less smallest target of non-terminating steps, (O,); 0 if the difference is a rounding error."""
+    """Return the range of each output's targets over non-terminating steps, (O,); 0 if it is a rounding error."""
     targets = _targets(definition, samples)[~samples.terminated]
     if not len(targets):
         return (0.0,) * len(definition.outputs)
@@ -88,7 +92,8 @@ def _targets(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def _floors(definition: EnvironmentDefinition) -> list[float]:
-    """Smallest size of each output (O,) that is not a rounding error; 0 for the reward, whose range is unknown."""
+    """Return the smallest size of each output (O,) that is not a rounding error; 0 for the reward, whose range is
+    unknown."""
     if definition.moves_observation:
         return [0.0] * len(definition.outputs)
     return [FLOOR * scaling(definition.coordinates[i].sampling)[1] for i in definition.moving] + [0.0]

@@ -19,21 +19,26 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class UncertaintyResult:
-    """Prediction and uncertainty at n points, arrays (n, O) with the outputs in the order of ``definition.outputs``."""
+    """Prediction and uncertainty at n points: arrays (n, O) with the outputs in the order of ``definition.outputs``."""
 
-    mean: (
-        Array  # predicted change of each coordinate, or of each observation entry that the model moves; then the reward
-    )
-    std: Array
-    model_uncertainty: Array
-    input_probability: Array
-    log_uncertainty_index: Array
+    mean: Array  # predicted change of each coordinate, or of each observation entry that the model moves; then reward
+    std: Array  # latent standard deviation, in the output's unit
+    model_uncertainty: Array  # U_m (eq. 10)
+    input_probability: Array  # P_i (eq. 11)
+    log_uncertainty_index: Array  # log U (eq. 12)
 
 
 def query_uncertainty(
     model: DynamicsModel, q: Array, u: Array, tolerances: Array, occupancy: Array | None = None
 ) -> UncertaintyResult:
-    """Return mean, standard deviation, U_m, P_i and log U at q (n, C) and u (n, F), for tolerances (O,)."""
+    """Return prediction and uncertainty at q (n, C) and u (n, F).
+
+    Args:
+        model: the model.
+        q, u: coordinates and actions.
+        tolerances: (O,) tolerance of each output, in its unit.
+        occupancy: (v, C) states that policies visited, or None.
+    """
     at, action = torch.from_numpy(q), torch.from_numpy(u)
     states = None if occupancy is None else torch.from_numpy(occupancy)
     mean, std = model.means(at, action), stds(model, at, action)
@@ -44,9 +49,9 @@ def query_uncertainty(
 
 
 def visited_confidence(model: DynamicsModel, states: Array, tolerances: Sequence[float]) -> float:
-    """Smallest confidence index (eq. 8, 9) of the outputs over visited states (v, C), for tolerances (O,).
+    """Return the smallest confidence index (eq. 8, 9) of the outputs over visited states (v, C), for tolerances (O,).
 
-    With these states in the place of the Monte Carlo set, it shows how well the model is known where a policy goes.
+    It shows how well the model is known where a policy goes, instead of over the Monte Carlo set.
 
     States outside the sampling range count as well, although the design never queries there. Each state is taken under
     one random action, as in the acquisition's reference, because a policy that learns tries actions other than its own.

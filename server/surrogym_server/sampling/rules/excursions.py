@@ -1,4 +1,4 @@
-"""Rule: test a confident model by an action sequence that leads far away from all samples."""
+"""Rule: test a confident model by an excursion, an action sequence that leads far away from all samples."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from surrogym_shared.nouns import Query
 
 
 def take_excursion(round: Round) -> tuple[Query, ...] | None:
-    """Return an excursion as the next query, if the model is to be tested and the budget has room."""
+    """Return an excursion as the next query if the model is to be tested and the budget has room, otherwise None or
+    ()."""
     if not round.testing:
         return None
     if not round.room:

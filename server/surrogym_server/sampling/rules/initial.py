@@ -9,7 +9,7 @@ from surrogym_shared.nouns import Query
 
 
 def complete_initial_rollouts(round: Round) -> tuple[Query, ...] | None:
-    """Return further random rollouts, if the initial design lacks more steps than a planned round takes.
+    """Return further random rollouts if the initial design lacks more steps than a planned round takes, otherwise None.
 
     Without them many small rounds would follow, each with a fit to few samples. Logged steps replace initial ones.
     """

@@ -1,4 +1,4 @@
-"""The order of the rules. The first one that applies chooses the queries of a round."""
+"""Order of the rules. The first rule that applies chooses the queries of a round."""
 
 from surrogym_server.sampling.rules.excursions import take_excursion
 from surrogym_server.sampling.rules.initial import complete_initial_rollouts
@@ -8,8 +8,8 @@ from surrogym_server.sampling.rules.repeats import repeat_steps
 from surrogym_server.sampling.rules.rule import Rule
 from surrogym_server.sampling.rules.valued import ask_best_candidates
 
-# An environment that can be set to any state answers single steps.
+# Rules for an environment that can be set to any state, whose queries are single steps.
 STEP_RULES: tuple[Rule, ...] = (repeat_steps, ask_best_candidates)
 
-# An environment that begins at resets or snapshots answers rollouts.
+# Rules for an environment that begins at resets or snapshots, whose queries are rollouts.
 ROLLOUT_RULES: tuple[Rule, ...] = (take_excursion, see_the_past, complete_initial_rollouts, plan_rollouts)

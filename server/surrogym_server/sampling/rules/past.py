@@ -8,11 +8,12 @@ from surrogym_server.sampling.rollouts import random_sequences
 from surrogym_server.sampling.round import Round
 from surrogym_shared.nouns import Query
 
-LENGTH = 8  # steps of each rollout
+LENGTH = 8  # number of steps of each rollout
 
 
 def see_the_past(round: Round) -> tuple[Query, ...] | None:
-    """Return random rollouts, if an error exceeds its tolerance and ``sampling.past`` lacks consecutive steps.
+    """Return random rollouts if an error exceeds its tolerance and ``sampling.past`` lacks consecutive steps, otherwise
+    None.
 
     An environment with snapshots needs none, because a snapshot contains what the environment remembers.
     """

@@ -1,4 +1,4 @@
-"""Rule: plan rollouts in the model, which maximise the acquisition's value along their predicted paths."""
+"""Rule: plan rollouts in the model that maximise the acquisition's value along their predicted paths."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def plan_rollouts(round: Round) -> tuple[Query, ...]:
 
 
 def steps_of_a_round(round: Round) -> int:
-    """Return the number of real steps of a planned round: a quarter of the number of samples.
+    """Return the number of real steps of a planned round: a quarter of the number of samples, at least ``SHORTEST``.
 
-    So rounds grow with the data, and fits are few. With snapshots it is half the number of samples, because a plan
-    need not first lead away from a reset, and at least one step for each output below its target.
+    So rounds grow with the data, and fits are few. With snapshots it is an eighth, because a plan need not first lead
+    away from a reset, and at least one step for each output below its target.
     """
     samples = len(round.samples)
     if round.definition.snapshots:

@@ -9,7 +9,8 @@ from surrogym_shared.nouns import Query
 
 
 def repeat_steps(round: Round) -> tuple[Query, ...] | None:
-    """Return repeats of the steps with the largest errors, unless they were repeated already."""
+    """Return repeats of earlier steps if they are needed to tell noise from misfit and the budget has room, otherwise
+    None."""
     if not round.may_examine:
         return None
     with plugin_calls(round.definition):

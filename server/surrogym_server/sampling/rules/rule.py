@@ -8,4 +8,4 @@ from surrogym_server.sampling.round import Round
 from surrogym_shared.nouns import Query
 
 Rule = Callable[[Round], tuple[Query, ...] | None]
-"""Chooses queries, or none, which ends the design. It returns None if it does not apply: the next rule is asked."""
+"""Function that returns the queries of a round, or () to end the design. If it returns None, the next rule is tried."""

@@ -11,8 +11,8 @@ from surrogym_shared.nouns import Query
 def ask_best_candidates(round: Round) -> tuple[Query, ...]:
     """Return one query for each output below the target, the least confident output first, while the budget has room.
 
-    If the design has ended, there are ``request.extra`` queries, and the outputs take turns. If candidates are reserved
-    (see ``Candidates``), the first query is one of them.
+    If the design has ended, return ``request.extra`` queries for the outputs in turn. If candidates are reserved (see
+    ``Candidates``), the first query is one of them.
     """
     judgement = round.judgement
     unanswered = Points.of(round.definition, round.request.unanswered)
