@@ -1,1 +1,1 @@
-"""The HTTP API: routes read the wire, call one service function, and write the wire."""
+"""The HTTP API: each route reads a request, calls one function of a service, and writes the reply."""

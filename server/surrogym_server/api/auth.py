@@ -1,4 +1,4 @@
-"""Permissions: bearer tokens with roles, and who sends a request. Without any token, everybody may do everything."""
+"""Permissions: bearer tokens with roles, and the sender of a request. A server without tokens allows all requests."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from surrogym_server.errors import Forbidden, Unauthenticated
 from surrogym_shared.wire import Role
 
 SALT = b"surrogym"
-WORK = 2**12  # of scrypt: 10 ms and 4 MB for each attempt to guess the token behind a fingerprint
+WORK = 2**12  # cost parameter n of scrypt: an attempt to guess the token of a fingerprint takes 10 ms and 4 MB
 FINGERPRINT_BYTES = 5
 DESCRIPTION = "A token of this server; not needed on loopback without tokens."
 
 
 class Gate:
-    """Roles of the known tokens. Tokens are compared in constant time."""
+    """The known tokens and their roles. Tokens are compared in constant time, against timing attacks."""
 
     def __init__(self, tokens: Mapping[str, Role]) -> None:
         self._tokens = [(token.encode(), role) for token, role in tokens.items()]
@@ -45,28 +45,28 @@ class Gate:
         """Check that a token may call a route.
 
         Raises:
-            Unauthenticated: no token, or an unknown one.
-            Forbidden: the token's role is not in ``allowed``.
+            Unauthenticated: the token is missing or unknown.
+            Forbidden: the token's role is neither admin nor in ``allowed``.
         """
         if self.open:
             return
         if token is None:
-            raise Unauthenticated("expected the header 'Authorization: Bearer <token>', got none")
+            raise Unauthenticated("expected the header 'Authorization: Bearer <token>', got none: set SURROGYM_TOKEN")
         role = self.role_of(token)
         if role not in (*allowed, "admin"):
             raise Forbidden(f"expected a token with role {' or '.join((*allowed, 'admin'))}, got {role}")
 
 
 def bearer_token(scope: Scope) -> str | None:
-    """The token in the headers of a request, if any."""
+    """Return the bearer token in the headers of a request; None if there is none."""
     scheme, _, token = raw_header(scope, b"authorization").decode("latin-1").partition(" ")
     return token.strip() if scheme.lower() == "bearer" else None
 
 
 class Access(HTTPBearer):
-    """The roles that may call a route, in addition to admin. A route declares it among its dependencies.
+    """Dependency that declares which roles may call a route, in addition to admin.
 
-    The route's door enforces it (``api.door``). As a dependency it only describes the route in OpenAPI.
+    It only describes the route in OpenAPI; ``api.door`` enforces the roles.
     """
 
     def __init__(self, *roles: Role) -> None:
@@ -75,7 +75,7 @@ class Access(HTTPBearer):
 
 
 def everybody() -> None:
-    """Dependency of a route that needs no token."""
+    """Dependency that declares that a route needs no token."""
 
 
 PUBLIC = Depends(everybody)
@@ -87,29 +87,31 @@ ADMIN = Depends(Access())
 
 
 def role_of(scope: Scope) -> Role:
-    """The role of a request's token; admin if the server has no tokens.
+    """Return the role of a request's token; admin if the server has no tokens.
 
     Raises:
-        Unauthenticated: an unknown token, or none.
+        Unauthenticated: the token is missing or unknown.
     """
     gate: Gate = scope["app"].state.gate
     return "admin" if gate.open else gate.role_of(bearer_token(scope) or "")
 
 
 def caller(scope: Scope) -> str:
-    """Role and fingerprint of a request's token, and the address of its sender. Only known tokens have a fingerprint,
-    because a mistyped one may be the password of something else."""
+    """Describe the sender of a request for the log: role and fingerprint of its token, and its address.
+
+    An unknown token has no fingerprint in the log, because it may be a password that was entered by mistake.
+    """
     return f"{holder(scope)} from {_address(scope)}"
 
 
 @lru_cache(maxsize=1_024)
 def fingerprint(token: str) -> str:
-    """Ten characters that distinguish tokens, the same on every server and after every start."""
+    """Return ten characters that identify a token without revealing it; the same on every server."""
     return hashlib.scrypt(token.encode(), salt=SALT, n=WORK, r=8, p=1, dklen=FINGERPRINT_BYTES).hex()
 
 
 def holder(scope: Scope) -> str:
-    """Role and fingerprint of a request's token; ``anybody`` if the server has no tokens."""
+    """Return the role and fingerprint of a request's token as text; ``anybody`` if the server has no tokens."""
     gate: Gate = scope["app"].state.gate
     if gate.open:
         return "anybody"
@@ -123,7 +125,7 @@ def holder(scope: Scope) -> str:
 
 
 def _address(scope: Scope) -> str:
-    """Address of the connection. If that is a proxy on this machine, the address that it forwards."""
+    """Return the address of a request's sender; behind a proxy on this machine, the address that the proxy forwards."""
     host, _ = scope.get("client") or ("", 0)
     try:
         return str(ip_address(host))

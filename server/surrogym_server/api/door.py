@@ -1,7 +1,7 @@
-"""The door of a route: who may call it, and with which body.
+"""Conditions for a request to a route, checked from its headers before the body is read: roles, media type, size.
 
-Both are decided from the headers, before the body is read. A route declares its roles among its dependencies
-(``api.auth``), the media types of its body by its parameters, and the size of a JSON body by ``json_up_to``.
+A route declares its roles among its dependencies (``api.auth``), the media types of its body by its parameters, and
+the size of a JSON body by ``json_up_to``.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from surrogym_server.api.headers import raw_header
 from surrogym_server.api.json_body import JSON, JsonRequest
 from surrogym_shared.wire import Role
 
-MEDIA_TYPE = "surrogym.media_type"  # in the scope: media type of the body, if the route reads one
-JSON_LIMIT = "x-max-json-bytes"  # in OpenAPI
+MEDIA_TYPE = "surrogym.media_type"  # key in the ASGI scope: media type of the body, if the route reads one
+JSON_LIMIT = "x-max-json-bytes"  # key in OpenAPI: largest JSON body of a route
 KIBIBYTE = 1024
 DEFAULT_JSON_BYTES = 64 * KIBIBYTE
 
 
 def json_up_to(kibibytes: int) -> dict[str, Any]:
-    """``openapi_extra`` of a route whose JSON bodies may be larger than the default of 64 KiB."""
+    """Return ``openapi_extra`` for a route whose JSON bodies may be larger than the default of 64 KiB."""
     return {JSON_LIMIT: kibibytes * KIBIBYTE}
 
 
 @dataclass(frozen=True)
 class Door:
-    """Conditions for a request, checked before its body is read.
+    """Conditions for a request to a route, checked before the body is read.
 
     Attributes:
-        roles: roles that may enter, in addition to admin; None lets everybody in.
+        roles: roles that may call the route, in addition to admin; None if it needs no token.
         bodies: largest size in bytes of each accepted media type, None for the server's own limit; empty if the route
             reads no body.
     """
@@ -50,9 +50,9 @@ class Door:
         """Check a request, and put the media type and the size limit of its body into its scope.
 
         Raises:
-            Unauthenticated: no token, or an unknown one.
+            Unauthenticated: the token is missing or unknown.
             Forbidden: the token's role does not allow this route.
-            HTTPException: 415 for another media type or an encoded body, 413 if the announced size is too large.
+            HTTPException: 415 for a wrong media type or a content encoding, 413 if Content-Length is too large.
         """
         state = scope["app"].state
         gate: Gate = state.gate
@@ -73,19 +73,21 @@ class Door:
     def _media_type(self, scope: Scope) -> str:
         given = raw_header(scope, b"content-type").decode("latin-1").partition(";")[0].strip().lower()
         if given not in self.bodies:
-            raise HTTPException(415, f"expected content type {' or '.join(self.bodies)}, got {given or 'none'}")
+            raise HTTPException(415, f"expected content type {' or '.join(self.bodies)}, got {given or 'no type'}")
         encoding = raw_header(scope, b"content-encoding").decode("latin-1").strip().lower()
         if encoding not in ("", "identity"):
-            raise HTTPException(415, f"expected a body without content encoding, got the encoding {encoding!r}")
+            raise HTTPException(415, f"expected a body without content encoding, got {encoding!r}: send it plain")
         return given
 
 
 def door_of(route: APIRoute) -> Door:
-    """Build the door that a route declares. Raises ``TypeError`` if the route does not declare who may call it."""
+    """Return the conditions that a route declares. Raises ``TypeError`` if the route does not declare its roles."""
     declared = [depends.dependency for depends in route.dependencies]
     access = [one for one in declared if isinstance(one, Access)]
     if len(access) + (everybody in declared) != 1:
-        raise TypeError(f"route {route.path}: expected one declaration of who may call it, got {len(access)}")
+        raise TypeError(
+            f"route {route.path}: expected one declaration of who may call it, such as READ, got {len(access)}"
+        )
     extra = route.openapi_extra or {}
     content = extra.get("requestBody", {}).get("content", {JSON: {}} if route.body_field else {})
     limits: dict[str, int | None] = dict.fromkeys(content)
@@ -95,7 +97,7 @@ def door_of(route: APIRoute) -> Door:
 
 
 class DoorRoute(APIRoute):
-    """A FastAPI route with its door."""
+    """A FastAPI route that checks roles, media type and size of a request before it reads the body."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         door, handle = door_of(self), super().get_route_handler()

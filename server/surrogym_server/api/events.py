@@ -1,4 +1,4 @@
-"""Routes of events: what happens to surrogates, as server-sent events."""
+"""Routes of events: streams of the changes of surrogates, as server-sent events."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ HEADERS = {"cache-control": "no-store", "x-accel-buffering": "no"}
     },
 )
 async def changes(request: Request, use: Use) -> StreamingResponse:
-    """Send an event ``changed`` after a change of any surrogate. Several changes in quick succession make one event.
-    Read ``/v1/surrogates`` again after it."""
+    """Stream an event ``changed`` after changes of any surrogate; read ``/v1/surrogates`` again after it. Several
+    changes in quick succession make one event."""
     return _stream(request, _changes(use.events.changes()))
 
 
@@ -60,20 +60,21 @@ async def events(
     after: Annotated[int | None, Query(ge=0, le=2**63 - 1)] = None,
     last_event_id: Annotated[int | None, Header(ge=0, le=2**63 - 1)] = None,
 ) -> StreamingResponse:
-    """Send queries, samples, fits and phases as they happen. With ``Last-Event-ID`` or ``after`` the stream continues
-    after a known event; without either it begins with the next event. The oldest of very many events are removed."""
+    """Stream the events of a surrogate: queries, samples, fits and phases. With ``Last-Event-ID`` or ``after`` the
+    stream begins after the event with this id; without either it begins with the next event. Only the newest events of
+    a surrogate are kept."""
     newest = await use.events.newest(name)
     start = next((id for id in (last_event_id, after) if id is not None), newest)
     return _stream(request, _lines(use.events.follow(name, start)))
 
 
 def _stream(request: Request, lines: AsyncIterator[str]) -> StreamingResponse:
-    """Raises ``Overloaded`` if the request's token has too many streams."""
+    """Return a streaming response of these lines. Raises ``Overloaded`` if the token has too many open streams."""
     streams: Waiting = request.app.state.streams
     streams.require_room(request)
 
     async def counted() -> AsyncIterator[str]:
-        with streams.count(request):  # a stream that never begins is never counted
+        with streams.count(request):  # counted here, so that only a stream that has begun counts
             yield CONNECTED
             async for text in lines:
                 yield text
@@ -93,7 +94,7 @@ async def _lines(pages: AsyncIterator[Page | None]) -> AsyncIterator[str]:
 
 @lru_cache(maxsize=8)
 def _text(page: Page) -> str:
-    """A page for a stream, made once for all that wait for it."""
+    """Return a page of events as text of a stream; cached, because all streams of a surrogate send the same page."""
     return "".join(
         f"id: {record.id}\nevent: {record.kind}\ndata: {resources.event(record).model_dump_json()}\n\n"
         for record in page.events

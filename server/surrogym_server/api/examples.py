@@ -1,4 +1,4 @@
-"""Example bodies in the API's documentation. A test validates each of them."""
+"""Example bodies for the documentation of the API. A test validates each of them."""
 
 from __future__ import annotations
 

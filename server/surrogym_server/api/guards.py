@@ -1,4 +1,4 @@
-"""Guards before the routes: sizes of bodies, host names, and pages of other sites."""
+"""Middleware before the routes that refuses large bodies, unknown host names, and requests of other web sites."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from surrogym_server.api.headers import raw_header
 from surrogym_server.api.problems import RETRY_AFTER_SECONDS, problem_response
 from surrogym_shared.codes import Code
 
-BODY_LIMIT = "surrogym.body_limit"  # in the scope: largest size of this body in bytes, set by the route's door
+BODY_LIMIT = "surrogym.body_limit"  # key in the ASGI scope: largest size of this body in bytes, set by ``api.door``
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
-OWN_SITE = (b"", b"same-origin", b"none")  # Sec-Fetch-Site of programs, of our own pages, of typed addresses
+OWN_SITE = (b"", b"same-origin", b"none")  # Sec-Fetch-Site of programs, the server's own pages and typed addresses
 
 
 class BodyLimit:
-    """Refuses bodies beyond the limit of their route, and beyond ``max_together`` bytes in all requests at once."""
+    """Middleware that refuses bodies larger than the limit of their route, or than ``max_together`` bytes in all
+    requests at a time."""
 
     def __init__(self, app: ASGIApp, max_together: int) -> None:
         self._app = app
@@ -53,7 +54,10 @@ class BodyLimit:
 
 
 class KnownHosts:
-    """Refuses other host names, against pages that let their name point to this machine (DNS rebinding)."""
+    """Middleware that refuses requests to a host name not in ``hosts``, against DNS rebinding.
+
+    In such an attack, a web site makes its own host name point to this machine.
+    """
 
     def __init__(self, app: ASGIApp, hosts: frozenset[str]) -> None:
         self._app = app
@@ -63,18 +67,19 @@ class KnownHosts:
         if scope["type"] == "lifespan" or (host := _host(scope)) in self._hosts:
             await self._app(scope, receive, send)
             return
-        detail = f"expected the host name to be one of {sorted(self._hosts)}, got {host!r}"
+        detail = f"expected the host name of the request to be one of {sorted(self._hosts)}, got {host!r}"
         await problem_response(Code.FORBIDDEN, detail)(scope, receive, send)
 
 
 class OwnPages:
-    """Refuses requests that a page of another site sends by a browser, if they could change something or open a stream.
+    """Middleware that refuses requests of another web site's pages, if they could change something or open a stream.
 
-    A browser names the page in ``Origin`` and its relation to this server in ``Sec-Fetch-Site``. Programs send neither.
+    A browser names the page's site in ``Origin``, and its relation to this server in ``Sec-Fetch-Site``. Programs send
+    neither header.
     """
 
     def __init__(self, app: ASGIApp, public_url: str | None) -> None:
-        """``public_url`` is the address of this server for browsers, if it is behind a proxy."""
+        """Wrap ``app``. ``public_url`` is the address of this server for browsers, if it is behind a proxy."""
         self._app = app
         self._public = None if public_url is None else origin_of(public_url)
 
@@ -88,7 +93,7 @@ class OwnPages:
         await self._app(scope, receive, send)
 
     def _foreign_page(self, scope: Scope) -> str | None:
-        """The page that sent a request, if it belongs to another site."""
+        """Describe the page that sent a request, if it belongs to another web site; None otherwise."""
         origin = raw_header(scope, b"origin").decode("latin-1").lower()
         if origin and origin not in (_called(scope), self._public):
             return f"one of {origin!r}"
@@ -99,7 +104,7 @@ class OwnPages:
 
 
 def origin_of(url: str) -> str:
-    """Scheme, host and port of an address, in the form of ``Origin``."""
+    """Return scheme, host and port of a URL in the form of the header ``Origin``."""
     parts = urlsplit(url.lower())
     default = {"http": 80, "https": 443}.get(parts.scheme)
     host = f"[{parts.hostname}]" if ":" in (parts.hostname or "") else parts.hostname
@@ -107,7 +112,7 @@ def origin_of(url: str) -> str:
 
 
 def _called(scope: Scope) -> str:
-    """The origin at which this server was called."""
+    """Return the origin (scheme, host, port) to which a request was sent."""
     scheme = {"ws": "http", "wss": "https"}.get(scope["scheme"], scope["scheme"])
     return f"{scheme}://{raw_header(scope, b'host').decode('latin-1').lower()}"
 

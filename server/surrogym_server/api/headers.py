@@ -1,4 +1,4 @@
-"""Fast access to one header of a request, for the path of every step."""
+"""Fast access to one header of a request, because each step reads headers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from starlette.types import Scope
 
 
 def raw_header(scope: Scope, name: bytes) -> bytes:
-    """The first header of a name, which is given in lower case; empty if there is none."""
+    """Return the first header of a request with this lower-case name; empty if there is none."""
     for key, value in scope["headers"]:
         if key == name:
             found: bytes = value

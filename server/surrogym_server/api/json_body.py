@@ -1,4 +1,4 @@
-"""Bodies of requests: parsed strictly, at most one long one in a turn of the event loop; described in OpenAPI."""
+"""Bodies of requests: strict parsing of JSON, and descriptions for OpenAPI."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from surrogym_shared import frames
 M = TypeVar("M", bound=BaseModel)
 
 JSON = "application/json"
-LONG = 16 * 1024  # bytes; parsing them takes half a millisecond
-DEEPEST = 200  # of jiter
-MOST_FIELDS = 64  # of a body; each unknown one makes an error
+LONG = 16 * 1024  # size in bytes of a body that takes half a millisecond to parse
+DEEPEST = 200  # largest number of nested levels that the parser jiter accepts
+MOST_FIELDS = 64  # largest number of fields of a body, because each unknown field adds to the error message
 SCHEMAS = "#/components/schemas/{model}"
 BINARY: dict[str, Any] = {frames.MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}}
 
 
 class JsonRequest(Request):
-    """A request whose body FastAPI reads with this module's parser."""
+    """A request whose JSON body is parsed by this module instead of by FastAPI."""
 
     async def json(self) -> Any:
-        """Parse the body. Raises ``HTTPException`` 400, which FastAPI lets pass."""
+        """Parse the body as JSON. Raises ``HTTPException`` 400 if that fails."""
         content = await self.body()
         await take_turn(self.scope, content)
         return parse(content)
 
 
 async def take_turn(scope: Scope, content: bytes) -> None:
-    """Wait until no other long body is parsed in this turn of the event loop, so that other requests are served in
-    between.
+    """Before a long body is parsed, let the event loop serve other requests.
 
-    A thread would not help, because the parser holds the interpreter's lock.
+    At most one long body is parsed in an iteration of the event loop. A thread would not help, because the parser holds
+    the global interpreter lock.
     """
     if len(content) > LONG:
         turn: asyncio.Lock = scope["app"].state.parsing
@@ -50,8 +50,8 @@ def parse(content: bytes) -> Any:
     """Parse a JSON text.
 
     Raises:
-        HTTPException: 400 if it is not JSON in UTF-8, if an object has a key twice, or if it has too many levels or
-            fields.
+        HTTPException: 400 if the text is not JSON in UTF-8, an object has a key twice, or there are too many nested
+            levels or fields.
     """
     try:
         parsed = jiter.from_json(content, catch_duplicate_keys=True)
@@ -64,11 +64,11 @@ def parse(content: bytes) -> Any:
 
 
 def parse_as(model: type[M], content: bytes) -> M:
-    """Parse and validate a body.
+    """Parse the JSON body of a request, and validate it as an instance of ``model``.
 
     Raises:
-        HTTPException: 400, like ``parse``.
-        RequestValidationError: it is not a valid ``model``.
+        HTTPException: 400 if the body is not valid JSON.
+        RequestValidationError: the body is not a valid instance of ``model``.
     """
     try:
         return model.model_validate(parse(content))
@@ -77,12 +77,12 @@ def parse_as(model: type[M], content: bytes) -> M:
 
 
 def described(model: type[BaseModel], example: dict[str, Any]) -> dict[str, Any]:
-    """OpenAPI of a body that is accepted as JSON or as a frame."""
+    """Return the OpenAPI description of a body that may be JSON or a binary frame."""
     schema = model.model_json_schema(ref_template=SCHEMAS)
     content = {JSON: {"schema": schema, "example": example}, **BINARY}
     return {"requestBody": {"required": True, "content": content}}
 
 
 def example(value: dict[str, Any]) -> Any:
-    """A body that FastAPI reads, with an example."""
+    """Return FastAPI's declaration of a request body, with an example for the documentation."""
     return Body(openapi_examples={"example": {"value": value}})

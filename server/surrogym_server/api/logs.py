@@ -1,4 +1,4 @@
-"""Routes of logs: recorded real steps as CSV, for who has no program that reads them."""
+"""Routes of logs: upload of recorded real steps as CSV text."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from surrogym_shared.wire import AddedLog, AddLog, DraftedLog, DraftLog
 
 router = APIRouter(prefix="/v1", tags=["logs"], route_class=DoorRoute)
 
-KIBIBYTES = 5 * 1024  # letters of a log, and what JSON adds to them
+KIBIBYTES = 5 * 1024  # largest size of a log in JSON
 
 
 @router.post(
@@ -44,8 +44,8 @@ async def draft(body: Annotated[DraftLog, example(examples.DRAFT_LOG)], request:
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_LARGE, Code.TOO_MANY_REQUESTS),
 )
 async def add(name: str, body: Annotated[AddLog, example(examples.ADD_LOG)], request: Request, use: Use) -> AddedLog:
-    """Check each row of a log against the surrogate's specification. The usable ones are stored as ``logged`` samples,
-    unless ``check_only``. The same log again changes nothing, and one that has grown adds its new steps."""
+    """Check each row of a log against the surrogate's specification, and store the usable rows as ``logged`` samples.
+    With ``check_only`` nothing is stored. A repeat of a log adds only steps that are not stored yet."""
     turns: Turns = request.app.state.log_turns
     return await turns.take(request, lambda: _added(name, body, use))
 

@@ -1,4 +1,4 @@
-"""``GET /metrics``: counts and states of the server in the text format of Prometheus, read on request."""
+"""``GET /metrics``: counters and states of the server in the text format of Prometheus."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ def metrics(request: Request, use: Use) -> Response:
 
 
 class _Measured(Protocol):
-    """A feature's service."""
+    """Service of an optional feature that has metrics."""
 
     def metrics(self) -> Iterable[Metric]: ...
 
 
 class _Reading:
-    """A collector for one request."""
+    """Prometheus collector for one request of ``/metrics``."""
 
     def __init__(self, version: str, use: Services, metrics: ProcessMetrics, parts: Iterable[_Measured]) -> None:
         self._version = version

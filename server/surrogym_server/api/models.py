@@ -1,4 +1,4 @@
-"""Routes of models: history, export, import, and predictions of the latest one."""
+"""Routes of models: history, export, import, and predictions."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ POINT_ERRORS = documented(
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def list_all(name: str, use: Use) -> ModelList:
-    """List all versions of the model with their fidelity, oldest first."""
+    """List all versions of a surrogate's model with their fidelity, oldest first."""
     return ModelList(models=[resources.model_view(record) for record in use.models.list(name)])
 
 
@@ -100,7 +100,7 @@ async def query_uncertainty(
 async def predict(
     name: str, body: Annotated[Points, example(examples.POINTS)], request: Request, use: Use
 ) -> Prediction:
-    """Predict one mean step from each point. No session is needed."""
+    """Predict one step from each point (coordinates and action) by the model's mean. No session is needed."""
     q, u = numbers("coordinates", body.coordinates), numbers("action", body.action)
     return resources.prediction(await _in_turn(request, lambda: use.models.predict(name, q, u, body.model)))
 
@@ -109,8 +109,9 @@ async def predict(
 async def imagine(
     name: str, body: Annotated[Imagine, example(examples.IMAGINE)], request: Request, use: Use
 ) -> Imagined:
-    """Imagine episodes without a session: one along the mean, and some along functions sampled from the posterior,
-    which diverge where the model is uncertain. An episode that terminates is shorter than ``actions``."""
+    """Simulate episodes in the model, without a session: one along the mean, and ``draws`` along functions sampled from
+    the posterior, which diverge where the model is uncertain. An episode that terminates is shorter than
+    ``actions``."""
     q, u = numbers("coordinates", body.coordinates), numbers("actions", body.actions)
     draws, seed, version = body.draws, body.seed, body.model
     episodes = await _in_turn(request, lambda: use.models.imagine(name, q, u, draws=draws, seed=seed, version=version))
@@ -118,6 +119,7 @@ async def imagine(
 
 
 async def _in_turn(request: Request, work: Callable[[], T]) -> T:
-    """Limit these requests, because read-only callers must not keep samplers and trainers waiting."""
+    """Run ``work`` in a thread when few enough predictions run, so that read-only callers don't delay samplers and
+    trainers."""
     turns: Turns = request.app.state.turns
     return await turns.take(request, work)

@@ -1,7 +1,7 @@
-"""Request ids, timing by route, and lines in the log.
+"""Request ids, durations by route, and the log of requests.
 
-Every request gets an id, which its reply, its problem body and its log lines carry. Requests that change something, and
-refused ones, leave a line in the log that names their sender.
+Each request gets an id, which is in its reply, its problem body and its log lines. Requests that change something, and
+refused requests, are logged with their sender.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ logger = logging.getLogger("surrogym_server.requests")
 
 UNKNOWN_ROUTE = "unknown"
 METHODS = frozenset({"GET", "POST", "PUT", "PATCH", "DELETE", "HEAD", "OPTIONS"})
-CHANGING = frozenset({"POST", "PUT", "PATCH", "DELETE"})  # each leaves a line with its sender, unless it is frequent
-FREQUENT = frozenset(  # routes that only read or make short-lived changes, and are called again and again
+CHANGING = frozenset({"POST", "PUT", "PATCH", "DELETE"})  # methods that are logged, except for the routes in FREQUENT
+FREQUENT = frozenset(  # routes that are called very often and change nothing lasting
     {
         "/v1/sessions/{id}/reset",
         "/v1/sessions/{id}/step",
@@ -38,18 +38,18 @@ FREQUENT = frozenset(  # routes that only read or make short-lived changes, and 
         "/v1/surrogates/{name}/imagine",
     }
 )
-MOST_PATH = 256  # characters of a path in the log: anybody may send long ones, without a token
-FAILED = 500  # a request that ended before its reply began
+MOST_PATH = 256  # characters of a path that are logged, because callers without a token may send very long paths
+FAILED = 500  # status recorded for a request that ended before its reply began
 
 _GIVEN = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _HEADER = REQUEST_HEADER.encode()
-# No page of another site may load a reply, not even to see whether it is one.
+# Headers for browsers: pages of other web sites may not load a reply, and its media type is not guessed.
 _FOR_BROWSERS = ((b"cross-origin-resource-policy", b"same-origin"), (b"x-content-type-options", b"nosniff"))
-_PROCESS, _NUMBERS = secrets.token_hex(4), count(1)  # drawing an id for each request would cost a system call
+_PROCESS, _NUMBERS = secrets.token_hex(4), count(1)  # a random id for each request would cost a system call
 
 
 class Observed:
-    """The outermost middleware, so that it sees what the caller sees."""
+    """Outermost middleware: it gives each request an id, measures its duration, and logs it."""
 
     def __init__(self, app: ASGIApp, metrics: ProcessMetrics) -> None:
         self._app = app
@@ -62,7 +62,7 @@ class Observed:
         id = _id_of(scope)
         REQUEST_ID.set(
             id
-        )  # never reset: each request has its own task, and the handler of unexpected errors is outside
+        )  # need not be reset, because each request has its own task; the handler of unexpected errors reads it
         started, status = time.perf_counter(), FAILED
         headers = (*_FOR_BROWSERS, (_HEADER, id.encode()))
 
@@ -76,11 +76,11 @@ class Observed:
         try:
             await self._app(scope, receive, identified)
         finally:
-            if scope["type"] == "http" or status != FAILED:  # of streams only the refused ones
+            if scope["type"] == "http" or status != FAILED:  # a stream is only noted if it was refused
                 self._note(scope, status, time.perf_counter() - started)
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
-        method = scope.get("method", "GET")  # a stream begins with a GET, but its scope has no method
+        method = scope.get("method", "GET")  # the scope of a stream has no method; it begins with a GET
         method = method if method in METHODS else "other"
         route = getattr(scope.get("route"), "path", UNKNOWN_ROUTE)
         key = (method, route, status)
@@ -97,6 +97,6 @@ class Observed:
 
 
 def _id_of(scope: Scope) -> str:
-    """The caller's own id of a request if it is usable, else a new one."""
+    """Return the id that the caller gave a request in its header if it is valid, else a new id."""
     given = raw_header(scope, _HEADER).decode("latin-1")
     return given if given and _GIVEN.fullmatch(given) else f"{_PROCESS}{next(_NUMBERS):06x}"

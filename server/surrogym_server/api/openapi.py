@@ -1,4 +1,4 @@
-"""OpenAPI of the app: FastAPI's description, with the refusals that come from outside the routes."""
+"""OpenAPI description of the app: FastAPI's, with the error replies that come from outside the routes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WITH_TOKEN = documented(Code.UNAUTHENTICATED, Code.FORBIDDEN)
 
 
 def install(app: FastAPI) -> None:
-    """List all methods of a path, which several routes may serve, in the refusal of another method."""
+    """Make the app's reply 405 (method not allowed) list all methods of the path, of all its routes."""
     app.add_exception_handler(405, _method_not_allowed)
 
 
@@ -42,10 +42,10 @@ async def _method_not_allowed(request: Request, _: Exception) -> Response:
 
 
 def describe(app: FastAPI) -> dict[str, Any]:
-    """OpenAPI of the app, complete; built once.
+    """Return the complete OpenAPI description of the app; it is built once.
 
-    A guard, a limit or a token can refuse requests to many routes. Its reply is described once, under
-    ``components/responses``, and each of these routes refers to it.
+    Error replies that many routes share, such as that to a missing token, are described once under
+    ``components/responses``, to which the routes refer.
     """
     if app.openapi_schema is None:
         schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
@@ -64,21 +64,20 @@ def describe(app: FastAPI) -> dict[str, Any]:
 
 
 def _add_refusals(operation: dict[str, Any]) -> None:
-    """Add the refusals that the route does not describe itself."""
+    """Add the error replies that all routes share to an operation, unless it describes them itself."""
     for status in (*ANY_REQUEST, *(WITH_TOKEN if "security" in operation else ())):
         operation["responses"].setdefault(str(status), {"$ref": RESPONSES.format(name=status)})
 
 
 def _parts_of_body(operation: dict[str, Any]) -> dict[str, Any]:
-    """Move the schemas of nested models to the components, for a body that FastAPI does not read."""
+    """Remove the schemas of nested models from the body of an operation, and return them for the components."""
     schema = operation.get("requestBody", {}).get("content", {}).get(JSON, {}).get("schema", {})
     parts: dict[str, Any] = schema.pop("$defs", {})
     return parts
 
 
 def _name_operations(paths: dict[str, Any]) -> None:
-    """Give operations short names, such as ``surrogates_create``, because generated clients use them as
-    function names."""
+    """Give operations short ids such as ``surrogates_create``, which generated clients use as function names."""
     for path, methods in paths.items():
         for method, operation in methods.items():
             behind = re.sub(r"\W", "_", path) + f"_{method}"
@@ -86,8 +85,8 @@ def _name_operations(paths: dict[str, Any]) -> None:
 
 
 def _drop_object_defaults(node: Any) -> None:
-    """Remove defaults that are objects. Their fields have defaults of their own, and generators of clients
-    refuse them."""
+    """Remove defaults that are objects from a schema, because generators of clients refuse them. The fields of these
+    objects have defaults themselves."""
     if isinstance(node, dict):
         if isinstance(node.get("default"), dict):
             del node["default"]

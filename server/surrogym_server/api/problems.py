@@ -1,4 +1,4 @@
-"""The table of errors: it maps every exception of the server to a problem body (RFC 9457)."""
+"""Conversion of each exception of the server to a reply with a problem body (RFC 9457)."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def install(app: FastAPI) -> None:
 
 
 async def answer_to(request: Request, error: Exception) -> Response:
-    """The reply to a request that failed. Raises the error itself if it is an unexpected one."""
+    """Return the error reply to a request that raised ``error``. Raises an unexpected error again."""
     for kind, answer in _ANSWERS.items():
         if isinstance(error, kind):
             return await answer(request, error)
@@ -85,17 +85,17 @@ async def answer_to(request: Request, error: Exception) -> Response:
 
 
 def code_of(error: errors.SurrogymError) -> Code:
-    """The code of an error: that of its class, or of its nearest base class in the table."""
+    """Return the error code of an exception: that of its class, or else of its nearest base class in ``CODES``."""
     return next(CODES[cls] for cls in type(error).__mro__ if cls in CODES)
 
 
 def problem_of(error: Exception) -> Problem:
-    """The problem body of an error. That of an unexpected error contains no details."""
+    """Return the problem body of an exception; without details if the exception is unexpected."""
     match error:
         case errors.SeqConflict():
             return _problem(Code.SEQ_CONFLICT, str(error), expected_seq=error.expected)
         case errors.PluginFailed():
-            logger.error("%s", error, exc_info=error)  # its author needs the traceback
+            logger.error("%s", error, exc_info=error)  # the author of the plug-in needs the traceback
             return _problem(Code.INTERNAL, str(error))
         case errors.SurrogymError():
             return _problem(code_of(error), str(error))
@@ -105,7 +105,7 @@ def problem_of(error: Exception) -> Problem:
 
 
 def response_of(problem: Problem, headers: Mapping[str, str] | None = None) -> Response:
-    """A problem body as a reply. ``headers`` are added to those of its code."""
+    """Return the reply with a problem body. ``headers`` are added to those of the problem's code."""
     return Response(
         problem.model_dump_json(exclude_none=True),
         status_code=problem.status,
@@ -122,19 +122,23 @@ def problem_response(
     headers: Mapping[str, str] | None = None,
     **members: Any,
 ) -> Response:
-    """Build the reply with a problem body from its parts."""
+    """Return the reply with a problem body, from an error code and a text for people.
+
+    ``status`` defaults to that of the code; ``members`` are further fields of the problem.
+    """
     return response_of(_problem(code, detail, status=status, **members), headers)
 
 
 def closing_reply(code: Code, detail: str, status: int | None = None) -> bytes:
-    """The whole reply with a problem body, after which the connection is closed; for requests that reach no app."""
+    """Return a complete HTTP reply with a problem body, as bytes, for a request that can't be passed to the app. The
+    reply announces that the connection is closed after it."""
     reply = problem_response(code, detail, status=status, headers={"connection": "close"})
     lines = b"".join(name + b": " + value + b"\r\n" for name, value in reply.raw_headers)
     return b"HTTP/1.1 %d \r\n%s\r\n%s" % (reply.status_code, lines, bytes(reply.body))
 
 
 def documented(*codes: Code) -> dict[int | str, dict[str, Any]]:
-    """The error replies of a route, for OpenAPI."""
+    """Return the OpenAPI description of the error replies with these codes."""
     by_status: dict[int, list[str]] = {}
     for code in codes:
         by_status.setdefault(STATUS[code], []).append(code.value)
@@ -148,9 +152,10 @@ def documented(*codes: Code) -> dict[int | str, dict[str, Any]]:
 
 
 def validation_detail(found: Sequence[Any]) -> str:
-    """The most specific error of a validation in one sentence: where, what was expected, and what came.
+    """Describe the most specific of the errors of a validation in one sentence: field, expected value, actual value.
 
-    If a value fits none of several types, the deepest error is about the type that it nearly fits.
+    If a value fits none of several types, this is the error with the longest path, because it belongs to the type that
+    the value nearly fits.
     """
     telling = max(found, key=lambda error: len(error["loc"]))
     said = in_words(telling)
@@ -159,7 +164,7 @@ def validation_detail(found: Sequence[Any]) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value, cut to the length of a message. A long value is not converted further than it is shown."""
+    """Return a value as text for a message, at most ``SHOWN_CHARACTERS`` long. Only as much of it is converted."""
     text = ""
     for piece in ["nothing"] if value is None else _pieces(value):
         text += piece
@@ -169,7 +174,7 @@ def shown(value: Any) -> str:
 
 
 def _pieces(value: Any) -> Iterator[str]:
-    """The ``repr`` of a value from JSON, piece by piece."""
+    """Yield the ``repr`` of a JSON value in pieces, so that a long value need not be converted completely."""
     if isinstance(value, dict):
         yield "{"
         for index, (key, entry) in enumerate(value.items()):
@@ -202,7 +207,7 @@ def _field(error: Any) -> str:
 
 
 def _is_field(part: int | str) -> bool:
-    """Whether a part of a location is a field or an index. Other parts name the body, or a type that was tried."""
+    """Whether a part of pydantic's error location is a field or an index, instead of the body or a type's name."""
     return isinstance(part, int) or (part.isidentifier() and part not in NO_FIELDS)
 
 
@@ -243,7 +248,7 @@ async def _http_error(request: Request, error: Exception) -> Response:
 
 
 async def _gone(_: Request, error: Exception) -> Response:
-    """Reply for the log only, because the caller has disconnected in the middle of the request."""
+    """Return a reply that only the log will show, because the caller has disconnected during its request."""
     assert isinstance(error, ClientDisconnect)
     return problem_response(
         Code.REQUEST_TIMEOUT, "expected a whole request, but the connection ended before it had arrived"
@@ -251,7 +256,7 @@ async def _gone(_: Request, error: Exception) -> Response:
 
 
 async def _unexpected(_: Request, error: Exception) -> Response:
-    """Starlette logs the error itself."""
+    """Return the reply to an unexpected error, with status 500. Starlette logs the error."""
     assert not isinstance(error, errors.SurrogymError)
     problem = problem_of(error)
     return response_of(problem, {REQUEST_HEADER: problem.request or ""})

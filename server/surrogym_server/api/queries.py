@@ -1,4 +1,4 @@
-"""Routes of queries: samplers claim, renew and fail them; people add them by hand."""
+"""Routes of queries: samplers claim queries, renew their leases and report failures; people add queries."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ LEASE_ERRORS = documented(
 async def claim(
     name: str, body: Annotated[ClaimQueries, example(examples.CLAIM)], request: Request, use: Use
 ) -> ClaimedQueries:
-    """Claim up to ``max_queries`` queries, each for one sampler only. If there are none, the reply waits at most
-    ``wait_seconds``, or until the design is finished."""
+    """Claim up to ``max_queries`` queries, each of which is leased to one sampler at a time. If no query is open, the
+    reply waits for one until ``wait_seconds`` have passed or the design ends."""
     present = partial(require_present, request)
     request.app.state.query_claims.require_room(request)
     with request.app.state.query_claims.count(request):
@@ -70,15 +70,15 @@ async def claim(
     responses=LEASE_ERRORS,
 )
 def renew(name: str, query_id: int, body: Annotated[RenewLease, example(examples.RENEW)], use: Use) -> Response:
-    """Renew the lease of a query whose real step takes long. It then ends ``lease_seconds`` from now."""
+    """Renew the lease of a query whose real step takes long. The lease then ends ``lease_seconds`` from now."""
     use.queries.renew(name, query_id, body.lease_token, body.lease_seconds)
     return Response(status_code=204)
 
 
 @router.post("/queries/{query_id}:fail", summary="Give a query back", dependencies=[SAMPLE], responses=LEASE_ERRORS)
 def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.FAIL)], use: Use) -> QueryView:
-    """Return a query with an error. It goes to the next sampler. A query that keeps failing is set aside, and the
-    design continues without it."""
+    """End the lease of a query that could not be answered, with an error. Another sampler may then claim the query. A
+    query that fails repeatedly is set aside, and the design continues without it."""
     return resources.query_view(
         use.queries.fail(name, query_id, body.lease_token, body.error, begun=body.begun, refused=body.refused)
     )
@@ -93,7 +93,7 @@ def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.F
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST),
 )
 def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUERIES)], use: Use) -> QueryList:
-    """Queue queries behind those of the design. The model learns from their answers too."""
+    """Queue queries of your own behind those of the design. The model learns from their answers too."""
     return resources.query_list(use.queries.add(name, resources.requested(body), body.idempotency_key))
 
 
@@ -106,8 +106,8 @@ def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUER
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.BEYOND_BUDGET, Code.INVALID_REQUEST),
 )
 def audit(name: str, body: Annotated[AuditModel, example(examples.ADD_QUERIES)], use: Use) -> QueryList:
-    """Queue real steps on a policy's way, to compare them with the model. They don't count towards the budget, and the
-    model learns from them too."""
+    """Queue the real steps of an audit, at states that a policy visits, to compare them with the model. They don't
+    count towards the budget, and the model learns from them too."""
     queries = resources.requested(body)
     return resources.query_list(use.queries.add(name, queries, body.idempotency_key, purpose="audit"))
 
@@ -119,7 +119,7 @@ def audit(name: str, body: Annotated[AuditModel, example(examples.ADD_QUERIES)],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def withdraw(name: str, body: Annotated[WithdrawQueries, example(examples.WITHDRAW)], use: Use) -> WithdrawnQueries:
-    """Remove the queries of an audit that no sampler has begun. Others stay."""
+    """Remove the given queries of an audit, except those of which a sampler may have taken a real step."""
     return WithdrawnQueries(withdrawn=use.queries.withdraw_audit(name, body.query_ids))
 
 
@@ -130,5 +130,6 @@ def withdraw(name: str, body: Annotated[WithdrawQueries, example(examples.WITHDR
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def list_all(name: str, use: Use, status: Annotated[list[QueryStatus], Query()] = []) -> QueryList:  # noqa: B006
-    """List queries, oldest first. ``status`` may be given several times."""
+    """List the queries of a surrogate, oldest first; only those with a given ``status``, of which there may be
+    several."""
     return resources.query_list(use.queries.list(name, status))

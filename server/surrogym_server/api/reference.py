@@ -1,4 +1,4 @@
-"""The OpenAPI document as one plain page without scripts or external resources, so that it works offline."""
+"""The OpenAPI document as one HTML page without scripts or external resources, so that it works offline."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HEADERS = {
 
 
 def page(openapi: dict[str, Any]) -> str:
-    """HTML of every operation, by tag, and of every schema."""
+    """Return the HTML page of an OpenAPI document: all operations by tag, then all schemas."""
     title = escape(f"{openapi['info']['title']} {openapi['info']['version']}")
     return "".join(
         [
@@ -84,7 +84,7 @@ def _schema(name: str, schema: dict[str, Any]) -> str:
 
 
 def _table(caption: str, rows: list[tuple[str, str, str]]) -> str:
-    """HTML table of name, type and description."""
+    """Return an HTML table with rows of name, type and description."""
     lines = [
         f"<tr><td><code>{escape(name)}</code></td><td>{kind}</td><td>{escape(text)}</td></tr>"
         for name, kind, text in rows
@@ -98,7 +98,7 @@ def _example(content: dict[str, Any]) -> Any:
 
 
 def _type(schema: dict[str, Any]) -> str:
-    """A schema in a few words, as HTML. One with a name is a link."""
+    """Describe a schema in a few words of HTML; a named schema becomes a link."""
     if reference := schema.get("$ref"):
         name = escape(reference.rpartition("/")[2])
         return f'<a href="#{name}">{name}</a>'

@@ -1,4 +1,4 @@
-"""Routes of samples and the ledger of real steps."""
+"""Routes of samples, of snapshots and of the counts of real steps."""
 
 from __future__ import annotations
 
@@ -47,9 +47,8 @@ MAX_PAGE = 10_000
     ),
 )
 def add_sample(name: str, body: Annotated[AddSamples, example(examples.ADD_SAMPLE)], use: Use) -> AddedSamples:
-    """Store one or many samples, all or none, with or without a query. They are stored durably when the reply comes. A
-    repeat is harmless: a sample of a query is identified by its lease token, a logged one by its place in its log,
-    others by the idempotency key."""
+    """Store samples, all or none. They are committed when the reply comes. A repeat adds nothing: a sample that answers
+    a query is identified by its lease token, a logged sample by its index in the log, others by the idempotency key."""
     samples = [resources.new_sample(sample) for sample in body.samples]
     log = LogPart(body.after, body.complete) if body.purpose == "logged" else None
     return resources.added_samples(use.samples.add(name, body.sampler, samples, body.idempotency_key, log))
@@ -72,7 +71,8 @@ def samples(
     limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = 1_000,
     format: Literal["json", "csv", "npz"] = "json",
 ) -> SamplePage | Response:
-    """Read samples. JSON comes in pages: give ``next_after`` as ``after`` for the next page. CSV and NPZ come whole."""
+    """Read the samples of a surrogate. JSON comes in pages: give ``next_after`` as ``after`` for the next page. CSV and
+    NPZ contain all samples."""
     if format == "json":
         return resources.sample_page(use.samples.page(name, after, limit), limit)
     write, media_type = (as_csv, CSV) if format == "csv" else (as_npz, NPZ)
@@ -87,7 +87,7 @@ def samples(
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def snapshots(name: str, use: Use) -> SnapshotList:
-    """List the saved states to which a sampler can return, oldest first. ``add_sample`` adds to them."""
+    """List the snapshots (saved states to which a sampler can return), oldest first. ``add_sample`` adds snapshots."""
     return resources.snapshot_list(use.samples.snapshots(name))
 
 
@@ -100,7 +100,8 @@ def snapshots(name: str, use: Use) -> SnapshotList:
 def drop_snapshots(
     name: str, body: Annotated[DropSnapshots, example(examples.DROP_SNAPSHOTS)], use: Use
 ) -> DroppedSnapshots:
-    """Forget snapshots. Queries that begin there are withdrawn, and the design chooses anew."""
+    """Remove snapshots that no sampler holds any more. Queries that begin at them are withdrawn, and the design chooses
+    new ones."""
     return DroppedSnapshots(dropped=use.samples.drop_snapshots(name, body.snapshots))
 
 
@@ -111,7 +112,8 @@ def drop_snapshots(
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST),
 )
 def report(name: str, body: Annotated[ReportSteps, example(examples.LEDGER)], use: Use) -> Ledger:
-    """Count real steps of an evaluation, separately from the cost of the design, once for each idempotency key."""
+    """Report real steps of an evaluation, which are counted separately from those of the design. Each idempotency key
+    counts once."""
     return resources.ledger(use.samples.report_steps(name, body.steps, body.episodes, body.note, body.idempotency_key))
 
 

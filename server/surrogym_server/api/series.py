@@ -1,5 +1,4 @@
-"""Series of surrogates in the text format of Prometheus. They are written here, because there are a dozen for each
-surrogate and the library takes 10 us for each."""
+"""Metrics of surrogates in the text format of Prometheus, written without the library, which takes 10 us for each."""
 
 from __future__ import annotations
 
@@ -8,7 +7,7 @@ from dataclasses import dataclass
 
 from surrogym_server.storage.records import SurrogateSummary
 
-Series = Iterable[tuple[str, float]]  # value of the label, and the number
+Series = Iterable[tuple[str, float]]  # pairs of a label's value and the number
 
 PURPOSES = ("initial", "adaptive", "manual", "audit", "logged", "evaluation")
 STATUSES = ("pending", "leased", "answered", "set_aside", "refused")
@@ -16,7 +15,11 @@ STATUSES = ("pending", "leased", "answered", "set_aside", "refused")
 
 @dataclass(frozen=True)
 class Family:
-    """Series with one name. ``label`` distinguishes those of one surrogate; empty if there is at most one."""
+    """A metric with its name, type and help text.
+
+    ``label`` names the label by which the series of a surrogate differ; empty if there is at most one series.
+    ``series`` returns the series of a surrogate.
+    """
 
     name: str
     kind: str
@@ -26,13 +29,13 @@ class Family:
 
 
 def exposition(summaries: Sequence[SurrogateSummary]) -> bytes:
-    """The text of all series of these surrogates."""
+    """Return the text of all metrics of these surrogates."""
     return "".join(line for family in FAMILIES for line in _lines(family, summaries)).encode()
 
 
 def _lines(family: Family, summaries: Sequence[SurrogateSummary]) -> Iterator[str]:
-    """Lines of a series. Names of surrogates need no escaping: they consist of letters, digits, dots, dashes and
-    underscores."""
+    """Yield the lines of one metric. Names of surrogates need no escaping, because they consist of letters, digits,
+    dots, dashes and underscores."""
     yield f"# HELP {family.name} {family.help}\n# TYPE {family.name} {family.kind}\n"
     for summary in summaries:
         begin = f'{family.name}{{surrogate="{summary.name}"'

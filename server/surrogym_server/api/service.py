@@ -20,15 +20,15 @@ router = APIRouter(tags=["service"], route_class=DoorRoute)
 @router.head("/healthz", include_in_schema=False, dependencies=[PUBLIC])
 @router.get("/healthz", summary="That the process lives", dependencies=[PUBLIC])
 async def healthz(request: Request) -> Health:
-    """Answer 200 as long as the process runs. This needs no token and no database."""
+    """Return status 200 as long as the server process runs. This needs no token and no database."""
     return Health(version=request.app.version)
 
 
 @router.head("/readyz", include_in_schema=False, dependencies=[PUBLIC])
 @router.get("/readyz", summary="That it can work", dependencies=[PUBLIC], responses=documented(Code.UNAVAILABLE))
 def readyz(use: Use) -> Ready:
-    """Whether the server can serve: its database has the tables and accepts writes. Otherwise the answer is 503.
-    Checked at most once a second; needs no token."""
+    """Return status 200 if the server can work: its database has the tables and accepts writes. Otherwise the status is
+    503. This needs no token, and checks the database at most once a second."""
     use.storage.ping()
     return Ready(status="ready", storage="ok")
 

@@ -1,4 +1,4 @@
-"""Routes of sessions, from their opening to their end; ``api.stepping`` is what happens in between."""
+"""Routes that open, describe and close sessions and submit their occupancy; ``api.stepping`` has reset and step."""
 
 from __future__ import annotations
 
@@ -46,7 +46,8 @@ SESSION_ERRORS = (Code.UNKNOWN_SESSION, Code.SESSION_EXPIRED, Code.INVALID_REQUE
     ),
 )
 async def open_session(name: str, body: Annotated[OpenSession, example(examples.OPEN)], use: Use) -> SessionView:
-    """Open a session: N lanes with one seed, variant and autoreset mode. The reply has the spaces and the seed."""
+    """Open a session: a virtual environment with N lanes, a seed, a variant and an autoreset mode. The reply has the
+    observation and action spaces and the seed."""
     session = await use.sessions.open(name, sessions.opening(body))
     return sessions.session_view(session, use.sessions.idle_seconds, use.sessions.replay)
 
@@ -65,7 +66,7 @@ async def list_sessions(name: str, use: Use) -> SessionList:
 
 @router.get("/sessions/{id}", summary="One session", dependencies=[TRAIN], responses=documented(*SESSION_ERRORS))
 async def get_session(id: str, use: Use) -> SessionView:
-    """Return a session's options, the last ``seq`` that was answered, and the model version of each lane."""
+    """Return a session's options, the last sequence number that was answered, and the model version of each lane."""
     return sessions.session_view(await use.sessions.get(id), use.sessions.idle_seconds, use.sessions.replay)
 
 
@@ -76,7 +77,7 @@ async def get_session(id: str, use: Use) -> SessionView:
     responses=documented(*SESSION_ERRORS),
 )
 async def session_coordinates(id: str, use: Use) -> SessionCoordinates:
-    """Return the present coordinates of every lane, in the form to which the original environment can be set."""
+    """Return the present coordinates of each lane. The original environment can be set to such coordinates."""
     return sessions.session_coordinates(await use.sessions.coordinates(id))
 
 
@@ -88,7 +89,7 @@ async def session_coordinates(id: str, use: Use) -> SessionCoordinates:
     responses=documented(Code.INVALID_REQUEST),
 )
 async def close_session(id: str, use: Use) -> Response:
-    """Close a session. This is harmless if the session has ended already."""
+    """Close a session. Does nothing if the session has ended already."""
     await use.sessions.close(id)
     return Response(status_code=204)
 
@@ -102,8 +103,8 @@ async def close_session(id: str, use: Use) -> Response:
 async def submit_occupancy(
     id: str, body: Annotated[SubmitOccupancy, example(examples.OCCUPANCY)], use: Use
 ) -> SubmittedOccupancy:
-    """Store the states that a session has visited under a name, by which ``improve`` can weigh its queries. The reply
-    has the model's confidence index over these states. Only a session that was opened with ``occupancy`` collects
-    them."""
+    """Store the states that a session has visited, under the name ``checkpoint``. ``improve`` can then choose queries
+    near these states. The reply has the model's confidence index over them. The session must have been opened with
+    ``occupancy``."""
     states, index = await use.sessions.submit_occupancy(id, body.checkpoint)
     return SubmittedOccupancy(checkpoint=body.checkpoint, states=states, confidence_index=index)

@@ -1,4 +1,4 @@
-"""State of the app for its routes."""
+"""The services of the app, as a dependency of its routes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from surrogym_server.storage.port import Storage
 
 @dataclass(frozen=True)
 class Services:
-    """The services that a route may call; ``app.py`` builds it."""
+    """The services that routes may call; ``app.py`` builds them."""
 
     surrogates: SurrogateService
     queries: QueryService

@@ -1,4 +1,4 @@
-"""Routes of surrogates: create, list, look at, change, delete, improve."""
+"""Routes of surrogates: create, list, describe, change, delete, improve."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ MAX_PAGE = 1_000
     responses=documented(Code.INVALID_REQUEST, Code.INVALID_SPEC, Code.SPEC_CONFLICT),
 )
 def create(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use) -> CreatedSurrogate:
-    """Create a surrogate from a specification, and queue its initial queries. The same name and specification again
-    change nothing, and ``created`` is false. Another specification for the name is refused."""
+    """Create a surrogate from a specification, and queue its initial queries. If the surrogate exists with the same
+    specification, nothing changes and ``created`` is false; with another specification, the request is refused."""
     spec = body.spec
     budget = default_budget(spec)
     status, created = use.surrogates.create(body.name, spec.model_dump(mode="json"), budget, spec.design.target)
@@ -56,8 +56,8 @@ def create(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use)
     responses=documented(Code.INVALID_REQUEST, Code.INVALID_SPEC, Code.SPEC_CONFLICT),
 )
 def check(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use) -> CheckedSurrogate:
-    """Preview what the registration of this body would store, with every default. Nothing is stored. A body that a
-    registration refuses is refused here too."""
+    """Check a registration without storing anything. The reply has the complete specification with all defaults, and
+    the number of initial real steps. A body that the registration would refuse is refused here too."""
     spec = body.spec
     budget = default_budget(spec)
     return resources.checked(
@@ -83,7 +83,8 @@ def list_all(
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def get(name: str, use: Use) -> SurrogateView:
-    """Return a surrogate's phase, the fidelity of every output, its ledger of real steps, and counts of its queries."""
+    """Return a surrogate's phase, the fidelity of each output, the counts of real steps by purpose, and the counts of
+    queries by status."""
     return resources.surrogate_view(use.surrogates.status(name))
 
 
@@ -94,9 +95,10 @@ def get(name: str, use: Use) -> SurrogateView:
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def patch(name: str, body: Annotated[PatchSurrogate, example(examples.PATCH)], use: Use) -> SurrogateView:
-    """Change the given fields; others stay. A larger budget or target continues a finished design, a tolerance makes
-    the server judge the model again, and resuming a failed design retries it. Queries that the design chose for another
-    target or tolerance, or a larger budget, are withdrawn if no sampler has begun them, and chosen again."""
+    """Change the given fields of a surrogate. A larger budget or target continues a finished design. After a change of
+    a tolerance, the server computes the model's confidence again. Resuming a failed design retries it. After a change
+    of target or tolerance, or with a lower budget, adaptive queries without a real step so far are withdrawn, and the
+    design chooses new ones."""
     return resources.surrogate_view(use.surrogates.change(name, **dict(body)))
 
 
@@ -122,9 +124,9 @@ async def delete(name: str, use: Use) -> Response:
 def improve(
     name: str, body: Annotated[Improve, example(examples.IMPROVE)], request: Request, use: Use
 ) -> ImprovedSurrogate:
-    """Request more queries from the design, chosen by the acquisition and weighted by the states that policies visited
-    and submitted. The budget must have room for them: steps that were taken, requested or reserved before count as
-    used. For a token of role ``admin`` the budget is raised if needed, and ``budget_raised_by`` is the increase."""
+    """Request more queries from the design. The acquisition chooses them, weighted by the submitted occupancy of
+    policies. The budget must have enough real steps left; steps of open queries and of earlier requests count as used.
+    For a token of role ``admin`` the budget is raised if needed, and ``budget_raised_by`` is the increase."""
     may_raise = role_of(request.scope) == "admin"
     granted = use.designer.improve(name, body.queries, body.checkpoint, body.idempotency_key, raise_budget=may_raise)
     return resources.improved(use.surrogates.status(name), granted.raised)

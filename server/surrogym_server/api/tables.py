@@ -21,7 +21,10 @@ ARRAYS = ("id", "purpose", "coordinates", "action", "next_coordinates", "reward"
 
 
 def as_csv(coordinate_names: Sequence[str], records: Sequence[SampleRecord]) -> bytes:
-    """One line for each sample. Coordinates are ``q.<name>``, next ones ``next.<name>``, actions ``u.0`` and so on."""
+    """Return samples as a CSV table with one row for each sample.
+
+    Columns of coordinates are named ``q.<name>``, of next coordinates ``next.<name>``, of actions ``u.0``, ``u.1``, ...
+    """
     text = io.StringIO()
     writer = csv.writer(text)
     actions = [f"u.{i}" for i in range(len(records[0].action))] if records else []
@@ -34,7 +37,7 @@ def as_csv(coordinate_names: Sequence[str], records: Sequence[SampleRecord]) -> 
 
 
 def as_npz(coordinate_names: Sequence[str], records: Sequence[SampleRecord]) -> bytes:
-    """Write samples as an NPZ archive: coordinates (n, C), action (n, F) and next_coordinates (n, C), and reward,
-    termination, purpose and the like (n,)."""
+    """Return samples as an NPZ archive: coordinates (n, C), action (n, F), next_coordinates (n, C), and one array (n,)
+    for each other field, such as reward, terminated and purpose."""
     arrays: dict[str, Any] = {name: np.array([getattr(record, name) for record in records]) for name in ARRAYS}
     return npz_of_steps(coordinate_names, arrays)

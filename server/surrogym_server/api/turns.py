@@ -1,5 +1,4 @@
-"""Turns for long work of read-only requests: a few run at once, a few wait, and nothing is computed for a caller who
-has gone."""
+"""Limits on the number of requests of one kind that run or wait."""
 
 from __future__ import annotations
 
@@ -17,12 +16,12 @@ from surrogym_server.errors import Overloaded
 
 T = TypeVar("T")
 
-MAX_WAITING = 2_000  # of a token and a kind; a quarter of all connections are enough for both kinds
+MAX_WAITING = 2_000  # waiting requests of one kind with one token; two kinds take at most a quarter of all connections
 
 
 class Turns:
-    """Limit on requests of one kind: ``at_work`` run at once, each in a thread, and ``waiting`` more wait for their
-    turn."""
+    """Limit on the requests of one kind: at most ``at_work`` of them run at a time, each in a thread, and at most
+    ``waiting`` more wait."""
 
     def __init__(self, what: str, at_work: int, waiting: int) -> None:
         """``what`` names the requests, for the message of a refusal."""
@@ -32,14 +31,16 @@ class Turns:
         self._turn = asyncio.Semaphore(at_work)
 
     async def take(self, request: Request, work: Callable[[], T]) -> T:
-        """Do ``work`` when its turn has come, and return its result.
+        """Run ``work`` in a thread as soon as fewer than ``at_work`` requests run, and return its result.
 
         Raises:
             Overloaded: too many requests wait.
-            ClientDisconnect: the caller has gone meanwhile; nothing was computed.
+            ClientDisconnect: the caller has disconnected during the wait; ``work`` was not run.
         """
         if self._inside >= self._most:
-            raise Overloaded(f"expected at most {self._most} {self._what} at work or waiting, got one more")
+            raise Overloaded(
+                f"expected at most {self._most} {self._what} at work or waiting, got one more: try again later"
+            )
         self._inside += 1
         try:
             async with self._turn:
@@ -50,7 +51,7 @@ class Turns:
 
 
 class Waiting:
-    """Limit on the requests of each token that wait for something to happen. They cost memory, but no work."""
+    """Limit on the requests of each token that wait for something to happen, because each takes memory."""
 
     def __init__(self, what: str, most: int = MAX_WAITING) -> None:
         """``what`` names the requests, for the message of a refusal."""
@@ -59,13 +60,13 @@ class Waiting:
         self._by_token = Counter[str | None]()
 
     def require_room(self, request: Request) -> None:
-        """Raise ``Overloaded`` if the token of a request has as many as it may have."""
+        """Raise ``Overloaded`` if the token of a request has the largest allowed number of waiting requests."""
         if self._by_token[bearer_token(request.scope)] >= self._most:
-            raise Overloaded(f"expected at most {self._most} {self._what} with one token, got one more")
+            raise Overloaded(f"expected at most {self._most} {self._what} with one token, got one more: close some")
 
     @contextmanager
     def count(self, request: Request) -> Iterator[None]:
-        """Count a request within the context."""
+        """Return a context during which a request counts as waiting."""
         token = bearer_token(request.scope)
         self._by_token[token] += 1
         try:

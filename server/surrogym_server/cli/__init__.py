@@ -1,1 +1,1 @@
-"""Commands that need the server; they join ``surrogym`` through an entry-point group."""
+"""Commands of ``surrogym`` that need the server package; they are found through an entry-point group."""

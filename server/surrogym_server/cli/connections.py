@@ -1,4 +1,4 @@
-"""Limits on connections that send nothing, send too slowly, or are too many."""
+"""uvicorn's HTTP protocol with limits on the number of connections, and on the size and duration of a request."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ HEAD = (
     f"expected at most {MAX_HEADERS} headers and {MAX_HEAD_BYTES} bytes of target, headers and trailers of a request, "
     "got more"
 )
-MAX_PIPELINED = 16  # requests of one connection that wait for the one before them
-SPARE_FILES = 128  # for the database, pipes and whatever else is open beside connections
+MAX_PIPELINED = 16  # largest number of unanswered requests on one connection
+SPARE_FILES = 128  # file descriptors kept free for the database, pipes and other open files besides connections
 
 
 def connections_within(most: int) -> int:
-    """Raise this process's limit of open files as far as allowed, and return how many connections then fit, at most
-    ``most``.
+    """Raise this process's limit of open files as far as the system allows. Return how many connections it permits, at
+    most ``most``.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
@@ -32,7 +32,7 @@ def connections_within(most: int) -> int:
 
 
 class TooMuch(Exception):
-    """A request exceeds a limit. Raised inside the parser, which then stops."""
+    """A request exceeds a limit. Raised in a callback of the HTTP parser, to stop the parser."""
 
     def __init__(self, detail: str, status: int) -> None:
         super().__init__(detail)
@@ -40,14 +40,14 @@ class TooMuch(Exception):
 
 
 class Patient(HttpToolsProtocol):
-    """uvicorn's HTTP protocol with limits on connections, on the size of a request's head, and on the time a request
-    takes to arrive.
+    """uvicorn's HTTP protocol with limits on the number of connections, on the size of a request's headers, and on the
+    time in which a request has to arrive.
     """
 
-    seconds: float
-    most: int  # connections
+    seconds: float  # longest time in which a request has to arrive
+    most: int  # largest number of connections
     _timer: asyncio.TimerHandle | None = None
-    _head_bytes = 0  # of target, headers and trailers of this request
+    _head_bytes = 0  # size of target, headers and trailers of this request
     _head_lines = 0
     _head_complete = False
     _too_much: TooMuch | None = None
@@ -85,7 +85,7 @@ class Patient(HttpToolsProtocol):
     def on_header(self, name: bytes, value: bytes) -> None:
         self._head_lines += 1
         self._count(len(name) + len(value))
-        if not self._head_complete:  # a trailer is counted, and nobody reads it
+        if not self._head_complete:  # a trailer counts towards the limit, but is not used
             super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
@@ -147,7 +147,7 @@ class Patient(HttpToolsProtocol):
         super()._start_asgi_task(cycle, app)
 
     def _refuse(self, code: Code, detail: str, status: int | None = None) -> None:
-        if self._working is not None:  # its answer would go to a closed connection
+        if self._working is not None:  # the app need not finish its answer, because the connection is closed
             self._working.disconnected = True
             self._working.message_event.set()
         self.transport.write(closing_reply(code, detail, status))
@@ -155,6 +155,10 @@ class Patient(HttpToolsProtocol):
 
 
 def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
-    """Return a subclass of ``Patient`` with limits on time (s) and connections. uvicorn takes a class, not an
-    object."""
+    """Return a subclass of ``Patient`` for uvicorn, which takes a class.
+
+    Args:
+        seconds: longest time in which a request has to arrive.
+        most: largest number of connections.
+    """
     return type("Patient", (Patient,), {"seconds": seconds, "most": most})

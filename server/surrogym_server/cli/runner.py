@@ -1,4 +1,4 @@
-"""Run the server process, from its listening socket to a clean end."""
+"""Run the server process, from opening its socket to a clean shutdown."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from surrogym_server.settings import Settings
 logger = logging.getLogger(__name__)
 
 GRACE_SECONDS = 5
-YOUNG_OBJECTS = 20_000  # objects after which the youngest are collected
+YOUNG_OBJECTS = 20_000  # threshold of Python's garbage collector for generation 0
 PARENT_LOOK_SECONDS = 0.5
 Tell = Callable[[str], None]
 
@@ -36,8 +36,8 @@ ANY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 
 
 class Runner(uvicorn.Server):
-    """uvicorn's server, which also announces its address, ends long polls at shutdown, and treats a signal as a normal
-    end.
+    """uvicorn's server, extended: it announces its address, ends long polls at shutdown, and ends normally after a
+    signal.
     """
 
     def __init__(self, app: FastAPI, settings: Settings, url: str, ready_file: Path | None, tell: Tell) -> None:
@@ -46,14 +46,14 @@ class Runner(uvicorn.Server):
             http=patient(settings.request_seconds, connections_within(settings.max_connections)),
             ws=prompt(settings.request_seconds, settings.max_bodies_bytes),
             log_config=None,
-            access_log=False,  # ours names the request
+            access_log=False,  # replaced by the log of ``api.observe``, which has the request's id and sender
             server_header=False,
             ssl_certfile=settings.tls_certificate,
             ssl_keyfile=settings.tls_key,
             timeout_graceful_shutdown=GRACE_SECONDS,
             ws_max_size=settings.max_body_bytes,
-            ws_per_message_deflate=False,  # frames are numbers: packing them costs more than it saves
-            ws_ping_timeout=None,  # a trainer that learns for minutes answers no ping, and has not gone
+            ws_per_message_deflate=False,  # compression of numbers takes more time than it saves
+            ws_ping_timeout=None,  # a trainer that is learning may answer no ping for minutes
         )
         super().__init__(config)
         self._app = app
@@ -71,8 +71,8 @@ class Runner(uvicorn.Server):
 
     @contextmanager
     def capture_signals(self) -> Generator[None, None, None]:
-        """Handle SIGHUP, the signal of a closed terminal, as well as uvicorn's signals. Under nohup it stays
-        ignored."""
+        """Return a context that handles uvicorn's signals and also SIGHUP, which a closing terminal sends. Under nohup,
+        SIGHUP stays ignored."""
         ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
         with super().capture_signals(), nullcontext() if ignored else _handled(signal.SIGHUP, self.handle_exit):
             yield
@@ -99,7 +99,7 @@ def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool, tel
         tell: called with the URL, once requests are accepted.
 
     Raises:
-        InvalidInput: the server can't listen on the address.
+        InvalidInput: the server can't listen on the address, or a setting can't be used.
         Unavailable: the database is in use by another server, or does not answer.
     """
     logs.configure(settings.log_level, settings.log_format)
@@ -112,7 +112,8 @@ def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool, tel
 
 @contextmanager
 def _fits(settings: Settings) -> Iterator[Fits | None]:
-    """Start the process of the fits, while this one is small enough to fork. None if fits may run in a cluster."""
+    """Return a context with the child processes of fits. The first is started now, because a fork is cheap and safe
+    only before other modules and threads are loaded. None if fits may run in a cluster."""
     if settings.engine != "local":
         yield None
         return
@@ -131,12 +132,11 @@ def _handled(sig: signal.Signals, handler: Callable[[int, FrameType | None], Non
 
 
 def _exempt_from_collection() -> None:
-    """Exempt all objects that exist now from garbage collection.
+    """Exempt all objects that exist now from garbage collection, and enable the collector for later objects.
 
-    They are torch and other imports, which stay alive. Each full collection would traverse them, and no step is
-    answered for some 200 ms meanwhile. The first collection is skipped as well, because only 3 % of these objects are
-    garbage. Objects that are made later are collected in larger portions than Python's 700: a page of 1,000 samples has
-    many times as many, which no collection finds to be garbage.
+    The present objects belong to torch and other imports and stay alive. A full collection would traverse them, which
+    delays steps by some 200 ms. Later objects are collected less often than by Python's default threshold of 700 new
+    objects, because a request for 1,000 samples creates many times as many, which all stay in use.
     """
     gc.freeze()
     gc.set_threshold(YOUNG_OBJECTS, *gc.get_threshold()[1:])
@@ -144,7 +144,7 @@ def _exempt_from_collection() -> None:
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    """Return a bound socket, so that a port in use is reported before anything else is opened."""
+    """Return a socket bound to the address. It is opened first, so that a port in use is reported at once."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listener = socket.socket(family, kind, protocol)
@@ -158,14 +158,14 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _url(listener: socket.socket, settings: Settings) -> str:
-    """URL under which a client on this machine reaches the server."""
+    """Return the URL by which a client on this machine reaches the server."""
     name = ANY_ADDRESS.get(settings.host, settings.host)
     scheme = "http" if settings.tls_certificate is None else "https"
     return f"{scheme}://{f'[{name}]' if ':' in name else name}:{listener.getsockname()[1]}"
 
 
 def _write_at_once(path: Path, text: str) -> None:
-    """Write a file atomically, so that readers see either nothing or all of it."""
+    """Write a file atomically, so that readers see either no file or the whole text."""
     draft = path.with_name(f"{path.name}.tmp")
     draft.write_text(text, encoding="utf-8")
     draft.replace(path)

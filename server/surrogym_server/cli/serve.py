@@ -16,7 +16,7 @@ from surrogym_server.errors import InvalidInput, SurrogymError
 from surrogym_shared.terminal import give, progress
 
 WORKERS_VARIABLE = "WEB_CONCURRENCY"
-OF_THE_COMMAND = ("ready_file", "exit_with_parent", "as_json", "quiet")  # its other options are settings
+OF_THE_COMMAND = ("ready_file", "exit_with_parent", "as_json", "quiet")  # options that are no settings of the server
 
 Host = Annotated[str | None, typer.Option(help="Address to listen on. [default: 127.0.0.1]")]
 Port = Annotated[int | None, typer.Option(help="Port to listen on; 0 takes any free one. [default: 8000]")]
@@ -86,7 +86,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no remarks. The
 
 
 def register(app: typer.Typer) -> None:
-    """Add ``serve`` to an app of commands."""
+    """Add the command ``serve`` to a typer app."""
     app.command()(serve)
 
 
@@ -125,7 +125,7 @@ def serve(
 
     Example: surrogym serve --port 8000 --database surrogym.db
     """
-    gc.disable()  # imported objects stay alive: searching them for garbage takes an eighth of the start-up time
+    gc.disable()  # collecting garbage among imported modules takes an eighth of the start-up time
     try:
         from surrogym_server.settings import read_settings
 
@@ -136,7 +136,7 @@ def serve(
             _refuse_options_of_ray(given)
         with progress("serve", quiet=quiet or not sys.stderr.isatty()) as update:
             update(None, "importing torch")
-            from surrogym_server.cli import runner  # neither --help nor a refusal should wait for it
+            from surrogym_server.cli import runner  # imported here, so that --help and refusals need not wait for torch
 
         def tell(url: str) -> None:
             about = {"url": url, "version": version("surrogym")}
@@ -152,10 +152,14 @@ def serve(
 
 
 def _refuse_options_of_ray(given: Mapping[str, Any]) -> None:
-    """Raise ``InvalidInput`` for an option of the command that the engine would ignore. Variables may stay set."""
+    """Raise ``InvalidInput`` if an option for Ray is given, but the engine is another. Environment variables for Ray
+    are ignored."""
     for name in ("ray_address", "ray_hosts"):
         if given[name] is not None:
-            raise InvalidInput(f"--{name.replace('_', '-')}: expected --engine ray with it, got the engine local")
+            raise InvalidInput(
+                f"--{name.replace('_', '-')}: expected --engine ray with it, got the engine local: add --engine ray "
+                "or omit this option"
+            )
 
 
 def _refuse_workers() -> None:

@@ -1,4 +1,4 @@
-"""A learned model for other programs: an FMU that steps as the served model does."""
+"""Export of a learned model for other programs, as an FMU that steps like a session of the model."""
 
 from surrogym_server.deployment.twin import MOST_NUMBERS, twin_of, write_twin
 

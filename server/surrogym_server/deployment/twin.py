@@ -1,4 +1,4 @@
-"""A surrogate as an FMU of FMI 3.0: a digital twin, with the uncertainty of each step.
+"""Export of a surrogate as an FMU (FMI 3.0), with the uncertainty of each step.
 
 The FMU steps like a session in the variant ``deterministic``: by the mean, with the standard deviations beside it.
 """
@@ -23,28 +23,35 @@ from surrogym_server.virtual import reward_limits
 from surrogym_shared.fmu import Block, Causality, Names, Variable, WrittenFmu, write_fmu
 from surrogym_shared.surrogate_file import SurrogateFile
 
-MOST_NUMBERS = 4_000_000  # constants in the source: a compiler needs about a minute and 1 GB for as many
+MOST_NUMBERS = 4_000_000  # largest number of constants in the C source, which takes about a minute and 1 GB to compile
 ANYWHERE = (-math.inf, math.inf)
 
 
 def write_twin(data: bytes, out: Path, period: float | None = None) -> WrittenFmu:
-    """Write a surrogate's file, from ``surrogym export``, as an FMU.
+    """Convert a file of ``surrogym export`` to an FMU, and write it.
 
     Args:
-        out: file to write.
-        period: seconds of one step; None: the sampling period of the specification.
+        data: content of the file of ``surrogym export``.
+        out: path of the FMU to write.
+        period: duration of one step in seconds; None for the sampling period of the specification.
 
     Raises:
-        NotASurrogateFile: other bytes.
-        InvalidInput: a model that can't be written in C; or no period that is above 0.
+        NotASurrogateFile: ``data`` is not the content of such a file.
+        InvalidInput: the model can't be written in C, or the period is missing or not above 0.
         CannotCompile: the C compiler of this machine refused the sources.
-        OSError: the file can't be written.
+        OSError: the FMU can't be written.
     """
     return write_fmu(twin_of(SurrogateFile.from_bytes(data), period), out)
 
 
 def twin_of(file: SurrogateFile, period: float | None = None) -> Block:
-    """The block of a surrogate: variables, and C source. Raises ``InvalidInput``."""
+    """Return the description of a surrogate's FMU: its variables and its C source.
+
+    ``period`` is the duration of one step in seconds; None for the sampling period of the specification.
+
+    Raises:
+        InvalidInput: the model can't be written in C, or the period is missing or not above 0.
+    """
     definition = stored_definition(file.spec)
     model = from_bytes(definition, file.model)
     seconds = _period(file.spec.sampling_period if period is None else period)
@@ -67,7 +74,8 @@ def twin_of(file: SurrogateFile, period: float | None = None) -> Block:
 def _period(seconds: float | None) -> float:
     if seconds is None:
         raise InvalidInput(
-            "expected --period with the seconds of one step, because the specification has no sampling_period"
+            "the duration of a step is unknown, because the specification has no sampling_period: give --period, in "
+            "seconds"
         )
     if not 0 < seconds < math.inf:
         raise InvalidInput(f"period: expected the seconds of one step, above 0, got {seconds}")
@@ -84,17 +92,20 @@ def _source_of(model: DynamicsModel) -> StepSource:
         )
     source = able.step_source()
     if source is None:
-        raise InvalidInput("model: expected numba, which lays out the tables, got an installation without it")
+        raise InvalidInput("numba is not installed, but is needed to write a model in C: install the package numba")
     if source.numbers > MOST_NUMBERS:
         raise InvalidInput(
-            f"model: expected at most {MOST_NUMBERS:,} numbers, got {source.numbers:,}: the family "
-            "sparse_gaussian_process needs fewer"
+            f"model: expected at most {MOST_NUMBERS:,} numbers, got {source.numbers:,}: use the model family "
+            "sparse_gaussian_process, which has fewer"
         )
     return source
 
 
 def _variables(definition: EnvironmentDefinition, units: Sequence[str]) -> Iterator[Variable]:
-    """All variables, in the order of the values in ``twin.c``. A name that is taken is preceded by its kind."""
+    """Yield the variables of the FMU, in the order of the values in ``twin.c``.
+
+    If two have the same name, the second gets its kind as a prefix, such as ``observation``.
+    """
     free = Names().free
 
     action, count = definition.action, definition.action.size
@@ -125,7 +136,8 @@ def _coordinate(coordinate: CoordinateDefinition, name: str, unit: str, start: f
 
 
 def _start(definition: EnvironmentDefinition, index: int) -> float:
-    """Start value of a coordinate: of the first declared state, or the median of its distribution."""
+    """Return the start value of the coordinate with this index: that of the first declared start state, or else the
+    median of its start distribution."""
     if definition.starts:
         return definition.starts[0][index]
     middle = torch.tensor(0.5, dtype=torch.float64)
@@ -147,7 +159,7 @@ def _header(definition: EnvironmentDefinition, model: DynamicsModel, rewards: tu
     yield _array("state_high", [min(one.high, _LARGEST) for one in coordinates]) + "\n"
 
 
-_LARGEST = torch.finfo(torch.float64).max  # so that an infinite start is refused
+_LARGEST = torch.finfo(torch.float64).max  # bound in the place of infinity, so that the FMU refuses an infinite start
 
 
 def _array(name: str, values: Sequence[float]) -> str:

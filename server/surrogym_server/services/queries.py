@@ -125,7 +125,10 @@ class QueryService:
         return [self._storage.queries.get(name, id) for id in ids]
 
     def withdraw_audit(self, name: str, query_ids: Sequence[int]) -> int:
-        """Remove the given queries that belong to an audit and that no sampler has leased. Return their number."""
+        """Remove the given queries of an audit, except those of which a sampler may have taken a real step.
+
+        Returns the number of removed queries.
+        """
         pending = self._storage.queries.list(name, ("pending",))
         audits = [query.id for query in pending if query.purpose == "audit" and query.id in set(query_ids)]
         withdrawn = self._storage.queries.withdraw(name, audits) if audits else 0

@@ -1,5 +1,5 @@
-"""Invariants of the ports as plain functions, for authors of implementations. A broken invariant raises
-``AssertionError``.
+"""Test functions for authors of a model family, an engine or a ``Compute``. Each checks one law of the interface, and
+raises ``AssertionError`` if it is broken.
 
 Examples:
     >>> import pytest

@@ -1,4 +1,4 @@
-"""Invariants of the abilities. A family without an ability passes its invariants trivially."""
+"""Test functions for the optional abilities of a model family. A family without an ability passes its tests."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ DRAWS = 400
 
 
 def _draws(case: ModelCase) -> list[FunctionDraws]:
-    """Objects that samples functions of the model: with the optimal hyperparameters, and with uncertain ones."""
+    """Return the model's samplers of functions: with optimal hyperparameters, and with sampled ones, if it has them."""
     plain, uncertain = offers(case.model, FunctionDraws), offers(case.model, UncertainHyperparameters)
     found = [] if plain is None else [plain]
     return found if uncertain is None else [*found, uncertain.uncertain_functions]
 
 
 def a_drawn_function_is_one_function(case: ModelCase) -> None:
-    """The same weights at the same point give the same step, whatever other rows are in the batch."""
+    """Check that a sampled function (its weights) gives the same step at the same point, for any other batch rows."""
     for able in _draws(case):
         noise = case.noise(3, able.path_size)
         paths = able.draw(noise)
@@ -55,7 +55,8 @@ def drawn_functions_scatter_as_the_stds_say(case: ModelCase) -> None:
 
 
 def a_drawn_function_may_have_columns_beyond_its_own(case: ModelCase) -> None:
-    """Functions may have more columns, as in a session whose lanes follow models of several sizes."""
+    """Check that additional columns of a function's weights are ignored. A session has them if its lanes follow models
+    of different sizes."""
     for able in _draws(case):
         paths = able.draw(case.noise(2, able.path_size))
         wider = torch.cat([paths, torch.zeros(2, 3, dtype=torch.float64)], 1)
@@ -139,7 +140,7 @@ def doubts_about_edges_are_probabilities_of_error(case: ModelCase) -> None:
 
 
 def _paths(case: ModelCase, points: Points) -> PredictedSteps:
-    """Three paths of four steps."""
+    """Return three predicted paths of four steps each, from twelve points."""
     q_next = case.model.transition(points.q, points.u).q_next
     return PredictedSteps(*(tensor.reshape(3, 4, -1) for tensor in (points.q, points.u, q_next)))
 

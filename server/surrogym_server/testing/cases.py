@@ -1,4 +1,4 @@
-"""Small environments with known equations, for checks of the invariants of a family of models."""
+"""Small environments with known equations, for tests of a model family."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ VARIATIONS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class ModelCase:
-    """One environment, what a family learns of it, and the points at which it is tested."""
+    """A test case of a model family: an environment, the learned model, and points at which the model is tested."""
 
     name: str
     definition: EnvironmentDefinition
-    count: int = SAMPLES  # of samples to learn from
+    count: int = SAMPLES  # number of samples to learn from
 
     def __str__(self) -> str:
         return self.name
@@ -78,12 +78,12 @@ class ModelCase:
 
     @cached_property
     def samples(self) -> Samples:
-        """Real steps to learn from."""
+        """Real steps from which the model learns."""
         return _real_steps(self, self.count, seed=0)
 
     @cached_property
     def unseen(self) -> Samples:
-        """Other real steps."""
+        """Real steps from which the model has not learned."""
         return _real_steps(self, POINTS, seed=1)
 
     @cached_property
@@ -99,14 +99,14 @@ class ModelCase:
         return Points(self.unseen.q, self.unseen.u)
 
     def noise(self, *shape: int) -> torch.Tensor:
-        """Standard normal numbers."""
+        """Return standard normal random numbers of this shape, the same at each call."""
         return torch.randn(*shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
 
 def model_cases(
     family: str, settings: Mapping[str, float | bool | str] | None = None, samples: int = SAMPLES
 ) -> tuple[ModelCase, ...]:
-    """Environments with ``samples`` real steps each. Their specifications name this family and these settings."""
+    """Return test cases for a model family with these settings: one environment each, with ``samples`` real steps."""
     design = {"model": {"name": family, "settings": dict(settings or {})}, "monte_carlo": 64, "initial": SAMPLES}
     return tuple(
         ModelCase(
@@ -122,8 +122,8 @@ def close(one: torch.Tensor, other: torch.Tensor) -> bool:
 
 
 def _real_steps(case: ModelCase, count: int, seed: int) -> Samples:
-    """Steps from anywhere in the sampling range of a pushed pendulum, whose reward depends on its angle and
-    the push."""
+    """Return steps of a pendulum from random states and actions. The action pushes the pendulum, and the reward depends
+    on its angle and the push."""
     q, u = random_points(case.definition, count, np.random.default_rng(seed))
     angle, speed = q[:, 0], q[:, 1]
     push = u[:, 0] - 1 if case.definition.action.nvec else u[:, 0]

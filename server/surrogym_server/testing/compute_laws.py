@@ -1,4 +1,4 @@
-"""Invariants of every ``Compute``; see the docstrings of ``engine.port``."""
+"""Test functions for implementations of ``Compute``. The laws are in its docstring in ``engine.port``."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ Function = Callable[[DesignJob], DesignResult]
 
 @dataclass(frozen=True)
 class ComputeCase:
-    """A ``Compute``, made with the function that does a job, and a job of a real design.
+    """A test case of a ``Compute``.
 
-    The functions are found by name in the process that calls them.
+    ``make`` creates the ``Compute`` from the function that computes a job; child processes import this function by its
+    name. ``job`` is a job of a real design.
     """
 
     make: Callable[[Function], Compute]
@@ -33,7 +34,7 @@ class ComputeCase:
     folder: Path  # an empty folder to which jobs can write
 
     def asked(self, **state: Any) -> DesignJob:
-        """A job for the functions of this file, which only read its state."""
+        """Return a job with this state, for the functions of this file, which read nothing else of a job."""
         return replace(self.job, state=state)
 
 
@@ -53,7 +54,7 @@ async def a_result_is_that_of_the_job_bit_for_bit(case: ComputeCase) -> None:
 
 
 async def jobs_at_once_do_not_wait_for_each_other(case: ComputeCase) -> None:
-    """Each job waits for a sign of the other."""
+    """Check that two jobs run at the same time: each waits for a file that the other writes."""
     first, second = (str(case.folder / name) for name in ("first", "second"))
     compute = case.make(_meet)
     try:
@@ -127,7 +128,7 @@ async def _gone(process: int) -> None:
 
 
 def _where(job: DesignJob) -> DesignResult:
-    """Do no work. The data hash of the result is the number of the process."""
+    """Return a result without computing anything. Its data hash is the number of the process."""
     del job
     return DesignResult(b"", {}, {"samples": 0}, str(os.getpid()), {}, "ready", 0.0)
 

@@ -1,4 +1,4 @@
-"""Invariants of every engine of sessions; see the docstrings of ``engine.port``."""
+"""Test functions for implementations of ``SessionEngine``. The laws are in its docstring in ``engine.port``."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ E = TypeVar("E", bound=SurrogymError)
 
 @dataclass(frozen=True)
 class EngineCase:
-    """A started engine, and one surrogate that it can open, with one continuous action and a model of version 1."""
+    """A test case of an engine: the started engine, and a surrogate with one continuous action and a model of version
+    1."""
 
     engine: SessionEngine
     surrogate: str
@@ -45,29 +46,29 @@ class EngineCase:
     def asked(
         self, *, key: str | None = None, seed: int | None = SEED, occupancy: bool = False, **settings: Any
     ) -> Open:
-        """A request to open a session."""
+        """Return a request to open a session of the surrogate with these settings."""
         chosen: dict[str, Any] = {"num_envs": LANES, "autoreset_mode": "same_step", "time_limit": 5} | settings
         opening = Opening(VirtualSettings(**chosen), None, seed, "latest", occupancy, key)
         return Open(self.surrogate, self.surrogate_id, self.definition, opening)
 
     async def opened(self, **options: Any) -> str:
-        """The id of a new session, reset by its first request."""
+        """Open a session, reset it, and return its id."""
         session = (await self.engine.open(self.asked(**options))).id
         await self.engine.advance(Reset(session, 1))
         return session
 
     def action(self, number: int = 0) -> NDArray[np.float64]:
-        """Actions (N, 1) within bounds."""
+        """Return random actions (N, 1) within their bounds; ``number`` is the seed."""
         low, high = self.definition.action.limits
         share: NDArray[np.float64] = np.random.default_rng(number).uniform(0.1, 0.9, (LANES, 1))
         return low + share * (high - low)
 
     def steps(self, session: str, count: int = STEPS) -> list[Advance]:
-        """A number of steps after the reset."""
+        """Return requests for ``count`` steps of a session that has just been reset."""
         return [Step(session, number + 2, self.action(number)) for number in range(count)]
 
     def policy(self, session: str, seq: int) -> PolicySteps:
-        """Steps in which a random policy acts with noise."""
+        """Return a request for a rollout with a random policy that acts with noise."""
         observation, rng = len(self.definition.observation_names), np.random.default_rng(0)
         layer = Layer(rng.normal(size=(observation, 1)), np.zeros(1))
         policy = ActingPolicy(np.zeros(observation), np.ones(observation), (layer,), log_deviations=np.zeros(1))
@@ -288,7 +289,7 @@ LAWS_OF_ENGINES: tuple[Law, ...] = (
 
 
 async def _refused(kind: type[E], asked: Awaitable[object]) -> E:
-    """Return the error of this class that a request raises; it must pickle."""
+    """Check that a request raises an error of this class that can be pickled, and return the error."""
     caught: E | None = None
     try:
         await asked

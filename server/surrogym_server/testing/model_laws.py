@@ -1,4 +1,4 @@
-"""Invariants of every family of models; see the docstrings of ``models.port``."""
+"""Test functions for model families. The laws are in the docstrings of ``models.port``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from surrogym_server.testing.cases import ModelCase, close
 from surrogym_server.virtual import VirtualSettings, create, reset, step
 from surrogym_shared.kinds import Variant
 
-GUESS = 0.5  # of the standard deviation of the targets: the error of a family that learns is smaller
+GUESS = 0.5  # largest error of a model that has learned, as a share of the targets' standard deviation
 RESERVED = "samples."
 NONSENSE: tuple[Any, ...] = ("nonsense", [], None, math.inf)
 
@@ -78,7 +78,7 @@ def points_do_not_see_those_beside_them(case: ModelCase) -> None:
 
 
 def without_points_there_are_no_steps(case: ModelCase) -> None:
-    """A prediction of no points has no rows, and gives no warning."""
+    """Check that a prediction at no points has no rows and gives no warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         made = case.model.transition(case.points.q[:0], case.points.u[:0], stds=True, reward_std=True)
@@ -95,7 +95,8 @@ def next_states_are_where_the_environment_can_be(case: ModelCase) -> None:
 
 
 def a_draw_is_the_mean_and_noise_times_the_std(case: ModelCase) -> None:
-    """For the speed: the angle, which depends on the predicted speed, uses the draw of the speed."""
+    """Check that a sampled next speed is the mean plus noise times the standard deviation. The angle is not checked,
+    because it follows the sampled speed."""
     q, u, noise = case.points.q, case.points.u, case.noise(len(case.points), 2)
     made = case.model.transition(q, u, noise=noise, stds=True)
     assert made.std is not None
@@ -173,7 +174,8 @@ def stored_arrays_are_float64_and_keep_off_reserved_names(case: ModelCase) -> No
 
 
 def a_damaged_file_is_refused_in_words(case: ModelCase) -> None:
-    """The file has no checksum, so that the codec itself has to find the damage."""
+    """Check that a damaged model file raises ``InvalidInput``. The checksum is removed, so that the codec has to detect
+    the damage."""
     data = to_bytes(case.model)
     header = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"][METADATA])
     del header["checksum"]

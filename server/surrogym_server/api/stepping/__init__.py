@@ -1,4 +1,1 @@
-"""The fast path of steps: lean routes, the stream, and messages that are answered as they arrive.
-
-Requests go to ``SessionEngine.advance``, or to ``SessionEngine.try_now`` if an answer must not wait.
-"""
+"""Routes of reset, step and rollout, made fast: without FastAPI's processing, and as messages of a WebSocket."""

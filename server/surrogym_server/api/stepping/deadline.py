@@ -1,5 +1,4 @@
-"""``x-deadline-ms``: the time that a caller waits for a reply, so that no step is computed for a caller who
-has gone."""
+"""The header ``x-deadline-ms``: how long a caller waits for a reply. A step that would be later is not computed."""
 
 from __future__ import annotations
 
@@ -22,10 +21,10 @@ PARAMETER: dict[str, Any] = {
 
 
 def seconds_left(headers: Mapping[str, str]) -> float | None:
-    """Seconds that a caller waits; None if the header is missing.
+    """Return how long the caller of a request waits, in seconds; None if the header is missing.
 
     Raises:
-        InvalidInput: not a whole number of milliseconds.
+        InvalidInput: the header is not a whole number of milliseconds.
     """
     given = headers.get(HEADER)
     if given is None:

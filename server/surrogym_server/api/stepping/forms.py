@@ -1,4 +1,4 @@
-"""reset, step and rollout in their two forms, JSON and frames: from a body to a request, and from a reply to a body."""
+"""Reading and writing of the requests reset, step and rollout in their two forms, JSON and binary frames."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from surrogym_shared import frames
 from surrogym_shared.wire import ResetSession, RolloutSession, StepSession
 
 Operation = Literal["reset", "step", "rollout"]
-Writers = Mapping[type[Advance], Callable[[Reply], bytes]]  # of the reply to each kind of request
+Writers = Mapping[type[Advance], Callable[[Reply], bytes]]  # functions that write the reply to each kind of request
 
-SHORT_ROLLOUT = 32  # steps; writing a longer one's reply takes milliseconds, for which others should not wait
+SHORT_ROLLOUT = 32  # number of steps up to which a reply is written in the event loop; a longer one takes milliseconds
 
 FRAMES: Mapping[Operation, tuple[type[frames.Request], ...]] = {
     "reset": (frames.ResetRequest,),
@@ -32,7 +32,13 @@ _JSON = msgspec.json.Encoder()
 
 
 def request_in_json(operation: Operation, session: str, content: bytes, within: float | None) -> Advance:
-    """Read a request from JSON. Raises like ``parse_as``, and ``InvalidInput``."""
+    """Read a reset, step or rollout from a JSON body. ``within`` is how long the caller waits, in seconds.
+
+    Raises:
+        HTTPException: the body is not valid JSON.
+        RequestValidationError: a field is missing or invalid.
+        InvalidInput: rows of an array have different lengths, or a policy's arrays contradict each other.
+    """
     match operation:
         case "step":
             step = parse_as(StepSession, content)
@@ -49,7 +55,7 @@ def request_in_json(operation: Operation, session: str, content: bytes, within: 
 
 
 def frame_of(operation: Operation, content: bytes) -> frames.Request:
-    """Read a frame. Raises ``FrameError`` if the content is not a frame of this operation."""
+    """Read a binary frame from a body. Raises ``FrameError`` if the body is not a frame of this operation."""
     request = frames.read_request(content)
     if not isinstance(request, FRAMES[operation]):
         expected = " or a ".join(kind.__name__ for kind in FRAMES[operation])
@@ -58,7 +64,10 @@ def frame_of(operation: Operation, content: bytes) -> frames.Request:
 
 
 def request_in_frame(frame: frames.Request, session: str, shape: frames.Shape, within: float | None = None) -> Advance:
-    """Read a request from a frame. Raises ``FrameError`` if it does not fit the session's shape."""
+    """Convert a binary frame to a request of the engine. ``within`` is how long the caller waits, in seconds.
+
+    Raises ``FrameError`` if the arrays of the frame do not have the sizes in ``shape``, those of the session.
+    """
     match frame:
         case frames.StepRequest():
             action, mask = frames.action_of(frame, shape), frames.mask_of(frame, shape)
@@ -72,7 +81,7 @@ def request_in_frame(frame: frames.Request, session: str, shape: frames.Shape, w
 
 
 async def carried_out(engine: SessionEngine, request: Advance, writers: Writers) -> bytes:
-    """The written reply to a request; a long one is written in a thread."""
+    """Carry out a request, and return the reply as bytes. A long reply is written in a thread."""
     reply = await engine.advance(request)
     write = writers[type(request)]
     return write(reply) if steps_of(reply.outcome) <= SHORT_ROLLOUT else await asyncio.to_thread(write, reply)
@@ -87,7 +96,7 @@ def _step_in_json(reply: Reply) -> bytes:
 
 
 def _rollout_in_json(reply: Reply) -> bytes:
-    """Write a rollout step by step, because a thread that encodes blocks all others."""
+    """Write the reply to a rollout as JSON, one step at a time, because the encoder blocks all other threads."""
     steps = [msgspec.Raw(_JSON.encode(step)) for step in sessions.rollout_steps(reply)]
     return _JSON.encode({"seq": reply.seq, "steps": steps, **sessions.rollout_actions(reply)})
 

@@ -1,4 +1,4 @@
-"""uvicorn's WebSocket for the stream: messages are answered as they arrive, and partial messages have limits."""
+"""uvicorn's WebSocket, extended to answer messages as they arrive and to limit unfinished messages."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from surrogym_server.api.stepping.stream import EXTENSION, Prompt
 from surrogym_shared.codes import Code
 from surrogym_shared.messages import MASKED, WHOLE_BINARY, Extent, FrameSplitter, apply_mask, header
 
-MAX_FRAMES = 256  # of a WebSocket in one read, and fragments of one message
+MAX_FRAMES = 256  # largest number of WebSocket frames in one read, and of fragments of one message
 
 
 class Unfinished:
-    """Number of bytes in unfinished messages of all streams together."""
+    """Counter of the bytes in unfinished messages of all streams together, with their limit ``most``."""
 
     def __init__(self, most: int) -> None:
         self.most = most
@@ -27,8 +27,12 @@ class Unfinished:
 
 
 def prompt(seconds: float, most_together: int) -> type[WebSocketsSansIOProtocol]:
-    """uvicorn's WebSocket with two limits: seconds for a whole message to arrive, and bytes of unfinished messages in
-    all streams together."""
+    """Return uvicorn's WebSocket class, extended by ``PromptMessages``, with two limits.
+
+    Args:
+        seconds: longest time for a whole message to arrive.
+        most_together: largest number of bytes in unfinished messages of all connections together.
+    """
     unfinished = Unfinished(most_together)
 
     class Bounded(PromptMessages):
@@ -40,18 +44,17 @@ def prompt(seconds: float, most_together: int) -> type[WebSocketsSansIOProtocol]
 class PromptMessages(WebSocketsSansIOProtocol):
     """uvicorn's WebSocket, extended so that the app can answer a message as it arrives.
 
-    ASGI wakes a task through a queue, and back, for each message. That takes as long as the rest of a small step. The
-    usual ASGI path is still used for everything that is not a whole binary message, for messages that the app does not
-    answer at once, and while the app is busy, so that the order of messages is kept. The library receives whole frames
-    only.
+    ASGI passes each message to a task through a queue, which takes as long as a small step. That path is still used for
+    messages that are not whole and binary, for those that the app does not answer at once, and while the app is busy,
+    so that the order of messages is kept. uvicorn's parser receives whole frames only.
     """
 
     _together = Unfinished(2**28)
     _seconds = 30.0
     _answer: Prompt | None = None
-    _oversized = False  # the library will refuse this frame; the following bytes belong to it
-    _waiting = False  # the app waits for the next message
-    _counted = 0  # of ``_together``
+    _oversized = False  # whether a frame is too large; uvicorn refuses it, and the following bytes belong to it
+    _waiting = False  # whether the app waits for the next message
+    _counted = 0  # number of bytes that this connection has added to ``_together``
     _timer: asyncio.TimerHandle | None = None
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
@@ -65,7 +68,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
             offers[EXTENSION] = self._take
 
     def data_received(self, data: bytes) -> None:
-        if not self.handshake_initiated or self._oversized:  # the handshake comes whole, from the HTTP protocol
+        if not self.handshake_initiated or self._oversized:  # uvicorn passes the handshake on whole
             super().data_received(data)
             if not self.handshake_initiated:
                 self._refuse_handshake()
@@ -85,7 +88,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
         super().connection_lost(exc)
 
     def send_receive_event_to_app(self) -> None:
-        if self.curr_msg_data_type == "text":  # the app refuses it; uvicorn would log an error for invalid UTF-8
+        if self.curr_msg_data_type == "text":  # the app refuses text, and uvicorn would log invalid UTF-8
             self.frames = [b"".join(self.frames).decode(errors="replace").encode()]
         super().send_receive_event_to_app()
 
@@ -97,13 +100,13 @@ class PromptMessages(WebSocketsSansIOProtocol):
             self._waiting = False
 
     async def send(self, message: Any) -> None:
-        if self.close_sent:  # for an invalid frame, while the app answered the message before it
+        if self.close_sent:  # an invalid frame has closed the connection while the app answered an earlier message
             raise ClientDisconnected
         await super().send(message)
-        self.handshake_complete |= self.close_sent  # by a refusal, for which uvicorn would log an error otherwise
+        self.handshake_complete |= self.close_sent  # else uvicorn would log an error after a refusal
 
     def _refuse_handshake(self) -> None:
-        """Answer a handshake that the library can't read. uvicorn would leave the connection open without a reply."""
+        """Answer a WebSocket handshake that can't be read. uvicorn would leave the connection open without a reply."""
         wrong = self.conn.handshake_exc
         why = "it is not whole" if wrong is None else wrong.__cause__ or wrong
         self.transport.write(
@@ -125,7 +128,10 @@ class PromptMessages(WebSocketsSansIOProtocol):
         return True
 
     def _count(self, unfinished: int) -> None:
-        """Count the bytes of an unfinished message, and end the connection if they are too many."""
+        """Update the number of bytes in this connection's unfinished message, and the timer for its arrival.
+
+        Closes the connection if the unfinished messages of all connections together are too large.
+        """
         if unfinished == self._counted:
             return
         self._together.bytes += unfinished - self._counted
@@ -142,7 +148,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
             )
 
     def _end(self, reason: str) -> None:
-        """Close the connection for a reason."""
+        """Close the connection, and send the reason if the handshake is complete."""
         if self.close_sent or self.transport.is_closing():
             return
         if self.conn.state is State.OPEN:

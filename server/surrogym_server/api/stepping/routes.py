@@ -1,4 +1,4 @@
-"""Routes on the path of every virtual step: reset, step and rollout, as JSON or frames, and the stream of frames."""
+"""Routes of reset, step and rollout, as JSON or binary frames, and of the stream of frames."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from surrogym_shared.wire import ResetReply, ResetSession, RolloutReply, Rollout
 
 
 class LeanRoute(APIRoute):
-    """A route on the path of every step. FastAPI describes it, but does not process its requests.
+    """A fast route for steps: it is described by FastAPI, but its requests are not processed by FastAPI.
 
-    Its endpoint takes an id and the request.
+    The endpoint gets the session's id and the request.
     """
 
     def __init__(self, path: str, endpoint: Callable[..., Awaitable[Response]], **options: Any) -> None:
@@ -53,7 +53,7 @@ router = APIRouter(prefix="/v1/sessions/{id}", tags=["sessions"], route_class=Le
 
 
 class StreamRoute(WebSocketRoute):
-    """Put the route into the scope, as HTTP routes do."""
+    """The route of a WebSocket, which puts itself into the ASGI scope for the metrics, as HTTP routes do."""
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         scope["route"] = self
@@ -88,15 +88,15 @@ def _documented(body: type[BaseModel], example: dict[str, Any], reply: type[Base
 
 @router.post("/reset", summary="Start new episodes", **_documented(ResetSession, examples.RESET, ResetReply))
 async def reset(id: str, request: Request) -> Response:
-    """Begin new episodes in all lanes, or in those of the mask. A seed starts them at episode 0; without one each lane
-    begins its next episode."""
+    """Begin new episodes in all lanes, or in those of ``mask``. With a seed, the lanes begin at episode 0 of this seed;
+    without one, each lane begins its next episode."""
     return await _carried("reset", id, request)
 
 
 @router.post("/step", summary="Step all lanes", **_documented(StepSession, examples.STEP, StepReply))
 async def step(id: str, request: Request) -> Response:
-    """Step all lanes, or those of the mask. The same ``seq`` with the same body gets the same reply, so a request whose
-    reply was lost can be repeated, over this or another transport."""
+    """Step all lanes, or those of ``mask``. A repeat with the same sequence number ``seq`` and the same body gets the
+    same reply and takes no step, so a request whose reply was lost can be sent again, also over another transport."""
     return await _carried("step", id, request)
 
 
@@ -106,13 +106,14 @@ async def step(id: str, request: Request) -> Response:
     **_documented(RolloutSession, examples.ROLLOUT, RolloutReply, **json_up_to(128)),
 )
 async def rollout(id: str, request: Request) -> Response:
-    """Step several times in one request, with given actions or with those of a policy that is sent as arrays; all steps
-    or none."""
+    """Step several times in one request, with given actions or with those of a policy that is sent as arrays. Either
+    all steps are taken or none."""
     return await _carried("rollout", id, request)
 
 
 async def _carried(operation: forms.Operation, id: str, request: Request) -> Response:
-    """The reply, in the form of the request."""
+    """Carry out a reset, step or rollout of the session with this id. The reply is JSON or a frame, like the
+    request."""
     scope = request.scope
     media_type: str = scope[MEDIA_TYPE]
     engine: SessionEngine = scope["state"]["services"].engine
@@ -133,7 +134,7 @@ def _left(limit: float | None, began: float) -> float | None:
 
 
 async def _body(request: Request) -> bytes:
-    """Read the body without the generator of ``Request.body``: nearly every body comes in one message. Raises
+    """Read the body of a request, faster than ``Request.body`` does if the body comes in one message. Raises
     ``ClientDisconnect``."""
     parts = []
     while True:
@@ -146,10 +147,10 @@ async def _body(request: Request) -> bytes:
 
 
 class StepDoor:
-    """Middleware that passes the requests of this file directly to their routes, as the router would.
+    """Middleware that passes resets, steps and rollouts directly to their routes.
 
-    It skips layers that these routes don't use, and that take as long as a small step: handlers of exceptions, a stack
-    of exits, and a search through all routes.
+    It skips parts of FastAPI and Starlette that these routes don't need and that take as long as a small step: the
+    handlers of exceptions, an exit stack, and the search through all routes.
     """
 
     def __init__(self, app: ASGIApp) -> None:

@@ -1,10 +1,10 @@
-"""``WS /v1/sessions/{id}/stream``: the frames of reset, step and rollout, each as one message.
+"""The WebSocket ``/v1/sessions/{id}/stream``: binary frames of reset, step and rollout, each as one message.
 
-It is plain ASGI, so that a step costs little more than two messages. Requests are carried out one at a time, and each
-is answered before the next is read. The connection may be dropped at any moment, because the session has an id.
+It is plain ASGI, which makes a step fast. Requests are carried out one at a time, and each is answered before the next
+is read. The connection may be dropped at any time, because the session continues under its id.
 
-A server that offers ``EXTENSION`` may pass on a message as it arrives, without waking a task. If its answer needs no
-waiting, it is given at once. Other messages use ASGI.
+A server that offers ``EXTENSION`` may pass on a message as it arrives, without waking a task. If the answer needs no
+waiting, it is sent at once. Other messages use ASGI.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from surrogym_shared import frames
 
 logger = logging.getLogger(__name__)
 
-EXTENSION = "surrogym.prompt"  # of the scope: called with a Prompt once the connection is accepted
-Prompt = Callable[[bytes], bytes | None]  # from a message to its reply; None to receive the message by ASGI
+EXTENSION = "surrogym.prompt"  # ASGI extension: a function that takes a Prompt after the connection is accepted
+Prompt = Callable[[bytes], bytes | None]  # returns the reply to a message; None to receive the message by ASGI
 
 
 class StepStream:
-    """The stream as an ASGI app. One call serves one connection."""
+    """ASGI app of the WebSocket of steps. One call serves one connection."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         engine: SessionEngine = scope["state"]["services"].engine
         id: str = scope["path_params"]["id"]
-        await receive()  # the client's wish to connect
+        await receive()  # the message "websocket.connect"
         try:
             _admit(scope)
             shape = sessions.session_shape(await engine.describe(id))
@@ -53,22 +53,22 @@ class StepStream:
         while (message := await receive())["type"] == "websocket.receive":
             reply = await _reply(engine, limit, id, shape, message.get("bytes"))
             await send({"type": "websocket.send", "bytes": reply})
-            await asyncio.sleep(0)  # lets other tasks run, even if this client has sent several messages ahead
+            await asyncio.sleep(0)  # lets other tasks run, even if more messages of this client have arrived
 
 
 def _admit(scope: Scope) -> None:
-    """Check the request's token. Raises ``Unauthenticated`` or ``Forbidden``."""
+    """Check that a request has a token of role train. Raises ``Unauthenticated`` or ``Forbidden``."""
     gate: Gate = scope["app"].state.gate
     gate.check(bearer_token(scope), ("train",))
 
 
 def _at_once(engine: SessionEngine, limit: float | None, id: str, shape: frames.Shape, content: bytes) -> bytes | None:
-    """The reply to one message if it needs no waiting. Otherwise None, and nothing is done."""
+    """Answer one message if that needs no waiting; otherwise do nothing and return None."""
     try:
         frame = frames.read_request(content)
     except frames.FrameError:
         return None
-    if isinstance(frame, frames.RolloutRequest | frames.PolicyRequest):  # writing their reply may take long
+    if isinstance(frame, frames.RolloutRequest | frames.PolicyRequest):  # writing the reply to a rollout may take long
         return None
     try:
         request = request_in_frame(frame, id, shape, limit)
@@ -81,7 +81,7 @@ def _at_once(engine: SessionEngine, limit: float | None, id: str, shape: frames.
 async def _reply(
     engine: SessionEngine, limit: float | None, id: str, shape: frames.Shape, content: bytes | None
 ) -> bytes:
-    """The reply to one message, as a frame. Raises nothing, unless it is cancelled."""
+    """Carry out the request in one message, and return the reply as a frame. An error becomes a reply too."""
     try:
         if content is None:
             raise frames.FrameError("expected a binary message, got text")
