@@ -1,1 +1,1 @@
-"""Storage: the port, and adapters for SQLite and PostgreSQL."""
+"""Storage: its abstract interface, and implementations for SQLite and PostgreSQL."""

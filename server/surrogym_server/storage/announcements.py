@@ -1,4 +1,4 @@
-"""The part of the storage port by which the servers of one database wake each other."""
+"""Interface of announcements, by which the servers of one database notify each other of changed surrogates."""
 
 from __future__ import annotations
 
@@ -7,42 +7,42 @@ from collections.abc import Callable
 
 Hear = Callable[
     [str | None], None
-]  # takes the name of a surrogate that changed, or None after announcements may have been lost
+]  # callback that gets the name of a changed surrogate, or None if announcements may have been lost
 
 
 class Announcements(ABC):
-    """Short messages between the servers of one database: something happened to a surrogate.
+    """Messages between the servers of one database that a surrogate has changed. Thread-safe.
 
-    They may be lost, so whoever waits for them also looks from time to time. Any thread may call.
+    A message may be lost, so a receiver has to compare the surrogates from time to time as well.
     """
 
     @abstractmethod
     def announce(self, surrogate: str) -> None:
-        """Tell all other servers soon that something happened to the surrogate. Returns at once, and never raises.
+        """Send to all other servers, soon, that a surrogate has changed. Returns at once, and never raises.
 
-        Announcements of one surrogate that wait to be sent are sent once.
+        Several unsent announcements of one surrogate are sent as one.
         """
 
     @abstractmethod
     def listen(self, hear: Hear) -> None:
-        """Call ``hear``, in a thread, for each announcement of another server from now on. To be called once.
+        """Call ``hear``, in a thread, for each later announcement of another server. May be called once.
 
-        After a lost connection, ``hear`` is called with None as soon as the connection is back.
+        After a lost connection is restored, ``hear`` is called with None.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Stop sending and listening. Closing twice is harmless."""
+        """Stop sending and listening. A second call does nothing."""
 
 
 class Alone(Announcements):
-    """Announcements for a database with a single server: none are sent, and none come."""
+    """Announcements for a database with a single server: nothing is sent or received."""
 
     def announce(self, surrogate: str) -> None:
-        """Do nothing: there is no other server."""
+        """Do nothing, because there is no other server."""
 
     def listen(self, hear: Hear) -> None:
-        """Do nothing: no announcement ever comes."""
+        """Do nothing, because there is no other server that could send an announcement."""
 
     def close(self) -> None:
-        """Do nothing."""
+        """Do nothing, because nothing was opened."""

@@ -1,8 +1,8 @@
-"""The storage port: all data that the server keeps. Its docstrings are invariants, by which every adapter is tested.
+"""Interface of the storage of all data. Its docstrings are invariants, by which each implementation is tested.
 
-For all of it:
-- an operation is atomic, and what it changed is durable when it returns;
-- any thread may call, and on PostgreSQL any number of servers;
+For all methods:
+- an operation is atomic, and its changes are durable when it returns;
+- all methods are thread-safe, and on PostgreSQL any number of servers may call them at a time;
 - time is the database's clock, and a lease ends by that clock alone, whichever process dies; if the clock is set back,
   no lease lasts longer than its duration;
 - an operation on a surrogate that does not exist raises ``UnknownSurrogate``;
@@ -50,24 +50,24 @@ from surrogym_shared.nouns import Query, RealSteps, Vector
 from surrogym_shared.states import Phase, Purpose, QueryStatus
 
 MAX_ATTEMPTS = 3
-LATEST = "latest"  # the alias of the newest policy
+LATEST = "latest"  # reserved alias of the newest policy
 
 T = TypeVar("T")
 
 
 class Surrogates(ABC):
-    """Part of the storage for surrogates, which are identified by name."""
+    """Part of the storage interface for surrogates, which are identified by name."""
 
     @abstractmethod
     def create(self, new: NewSurrogate) -> tuple[SurrogateRecord, bool]:
-        """Create a surrogate in phase ``collecting`` with its initial queries, and return whether it is new.
+        """Create a surrogate in phase ``collecting`` with its initial queries. Return it, and whether it is new.
 
-        Many queries are queued in several transactions, so that they block no writer for long. No fit is due before
-        all are there. If a crash interrupts the call, ``Designs.unbegun`` returns the surrogate, and ``ask_first``
-        queues the missing queries.
+        Many queries are queued in several transactions, so that other writers wait only briefly. No fit is due before
+        all are queued. If a crash interrupts the call, ``Designs.unbegun`` returns the surrogate, and
+        ``Designs.ask_first`` queues the missing queries.
 
-        If the name is taken, return the existing surrogate unchanged, and False. The caller checks whether its
-        specification is the same.
+        If a surrogate of this name exists, it is returned unchanged, with False. The caller has to compare the
+        specifications.
         """
 
     @abstractmethod
@@ -75,7 +75,7 @@ class Surrogates(ABC):
 
     @abstractmethod
     def standing(self, name: str) -> Standing:
-        """Return the fields of a surrogate that every claim and answer reads. Raises ``UnknownSurrogate``."""
+        """Return the id, phase and pause of a surrogate, which frequent requests read. Raises ``UnknownSurrogate``."""
 
     @abstractmethod
     def name_of(self, id: int) -> str:
@@ -86,10 +86,10 @@ class Surrogates(ABC):
 
     @abstractmethod
     def summaries(self, after: int = 0, limit: int | None = None) -> list[SurrogateSummary]:
-        """Return up to ``limit`` surrogates with an id above ``after``, oldest first.
+        """Return summaries of up to ``limit`` surrogates with an id above ``after``, oldest first.
 
-        The number of statements does not depend on the number of surrogates. No model is loaded, and of a specification
-        only the environment's name is parsed.
+        The number of SQL statements does not depend on the number of surrogates. No model is loaded, and only the
+        environment's name is parsed from a specification.
         """
 
     @abstractmethod
@@ -102,16 +102,15 @@ class Surrogates(ABC):
         target: float | None = None,
         tolerances: dict[str, float | None] | None = None,
     ) -> SurrogateRecord:
-        """Change the fields that are not None; of ``tolerances`` those of the named outputs.
+        """Change the fields of a surrogate that are given (not None), and return its record.
 
-        A tolerance of None returns that output to its default. Another budget, target or tolerance, or resuming a
-        failed design, makes a fit due. Resuming (``paused`` False, even if it was not paused) retries the queries that
-        were set aside, each with ``MAX_ATTEMPTS`` more.
+        ``tolerances`` are by output; None for an output restores its default. Another budget, target or tolerance, or
+        resuming a failed design, makes a fit due. ``paused`` False, even if the surrogate was not paused, retries the
+        queries that were set aside, each with ``MAX_ATTEMPTS`` more attempts.
 
-        Queries that the design chose by another target or tolerance, or by a larger budget, are withdrawn if no sampler
-        has begun them. A running fit loses its right, and the next fit judges and chooses anew. Queries added by
-        ``improve`` are chosen again, unless the budget is smaller. Initial queries are withdrawn only if they exceed
-        the budget.
+        After a change of target or tolerance, or a lower budget, adaptive queries without a real step so far are
+        withdrawn, a running fit loses its lease, and the next fit chooses new queries. Queries requested by ``improve``
+        are chosen again, unless the budget is lower. Initial queries are withdrawn only if they exceed the budget.
         """
 
     @abstractmethod
@@ -119,18 +118,19 @@ class Surrogates(ABC):
 
     @abstractmethod
     def delete(self, name: str) -> None:
-        """Delete the surrogate and everything that belongs to it.
+        """Delete a surrogate and all its data.
 
-        Its name is free at once. Its rows are removed in transactions that block no writer for long.
+        Its name can be used again at once. Its rows are removed in several transactions, so that other writers wait
+        only briefly.
         """
 
     @abstractmethod
     def complete_removals(self) -> int:
-        """Complete the deletions that a crash has interrupted. Returns the number of surrogates concerned."""
+        """Complete deletions of surrogates that a crash has interrupted, and return their number."""
 
 
 class Designs(ABC):
-    """Part of the storage for designs: at any time at most one server has the right to fit a surrogate."""
+    """Part of the storage interface for designs. A server fits a surrogate under a lease, which only one can hold."""
 
     @abstractmethod
     def improve(
@@ -142,94 +142,99 @@ class Designs(ABC):
         key: str | None = None,
         raise_budget: bool = False,
     ) -> Granted:
-        """Let the next fit add ``queries`` more, even if the design is ready. A fit becomes due.
-
-        The number counts real steps: a rollout has as many as actions.
+        """Request that the next fit chooses further queries, even if the design has ended. A fit becomes due.
 
         Args:
-            raise_budget: raise the budget by the steps that are not ``left``.
+            name: name of the surrogate.
+            queries: number of real steps of these queries.
+            checkpoint: name of the occupancy that weights the choice; None for no weights.
+            key: idempotency key of the request.
+            raise_budget: whether to raise the budget by the missing steps.
 
         Raises:
-            BeyondBudget: the budget has fewer steps left, and may not be raised.
+            BeyondBudget: the budget has fewer steps left, and ``raise_budget`` is False.
         """
 
     @abstractmethod
     def left(self, name: str) -> int:
-        """Return the number of real steps that the budget has left.
+        """Return the number of real steps that a surrogate's budget has left, at least 0.
 
-        Steps that were taken, that unanswered queries (open or set aside) need, or that ``improve`` has promised are
-        subtracted. The result is 0 if they exceed the budget.
+        It is the budget minus the steps taken, the steps of unanswered queries (open or set aside), and the steps
+        requested by ``improve`` and not chosen yet.
         """
 
     @abstractmethod
     def due(self) -> list[str]:
-        """Return the names of the surrogates to fit now, oldest first.
+        """Return the names of the surrogates that have to be fitted now, oldest first.
 
         Such a surrogate has samples, no pending or leased query, and a change since its last fit (a sample, a query set
-        aside, an ``improve``, another budget or target, a damaged model). After a log has been imported, it does not
-        wait for queries. It is not paused, and no server holds the right to fit. A right with more time left than it
-        was given, because the clock was set back, counts as free.
+        aside, an ``improve``, another budget or target, a damaged model). After the import of a log, it may have open
+        queries. It is not paused, and no server holds the lease of its fit. A lease with more time left than its
+        duration, because the clock was set back, counts as expired.
         """
 
     @abstractmethod
     def hopeless(self) -> list[str]:
-        """Return the names of surrogates that can't continue, oldest first.
+        """Return the names of surrogates whose design can't continue, oldest first.
 
-        Such a surrogate is collecting and not paused, has neither samples nor open queries, and its queries were set
-        aside. So there is nothing to fit, and nothing to wait for.
+        Such a surrogate is in phase ``collecting`` and not paused. It has no samples, and all its queries were set
+        aside or refused.
         """
 
     @abstractmethod
     def unbegun(self) -> list[str]:
-        """Return the names of surrogates whose design lacks initial queries, oldest first.
+        """Return the names of surrogates whose initial queries are missing, oldest first.
 
-        Such a surrogate has a budget but never had a query, is collecting and not paused, and has no samples: it was
-        created with a budget of 0. Or a crash has interrupted ``Surrogates.create`` a minute ago or earlier.
+        Such a surrogate was created with a budget of 0 and has one now, has no query or sample, is in phase
+        ``collecting``, and is not paused; or a crash interrupted ``Surrogates.create`` at least a minute ago.
         """
 
     @abstractmethod
     def ask_first(self, name: str, queries: Sequence[Query]) -> None:
-        """Queue the missing initial queries of a surrogate that ``unbegun`` returned; none if none are missing."""
+        """Queue the missing initial queries of a surrogate, given all its initial queries. Does nothing if none is
+        missing."""
 
     @abstractmethod
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
-        """Take the right to fit. The phase becomes ``fitting``. Returns None if the surrogate is not due."""
+        """Lease the fit of a surrogate to the server ``owner`` for ``seconds``; the phase becomes ``fitting``.
+
+        Returns None if the surrogate is not due.
+        """
 
     @abstractmethod
     def renew(self, lease: FitLease, seconds: float) -> FitLease:
-        """Extend the right to ``seconds`` from now. A right that has expired, and that no server has taken since, is
-        valid again.
+        """Extend the lease of a fit to ``seconds`` from now, even if it has expired but no other server has taken it.
 
         Raises:
-            LeaseExpired: another server has taken the right since.
+            LeaseExpired: another server has taken the lease, or it was withdrawn.
         """
 
     @abstractmethod
     def commit(self, lease: FitLease, design: NewDesign) -> int:
-        """Store model, state, phase and next queries together, and release the right. Returns the model's version.
+        """Store the result of a fit (model, state, phase, next queries), and end its lease. Return the model's version.
 
-        The error is cleared. Queries get the new round and purpose ``adaptive``. Samples that arrived since ``begin``
-        make the next fit due.
+        The error of the design is cleared. The queries get the new round and the purpose ``adaptive``. Samples that
+        arrived after ``begin`` make the next fit due.
 
         Raises:
-            LeaseExpired: another server has taken the right since.
+            LeaseExpired: another server has taken the lease, or it was withdrawn.
         """
 
     @abstractmethod
     def abort(self, lease: FitLease, error: str | None) -> None:
-        """Release the right without a model. Harmless if the right is gone.
+        """End the lease of a fit without a result. Does nothing if the lease has ended.
 
-        With an error, the phase becomes ``failed``, and the next fit is due once something changes. Without one (a
-        shutdown), the fit stays due.
+        With an ``error``, the phase becomes ``failed``, and the next fit is due after a change. With None, as at a
+        shutdown, the fit stays due.
         """
 
 
 class Queries(ABC):
-    """The queue of queries and their leases.
+    """Part of the storage interface for queries and their leases.
 
-    A query is pending, leased, answered, set_aside or refused. A lease that fails or expires makes it pending again;
-    after ``MAX_ATTEMPTS`` it is set aside. A query that is returned before a real step does not count as an attempt.
-    One that the original environment refuses is not claimed again, and does not count towards the budget.
+    A query is pending, leased, answered, set_aside or refused. If its lease fails or expires, it becomes pending again;
+    after ``MAX_ATTEMPTS`` attempts it is set aside. A lease that ended before a real step does not count as an attempt.
+    A query that the original environment refused is not leased again, and does not count towards the budget.
     """
 
     @abstractmethod
@@ -241,7 +246,7 @@ class Queries(ABC):
         purpose: Purpose = "manual",
         key: str | None = None,
     ) -> list[int]:
-        """Queue queries by hand, or of an audit, and return their ids.
+        """Queue queries that a person or an audit (``purpose``) chose, and return their ids.
 
         Raises:
             BeyondBudget: all audits of the surrogate together would have more steps than its budget, and more than 128.
@@ -249,61 +254,70 @@ class Queries(ABC):
 
     @abstractmethod
     def claim(self, name: str, sampler: str, limit: int, seconds: float) -> list[LeasedQuery]:
-        """Lease up to ``limit`` pending queries for ``seconds``, oldest first, each to one caller only.
+        """Lease up to ``limit`` pending queries to a sampler for ``seconds``, oldest first.
 
-        Expired leases are ended first. A paused surrogate gives out no queries.
+        Expired leases are ended before. If the surrogate is paused, the result is empty.
         """
 
     @abstractmethod
     def renew(self, name: str, query_id: int, token: str, seconds: float) -> float:
-        """Extend the lease to ``seconds`` from now, and return its end.
+        """Extend the lease of a query to ``seconds`` from now, and return the time of its end.
 
         Raises:
-            UnknownQuery, ForeignLease: as the class says.
-            LeaseExpired: the lease has ended, by its time, an answer or a failure.
+            UnknownQuery: the surrogate has no such query.
+            ForeignLease: the token is not that of a lease of this query.
+            LeaseExpired: the lease has expired, or ended with an answer or a failure.
         """
 
     @abstractmethod
     def fail(
         self, name: str, query_id: int, token: str, error: str, *, begun: bool = True, refused: bool = False
     ) -> QueryRecord:
-        """End the lease with an error. The query becomes pending again, or is set aside. A repeat is harmless.
+        """End the lease of a query that could not be answered. The query becomes pending again, or is set aside.
 
-        ``begun`` says that a real step may have been taken, so that the ledger counts it as unresolved. ``refused``
-        says that the original environment refused the query before a real step, whatever ``begun`` says. A query that
-        begins at a snapshot which was dropped meanwhile is then removed, or set aside if a step may have been taken.
+        A repeat changes nothing. If the query begins at a snapshot that was dropped during the lease, it is removed, or
+        set aside if a step may have been taken.
+
+        Args:
+            name: name of the surrogate.
+            query_id: id of the query.
+            token: token of the lease.
+            error: description of the failure.
+            begun: whether a real step may have been taken, which then counts as unresolved.
+            refused: whether the original environment refused the query before a real step; ``begun`` is then ignored.
 
         Raises:
-            UnknownQuery: there is no such query.
-            ForeignLease: the token was never given out for this query.
-            LeaseExpired: the lease ended by its time or an answer.
+            UnknownQuery: the surrogate has no such query.
+            ForeignLease: the token is not that of a lease of this query.
+            LeaseExpired: the lease has expired, or ended with an answer.
         """
 
     @abstractmethod
     def withdraw(self, name: str, query_ids: Sequence[int]) -> int:
-        """Remove the given queries that are pending and that no sampler has begun. Returns how many were removed."""
+        """Remove the given queries that are pending and of which no real step may have been taken. Return their
+        number."""
 
     @abstractmethod
     def get(self, name: str, query_id: int) -> QueryRecord:
-        """Return a query. Raises ``UnknownQuery`` if it does not exist."""
+        """Return the record of a query. Raises ``UnknownQuery`` if the surrogate has no such query."""
 
     @abstractmethod
     def list(self, name: str, statuses: Sequence[QueryStatus] = (), limit: int = 10_000) -> list[QueryRecord]:
-        """Return the queries with one of the ``statuses``, oldest first; all queries if ``statuses`` is empty."""
+        """Return up to ``limit`` queries with one of the ``statuses`` (empty: any status), oldest first."""
 
     @abstractmethod
     def counts(self, name: str) -> QueryCounts: ...
 
     @abstractmethod
     def sweep_expired(self) -> int:
-        """End the expired leases of all surrogates, and return how many there were.
+        """End the expired leases of all surrogates, and return their number.
 
-        A lease with more time left than it was given, because the clock was set back, gets that time from now.
+        A lease with more time left than its duration, because the clock was set back, is shortened to its duration.
         """
 
 
 class Samples(ABC):
-    """Samples, which are never changed, and never lost once acknowledged."""
+    """Part of the storage interface for samples, which are never changed, and never lost after ``add`` has returned."""
 
     @abstractmethod
     def add(
@@ -315,143 +329,151 @@ class Samples(ABC):
         key: str | None = None,
         log: LogPart | None = None,
     ) -> AddedSamples:
-        """Store a batch of samples, all or nothing, and answer the queries that it names. It is committed when this
-        returns.
+        """Store a batch of samples, all or none, and mark the queries that they answer. Committed when this returns.
 
-        A sample takes the purpose of its query, or ``manual``. Under a lease that has ended (by its time or a failure)
-        it is kept and flagged late. It still answers the query unless another lease of the query is live. Each lease
-        has one answer: a sample, or the first samples of a rollout, with ``step`` 0, 1, ... up to the query's
-        ``steps``. Sending it again is a duplicate and gets the same id.
+        A sample gets the purpose of its query, or ``manual``. If its lease has expired or failed, the sample is stored
+        and marked as late; it still answers the query unless the query is leased again. Each lease has one answer: a
+        sample, or the first samples of a rollout, with ``step`` 0, 1, ... below the query's ``steps``. A repeat of an
+        answer adds nothing and gets the same ids.
 
-        Samples of a ``log`` answer no query, and don't count towards the budget. Each is identified by its numbers and
-        by all samples of its log before it. So a log that comes again, or has grown, adds only what is new. Equal steps
-        of one log all count, and those of two logs too. A log that differs from a stored one in a later part has to
-        restart, see ``AddedSamples``. Until a log is complete, its samples make no fit due.
+        Samples of a ``log`` answer no query, and don't count towards the budget. A logged sample is identified by its
+        values and by all earlier samples of its log, so a repeated or extended log adds only new samples, but equal
+        steps within a log are all stored. A log that differs from a stored one in a later part has to restart, see
+        ``AddedSamples``. No fit is due for a log before its last part.
 
         Raises:
-            UnknownQuery: there is no such query.
-            ForeignLease: a lease token is missing, or was never given out for the query.
+            UnknownQuery: the surrogate has no such query.
+            ForeignLease: a lease token is missing, or is not that of a lease of the query.
             InvalidInput: a logged sample names a query, or an answer lacks a step or has more steps than the query.
-            IdempotencyConflict: the same lease token, or key, came with another sample.
+            IdempotencyConflict: the same lease token or idempotency key came with other samples.
         """
 
     @abstractmethod
     def arrays(self, name: str) -> RealSteps:
-        """Return all samples, in order of arrival; (0, 0) arrays while there are none."""
+        """Return all samples of a surrogate as arrays, in order of arrival; of shape (0, 0) if there are none."""
 
     @abstractmethod
     def page(self, name: str, after: int, limit: int) -> list[SampleRecord]:
-        """Return up to ``limit`` samples with an id above ``after``, in order."""
+        """Return up to ``limit`` samples with an id above ``after``, in order of their ids."""
 
     @abstractmethod
     def count(self, name: str) -> int: ...
 
     @abstractmethod
     def reward_range(self, name: str) -> tuple[float, float] | None:
-        """Return the smallest and the largest reward; None without samples."""
+        """Return the smallest and the largest reward of a surrogate's samples; None if there are no samples."""
 
 
 class Snapshots(ABC):
-    """Part of the storage for the names of snapshots that samplers keep. ``Samples.add`` adds new names."""
+    """Part of the storage interface for the names and coordinates of samplers' snapshots; ``Samples.add`` adds them."""
 
     @abstractmethod
     def all(self, name: str) -> dict[str, Vector]:
-        """Return the coordinates (C,) of each snapshot, by its name, oldest first."""
+        """Return the coordinates (C,) of each snapshot of a surrogate, by the snapshot's name, oldest first."""
 
     @abstractmethod
     def drop(self, name: str, snapshots: Sequence[str]) -> int:
-        """Forget snapshots, and return how many were known. Unknown names are skipped.
+        """Remove snapshots, and return the number removed. Unknown names are skipped.
 
-        Pending queries that begin there are removed, and a fit becomes due, which chooses anew. Queries of which a
-        sampler may have taken steps are set aside instead.
+        Pending queries that begin at them are removed, or set aside if a real step may have been taken. A fit becomes
+        due, which chooses other queries.
         """
 
 
 class Ledger(ABC):
-    """Part of the storage that counts real steps by purpose."""
+    """Part of the storage interface that counts a surrogate's real steps by purpose."""
 
     @abstractmethod
     def report(self, name: str, steps: int, *, key: str, episodes: int = 0, note: str = "") -> LedgerRecord:
-        """Count evaluation steps, once per key, and return the updated ledger."""
+        """Add real steps of an evaluation, once for each key, and return the counts of real steps by purpose."""
 
     @abstractmethod
     def read(self, name: str) -> LedgerRecord: ...
 
 
 class Models(ABC):
-    """Part of the storage for models, with versions 1, 2, ... The version None means the latest undamaged one."""
+    """Part of the storage interface for models, which have versions 1, 2, ... As an argument, version None stands for
+    the newest version that is not marked as damaged."""
 
     @abstractmethod
     def list(self, name: str) -> list[ModelRecord]:
-        """Return all models of a surrogate, oldest first."""
+        """Return the records of all models of a surrogate, oldest first."""
 
     @abstractmethod
     def get(self, name: str, version: int | None = None) -> ModelRecord:
-        """Return a model's record.
+        """Return the record of a model; of the newest undamaged one if ``version`` is None.
 
         Raises:
-            UnknownModel: there is no such version.
-            NoModel: there is no model at all.
+            UnknownModel: the surrogate has no model of this version.
+            NoModel: ``version`` is None, and the surrogate has no undamaged model.
         """
 
     @abstractmethod
     def newest(self) -> dict[int, int]:
-        """Return the newest version that is not set aside, for each surrogate that has one, by the surrogate's id."""
+        """Return the newest undamaged model version of each surrogate that has one, by the surrogate's id."""
 
     @abstractmethod
     def blob(self, name: str, version: int | None = None) -> bytes:
-        """Return the stored bytes of a model. Raises as ``get``.
+        """Return the stored file of a model; of the newest undamaged one if ``version`` is None.
 
         Raises:
-            Damaged: the bytes differ from those that were stored.
+            UnknownModel, NoModel: there is no such model.
+            Damaged: the file differs from the one that was stored.
         """
 
     @abstractmethod
     def set_aside(self, name: str, version: int, damage: str) -> bool:
-        """Mark a version as damaged. The version before it becomes the newest, and a fit becomes due.
+        """Mark a model version as damaged, so that the version before it is used instead, and a fit becomes due.
 
-        Returns True unless the version was marked before. Version numbers are never used again.
+        ``damage`` describes the damage. Returns False if the version was marked before. Its number is not used again.
         """
 
     @abstractmethod
     def add(self, name: str, model: NewModel) -> int:
-        """Store an imported model as the newest version, and return its version number. The design is not changed."""
+        """Store an imported model as the newest version, and return its version. The design is not changed."""
 
 
 class Priors(ABC):
-    """Part of the storage for priors: models of what is known of an environment beforehand, such as of a simulator.
+    """Part of the storage interface for priors: models that are known before the first real step, such as of a
+    simulator.
 
-    Each surrogate has at most one. While its design waits for a prior, no fit is due.
+    Each surrogate has at most one prior. While its design waits for a prior, no fit is due.
     """
 
     @abstractmethod
     def get(self, name: str) -> PriorRecord | None:
-        """Return the description of the prior, also of one that is awaited; None if there is none."""
+        """Return the description of a surrogate's prior, also if the design still waits for it; None if there is
+        none."""
 
     @abstractmethod
     def blob(self, name: str) -> bytes | None:
-        """Return the prior's model; None if there is none yet. Raises ``Damaged`` if it has changed since then."""
+        """Return the file of a prior's model; None if it is not stored (yet).
+
+        Raises ``Damaged`` if the file differs from the one that was stored.
+        """
 
     @abstractmethod
     def put(self, name: str, blob: bytes, about: JSON) -> None:
-        """Store a prior in place of any other. Queries that no sampler has begun are withdrawn, and a fit is due."""
+        """Store a prior, which replaces an earlier one. Adaptive queries without a real step so far are withdrawn, and
+        a
+        fit becomes due. ``about`` is the description of the prior."""
 
     @abstractmethod
     def wait(self, name: str) -> None:
-        """Let the design wait for a prior. If there is one, nothing changes."""
+        """Let the design of a surrogate wait for a prior. Does nothing if it has one."""
 
     @abstractmethod
     def drop(self, name: str) -> bool:
-        """Remove the prior, or stop waiting for it, and return whether there was one. A fit without it is due."""
+        """Remove a surrogate's prior, or stop waiting for it. Return whether there was one. A fit becomes due."""
 
 
 class Occupancy(ABC):
-    """Part of the storage for occupancies: the states that policies visited, by training checkpoint."""
+    """Part of the storage interface for occupancies: states that policies visited, by the name of a checkpoint."""
 
     @abstractmethod
     def put(self, name: str, checkpoint: str, states: Array) -> None:
-        """Store states (m, C) under a checkpoint. Storing the same checkpoint again replaces them and makes them the
-        latest."""
+        """Store visited states (m, C) under the name ``checkpoint``, as the latest occupancy. States that were stored
+        under this name before are replaced."""
 
     @abstractmethod
     def get(self, name: str, checkpoint: str) -> OccupancyRecord | None:
@@ -463,11 +485,11 @@ class Occupancy(ABC):
 
 
 class Sessions(ABC):
-    """Part of the storage for sessions that a clean shutdown saves for the next start."""
+    """Part of the storage interface for sessions that a server saves at shutdown and restores at the next start."""
 
     @abstractmethod
     def save(self, sessions: Sequence[SavedSession]) -> None:
-        """Store sessions. One with the same id is replaced."""
+        """Store sessions. A stored session with the same id is replaced."""
 
     @abstractmethod
     def take(self) -> list[SavedSession]:
@@ -475,47 +497,49 @@ class Sessions(ABC):
 
 
 class Events(ABC):
-    """Part of the storage for events of surrogates.
+    """Part of the storage interface for events of surrogates.
 
-    Every change that may end a wait appends an event: a claim that waits for queries or jobs looks again after each
-    event.
+    Each change that may end a wait appends an event, because a claim that waits for queries or jobs asks again after
+    each event.
     """
 
     @abstractmethod
     def newest(self, names: Sequence[str]) -> dict[str, int]:
-        """Return the id of each surrogate's newest event, 0 before the first. Surrogates that do not exist are left
-        out.
+        """Return the id of each surrogate's newest event, by name; 0 if it has none. Unknown surrogates are left out.
 
-        It takes one statement, whose cost does not depend on the number of events.
+        This takes one SQL statement, whose cost does not depend on the number of events.
         """
 
     @abstractmethod
     def prune(self, keep: int) -> int:
-        """Remove all but the newest ``keep`` events of each surrogate. Returns the number of events removed.
+        """Remove all but the newest ``keep`` events of each surrogate. Return the number of events removed.
 
-        Surrogates without a new event since the last call are skipped. Each transaction removes a few events only, so
-        that it blocks no writer for long.
+        Surrogates without a new event since the last call are skipped. Events are removed in many short transactions,
+        so that other writers wait only briefly.
         """
 
     @abstractmethod
     def list(self, name: str, after: int = 0, limit: int = 1_000) -> list[EventRecord]:
-        """Return up to ``limit`` events with an id above ``after``, in order."""
+        """Return up to ``limit`` events of a surrogate with an id above ``after``, in order of their ids."""
 
 
 class PolicyNames(ABC):
-    """Versions and aliases of policies, which several features read. The feature ``policies`` stores them."""
+    """Part of the storage interface that reads versions and aliases of policies, which several features need. The
+    feature ``policies`` stores them."""
 
     @abstractmethod
     def version(self, name: str, which: str) -> int:
-        """Return the version that ``which`` names: a number, an alias, or ``latest``. Raises ``UnknownPolicy``."""
+        """Return the policy version that ``which`` names: a number, an alias, or ``latest``. Raises
+        ``UnknownPolicy``."""
 
     @abstractmethod
     def has_evaluation(self, name: str, version: int, id: int) -> bool:
-        """Return whether a policy version has this evaluation. Raises ``UnknownPolicy`` if there is no such version."""
+        """Return whether a policy has an evaluation with this id. Raises ``UnknownPolicy`` if there is no such
+        version."""
 
 
 class Storage(ABC):
-    """The whole storage, by its parts. ``open_storage`` of an adapter makes one."""
+    """Interface of the whole storage, which consists of parts. ``open_storage`` creates an implementation."""
 
     surrogates: Surrogates
     designs: Designs
@@ -533,16 +557,16 @@ class Storage(ABC):
 
     @abstractmethod
     def part(self, store: Callable[[Any], T]) -> T:
-        """Return the store of a feature, made by calling ``store`` with the adapter's database."""
+        """Create the store of an optional feature by calling ``store`` with the database of this storage."""
 
     @abstractmethod
     def ping(self) -> None:
-        """Check that all tables exist and that the database accepts writes. Frequent calls cost little.
+        """Check that all tables exist and that the database accepts writes. The result is cached for a second.
 
         Raises:
-            Unavailable: the check fails, or a write takes longer than a caller should wait.
+            Unavailable: the check fails, or a write takes too long.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Release connections and locks. Closing twice is harmless."""
+        """Release connections and locks. A second call does nothing."""

@@ -1,4 +1,4 @@
-"""Records of storage: frozen, and independent of any database and of the wire.
+"""Records of the storage: frozen dataclasses that depend neither on a database nor on wire types.
 
 Shapes: C coordinates, F action entries, D observation entries. Times are seconds since 1970, on the database's clock.
 ``JSON`` is a value that ``json.dumps`` and ``json.loads`` return unchanged.
@@ -20,7 +20,7 @@ from surrogym_shared.states import EventKind, Phase, Purpose, QueryStatus, Sampl
 Array = NDArray[np.float64]
 JSON = dict[str, Any]
 FREE = ("audit", "logged")  # purposes of samples that don't count towards the budget
-Synchronous = Literal["full", "normal"]  # full: every commit of a SQLite file waits for the disk
+Synchronous = Literal["full", "normal"]  # SQLite's setting; full: each commit waits until the disk has stored it
 
 OPEN_STATUSES: tuple[QueryStatus, ...] = ("pending", "leased")
 
@@ -30,7 +30,7 @@ OPEN_STATUSES: tuple[QueryStatus, ...] = ("pending", "leased")
 
 @dataclass(frozen=True)
 class NewSurrogate:
-    """A surrogate to create, with the queries of its first round."""
+    """A surrogate to create, with its initial queries."""
 
     name: str
     spec: JSON
@@ -41,7 +41,7 @@ class NewSurrogate:
 
 @dataclass(frozen=True)
 class Standing:
-    """Id of a surrogate, and its fields that change often."""
+    """Id, phase and pause of a surrogate, which frequent requests read."""
 
     id: int
     phase: Phase
@@ -50,38 +50,38 @@ class Standing:
 
 @dataclass(frozen=True)
 class SurrogateRecord:
-    id: int  # unlike a name, never used again after a deletion
+    id: int  # never used again after a deletion, unlike the name
     name: str
     spec: JSON
     budget: int
     target: float
-    tolerances: dict[str, float]  # tolerances that people set after its creation, by output
+    tolerances: dict[str, float]  # tolerances that were set after the surrogate's creation, by output
     phase: Phase
     paused: bool
-    round: int  # rounds of the design so far
+    round: int  # number of rounds of the design so far
     state: JSON  # state of the design
     error: str | None
-    extra_queries: int  # real steps that ``Designs.improve`` requested and no fit has chosen yet
-    checkpoint: str | None  # occupancy that the last request to improve named
+    extra_queries: int  # number of real steps that ``Designs.improve`` requested and no fit has chosen yet
+    checkpoint: str | None  # name of the occupancy in the last request to improve
     created_at: float
 
 
 @dataclass(frozen=True)
 class Granted:
-    """Result of ``Designs.improve``: the surrogate, and by how much its budget was raised."""
+    """Result of ``Designs.improve``: the surrogate, and the increase of its budget."""
 
     record: SurrogateRecord  # the surrogate after the change
-    raised: int  # real steps by which the budget was raised
+    raised: int  # increase of the budget, in real steps
 
 
 @dataclass(frozen=True)
 class FitLease:
-    """The right to fit one surrogate, until it expires. It is passed to renew, commit or abort."""
+    """Lease of the fit of one surrogate, which ``Designs`` renews and ends."""
 
     surrogate: str
     token: str
     revision: int  # revision of the surrogate when the fit began
-    extra_queries: int  # real steps that this fit has to choose even if the design has ended
+    extra_queries: int  # number of real steps that this fit has to choose even if the design has ended
     checkpoint: str | None
     expires: float
 
@@ -98,9 +98,9 @@ class NewModel:
 
 @dataclass(frozen=True)
 class ModelRecord:
-    """A model without its bytes."""
+    """Description of a stored model, without the model's file."""
 
-    version: int  # 1, 2, ... per surrogate
+    version: int  # 1, 2, ... for each surrogate
     created_at: float
     samples: int
     data_hash: str
@@ -122,7 +122,7 @@ class NewDesign:
     state: JSON
     phase: Phase
     queries: tuple[Query, ...] = ()
-    extra: bool = False  # the queries come from ``Designs.improve``, and the design itself would not have chosen them
+    extra: bool = False  # whether the queries were only chosen because ``Designs.improve`` requested them
 
 
 # Queries and samples
@@ -130,7 +130,7 @@ class NewDesign:
 
 @dataclass(frozen=True, kw_only=True)
 class QueryRecord(Query):
-    """A stored query and its state."""
+    """A stored query with its status and attempts."""
 
     id: int
     purpose: Purpose
@@ -140,13 +140,13 @@ class QueryRecord(Query):
     sampler: str | None  # name of the sampler that claimed the query last
     error: str | None  # error of the last failed attempt
     lease_seconds_left: float | None = (
-        None  # of the open lease, by the database's clock; negative once it has expired, None without a lease
+        None  # time left of the open lease, by the database's clock; negative after it has expired; None without lease
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class LeasedQuery(Query):
-    """A stored query and the lease under which a sampler answers it."""
+    """A query that is leased to a sampler, with its lease."""
 
     id: int
     number: int  # number of earlier queries of the same surrogate
@@ -171,7 +171,7 @@ class QueryCounts:
 
 @dataclass(frozen=True)
 class Sample(RealStep):
-    """A real step as a sampler took it; its entries are floats, and it may answer a query."""
+    """A real step that a sampler took, as tuples of floats; it may answer a query."""
 
     coordinates: Vector
     action: Vector
@@ -179,7 +179,7 @@ class Sample(RealStep):
     observation: Vector | None = None
     next_observation: Vector | None = None
     query_id: int | None = None
-    step: int = 0  # position of this step in its rollout, from 0
+    step: int = 0  # index of this step in its rollout
 
 
 @dataclass(frozen=True)
@@ -192,25 +192,25 @@ class NewSample(Sample):
 
 @dataclass(frozen=True)
 class LogPart:
-    """Where in a log the samples of a report belong."""
+    """Position of a batch of samples in the log to which they belong."""
 
-    after: str | None = None  # ``AddedSamples.digest`` of the part before; None for the first part of a log
-    complete: bool = True  # this is the last part of the log
+    after: str | None = None  # ``AddedSamples.digest`` of the previous batch; None for the first batch of a log
+    complete: bool = True  # whether this is the last batch of the log
 
 
 @dataclass(frozen=True)
 class AddedSamples:
     """Result of adding a batch of samples.
 
-    A log comes in several batches, and a log that begins like a stored one shares its samples with it. If the two
-    differ within a batch, the batch has to be sent again from the sample at which they differ. Then nothing was stored,
-    and ``restart`` is set.
+    A log comes in batches. A log that begins like a stored log shares the stored samples. If a later batch continues
+    differently, nothing is stored, ``restart`` is set, and the log has to be sent again.
 
     Attributes:
         ids: ids of the samples, in order.
         duplicates: number of samples that had been stored before.
-        digest: hash of the log up to the end of the batch; None if the samples are not logged.
-        restart: hash of the log up to the sample from which it has to be sent again; None if the batch was stored.
+        digest: hash of the log up to the end of the batch; None if the samples belong to no log.
+        restart: value of ``LogPart.after`` with which the log has to be sent again from its start; None if the batch
+            was stored.
     """
 
     ids: tuple[int, ...]
@@ -221,15 +221,15 @@ class AddedSamples:
 
 @dataclass(frozen=True, kw_only=True)
 class SampleRecord(Sample):
-    """A stored sample."""
+    """A stored sample, with its purpose, its sampler and its lease."""
 
     id: int
     purpose: SamplePurpose
     sampler: str
-    attempt: int  # number of the lease of its query; 0 without a query
-    late: bool  # the sample came under a lease that had ended
-    trajectory: int | None  # the same number for all samples of one rollout, which follow each other
-    requested_coordinates: Vector | None  # (C,) of the query; None without a query, and for a rollout
+    attempt: int  # number of the query's lease under which the sample came, from 1; 0 without a query
+    late: bool  # whether the lease had ended when the sample came
+    trajectory: int | None  # a number that all samples of one rollout share; None if the sample belongs to no rollout
+    requested_coordinates: Vector | None  # (C,) coordinates of the query; None without a query, and for a rollout
     created_at: float
 
 
@@ -238,10 +238,10 @@ class SampleRecord(Sample):
 
 @dataclass(frozen=True)
 class LedgerRecord:
-    """Acknowledged real steps by purpose.
+    """Counts of real steps by purpose.
 
-    ``unresolved`` counts the steps that may have been taken under leases that ended without an answer. Of these,
-    ``failed`` were under leases that a sampler returned with an error; the others expired.
+    ``unresolved`` counts the steps that may have been taken under leases that ended without an answer: ``failed`` of
+    them under leases that a sampler ended with an error, the others under leases that expired.
     """
 
     initial: int = 0
@@ -255,18 +255,18 @@ class LedgerRecord:
 
     @property
     def total(self) -> int:
-        """Real steps that count towards the budget."""
+        """Number of real steps that count towards the budget."""
         return self.initial + self.adaptive + self.manual
 
     @property
     def samples(self) -> int:
-        """Number of samples that the model learns from."""
+        """Number of samples from which the model learns."""
         return self.total + self.audit + self.logged
 
 
 @dataclass(frozen=True)
 class SurrogateSummary:
-    """Entry of a list of surrogates."""
+    """Entry in the list of surrogates, without specification and model."""
 
     id: int
     name: str
@@ -286,7 +286,7 @@ class SurrogateSummary:
 
 @dataclass(frozen=True)
 class PriorRecord:
-    """Description of a prior. ``awaited``: the design waits for it."""
+    """Description of a prior. If ``awaited`` is True, the design still waits for its model."""
 
     created_at: float
     about: JSON
@@ -317,5 +317,5 @@ class EventRecord:
 
 
 def fingerprint(*parts: object) -> str:
-    """A hash that is equal for equal bodies, to compare requests with the same idempotency key."""
+    """Return a hash of JSON values, to compare the contents of requests with the same idempotency key."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""The SQL adapters of the storage port for SQLite and PostgreSQL, which share their statements."""
+"""Implementation of the storage interface for SQLite and PostgreSQL, which share their SQL statements."""
 
 from surrogym_server.storage.sql.storage import SqlStorage, open_storage
 

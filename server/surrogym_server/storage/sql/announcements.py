@@ -1,4 +1,4 @@
-"""Announcements by PostgreSQL's LISTEN and NOTIFY: one connection listens, and one thread sends."""
+"""Announcements by LISTEN and NOTIFY of PostgreSQL, with one thread that sends and one that listens."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 CHANNEL = "surrogym"
-QUIET_SECONDS = 30.0  # longest wait on the connection before the thread checks whether the server ends
-FIRST_DELAY, LONGEST_DELAY = 0.1, 10.0  # seconds before another try to connect
+QUIET_SECONDS = 30.0  # longest wait for a message before the thread checks whether the server stops
+FIRST_DELAY, LONGEST_DELAY = 0.1, 10.0  # shortest and longest time in seconds between two attempts to connect
 CLOSING_SECONDS = 2.0
-GAP_SECONDS = 0.05  # pause between announcements, so that many answers of a surrogate make one
+GAP_SECONDS = 0.05  # pause between announcements, so that several changes of a surrogate are announced as one
 
 
 class NotifiedAnnouncements(Announcements):
-    """Announcements by PostgreSQL. Its threads start with ``listen``, because many programs need none."""
+    """Announcements by PostgreSQL. The threads start with ``listen``, because many programs need no announcements."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._origin = uuid4().hex
-        self._waiting: dict[str, None] = {}  # names to announce, in order
+        self._waiting: dict[str, None] = {}  # names to announce, as an ordered set
         self._changed = threading.Condition()
         self._ended = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -65,12 +65,12 @@ class NotifiedAnnouncements(Announcements):
                 self._database.notify(CHANNEL, [f"{self._origin} {name}" for name in names])
             except (
                 Unavailable
-            ) as error:  # a lost announcement does no harm: the other servers also look from time to time
+            ) as error:  # a lost announcement does no harm, because other servers also compare events periodically
                 logger.debug("other servers were not told of %s: %s", names, error)
             self._ended.wait(GAP_SECONDS)
 
     def _listen(self, hear: Hear) -> None:
-        import psycopg  # not at the top, because a server on SQLite does not need it
+        import psycopg  # imported here, because a server on SQLite does not need it
 
         delay, missed = FIRST_DELAY, False
         while not self._ended.is_set():

@@ -1,7 +1,7 @@
-"""Connections, transactions and the clock: the only file that distinguishes between the databases.
+"""Connections, transactions and the clock of a database, for SQLite and PostgreSQL.
 
-Writers of one surrogate take turns. On SQLite ``BEGIN IMMEDIATE`` admits one writer; on PostgreSQL a write locks the
-surrogate's row first. Claims, which skip locked rows, and renewals lock less.
+Transactions that write to one surrogate run one after the other. On SQLite, ``BEGIN IMMEDIATE`` admits one writer; on
+PostgreSQL, a write locks the surrogate's row first. Claims and renewals of queries lock less.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from surrogym_server.storage.records import Synchronous
 from surrogym_server.storage.sql.filelock import FileLock, marks
 
 SQLITE_CODES = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-SQLSTATES = ("XX001", "XX002", "42P01", "42703")  # data and index corrupted, undefined table and column
+SQLSTATES = ("XX001", "XX002", "42P01", "42703")  # data corrupted, index corrupted, undefined table, undefined column
 OTHER_SCHEMA = re.compile(
     r"no such (table|column)|has no column|already exists"
 )  # SQLite's messages about a wrong schema, which have no code
@@ -37,12 +37,13 @@ UNDECODABLE = "Could not decode to UTF-8"  # in the message of SQLite's driver, 
 
 
 def damaged(reason: object) -> Damaged:
-    """The error for stored data that this program can't have written."""
+    """Return the error for stored data that are damaged; ``reason`` describes the damage."""
     return Damaged(f"the database is damaged: {reason}")
 
 
 def means_damage(error: sa.exc.DBAPIError) -> bool:
-    """Whether an error of the driver means that stored data can't be read, or that the tables differ."""
+    """Whether an error of the database driver means that stored data can't be read, or that tables are missing or
+    different."""
     if getattr(error.orig, "sqlstate", None) in SQLSTATES:
         return True
     message = str(error.orig)
@@ -50,17 +51,17 @@ def means_damage(error: sa.exc.DBAPIError) -> bool:
 
 
 def are_broken_pages(error: sa.exc.DBAPIError) -> bool:
-    """Whether an error of the driver means that a file's structure is broken, which can't be repaired while
-    it is open."""
+    """Whether an error of the driver means that the structure of a SQLite file is broken, which can't be repaired while
+    the server runs."""
     return getattr(error.orig, "sqlite_errorcode", 0) & 0xFF in SQLITE_CODES
 
 
-BUSY_SECONDS = 5  # wait of a statement for locks of other programs or threads
-STALLED_SECONDS = 10  # PostgreSQL ends a transaction whose process has stopped, and its locks with it
-BATCH = 250  # most rows that one transaction writes or removes
-PAUSE_SECONDS = 0.002  # pause between transactions, so that a waiting writer gets its turn
+BUSY_SECONDS = 5  # longest wait of a statement for locks of other programs or threads
+STALLED_SECONDS = 10  # time after which PostgreSQL ends an idle transaction, and its locks with it
+BATCH = 250  # largest number of rows that one transaction writes or removes
+PAUSE_SECONDS = 0.002  # pause between two transactions of a batch, so that a waiting writer can begin
 POOL = {"pool_size": 8, "max_overflow": 56, "pool_timeout": BUSY_SECONDS}
-POSTGRESQL = {  # text is UTF-8 whatever the database's encoding; if that is SQL_ASCII, psycopg would return bytes
+POSTGRESQL = {  # UTF-8 for every database, because with SQL_ASCII psycopg would return bytes instead of text
     "client_encoding": "utf8",
     "connect_timeout": BUSY_SECONDS,
 }
@@ -83,34 +84,41 @@ def _now(_: _Now, compiler: SQLCompiler, **__: Any) -> str:
     return CLOCKS.get(compiler.dialect.name, "now()")  # another dialect appears only in messages
 
 
-NOW = _Now()  # seconds since 1970 by the database's clock
+NOW = _Now()  # SQL expression of the database's clock, in seconds since 1970
 
 
 def constant(word: str) -> sa.ColumnElement[str]:
-    """Write a constant into a statement. A parameter would hide from the planner that the value is rare."""
+    """Return SQL text that contains ``word`` as a constant. With a parameter, the query planner would not know that the
+    value is rare."""
     return sa.literal_column(f"'{word}'", sa.Text())
 
 
 class Database:
-    """Provides connections inside a transaction, and translates the driver's errors."""
+    """Provides connections for transactions, and converts errors of the driver to ``SurrogymError``."""
 
     def __init__(self, engine: Engine, lock: FileLock | None = None, *, way_out: str) -> None:
-        """``way_out`` is the advice in the error if the database is damaged."""
+        """Wrap an SQLAlchemy engine.
+
+        Args:
+            engine: engine of SQLite or PostgreSQL.
+            lock: lock on the SQLite file; None for PostgreSQL.
+            way_out: advice in the error message if the database is damaged.
+        """
         self.way_out = way_out
         self._engine = engine
         self._lock = lock
         self._writing = engine.execution_options(begin="BEGIN IMMEDIATE")
-        # SQLite's own waiting polls; a lock in this process wakes the next writer at once
+        # A lock of this process wakes the next writer at once, while SQLite's own lock is polled.
         self._turn = threading.RLock() if engine.dialect.name == "sqlite" else None
         self._open_connection: Connection | None = None
         self._broken: str | None = None
 
     def hold_open(self) -> None:
-        """Keep one connection to a SQLite file until ``close``, and watch the file and SQLite's files beside it.
+        """Keep a connection to the SQLite file open until ``close``, and watch for changes by other programs.
 
-        SQLite deletes its write-ahead log with the last connection. While this one is open, a missing or different log
-        shows that another program changed it. The content of the log is merged into the file first. So the beginning of
-        the file differs from that of a copy made while no server ran.
+        SQLite deletes its write-ahead log with the last connection. While this connection is open, a missing or
+        different log shows that another program has changed it. The log is merged into the file first, so that the
+        first bytes of the file differ from those of an older copy. Does nothing for PostgreSQL.
         """
         if self._lock is None:
             return
@@ -138,9 +146,10 @@ class Database:
                 yield connection
 
     def write_in_batches(self, batch: Callable[[Connection], int]) -> int:
-        """Repeat a write, each time in a transaction of its own, until it returns 0. Returns the sum.
+        """Call ``batch`` repeatedly, each time in its own transaction, until it returns 0. Return the sum of its
+        results.
 
-        Between two transactions other writers have their turn. A batch of ``BATCH`` rows takes some milliseconds.
+        Other writers can run between two transactions. A batch of ``BATCH`` rows takes some milliseconds.
         """
         total = 0
         while True:
@@ -152,19 +161,18 @@ class Database:
             time.sleep(PAUSE_SECONDS)
 
     def require_sound(self) -> None:
-        """Raise ``Damaged`` once broken pages of the file were found. Other damage may be repaired while the server
-        runs."""
+        """Raise ``Damaged`` if broken pages of the SQLite file have been found since the start. Other damage can be
+        repaired while the server runs."""
         if self._broken is not None:
             raise Damaged(f"{self._broken}; {self.way_out}")
 
     def _require_own(self) -> None:
-        """Check that the files are those which this server wrote; see ``FileLock``."""
+        """Check that no other program has changed or replaced the SQLite file. Raises ``Unavailable``."""
         if self._lock is None:
             return
         self._lock.require_in_place()
         if not self._lock.is_as_noted():
-            # A program that is still merging the log into the file can't be at work while this process has the write
-            # lock.
+            # With the write lock, no other connection can be merging the log into the file.
             with self._take_turn():
                 self._lock.require_own_content()
 
@@ -175,17 +183,17 @@ class Database:
 
     @property
     def notifies(self) -> bool:
-        """Whether the database can notify connections of changes by others (PostgreSQL can)."""
+        """Whether the database can send notices to its connections, as PostgreSQL can."""
         return self._engine.dialect.name == "postgresql"
 
     def notify(self, channel: str, payloads: Sequence[str]) -> None:
-        """Send payloads to all connections that listen to a channel of this database."""
+        """Send messages (``payloads``) to all connections that listen to a channel of this PostgreSQL database."""
         with self.write() as connection:
             for payload in payloads:
                 connection.execute(sa.select(sa.func.pg_notify(channel, payload)))
 
     def detached(self) -> Any:
-        """Open a connection of the driver outside of transactions; the caller closes it. Raises ``Unavailable``."""
+        """Open a connection of the driver without a transaction. The caller has to close it. Raises ``Unavailable``."""
         with self._translated():
             own = self._engine.raw_connection()
             driver = own.driver_connection
@@ -221,7 +229,7 @@ class Database:
             yield
         except UNSTORABLE as error:
             raise InvalidInput(STORABLE) from error
-        except UnicodeDecodeError as error:  # SQLite's message contains a damaged name, which the driver can't decode
+        except UnicodeDecodeError as error:  # the driver can't decode a damaged name in SQLite's message
             raise self._damaged(error.object.decode(errors="replace"), pages=True) from error
         except sa.exc.TimeoutError as error:
             raise Unavailable(f"the database can't be used now: {error}") from error
@@ -245,16 +253,16 @@ def conflict_insert(connection: Connection, table: sa.Table) -> sqlite.Insert | 
 
 
 def connect(url: str, synchronous: Synchronous = "full") -> Database:
-    """Open the database of ``sqlite:///path/to/file`` or ``postgresql://user@host/name``.
+    """Open a SQLite file or a PostgreSQL database.
 
     Args:
-        url: its address.
-        synchronous: of a SQLite file; ``full`` waits for the disk at every commit, ``normal`` may lose the last
-            commits if the power fails, but not if the process dies. PostgreSQL has a setting of its own.
+        url: address such as ``sqlite:///path/to/file`` or ``postgresql://user@host/name``.
+        synchronous: setting of SQLite: ``full`` waits for the disk at each commit, ``normal`` may lose the last
+            commits if the power fails, but not if the process dies.
 
     Raises:
-        InvalidInput: another kind of address.
-        Unavailable: another server holds the SQLite file, or a log lies beside it that isn't its own.
+        InvalidInput: the address is of another kind.
+        Unavailable: another server uses the SQLite file, or its write-ahead log belongs to another database.
     """
     try:
         location = sa.make_url(url)
@@ -275,11 +283,11 @@ def _sqlite(path: Path, synchronous: Synchronous) -> Database:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise Unavailable(f"expected a folder for the database, got {path.parent}: {error}") from None
-    if path.exists() and not (path.is_file() or path.is_dir()):  # opening a pipe would wait for ever
+    if path.exists() and not (path.is_file() or path.is_dir()):  # opening a pipe could block forever
         raise InvalidInput(f"expected a file for the database, got {path}, which is a pipe, a socket or a device")
     lock = FileLock(path)
     engine = sa.create_engine(URL.create("sqlite", database=str(path)), connect_args={"timeout": BUSY_SECONDS}, **POOL)
-    sa.event.listen(engine, "do_connect", lambda *_: lock.require_in_place())  # or SQLite would create another file
+    sa.event.listen(engine, "do_connect", lambda *_: lock.require_in_place())  # SQLite would create a missing file
     sa.event.listen(engine, "connect", partial(_prepare_sqlite, synchronous))
     sa.event.listen(engine, "begin", _begin_sqlite)
     sa.event.listen(engine, "before_cursor_execute", _require_storable)
@@ -288,13 +296,13 @@ def _sqlite(path: Path, synchronous: Synchronous) -> Database:
 
 
 def _prepare_sqlite(synchronous: Synchronous, connection: Any, _: object) -> None:
-    connection.isolation_level = None  # the driver starts no transactions; _begin_sqlite does
+    connection.isolation_level = None  # the driver begins no transaction itself; ``_begin_sqlite`` does
     for pragma in ("journal_mode=WAL", f"synchronous={synchronous}", "foreign_keys=ON"):
         connection.execute(f"PRAGMA {pragma}").close()
 
 
 def _require_storable(_: Connection, __: Any, ___: str, parameters: Any, *____: Any) -> None:
-    """Refuse what PostgreSQL can't store, so that both databases take the same. SQLite would store NUL."""
+    """Raise ``InvalidInput`` for text with the character NUL, which SQLite could store but PostgreSQL could not."""
     if _has_nul(parameters):
         raise InvalidInput(STORABLE)
 
@@ -319,17 +327,19 @@ def _postgresql(url: URL) -> Database:
     return Database(engine, way_out="restore a copy")
 
 
-# Compared by exact class: IntegrityError and ProgrammingError derive from DatabaseError, but are bugs of this program.
+# Errors of a database that can't be used now. They are compared by exact class, because subclasses of DatabaseError
+# such
+# as IntegrityError are bugs of this program.
 UNUSABLE = (sa.exc.OperationalError, sa.exc.InternalError, sa.exc.InterfaceError, sa.exc.DatabaseError)
 UNSTORABLE = (sa.exc.DataError, OverflowError, UnicodeEncodeError)
 
 
 def never_connected(error: BaseException | None) -> bool:
-    """Whether an error of PostgreSQL is of the connection. Errors of statements have a code; these have none."""
+    """Whether an error of PostgreSQL comes from the connection. Errors of statements have a code, others have none."""
     return isinstance(error, sa.exc.OperationalError) and getattr(error.orig, "sqlstate", None) is None
 
 
 def _reason(error: Exception) -> str:
-    """The driver's message, without the position in the statement, which no person typed."""
+    """Return the first line of the driver's message; the other lines show the SQL statement."""
     message = str(getattr(error, "orig", None) or error)
     return message.partition("\n")[0]

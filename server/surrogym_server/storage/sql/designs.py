@@ -1,4 +1,4 @@
-"""Adapter of ``Designs``: the right to fit, and the storage of a fit's result."""
+"""Implementation of ``Designs``: leases of fits, and the storage of a fit's result."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from surrogym_server.storage.sql.tables import priors, queries, samples, surroga
 from surrogym_shared.nouns import Query
 from surrogym_shared.states import Phase
 
-INTERRUPTED_SECONDS = 60.0  # the server that queues initial queries has died if they stay incomplete for so long
-# Conditions on a row of the table of surrogates, and parts of them.
+INTERRUPTED_SECONDS = 60.0  # if initial queries are incomplete for longer, the server that queued them has died
+# The following SQL expressions are conditions on a row of the table of surrogates, and parts of such conditions.
 OWN_QUERIES = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogates.c.id)
 OWN_SAMPLES = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogates.c.id)
-# The statuses are constants in the statement: with parameters, PostgreSQL would read all queries, not use an index.
+# The statuses are constants in the SQL text, because with parameters PostgreSQL would not use an index.
 OPEN = [constant(status) for status in OPEN_STATUSES]
 AWAITS_PRIOR = sa.exists(
     sa.select(priors.c.surrogate_id).where(priors.c.surrogate_id == surrogates.c.id, priors.c.blob.is_(None))
@@ -43,9 +43,9 @@ OPEN_QUERY = sa.exists(OWN_QUERIES.where(queries.c.status.in_(OPEN)))
 
 
 _EXPIRES = surrogates.c.fit_expires
-_SET_BACK = NOW + surrogates.c.fit_seconds < _EXPIRES  # the clock was set back: the right lasts too long
-# Whether a surrogate is to be fitted now: something has changed since the last fit, nobody fits it, and it waits for
-# no query. A new log is fitted without waiting.
+_SET_BACK = NOW + surrogates.c.fit_seconds < _EXPIRES  # the clock was set back, so the lease would last too long
+# Whether a surrogate has to be fitted now: it has changed since its last fit, no server fits it, and it has no open
+# query. With a new log, it may have open queries.
 IS_DUE = sa.and_(
     surrogates.c.paused.is_(False),
     surrogates.c.revision > surrogates.c.fitted_revision,
@@ -174,12 +174,16 @@ def _lasting(expires: float, seconds: float) -> dict[str, float]:
 
 
 def _unspoken(connection: Connection, record: SurrogateRecord) -> int:
-    """Real steps that the budget has left; negative if it was lowered, or if people reported more samples."""
+    """Return the number of real steps that the budget has left; negative if the budget was lowered or more samples were
+    reported."""
     return record.budget - surrogate_rows.spoken_for(connection, record.id) - record.extra_queries
 
 
 def _to_raise(connection: Connection, record: SurrogateRecord, queries: int, *, allowed: bool) -> int:
-    """Increase of the budget that a number of further queries needs. Raises ``BeyondBudget``."""
+    """Return the increase of the budget that ``queries`` further real steps need.
+
+    Raises ``BeyondBudget`` if an increase is needed and not ``allowed``.
+    """
     unspoken = _unspoken(connection, record)
     missing = max(0, queries - unspoken)
     if missing and not allowed:
@@ -195,7 +199,7 @@ def _to_raise(connection: Connection, record: SurrogateRecord, queries: int, *, 
 def _hold_right(connection: Connection, lease: FitLease) -> Row[Any]:
     surrogate = hold(connection, lease.surrogate, surrogates.c.fit_token)
     if surrogate.fit_token != lease.token:
-        raise LeaseExpired(f"the right to fit {lease.surrogate!r} has ended: start the fit again")
+        raise LeaseExpired(f"the lease of the fit of {lease.surrogate!r} has ended: start the fit again")
     return surrogate
 
 

@@ -1,4 +1,4 @@
-"""One server for each SQLite file: a lock on the file itself, which ends with its process, however that ends.
+"""Lock on a SQLite file, so that only one server uses it. The lock ends with its process, even after a crash.
 
 A write-ahead log beside the file may belong to another database. The lock finds out for which database it was written,
 from the first bytes of the database and the frames of the log (formats: sqlite.org/fileformat2.html,
@@ -24,38 +24,39 @@ from typing import BinaryIO
 
 from surrogym_server.errors import Unavailable
 
-LOCKED_BYTE = 2**62  # beyond any database, and far from the bytes at 2**30 that SQLite locks
+LOCKED_BYTE = 2**62  # position of the locked byte, beyond any database and far from the bytes that SQLite locks
 WHOLE_DESCRIPTION = getattr(
     fcntl, "F_OFD_SETLK", None
-)  # command for a lock of one open file; None on systems without it
+)  # fcntl command for an open file description lock; None on systems without it
 SQLITE_SHARED = (
     2**30 + 2,
     510,
-)  # bytes on which SQLite's readers share a lock; a program that merges the log locks them exclusively
-BUSY = (BlockingIOError, PermissionError)  # errors that fcntl raises if another process holds a lock
+)  # first byte and number of bytes that SQLite's readers lock as shared, and a program that merges the log as exclusive
+BUSY = (BlockingIOError, PermissionError)  # errors of fcntl if another process holds the lock
 
-BESIDE = ("-wal", "-shm")  # suffixes of SQLite's files beside a database: its write-ahead log, and the log's index
+BESIDE = ("-wal", "-shm")  # suffixes of the names of SQLite's write-ahead log and of its index
 
-Identity = tuple[int, int]  # device and inode, which identify a file
+Identity = tuple[int, int]  # device number and inode of a file, which identify it
 
-_locked_files: set[Identity] = set()  # files that this process has locked
+_locked_files: set[Identity] = set()  # files on which this process holds a lock
 _turn = threading.Lock()
 
 
 class FileLock:
-    """A lock held from construction to ``close`` or the end of the process; child processes never inherit it.
+    """Lock on a SQLite file, held from construction to ``close`` or the end of the process. Child processes don't
+    inherit it.
 
-    The lock belongs to the file, under whatever name the file is opened. A file that does not exist is created, empty.
-    Close it after SQLite's connections: closing any descriptor of a file drops the locks that SQLite has on it.
+    The lock holds for all names and links of the file. A missing file is created. Close the lock after SQLite's
+    connections, because closing any descriptor of a file drops SQLite's locks on it.
 
     Raises:
-        Unavailable: another server holds the lock, the file can't be read and written, or a write-ahead log lies beside
-            it that was written for another database.
+        Unavailable: another server holds the lock, the file can't be read and written, or its write-ahead log was
+            written for another database.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        resolved = path.resolve()  # SQLite keeps its files beside the target of a symbolic link
+        resolved = path.resolve()  # SQLite's log lies beside the target of a symbolic link
         self._log, self._index = (resolved.with_name(resolved.name + suffix) for suffix in BESIDE)
         self._beside: dict[Path, Identity | None] = {}
         self._noted: bytes | None = None
@@ -63,7 +64,7 @@ class FileLock:
         with _turn:
             if not path.exists():
                 self._require_own_log(b"")
-            if _identity(path) in _locked_files:  # must not be opened: closing it again would drop its locks
+            if _identity(path) in _locked_files:  # closing it again would drop its locks
                 raise _unavailable(path)
             self._descriptors = [_lock_byte(path)] if WHOLE_DESCRIPTION else [_lock_beside(path), _open(path)]
             self._index_descriptor: int | None = None
@@ -78,28 +79,29 @@ class FileLock:
             raise
 
     def header(self) -> bytes:
-        """The first bytes of the file on the disk, without data that are only in its log."""
+        """Return the header of the SQLite file (its first 100 bytes), without changes that are only in its log."""
         return os.pread(self._descriptors[-1], HEADER_BYTES, 0)
 
     def log_is_merged(self) -> bool:
-        """Whether all of the file's log is merged, so that the next transaction may begin a new log. The caller has the
-        write lock."""
+        """Whether the whole write-ahead log is merged into the file, so that the next transaction may begin a new log.
+        The caller must hold the write lock."""
         if self._index_descriptor is None:
             self._index_descriptor = os.open(
                 self._index, os.O_RDONLY | os.O_CLOEXEC
-            )  # SQLite has created the file by now
+            )  # SQLite has created this file before
         return is_merged(os.pread(self._index_descriptor, INDEX_BYTES, 0))
 
     def watch(self) -> None:
-        """Remember the file's first bytes, its write-ahead log and the log's index, to notice changes by others."""
+        """Remember the file's header and the identity of its log and of the log's index, to notice later changes by
+        other programs."""
         self._beside = {path: _identity(path) for path in (self._log, self._index)}
         self._noted = self.header()
 
     def require_in_place(self) -> None:
-        """Check that the path still points to the locked file, with the noted files beside it.
+        """Check that the path still leads to the locked file, and that its log and index are the remembered files.
 
         Raises:
-            Unavailable: one of them was moved, replaced or deleted, or the file was found overwritten.
+            Unavailable: one of these files was moved, replaced or deleted, or the database was overwritten.
         """
         if self._overwritten:
             raise self._foreign()
@@ -112,17 +114,16 @@ class FileLock:
                 )
 
     def is_as_noted(self) -> bool:
-        """Whether the file's first bytes are those remembered: nobody wrote to it, and no log was merged into it."""
+        """Whether the file's header is the remembered one; if so, no program has written to the file since then."""
         return self._noted is None or self.header() == self._noted
 
     def require_own_content(self) -> None:
-        """Find out whether a changed beginning of the file comes from its own log, and remember the new beginning if
-        so.
+        """Check that a changed header of the file comes from its own log, and remember the new header.
 
-        The caller keeps others from writing.
+        The caller must hold the write lock.
 
         Raises:
-            Unavailable: another program has overwritten the file. Nothing is merged into it from then on.
+            Unavailable: another program has overwritten the file. SQLite is then kept from merging the log into it.
         """
         if self.is_as_noted():
             return
@@ -151,7 +152,7 @@ class FileLock:
             )
 
     def _forbid_merging(self) -> None:
-        """Keep SQLite from merging the old file's log into the new one when its last connection is closed."""
+        """Keep SQLite from merging the log into the overwritten file when its last connection is closed."""
         if WHOLE_DESCRIPTION:
             with contextlib.suppress(OSError):
                 fcntl.fcntl(self._descriptors[-1], WHOLE_DESCRIPTION, _range(fcntl.F_RDLCK, *SQLITE_SHARED))
@@ -173,8 +174,8 @@ def _identity(path: Path) -> Identity | None:
 
 
 def _lock_byte(path: Path) -> int:
-    """Lock ``LOCKED_BYTE`` of a file by an open file description lock, and return the descriptor, which alone releases
-    it."""
+    """Lock ``LOCKED_BYTE`` of a file by an open file description lock. Return the descriptor; closing it releases the
+    lock."""
     descriptor = _open(path)
     assert WHOLE_DESCRIPTION is not None
     try:
@@ -186,13 +187,16 @@ def _lock_byte(path: Path) -> int:
 
 
 def _range(kind: int, first: int, count: int) -> bytes:
-    """Pack a ``struct flock`` for ``fcntl``, which describes the range of bytes to lock."""
+    """Return a ``struct flock`` for ``fcntl``: kind of lock, first byte, and number of bytes."""
     return struct.pack("hhqqi0q", kind, os.SEEK_SET, first, count, 0)
 
 
 def _lock_beside(path: Path) -> int:
-    """Lock a file beside the database, and return its descriptor, on systems without open file description locks. All
-    symbolic links to a database lead to the same lock."""
+    """Lock the file ``.lock`` beside a database, for systems without open file description locks. Return its
+    descriptor.
+
+    All symbolic links to a database lead to the same lock.
+    """
     resolved = path.resolve()
     descriptor = _open(resolved.with_name(resolved.name + ".lock"))
     try:
@@ -222,26 +226,27 @@ def _unavailable(path: Path, error: OSError | None = None) -> Unavailable:
 
 
 HEADER_BYTES = 100  # size of the header of a SQLite database
-USER_VERSION, APPLICATION_ID = slice(60, 64), slice(68, 72)  # in the header; SQLite leaves both to applications
+USER_VERSION, APPLICATION_ID = slice(60, 64), slice(68, 72)  # fields of the header that SQLite leaves to applications
 LOG_HEADER, FRAME_HEADER = struct.Struct(">8I"), struct.Struct(">6I")
 BIG_ENDIAN = 1  # bit of the log's magic number: byte order of the words in its checksums
-INDEX_BYTES = 136  # bytes to read of the log's index: two headers, then the position up to which the log was merged
+INDEX_BYTES = 136  # size of the first part of the log's index: two headers, and the number of merged frames
 INDEX_VERSION = 3_007_000
 WORD = 0xFFFF_FFFF
 
 
 def marks(header: bytes) -> tuple[str, ...]:
-    """Return the statements by which the first transaction of a log marks it as belonging to this header's database."""
+    """Return the SQL statements by which the first transaction of a log marks the database with this header as its
+    own."""
     number = 1 + secrets.randbelow(2**31 - 1)
     return f"PRAGMA user_version={number}", f"PRAGMA application_id={_signed(zlib.crc32(header))}"
 
 
 def belongs(log: Path, header: bytes) -> bool:
-    """Whether SQLite may merge the file ``log`` into the database that begins with ``header``.
+    """Whether the write-ahead log ``log`` may belong to the database whose header is ``header``.
 
-    It may if there is nothing to merge, if the log begins with the mark of this database, or if the header comes from
-    the log because merging has begun. A log without a mark is from an older program, and may belong to a database
-    without a mark.
+    It does if it contains nothing to merge, if it has the mark of this database, or if the header comes from the log
+    because merging has begun. A log without a mark is from an older program, and may belong to a database without a
+    mark.
     """
     try:
         file = log.open("rb")
@@ -264,11 +269,11 @@ def is_merged(index: bytes) -> bool:
     """Whether all frames of a write-ahead log are merged into its database, so that the next transaction may begin a
     new log.
 
-    ``index`` has the first ``INDEX_BYTES`` bytes of the log's index, the file ``-shm``. The caller has the write lock,
-    so that the index does not change.
+    ``index`` is the first ``INDEX_BYTES`` bytes of the log's index, the file ``-shm``. The caller must hold the write
+    lock, so that the index does not change.
     """
     if len(index) < INDEX_BYTES or struct.unpack_from("=I", index)[0] != INDEX_VERSION:
-        return True  # an unknown index counts as merged: the log is then marked once more, without harm
+        return True  # an unknown index counts as merged: a second mark does no harm
     frames, merged = struct.unpack_from("=I", index, 16)[0], struct.unpack_from("=I", index, 96)[0]
     return bool(frames == merged)
 
@@ -282,7 +287,7 @@ def _signed(number: int) -> int:
 
 
 def _frames(file: BinaryIO) -> Iterator[tuple[tuple[int, ...], int]]:
-    """The headers of the frames of the log's present generation, and the positions of their pages."""
+    """Yield the header of each frame in the log's present generation, and the position of its page in the file."""
     file.seek(0)
     begin = file.read(LOG_HEADER.size)
     if len(begin) < LOG_HEADER.size:
@@ -300,7 +305,7 @@ def _frames(file: BinaryIO) -> Iterator[tuple[tuple[int, ...], int]]:
 
 
 def _first_pages(file: BinaryIO) -> Iterator[bytes]:
-    """Yield each version of the database's header that the log contains."""
+    """Yield each version of the database's header (the start of page 1) that the log contains."""
     for (page, *_), place in _frames(file):
         if page == 1:
             file.seek(place)
@@ -308,7 +313,7 @@ def _first_pages(file: BinaryIO) -> Iterator[bytes]:
 
 
 def _has_a_whole_transaction(file: BinaryIO) -> bool:
-    """Whether the log contains a transaction that SQLite would merge. After a power loss its checksums may be wrong."""
+    """Whether the log contains a complete transaction with right checksums, which SQLite would merge."""
     file.seek(0)
     begin = file.read(LOG_HEADER.size)
     if len(begin) < LOG_HEADER.size:
@@ -323,7 +328,7 @@ def _has_a_whole_transaction(file: BinaryIO) -> bool:
         sums = _checksum(struct.pack(">2I", page, size) + file.read(page_size), order, sums)
         if sums != (first, second):
             return False
-        if size:  # the last frame of a transaction has the database's size, others have 0
+        if size:  # only the last frame of a transaction has a size other than 0
             return True
     return False
 

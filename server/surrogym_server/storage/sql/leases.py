@@ -1,7 +1,7 @@
 """Leases of queries: how they begin, how they end, and which of them a reported sample answers.
 
-The caller holds the surrogate unless a docstring says otherwise. A lease has one answer: one sample, or the first
-samples of a rollout. An answer comes whole, in one batch.
+The caller must have locked the surrogate (``rows.hold``) unless a docstring says otherwise. A lease has one answer: one
+sample, or the first samples of a rollout. All samples of an answer come in one batch.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LEASE_QUERIES = (
 SET_OUTCOME = (
     sa.update(leases).where(leases.c.id.in_(sa.bindparam("ended", expanding=True))).values(outcome=sa.bindparam("how"))
 )
-# The value is a constant in the statement: with a parameter, PostgreSQL would not use the index of open leases.
+# The value is a constant in the SQL text, because with a parameter PostgreSQL would not use the index of open leases.
 IS_OPEN = leases.c.outcome == constant("open")
 ENDED = sa.exists().where(leases.c.surrogate_id == surrogates.c.id, has_ended(leases, IS_OPEN))
 SHARE = (
@@ -48,7 +48,7 @@ SHARE = (
 def begin(
     connection: Connection, surrogate: Row[Any], rows: Sequence[Row[Any]], sampler: str, seconds: float
 ) -> list[LeasedQuery]:
-    """Make leases of the queries in these rows, which the caller has locked, for one sampler."""
+    """Lease the queries in these rows, which the caller has locked, to one sampler for ``seconds``."""
     if not rows:
         return []
     leased = [
@@ -87,7 +87,7 @@ def of_query(connection: Connection, surrogate_id: int, query_id: int, token: st
 
     Raises:
         UnknownQuery: the surrogate has no such query.
-        ForeignLease: the token was never given out for it.
+        ForeignLease: the token is not that of a lease of this query.
     """
     columns: list[Any] = [leases.c.id, leases.c.expires, leases.c.outcome]
     given_out = sa.select(*columns).where(
@@ -103,11 +103,11 @@ def of_query(connection: Connection, surrogate_id: int, query_id: int, token: st
 
 
 def unknown_query(query_id: int) -> UnknownQuery:
-    return UnknownQuery(f"expected a query of this surrogate, got {query_id}, which does not exist")
+    return UnknownQuery(f"expected the id of a query of this surrogate, got {query_id}, which does not exist")
 
 
 def foreign_lease(query_id: int) -> ForeignLease:
-    return ForeignLease(f"expected a lease token of query {query_id}, got another token")
+    return ForeignLease(f"expected a lease token of query {query_id}, got another token: send the one of its claim")
 
 
 def set_outcome(connection: Connection, lease_ids: Sequence[int], outcome: str) -> None:
@@ -115,9 +115,9 @@ def set_outcome(connection: Connection, lease_ids: Sequence[int], outcome: str) 
 
 
 def share(connection: Connection, name: str) -> Row[Any]:
-    """Lock a surrogate against deletion, without blocking writers. Returns (id, paused, now, has_ended).
+    """Lock a surrogate against deletion, without blocking writers, and end expired leases of its queries.
 
-    ``has_ended``: whether leases of its queries have expired. The caller then ends them, which blocks writers.
+    Returns a row with the columns id, paused, now (the database's time), and has_ended (whether leases had expired).
     """
     row = connection.execute(SHARE, {"named": name}).one_or_none()
     if row is None:
@@ -128,7 +128,7 @@ def share(connection: Connection, name: str) -> Row[Any]:
 
 
 def sweep(connection: Connection, surrogate: Row[Any]) -> int:
-    """End the surrogate's expired leases. Returns their number."""
+    """End the expired leases of a surrogate's queries, and return their number."""
     result = connection.execute(
         sa.update(leases)
         .where(leases.c.surrogate_id == surrogate.id, leases.c.outcome == "open", leases.c.expires <= surrogate.now)
@@ -144,10 +144,10 @@ def sweep(connection: Connection, surrogate: Row[Any]) -> int:
 def give_back(
     connection: Connection, surrogate: Row[Any], query_ids: Sequence[int], error: str, outcome: Returned
 ) -> None:
-    """Return leased queries to the queue, or set them aside after their last attempt or a refusal.
+    """Make queries whose lease has ended pending again, or set them aside after their last attempt or a refusal.
 
-    A query has the same number of attempts each time it is requeued. A lease that ended before a real step does not
-    count as an attempt. The leases already have their ``outcome``.
+    A lease that ended before a real step does not count as an attempt. A query that people requeue gets all attempts
+    again. The caller has stored the ``outcome`` of the leases.
     """
     failures = (
         sa.select(sa.func.count())
@@ -174,7 +174,8 @@ def give_back(
 
 
 def is_unbegun(surrogate_id: int) -> sa.ColumnElement[bool]:
-    """Whether a row of queries is a pending query of this surrogate that no sampler has begun."""
+    """Return the SQL condition that a query of this surrogate is pending and that no real step of it may have been
+    taken."""
     leases_with_steps = sa.select(leases.c.id).where(
         leases.c.query_id == queries.c.id, leases.c.outcome.not_in(BEFORE_A_STEP)
     )
@@ -182,7 +183,7 @@ def is_unbegun(surrogate_id: int) -> sa.ColumnElement[bool]:
 
 
 def requeue_set_aside(connection: Connection, surrogate: Row[Any]) -> int:
-    """Make the queries that were set aside or refused pending, with as many attempts as a new query. Returns their
+    """Make a surrogate's queries that were set aside or refused pending again, with all attempts. Return their
     number."""
     set_aside = (queries.c.surrogate_id == surrogate.id) & queries.c.status.in_(("set_aside", "refused"))
     return connection.execute(sa.update(queries).where(set_aside).values(status="pending")).rowcount
@@ -209,7 +210,7 @@ ANSWER = (
 
 
 class Reported(NamedTuple):
-    """A stored sample, to compare with one that is reported again."""
+    """Id and content hash of a stored sample, to recognise a repeated report of it."""
 
     sample_id: int
     fingerprint: str
@@ -217,23 +218,26 @@ class Reported(NamedTuple):
 
 @dataclass(frozen=True)
 class Answered:
-    """A lease under which samples were reported, with its query."""
+    """A lease under which samples are reported, with its query."""
 
     lease_id: int
     query_id: int
     purpose: Purpose
-    steps: int  # most real steps that the query may take
+    steps: int  # largest number of real steps of the query
     attempt: int
     live: bool
-    contested: bool  # another lease of the query is live
-    reported: dict[int, Reported]  # samples that are stored under this lease already, by step
+    contested: bool  # whether the query has another lease that has not ended
+    reported: dict[int, Reported]  # samples that are already stored for this lease, by step
 
 
 def read_answered(connection: Connection, surrogate: Row[Any], batch: Sequence[NewSample]) -> list[Answered | None]:
-    """Find the lease under which each sample was reported, or None. Locks their queries.
+    """Return the lease of each reported sample, or None for a sample without a query. Locks the queries.
 
     Raises:
-        UnknownQuery, ForeignLease, InvalidInput, IdempotencyConflict: as ``Samples.add`` says.
+        UnknownQuery: the surrogate has no such query.
+        ForeignLease: the lease token is not that of a lease of the query.
+        InvalidInput: a sample has a lease token without a query, or an answer lacks a step or has too many.
+        IdempotencyConflict: an answer has more steps than when it was reported first.
     """
     query_ids = {sample.query_id for sample in batch if sample.query_id is not None}
     by_id = _lock_queries(connection, surrogate, query_ids)
@@ -249,7 +253,7 @@ def read_answered(connection: Connection, surrogate: Row[Any], batch: Sequence[N
 
 
 def settle(connection: Connection, answers: Iterable[Answered]) -> None:
-    """Mark leases as answered, and their queries too, except a query of which another lease is live."""
+    """Mark leases and their queries as answered. A query stays leased if the lease has ended and another is open."""
     leases_done = {one.lease_id: one for one in answers}
     if not leases_done:
         return
@@ -260,7 +264,12 @@ def settle(connection: Connection, answers: Iterable[Answered]) -> None:
 
 
 def _check_steps(lease: Answered, steps: set[int]) -> None:
-    """Raise an error if a lease's answer lacks a step, has too many, or has more steps than when first reported."""
+    """Check the steps that are reported as the answer under a lease.
+
+    Raises:
+        InvalidInput: a step is missing, or there are more than the query has.
+        IdempotencyConflict: there are more steps than when the answer was reported first.
+    """
     if lease.reported:
         if more := steps - lease.reported.keys():
             raise IdempotencyConflict(
@@ -282,7 +291,7 @@ def _lock_queries(connection: Connection, surrogate: Row[Any], query_ids: set[in
 
 
 def _leases(connection: Connection, surrogate: Row[Any], by_id: dict[int, Row[Any]]) -> dict[tuple[int, str], Answered]:
-    """Read all leases of these queries, by query id and token."""
+    """Read all leases of these queries. Return them by query id and token."""
     if not by_id:
         return {}
     rows = connection.execute(LEASES, {"asked": list(by_id), "now": surrogate.now}).all()
@@ -304,7 +313,7 @@ def _leases(connection: Connection, surrogate: Row[Any], by_id: dict[int, Row[An
 
 
 def _reported(connection: Connection, lease_ids: Sequence[int]) -> dict[int, dict[int, Reported]]:
-    """Return the samples stored under each of these leases, by step."""
+    """Return the stored samples of each of these leases, by lease id and step."""
     reported: dict[int, dict[int, Reported]] = defaultdict(dict)
     for lease_id, step, *columns in connection.execute(REPORTED, {"reported": lease_ids}):
         reported[lease_id][step] = Reported(*columns)

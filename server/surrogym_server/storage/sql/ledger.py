@@ -1,6 +1,6 @@
-"""Adapter of ``Ledger``: real steps by purpose, counted from the stored samples and leases.
+"""Implementation of ``Ledger``: counts of real steps by purpose, from the stored samples and leases.
 
-The numbers of samples are kept in memory, because counting a million rows takes 0.3 s.
+The counts of samples are cached in memory, because counting a million rows takes 0.3 s.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from surrogym_server.storage.sql.rows import Span, append_event, find, hold, rec
 from surrogym_server.storage.sql.tables import evaluations, leases, queries, samples, surrogates
 
 COUNTED = ("initial", "adaptive", "manual", "audit", "logged", "evaluation", "failed", "expired")
-MOST_KEPT = 100_000  # most surrogates whose counts are kept in memory
+MOST_KEPT = 100_000  # largest number of surrogates whose counts are cached
 
-PURPOSE = sa.type_coerce(samples.c.purpose, sa.Text)  # the column's own type would refuse unknown words
+PURPOSE = sa.type_coerce(samples.c.purpose, sa.Text)  # read as text, because the column's type refuses unknown words
 BY_PURPOSE: sa.Select[Any] = sa.select(
     samples.c.surrogate_id, PURPOSE, sa.func.count(), sa.func.max(samples.c.id)
 ).group_by(samples.c.surrogate_id, samples.c.purpose)
-COUNTED_AT_ONCE = 500  # surrogates of one statement; SQLite parses an expression of at most 1,000 levels
+COUNTED_AT_ONCE = 500  # surrogates in one statement, because SQLite limits the depth of an expression to 1,000
 SINCE = BY_PURPOSE.where(samples.c.surrogate_id == sa.bindparam("owner"), samples.c.id > sa.bindparam("newest"))
 
 
 @dataclass(frozen=True)
 class SampleCounts:
-    """Number of a surrogate's samples by purpose, up to the one with the id ``newest``."""
+    """Numbers of a surrogate's samples by purpose, up to the sample with the id ``newest``."""
 
     newest: int = 0
     by_purpose: Mapping[str, int] = field(default_factory=dict)
@@ -42,10 +42,10 @@ NONE = SampleCounts()
 
 
 class CountedSamples:
-    """Numbers of samples of each surrogate. Each call counts only the samples that were added since the last one.
+    """Cache of the numbers of samples of each surrogate. A call counts only the samples added since the last call.
 
-    Samples of a surrogate are added one transaction after the other, so their ids grow. Samples are never changed, and
-    only deleted with their surrogate. Other processes may add samples too.
+    This works because the ids of a surrogate's samples increase, and because samples are never changed, and only
+    deleted with their surrogate. Other processes may add samples too.
     """
 
     def __init__(self) -> None:
@@ -57,7 +57,10 @@ class CountedSamples:
         return self._add(surrogate_id, earlier, since)
 
     def of_many(self, connection: Connection, newest: Mapping[int, int | None]) -> dict[int, SampleCounts]:
-        """Count the samples of surrogates by a few statements, given the id of the newest sample of each."""
+        """Return the counts of several surrogates by a few SQL statements.
+
+        ``newest`` has the id of each surrogate's newest sample, by surrogate id.
+        """
         earlier = {id: self._counts.get(id, NONE) for id in newest}
         stale = [id for id, last in newest.items() if earlier[id].newest < (last or 0)]
         for first in range(0, len(stale), COUNTED_AT_ONCE):
@@ -106,9 +109,10 @@ def _evaluations() -> sa.Select[Any]:
 
 
 def _unresolved() -> sa.Select[Any]:
-    """Select the steps of leases that failed or expired, also of those that are still marked as open.
+    """Return the SELECT of the numbers of steps under leases that failed or expired, by surrogate and outcome.
 
-    The conditions use an index, so that leases with an answer, which are nearly all, are not read.
+    Expired leases that are still marked as open count too. The conditions use an index, so that answered leases, nearly
+    all, are not read.
     """
     failed, expired, is_open = constant("failed"), constant("expired"), constant("open")
     unswept = (leases.c.outcome == is_open) & (leases.c.expires <= NOW)
@@ -150,11 +154,12 @@ class SqlLedger(port.Ledger):
 
 
 def ledgers(connection: Connection, span: Span, sampled: Mapping[int, Mapping[str, int]]) -> dict[int, LedgerRecord]:
-    """The ledger of each surrogate of the span that has any steps.
+    """Return the counts of real steps of each surrogate in a range of ids that has any.
 
     Args:
-        span: ids of surrogates.
-        sampled: number of samples by surrogate and purpose.
+        connection: connection to the database.
+        span: first and last id of the surrogates.
+        sampled: numbers of samples by surrogate id and purpose.
     """
     rows = connection.execute(OTHERS, {"first": span[0], "last": span[1]}).all()
     of_surrogates: defaultdict[int, dict[str, int]] = defaultdict(dict)

@@ -1,4 +1,4 @@
-"""Store the states that policies visited, the sessions that a stopping server saves, and events of surrogates."""
+"""Implementations of ``Occupancy``, ``Sessions`` and ``Events``: visited states, saved sessions and events."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from surrogym_server.storage.sql.rows import find, hold
 from surrogym_server.storage.sql.tables import events, occupancies, surrogates
 from surrogym_server.storage.sql.tables import sessions as saved
 
-MAX_CHECKPOINTS = 1_000  # most stored occupancies of a surrogate
+MAX_CHECKPOINTS = 1_000  # largest number of stored occupancies of a surrogate
 NEWEST = sa.select(
     surrogates.c.name,
     sa.select(sa.func.max(events.c.id)).where(events.c.surrogate_id == surrogates.c.id).scalar_subquery(),

@@ -1,4 +1,4 @@
-"""Adapters of ``Models`` and ``PolicyNames``: models by version, versions and aliases of policies."""
+"""Implementations of ``Models`` and ``PolicyNames``: models by version, versions and aliases of policies."""
 
 from __future__ import annotations
 
@@ -56,9 +56,7 @@ class SqlModels(port.Models):
         with self._database.read() as connection:
             row = _one(connection, name, version, models.c.version, models.c.blob, models.c.checksum)
         if _checksum(row.blob) != row.checksum:
-            raise damaged(
-                f"the checksum of model {row.version} of {name!r} differs from the one that was stored with it"
-            )
+            raise damaged(f"model {row.version} of {name!r} has changed since it was stored: its checksum differs")
         return bytes(row.blob)
 
     def set_aside(self, name: str, version: int, damage: str) -> bool:
@@ -81,7 +79,7 @@ def _checksum(blob: bytes) -> str:
 
 
 def newest_of(connection: Connection, span: Span) -> dict[int, tuple[int, float]]:
-    """Version and confidence index of the newest model of each surrogate of the span that has one."""
+    """Return version and confidence index of the newest undamaged model of each surrogate in a range of ids, by id."""
     latest = sa.select(models.c.surrogate_id, sa.func.max(models.c.version).label("version"))
     newest = latest.where(within(models, span), INTACT).group_by(models.c.surrogate_id).subquery()
     same = (models.c.surrogate_id == newest.c.surrogate_id) & (models.c.version == newest.c.version)
@@ -91,8 +89,10 @@ def newest_of(connection: Connection, span: Span) -> dict[int, tuple[int, float]
 
 
 def insert_model(connection: Connection, surrogate: Row[Any], model: NewModel) -> int:
-    """Store a model as the newest version. The caller has locked the surrogate (``rows.hold``), so that versions have
-    no gaps."""
+    """Store a model as the newest version, and return its version.
+
+    The caller must have locked the surrogate (``rows.hold``), so that versions have no gaps.
+    """
     newest = sa.select(sa.func.max(models.c.version)).where(models.c.surrogate_id == surrogate.id)
     version = (connection.execute(newest).scalar() or 0) + 1
     connection.execute(
@@ -115,10 +115,10 @@ def insert_model(connection: Connection, surrogate: Row[Any], model: NewModel) -
 
 
 def _confidence_index(fidelity: str) -> float:
-    """Read only the confidence index of a stored fidelity, because parsing all of it takes ten times as long."""
+    """Return the confidence index in a stored fidelity (JSON). Parsing all its fields would take ten times as long."""
     try:
         return _JUDGED.decode(fidelity).confidence_index
-    except msgspec.DecodeError:  # it may contain NaN, which only Python's parser reads
+    except msgspec.DecodeError:  # the JSON may contain NaN, which only Python's parser reads
         try:
             return float(json.loads(fidelity)["confidence_index"])
         except (ValueError, KeyError, TypeError) as error:
@@ -133,7 +133,7 @@ def _one(connection: Connection, name: str, version: int | None, *columns: sa.Co
         return row
     if version is None:
         raise NoModel(f"expected a model of {name!r}, but no model has been fitted yet: start surrogym sample")
-    raise UnknownModel(f"expected a version of {name!r}'s models, got {version}, which does not exist")
+    raise UnknownModel(f"expected a version of the models of {name!r}, got {version}, which does not exist")
 
 
 class SqlPolicyNames(port.PolicyNames):
@@ -154,7 +154,10 @@ class SqlPolicyNames(port.PolicyNames):
 
 
 def resolve(connection: Connection, surrogate: int, name: str, which: str) -> int:
-    """Return the version number that ``which`` means: a number, an alias or ``latest``. Raises ``UnknownPolicy``."""
+    """Return the policy version that ``which`` names: a number, an alias or ``latest``.
+
+    ``surrogate`` is the surrogate's id, ``name`` its name. Raises ``UnknownPolicy``.
+    """
     if which.isascii() and which.isdecimal() and len(which) < 10:
         require_version(connection, surrogate, name, int(which))
         return int(which)

@@ -1,4 +1,4 @@
-"""Adapter of ``Priors``: the model of what is known of an environment beforehand, one for each surrogate."""
+"""Implementation of ``Priors``: at most one prior model for each surrogate."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class SqlPriors(port.Priors):
 
 
 def _plan_anew(connection: Connection, name: str) -> None:
-    """Withdraw what the design planned with another prior, and make a fit due."""
+    """Withdraw queries that were chosen with another prior and without a real step so far, and make a fit due."""
     surrogate, before = hold(connection, name), stored.read(connection, name)
     touch(connection, surrogate, **stored.withdraw_unbegun(connection, surrogate, before, None))
     append_event(connection, surrogate, "phase", phase=before.phase, error=before.error)

@@ -1,8 +1,8 @@
-"""Adapters of ``Queries`` and ``Snapshots``: the queue of queries, and the snapshots that some of them begin at.
+"""Implementations of ``Queries`` and ``Snapshots``: the queue of queries, and the snapshots at which some begin.
 
-The initial queries of a design are queued in transactions that block nobody for long. A row of ``requests`` holds how
-many are queued as long as some are missing. Until then no fit is due. If a crash interrupts the work, another call of
-``queue_initial`` with the same queries continues.
+The initial queries of a design are queued in several short transactions. While some are missing, a row of the table
+``requests`` holds the number of queued ones, and no fit is due. If a crash interrupts the work, another call of
+``queue_initial`` with the same queries continues it.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ OLDEST_FREE: sa.Select[Any] = (
     .limit(sa.bindparam("most", type_=sa.Integer()))
     .with_for_update(skip_locked=True)
 )
-LEAST_AUDITED = 128  # real steps of audits that any surrogate may take; three audits without a result take 120
+LEAST_AUDITED = 128  # real steps that audits may take even with a smaller budget; three audits take at most 120
 
 
 class SqlQueries(port.Queries):
@@ -170,13 +170,13 @@ class SqlQueries(port.Queries):
         try:
             with self._database.write() as connection:
                 return leasing.sweep(connection, hold(connection, name))
-        except UnknownSurrogate:  # the surrogate was deleted meanwhile
+        except UnknownSurrogate:  # the surrogate was just deleted
             return 0
 
 
 def _require_room(connection: Connection, surrogate: Row[Any], steps: int) -> None:
-    """Raise ``BeyondBudget`` if all audits together would take more steps than the budget and than
-    ``LEAST_AUDITED``."""
+    """Raise ``BeyondBudget`` if the surrogate's audits, with ``steps`` more real steps, would take more than its budget
+    and more than ``LEAST_AUDITED`` steps."""
     sums = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0), sa.func.max(surrogates.c.budget))
     own = (queries.c.surrogate_id == surrogates.c.id) & (queries.c.purpose == "audit")
     join = sums.select_from(surrogates.outerjoin(queries, own)).where(surrogates.c.id == surrogate.id)
@@ -185,12 +185,13 @@ def _require_room(connection: Connection, surrogate: Row[Any], steps: int) -> No
     if before + steps > limit:
         raise BeyondBudget(
             f"expected at most {max(0, limit - int(before))} more real steps of audits, got {steps}: all audits "
-            f"together take at most as many real steps as the budget has, or {LEAST_AUDITED} if that is more"
+            f"together may take {limit}, the larger of the budget and {LEAST_AUDITED}: raise the budget with surrogym "
+            "change --budget"
         )
 
 
 def query_counts(connection: Connection, span: Span) -> dict[int, QueryCounts]:
-    """Number of queries by status, for each surrogate of the span that has any."""
+    """Return the numbers of queries by status of each surrogate in a range of ids that has any, by id."""
     of_surrogates: defaultdict[int, dict[str, int]] = defaultdict(dict)
     statement = sa.select(queries.c.surrogate_id, queries.c.status, sa.func.count()).where(within(queries, span))
     rows = connection.execute(statement.group_by(queries.c.surrogate_id, queries.c.status)).all()
@@ -204,7 +205,7 @@ def _lease_expired(query_id: int) -> LeaseExpired:
 
 
 def _records() -> sa.Select[Any]:
-    """Return the SELECT of queries, each with the time left of its open lease, of which it has at most one."""
+    """Return the SELECT of queries with the time left of their open lease; a query has at most one."""
     left = (leases.c.expires - NOW).label("lease_seconds_left")
     is_open = (leases.c.query_id == queries.c.id) & (leases.c.outcome == "open")
     return sa.select(*STATE, *CONTENT, left).outerjoin(leases, is_open)
@@ -245,7 +246,7 @@ class SqlSnapshots(port.Snapshots):
 
 
 def insert_snapshots(connection: Connection, surrogate: Row[Any], new: dict[str, Vector]) -> None:
-    """Store snapshots by name with their coordinates (C,). A name that is stored already does not change."""
+    """Store the names of new snapshots with their coordinates (C,). Stored snapshots are not changed."""
     if new:
         rows = [{"surrogate_id": surrogate.id, "name": name, "coordinates": at} for name, at in new.items()]
         insert = conflict_insert(connection, snapshots).on_conflict_do_nothing()
@@ -253,8 +254,8 @@ def insert_snapshots(connection: Connection, surrogate: Row[Any], new: dict[str,
 
 
 def give_up_lost(connection: Connection, surrogate: Row[Any], given_back: QueryRecord) -> None:
-    """Give up a query that was leased while its snapshot was reported as gone. Otherwise samplers would claim it again
-    and again."""
+    """Remove or set aside a query whose lease has ended, if its snapshot was dropped during the lease. Otherwise
+    samplers would claim it repeatedly."""
     if given_back.snapshot is None or given_back.status != "pending":
         return
     own = (snapshots.c.surrogate_id == surrogate.id) & (snapshots.c.name == given_back.snapshot)
@@ -268,9 +269,10 @@ def _forget(connection: Connection, surrogate: Row[Any], names: Sequence[str]) -
 
 
 def _give_up_queries(connection: Connection, surrogate: Row[Any], names: Sequence[str]) -> None:
-    """Remove the pending queries that begin at dropped snapshots; set aside those of which steps may have been taken.
+    """Remove pending queries that begin at the dropped snapshots ``names``; set aside those of which a real step may
+    have been taken.
 
-    Steps of removed queries that ``improve`` had requested are requested again.
+    Removed queries that ``improve`` had requested are requested again.
     """
     from_there = queries.c.snapshot.in_(names)
     unbegun = leasing.is_unbegun(surrogate.id) & from_there
@@ -287,26 +289,30 @@ def _give_up_queries(connection: Connection, surrogate: Row[Any], names: Sequenc
         touch(connection, surrogate, extra_queries=surrogates.c.extra_queries + again)
 
 
-INITIAL, NO_KEY = "initial", ""  # no request of a client has an empty key
+INITIAL, NO_KEY = "initial", ""  # operation and key of the row of ``requests``; clients can't use an empty key
 _OF_DESIGN = (requests.c.operation == INITIAL) & (requests.c.key == NO_KEY)
-IS_INCOMPLETE = sa.exists(  # condition on a surrogate's row: initial queries are missing
+IS_INCOMPLETE = sa.exists(  # condition on a row of surrogates: some of its initial queries are missing
     sa.select(requests.c.key).where(requests.c.surrogate_id == surrogates.c.id, _OF_DESIGN)
 )
 
 
 def begin_initial(connection: Connection, surrogate: Row[Any], queries: Sequence[Query]) -> None:
-    """Queue as many initial queries as one transaction may, and note in the table whether others are missing."""
+    """Queue the first batch of a surrogate's initial queries. If others are missing, ``requests`` holds the number of
+    queued ones."""
     remember(connection, surrogate, INITIAL, NO_KEY, "", 0)
     _ask_some(connection, surrogate, queries)
 
 
 def end_initial(connection: Connection, surrogate: Row[Any]) -> None:
-    """Note that no initial query is missing any more: those in the queue are all."""
+    """Record that no initial query of a surrogate is missing any more."""
     connection.execute(sa.delete(requests).where(requests.c.surrogate_id == surrogate.id, _OF_DESIGN))
 
 
 def queue_initial(database: Database, name: str, queries: Sequence[Query]) -> None:
-    """Queue the initial queries that are missing. If none are, nothing changes. Raises ``UnknownSurrogate``."""
+    """Queue the missing initial queries of a surrogate, given all its initial queries. Does nothing if none is missing.
+
+    Raises ``UnknownSurrogate``.
+    """
 
     def batch(connection: Connection) -> int:
         return _ask_some(connection, hold(connection, name), queries)
@@ -318,7 +324,7 @@ def queue_initial(database: Database, name: str, queries: Sequence[Query]) -> No
 
 
 def _ask_some(connection: Connection, surrogate: Row[Any], queries: Sequence[Query]) -> int:
-    """Queue a batch of the missing initial queries. Returns how many; 0 if none were missing."""
+    """Queue a batch of a surrogate's missing initial queries, given all initial queries. Return the number queued."""
     own = (requests.c.surrogate_id == surrogate.id) & _OF_DESIGN
     queued = connection.execute(sa.select(requests.c.result).where(own)).scalar()
     if queued is None:

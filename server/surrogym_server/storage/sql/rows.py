@@ -1,4 +1,4 @@
-"""Statements that several stores share: find a surrogate, append an event, remember an idempotency key, end leases."""
+"""SQL statements that several stores share, on surrogates, events, idempotency keys, queries and leases."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from surrogym_shared.states import EventKind, Purpose
 
 Span = tuple[int, int]  # first and last id of a range of surrogates
 
-# Statements of every answer and claim are built once: SQLAlchemy takes four times as long to build and name one as to
-# send it.
+# Statements of frequent requests are built once, because SQLAlchemy takes four times as long to build one as to send
+# it.
 NAMED = surrogates.c.name == sa.bindparam("named")
 FIND = sa.select(surrogates.c.id).where(NAMED)
 LOCKED_COLUMNS = (surrogates.c.id, surrogates.c.phase, surrogates.c.paused, surrogates.c.round, NOW.label("now"))
@@ -28,14 +28,14 @@ TOUCH = (
 )
 NEW_EVENT, NEW_REQUEST = sa.insert(events), sa.insert(requests)
 
-# A surrogate whose rows are being removed has no name any more; the column holds this word and its id.
-REMOVED = "/removed/"  # no name has a slash; the id follows
+# While the rows of a deleted surrogate are removed, its name is replaced by this prefix and its id.
+REMOVED = "/removed/"  # differs from all names, which have no slash
 IS_THERE = surrogates.c.name.not_like(f"{REMOVED}%")
 NAMELESS = sa.select(surrogates.c.id).where(~IS_THERE)
 
 
 def find(connection: Connection, name: str) -> int:
-    """Return the id of the surrogate with a name. Raises ``UnknownSurrogate``."""
+    """Return the id of the surrogate with this name. Raises ``UnknownSurrogate``."""
     row = connection.execute(FIND, {"named": name}).scalar()
     if row is None:
         raise unknown_surrogate(name)
@@ -43,9 +43,10 @@ def find(connection: Connection, name: str) -> int:
 
 
 def hold(connection: Connection, name: str, *extra: sa.ColumnElement[Any]) -> Row[Any]:
-    """Lock the surrogate until the transaction ends: (id, phase, paused, round, now, *extra).
+    """Lock a surrogate until the transaction ends. Return the columns (id, phase, paused, round, now, *extra).
 
-    Every writer calls it first, so that writers take turns and events get their ids in order.
+    Each transaction that writes to a surrogate calls this first, so that such transactions run one after the other and
+    events get their ids in order.
     """
     row = connection.execute(HOLD.add_columns(*extra) if extra else HOLD, {"named": name}).one_or_none()
     if row is None:
@@ -54,7 +55,7 @@ def hold(connection: Connection, name: str, *extra: sa.ColumnElement[Any]) -> Ro
 
 
 def within(table: sa.Table, span: Span) -> sa.ColumnElement[bool]:
-    """Whether a row of a table belongs to a surrogate of the span."""
+    """Return the SQL condition that a row of a table belongs to a surrogate in a range of ids."""
     return table.c.surrogate_id.between(*span)
 
 
@@ -69,15 +70,15 @@ def append_event(connection: Connection, surrogate: Row[Any], kind: EventKind, *
 
 
 def touch(connection: Connection, surrogate: Row[Any], **changes: Any) -> None:
-    """Increase the surrogate's revision, so that its design becomes due, and change other fields."""
+    """Increase a surrogate's revision, so that a fit becomes due, and change the given other columns."""
     connection.execute(TOUCH.values(**changes) if changes else TOUCH, {"touched": surrogate.id})
 
 
 def recall(connection: Connection, surrogate: Row[Any], operation: str, key: str | None, body: str) -> Any:
-    """Return the earlier result of the operation for this key; None if the key is new.
+    """Return the result of an earlier request with the same operation and idempotency key; None if the key is new.
 
     Raises:
-        IdempotencyConflict: the key was used with another body.
+        IdempotencyConflict: the earlier request had another content hash than ``body``.
     """
     if key is None:
         return None
@@ -99,7 +100,8 @@ def recall(connection: Connection, surrogate: Row[Any], operation: str, key: str
 def remember(
     connection: Connection, surrogate: Row[Any], operation: str, key: str | None, body: str, result: Any
 ) -> None:
-    """Store the result of an operation under its idempotency key, for a repeat."""
+    """Store the result of an operation under its idempotency key, so that a repeat gets it. ``body`` is the request's
+    content hash."""
     if key is not None:
         row = {"surrogate_id": surrogate.id, "operation": operation, "key": key, "fingerprint": body, "result": result}
         connection.execute(NEW_REQUEST, row)
@@ -114,8 +116,10 @@ def insert_queries(
     *,
     extra: bool = False,
 ) -> list[int]:
-    """Queue queries, and return their ids in the same order. ``extra`` marks queries that ``improve`` requested, which
-    the design alone would not have chosen."""
+    """Insert queries as pending, and return their ids in the same order.
+
+    ``extra`` marks queries that were only chosen because ``improve`` requested them.
+    """
     if not new_queries:
         return []
     common = {"surrogate_id": surrogate.id, "purpose": purpose, "round": round, "status": "pending", "attempts": 0}
@@ -128,7 +132,7 @@ def insert_queries(
 
 
 def _columns(query: Query) -> dict[str, Any]:
-    """Convert a query to the columns of its row. Its actions (T, F) become one vector."""
+    """Convert a query to the columns of its row. The actions (T, F) become one vector (T * F,)."""
     return {
         "kind": query.kind,
         "coordinates": query.coordinates,
@@ -145,22 +149,25 @@ def query_in(row: Row[Any]) -> dict[str, Any]:
     return {"coordinates": row.coordinates, "actions": actions, "snapshot": row.snapshot}
 
 
-# Leases expire by the database's clock alone. Their tables have columns ``expires`` and ``seconds``.
+# The functions below work for any table of leases with the columns ``expires`` and ``seconds``, by the database's
+# clock.
 
-Condition = sa.ColumnElement[bool]  # on a row of a table
+Condition = sa.ColumnElement[bool]  # SQL condition on a row of a table
 
 
 def has_ended(table: sa.Table, is_leased: Condition) -> sa.ColumnElement[bool]:
-    """Whether a lease has expired."""
+    """Return the SQL condition that a row of a table holds a lease (``is_leased``) which has expired."""
     return is_leased & (table.c.expires <= NOW)
 
 
 def is_too_long(table: sa.Table, is_leased: Condition) -> sa.ColumnElement[bool]:
-    """Whether a lease has more time left than it began with, because the database's clock was set back."""
+    """Return the SQL condition that a row holds a lease (``is_leased``) with more time left than its duration, because
+    the database's clock was set back."""
     return is_leased & (table.c.expires > NOW + table.c.seconds)
 
 
 def shorten(connection: Connection, table: sa.Table, is_leased: Condition) -> None:
-    """Shorten leases that are too long to their original duration from now, so that live callers keep their leases."""
+    """Shorten the leases of a table that have more time left than their duration, because the clock was set back, to
+    their duration from now."""
     too_long = sa.update(table).where(is_too_long(table, is_leased))
     connection.execute(too_long.values(expires=NOW + table.c.seconds))

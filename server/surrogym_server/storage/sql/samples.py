@@ -1,13 +1,13 @@
-"""Adapter of ``Samples``: they are stored once, all or nothing, and never changed.
+"""Implementation of ``Samples``: samples are stored once, all or none of a batch, and never changed.
 
-Logged samples are identified by their place in their log, and used by the design when the log is complete.
+Logged samples are identified by their position in their log, and a fit uses them when the log is complete.
 
-The digest of a log up to a sample is a hash of the digest before it and of the sample's numbers. The fingerprint of a
-logged sample holds both digests, so a sample is found by everything that came before it. A log that equals a stored one
-up to some place, and then differs from what follows there, is another log. It is stored whole, under other digests.
+The digest of a log up to a sample is a hash of the previous digest and of the sample's values. The fingerprint of a
+logged sample contains the digests before and after it, so it depends on all earlier samples of the log. A log that
+begins like a stored log and then differs is stored completely, under other digests.
 
-``logged_revision`` is the revision of the surrogate that has all of the last log. While a log is incomplete it is one
-ahead of ``revision``, so that the call that completes it makes a fit due even if it brings no new sample.
+``logged_revision`` is the revision of the surrogate with which its last log was complete. While a log is incomplete, it
+is ``revision`` + 1, so that the batch that completes the log makes a fit due even if it has no new sample.
 """
 
 from __future__ import annotations
@@ -66,10 +66,10 @@ class SqlSamples(port.Samples):
     ) -> AddedSamples:
         body = fingerprint(
             sampler, [asdict(sample) for sample in samples] if key else []
-        )  # compared with the earlier request if the idempotency key was used before
+        )  # to be compared with an earlier request with the same idempotency key
         with self._database.write() as connection:
             surrogate = hold(connection, name)
-            if log is not None:  # a sample of a log is identified by the log before it
+            if log is not None:  # logged samples are identified by their position in the log, not by a key
                 added = store_logged(connection, surrogate, sampler, samples, log.after)
                 if log.complete and added.restart is None:
                     complete_log(connection, surrogate)
@@ -129,7 +129,10 @@ def _store(
     batch: Sequence[NewSample],
     answers: Sequence[Answered | None],
 ) -> AddedSamples:
-    """Insert the new samples of the batch. A step reported under one lease is one sample."""
+    """Insert the new samples of a batch, and mark the queries that they answer.
+
+    A sample that repeats the lease and step of a stored one is a duplicate. ``answers`` has the lease of each sample.
+    """
     identities = [_identity(place, *pair) for place, pair in enumerate(zip(batch, answers, strict=True))]
     leases = [lease for lease in answers if lease]
     reported = {(lease.lease_id, step): sample for lease in leases for step, sample in lease.reported.items()}
@@ -155,12 +158,12 @@ def _store(
 
 
 def _identity(place: int, sample: NewSample, lease: Answered | None) -> Identity:
-    """Return what identifies a sample in its batch: its lease and step, or its place if it has no lease."""
+    """Return the identity of a sample in its batch: its lease and step, or its index if it has no lease."""
     return (lease.lease_id, sample.step) if lease else (None, place)
 
 
 def _raw_arrays(surrogate_id: int) -> sa.Select[Any]:
-    """Read samples in bulk, with vectors as bytes, so that no Python float is made for each coordinate."""
+    """Return the SELECT of all samples of a surrogate, with vectors as bytes, which is faster than as Python floats."""
     vectors = (samples.c.coordinates, samples.c.action, samples.c.next_coordinates)
     raw: list[Any] = [sa.type_coerce(column, sa.LargeBinary()) for column in vectors]
     statement = sa.select(*raw, samples.c.reward, samples.c.terminated, samples.c.purpose)
@@ -173,7 +176,7 @@ def _matrix(rows: Sequence[bytes]) -> Array:
 
 
 def insert_samples(connection: Connection, surrogate: Row[Any], sampler: str, rows: list[dict[str, Any]]) -> list[int]:
-    """Insert rows of samples and append the event. Returns their ids in order."""
+    """Insert rows of samples, append one event for them, and return their ids in order."""
     if not rows:
         return []
     ids = [int(id) for id in connection.execute(NEW_SAMPLES, rows).scalars()]
@@ -185,7 +188,8 @@ def insert_samples(connection: Connection, surrogate: Row[Any], sampler: str, ro
 def row_of(
     surrogate: Row[Any], sampler: str, sample: NewSample, lease: Answered | None = None, *, logged: bool = False
 ) -> dict[str, Any]:
-    """Convert a sample to a row of its table. It may be an answer under a lease, logged, or reported by hand."""
+    """Convert a sample to a row of the table of samples. The sample may answer a query (``lease``), or be
+    ``logged``."""
     purpose: SamplePurpose = "logged" if logged else "manual"
     return {
         "surrogate_id": surrogate.id,
@@ -212,10 +216,12 @@ def row_of(
 def store_logged(
     connection: Connection, surrogate: Row[Any], sampler: str, batch: Sequence[NewSample], after: str | None
 ) -> AddedSamples:
-    """Insert the new samples of one part of a log. ``after`` is the digest of the part before; None for the first.
+    """Insert the new samples of one batch of a log.
+
+    ``after`` is the digest of the log up to the previous batch; None for the first batch.
 
     Raises:
-        InvalidInput: a sample that names a query.
+        InvalidInput: a sample has a query id.
     """
     for index, sample in enumerate(batch):
         if sample.query_id is not None:
@@ -231,7 +237,7 @@ def store_logged(
         old = next((place for place, link in enumerate(links) if link not in stored_ids), len(links))
         if old == len(links) or not _continued(connection, surrogate, chain[old]):
             break
-        before = chain[old + 1]  # logs that continue in the same way from here share this digest
+        before = chain[old + 1]  # equal logs that differ from the stored one at this sample start from this digest
         if after is not None:
             return AddedSamples((), 0, restart=before)
     new = [row | {"fingerprint": link} for row, link in zip(rows[old:], links[old:], strict=True)]
@@ -242,21 +248,21 @@ def store_logged(
 
 
 def complete_log(connection: Connection, surrogate: Row[Any]) -> None:
-    """Make a fit due for the samples of a complete log."""
+    """Make a fit due for the samples of a log whose last batch was stored."""
     ahead = sa.select(surrogates.c.logged_revision > surrogates.c.revision).where(surrogates.c.id == surrogate.id)
     if connection.execute(ahead).scalar():
         touch(connection, surrogate)
 
 
 def _stored_ids(connection: Connection, surrogate: Row[Any], fingerprints: Sequence[str]) -> dict[str, int]:
-    """Return the ids of stored logged samples with these fingerprints, by fingerprint."""
+    """Return the ids of a surrogate's logged samples with these fingerprints, by fingerprint."""
     same = samples.c.fingerprint.in_(set(fingerprints))
     statement = sa.select(samples.c.fingerprint, samples.c.id).where(samples.c.surrogate_id == surrogate.id, same)
     return {row.fingerprint: row.id for row in connection.execute(statement.where(samples.c.purpose == "logged"))}
 
 
 def _continued(connection: Connection, surrogate: Row[Any], digest: str) -> bool:
-    """Whether a stored sample continues the log that has this digest."""
+    """Whether a stored log has a sample directly after the position with this digest."""
     follows = samples.c.fingerprint.startswith(f"{digest}:")
     statement = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogate.id, follows).limit(1)
     return connection.execute(statement).first() is not None

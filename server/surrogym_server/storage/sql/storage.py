@@ -1,4 +1,4 @@
-"""SqlStorage: the storage on one SQLite or PostgreSQL database, its migration, and its checks."""
+"""``SqlStorage``: the storage in a SQLite or PostgreSQL database, with migrations and checks of the database."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from surrogym_server.storage.sql.tables import metadata
 
 
 class SqlStorage(Storage):
-    """The ``Storage`` port on a SQLite or PostgreSQL database."""
+    """Implementation of ``Storage`` with a SQLite or PostgreSQL database."""
 
     def __init__(self, database: Database) -> None:
         self._database, counts = database, CountedSamples()
@@ -62,16 +62,17 @@ class SqlStorage(Storage):
 
 
 def open_storage(url: str, synchronous: Synchronous = "full") -> Storage:
-    """Open a database, and bring its schema up to date.
+    """Open a database, check it, and migrate its schema to the newest version.
 
     Args:
         url: ``sqlite:///path/to/file`` (created if it does not exist, for one server at a time) or
-            ``postgresql://user:password@host/name`` (for several).
-        synchronous: as in ``connect``.
+            ``postgresql://user:password@host/name`` (for several servers).
+        synchronous: setting of SQLite: ``full`` waits for the disk at each commit, ``normal`` may lose the last
+            commits if the power fails.
 
     Raises:
-        InvalidInput: another kind of address.
-        Unavailable: another server holds the SQLite file, PostgreSQL does not answer, or the database was written by a
+        InvalidInput: the address is of another kind.
+        Unavailable: another server uses the SQLite file, PostgreSQL does not answer, or the database was written by a
             newer program.
         Damaged: pages, tables or columns are broken or missing; the message says how to recover.
     """
@@ -87,7 +88,7 @@ def open_storage(url: str, synchronous: Synchronous = "full") -> Storage:
 
 
 def _way_out(url: str, message: str) -> str:
-    """Return advice to people about a PostgreSQL database that can't be opened."""
+    """Return what a person can do if the PostgreSQL database at ``url`` can't be opened."""
     name = sa.make_url(url).database
     if f'database "{name}" does not exist' in message:
         return f"createdb {name} makes it, or check --database"
@@ -108,15 +109,15 @@ def _bring_up(database: Database) -> None:
 
 SCRIPTS = Path(__file__).parent / "migrations"
 VERSION = sa.table("alembic_version", sa.column("version_num", sa.Text))
-MIGRATION_LOCK = 0x5355_5252  # one server migrates at a time; any number will do
+MIGRATION_LOCK = 0x5355_5252  # arbitrary number of PostgreSQL's advisory lock, so that one server migrates at a time
 
 
 def migrate(database: Database) -> None:
-    """Run the missing migrations.
+    """Run the migrations that the database's schema lacks.
 
     Raises:
         Unavailable: the database was written by a newer program, or by an unreleased one.
-        Damaged: no program has ever made its schema.
+        Damaged: the database's record of its schema version is invalid.
     """
     revisions = [script.name[1:5] for script in sorted(SCRIPTS.glob("versions/r*.py"))]
     with database.write() as connection:
@@ -128,14 +129,14 @@ def migrate(database: Database) -> None:
 
 
 def _present(connection: Connection) -> list[str]:
-    """Return the schema's revisions: one; none in a new database; several if somebody has changed the table."""
+    """Return the revisions of the database's schema: usually one, none in a new database."""
     if not sa.inspect(connection).has_table(VERSION.name):
         return []
     return list(connection.execute(sa.select(VERSION.c.version_num)).scalars())
 
 
 def _upgrade(connection: Connection) -> None:
-    from alembic import command  # not at the top: importing takes a fifteenth of a server's start
+    from alembic import command  # imported here, because the import takes a fifteenth of a server's start
     from alembic.config import Config
     from alembic.util import CommandError
 
@@ -144,16 +145,16 @@ def _upgrade(connection: Connection) -> None:
     config.set_main_option("path_separator", "os")
     try:
         command.upgrade(config, "head")
-    except CommandError as error:  # the database's record of its own schema is invalid
+    except CommandError as error:  # the table alembic_version has no valid entry
         raise damaged(error) from error
 
 
 def _take_turn(connection: Connection) -> None:
     if connection.dialect.name == "postgresql":
-        connection.execute(sa.text("SET LOCAL lock_timeout = 0"))  # another migration may take long
+        connection.execute(sa.text("SET LOCAL lock_timeout = 0"))  # wait for another migration without limit
         connection.execute(
             sa.text("SET LOCAL idle_in_transaction_session_timeout = 0")
-        )  # a migration may pause to compute
+        )  # a migration may compute for a while between two statements
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(MIGRATION_LOCK)))
 
 
@@ -174,20 +175,21 @@ def _refuse_others(present: list[str], revisions: list[str]) -> None:
 
 logger = logging.getLogger(__name__)
 
-CHECK_SECONDS = 10.0  # enough for about 25 GB that are cached in memory
+CHECK_SECONDS = 10.0  # longest check of a SQLite file; enough for about 25 GB that are cached in memory
 INDEXES_BYTES = 128 * 2**20  # largest file whose indexes are checked too; for 100 MB this takes 1.5 s instead of 0.4 s
-FRESH_SECONDS = 1.0  # lifetime of a result, so that frequent checks cause one small write a second
-PATIENCE_SECONDS = 2.0  # longest wait of a caller for a new result
+FRESH_SECONDS = 1.0  # time for which a check of readiness is reused, so that it writes at most once a second
+PATIENCE_SECONDS = 2.0  # longest wait of a caller for a check of readiness
 
 schema = sa.table("alembic_version", sa.column("version_num"))
 
 
 def check_pages(connection: Connection, seconds: float = CHECK_SECONDS) -> None:
-    """Read a SQLite file once and check its structure, for at most ``seconds``. The indexes are checked too if the file
-    has at most ``INDEXES_BYTES``. PostgreSQL checks its own files.
+    """Check the structure of a SQLite file, for at most ``seconds``. Does nothing for PostgreSQL.
+
+    The indexes are checked too if the file has at most ``INDEXES_BYTES`` bytes.
 
     Raises:
-        Damaged: names the place.
+        Damaged: the structure is broken; the message has SQLite's description.
     """
     if connection.dialect.name != "sqlite":
         return
@@ -208,8 +210,8 @@ def check_pages(connection: Connection, seconds: float = CHECK_SECONDS) -> None:
             raise
     finally:
         timer.cancel()
-        timer.join()  # otherwise it might interrupt a later statement
-    if expired.is_set():  # an interrupted check gives no reliable result
+        timer.join()  # the timer must not interrupt a later statement
+    if expired.is_set():  # the result of an interrupted check is not reliable
         logger.warning("the database is large: its check stopped after %g s, and the rest was not checked", seconds)
     elif result != "ok":
         raise damaged(" ".join(result.split()))
@@ -221,10 +223,10 @@ def _check(connection: Connection) -> str:
 
 
 def check_tables(connection: Connection) -> None:
-    """Check that every table and column exists, without reading rows.
+    """Check that all tables and columns exist, without reading rows.
 
     Raises:
-        Damaged: names what is missing.
+        Damaged: a table or column is missing; the message names it.
     """
     for table in metadata.sorted_tables:
         connection.execute(sa.select(table).limit(0))
@@ -239,8 +241,14 @@ class Readiness:
         self._probe_start = 0.0
 
     def require(self) -> None:
-        """Raise ``Unavailable`` unless all tables exist, a write was recently made durable, and no broken page was ever
-        found: data written to such a file may be lost."""
+        """Check that all tables exist, that the database accepts writes, and that no broken page was found.
+
+        The result of the last second is reused.
+
+        Raises:
+            Unavailable: the check failed, or took too long.
+            Damaged: a page of the SQLite file is broken.
+        """
         self._database.require_sound()
         probe = self._latest()
         wait([probe], PATIENCE_SECONDS)
@@ -256,7 +264,7 @@ class Readiness:
         self._thread.shutdown(wait=False)
 
     def _latest(self) -> Future[None]:
-        """Return the last check of the database, or begin a new one if that is finished and old."""
+        """Return the last check of the database, or start a new check if the last one ended a while ago."""
         with self._lock:
             now = time.monotonic()
             if self._probe is None or (self._probe.done() and now - self._probe_start >= FRESH_SECONDS):
@@ -267,5 +275,5 @@ class Readiness:
         with self._database.write() as connection:
             check_tables(connection)
             version = connection.execute(sa.select(schema.c.version_num)).scalar()
-            for value in ("", version):  # two different values, because SQLite writes nothing if nothing changes
+            for value in ("", version):  # two different values, so that SQLite really writes
                 connection.execute(sa.update(schema).values(version_num=value))

@@ -1,7 +1,7 @@
-"""Adapter of ``Surrogates``: surrogates by name, entries of their list, and their removal.
+"""Implementation of ``Surrogates``: surrogates by name, summaries for their list, and their deletion.
 
-A removal takes the name away at once; the rows go in transactions that block nobody for long. A surrogate without a
-name is one that is being removed. A removal that a crash has interrupted is completed later.
+A deletion first replaces the name, so that the surrogate is not found any more, and then removes its rows in several
+short transactions. A deletion that a crash has interrupted is completed later.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ def update_phase(connection: Connection, surrogate: Row[Any], phase: Phase, erro
 
 
 def resting_phase(round: int) -> Phase:
-    """The phase of a design that waits for samples."""
+    """Return the phase of a design that waits for samples, given the number of its rounds so far."""
     return "sampling" if round else "collecting"
 
 
@@ -174,7 +174,7 @@ def _record(row: Row[Any]) -> SurrogateRecord:
 
 
 def _insert(connection: Connection, new: NewSurrogate) -> bool:
-    """Insert a surrogate, and return whether the name was free."""
+    """Insert a surrogate unless its name is taken, and return whether it was inserted."""
     insert = conflict_insert(connection, surrogates).values(
         name=new.name,
         spec=new.spec,
@@ -201,12 +201,11 @@ def _set_or_taken_back(before: dict[str, float], changes: dict[str, float | None
 def withdraw_unbegun(
     connection: Connection, surrogate: Row[Any], before: SurrogateRecord, budget: int | None
 ) -> dict[str, Any]:
-    """Withdraw what a design planned for another target, tolerance or budget.
+    """Withdraw the adaptive queries of a design without a real step so far, and the lease of a running fit.
 
-    This is the right of a running fit, and the queries that no sampler has begun.
-
-    Steps that ``improve`` requested are requested again, unless the new ``budget`` is smaller. Initial queries beyond a
-    smaller budget are withdrawn too. Returns the fields of the surrogate that change.
+    This follows a change of target, tolerance, prior or budget. ``budget`` is the new budget if it is lower, else None.
+    With a lower budget, initial queries beyond it are withdrawn too; otherwise, steps that ``improve`` requested are
+    requested again. Returns the columns of the surrogate that the caller has to change.
     """
     unbegun = is_unbegun(surrogate.id)
     statement = sa.delete(queries).where(unbegun, queries.c.purpose == "adaptive")
@@ -228,9 +227,9 @@ def withdraw_unbegun(
 
 
 def spoken_for(connection: Connection, surrogate_id: int) -> int:
-    """Number of real steps that count towards the budget: samples, and the steps of unanswered queries.
+    """Return the number of real steps that count towards the budget: samples, and steps of unanswered queries.
 
-    Queries that were set aside count, because steps may have been taken; refused ones don't.
+    Queries that were set aside count, because steps may have been taken; refused queries don't.
     """
     sampled = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id, samples.c.purpose.not_in(FREE))
     steps = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0)).where(
@@ -258,7 +257,7 @@ SUMMARY_FIELDS = (
     "round",
     "error",
     "created_at",
-)  # columns that a summary has unchanged
+)  # fields of a summary that are columns of the table
 SUMMARY_COLUMNS = [getattr(surrogates.c, name) for name in SUMMARY_FIELDS]
 
 
@@ -270,7 +269,8 @@ ANSWERED = (
 
 
 class _Named(msgspec.Struct):
-    """The only part of a specification that a list needs; parsing all of it takes ten times as long."""
+    """The only field of a specification that the list of surrogates needs. Parsing all fields would take ten times as
+    long."""
 
     environment: str = ""
 
@@ -278,7 +278,7 @@ class _Named(msgspec.Struct):
 _NAMED = msgspec.json.Decoder(_Named)
 
 
-UNANSWERED = ("pending", "leased", "set_aside", "refused")  # statuses that an index counts
+UNANSWERED = ("pending", "leased", "set_aside", "refused")  # statuses of few queries, which are counted by an index
 OPEN_COUNTS = [
     sa.select(sa.func.count())
     .where(queries.c.surrogate_id == surrogates.c.id, queries.c.status == status)
@@ -287,23 +287,25 @@ OPEN_COUNTS = [
     for status in UNANSWERED
 ]
 NEWEST = sa.select(sa.func.max(samples.c.id)).where(samples.c.surrogate_id == surrogates.c.id).scalar_subquery()
-AT_ONCE = 1_000  # most surrogates that one statement reads
+AT_ONCE = 1_000  # largest number of surrogates that one statement reads
 
 
 class Counted:
-    """Numbers of samples and answered queries, kept in memory.
+    """Cache of the numbers of samples and of answered queries of each surrogate.
 
-    They change only in a transaction that adds a sample. So the number of answered queries holds as long as the newest
+    Both change only in transactions that add a sample. So a number of answered queries is valid as long as the newest
     sample is the same.
     """
 
     def __init__(self, samples: CountedSamples) -> None:
         self._samples = samples
-        self._answers: dict[int, tuple[int | None, int]] = {}  # by surrogate: its newest sample's id, and the number
+        self._answers: dict[int, tuple[int | None, int]] = {}  # id of the newest sample, and number of answered queries
 
     def read(self, connection: Connection, newest: Mapping[int, int | None]) -> dict[int, tuple[SampleCounts, int]]:
-        """Return the numbers of samples and answered queries of each surrogate, given the id of its newest sample,
-        which was read before."""
+        """Return the numbers of samples and of answered queries of each surrogate, by surrogate id.
+
+        ``newest`` has the id of each surrogate's newest sample.
+        """
         counts = self._samples.of_many(connection, newest)
         stale = [id for id in newest if self._answers.get(id, (-1, 0))[0] != newest[id]]
         for first in range(0, len(stale), AT_ONCE):
@@ -321,7 +323,10 @@ class Counted:
 def read_summaries(
     connection: Connection, condition: sa.ColumnElement[bool], limit: int | None, counts: Counted
 ) -> list[SurrogateSummary]:
-    """Up to ``limit`` surrogates that meet a condition, oldest first. The condition must choose a range of ids."""
+    """Return summaries of up to ``limit`` surrogates that meet an SQL condition, oldest first.
+
+    The condition must select a contiguous range of ids.
+    """
     statement = (
         sa.select(*SUMMARY_COLUMNS, sa.type_coerce(surrogates.c.spec, sa.Text), NEWEST, *OPEN_COUNTS)
         .where(condition)
@@ -352,12 +357,13 @@ def _environment(spec: str) -> str:
         raise damaged(f"expected JSON in surrogates.spec, got {reprlib.repr(spec)}: {error}") from error
 
 
-LARGE = {models: 8, policies: 8}  # tables whose rows have many bytes, or further rows
+LARGE = {models: 8, policies: 8}  # tables with large rows, and the number of rows to remove in one transaction
 NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None, "fit_seconds": None}
 
 
 def _take_name(connection: Connection, name: str) -> int:
-    """Take the name from a surrogate, so that nobody finds it, and return its id. Raises ``UnknownSurrogate``."""
+    """Replace the name of a surrogate to be deleted, so that it is not found any more, and return its id. Raises
+    ``UnknownSurrogate``."""
     id = int(hold(connection, name).id)
     for table in metadata.tables.values():
         if AT_ONCE in table.info:
@@ -368,13 +374,13 @@ def _take_name(connection: Connection, name: str) -> int:
 
 
 def _interrupted(connection: Connection) -> list[int]:
-    """Ids of the surrogates whose removal is not complete: they have no name any more."""
+    """Return the ids of deleted surrogates whose rows are not all removed."""
     return [*connection.execute(NAMELESS).scalars()]
 
 
 def _remove(database: Database, id: int) -> None:
-    """Remove a surrogate that has no name any more, with its rows. A repeat is harmless."""
-    for table in reversed(metadata.sorted_tables):  # referring rows are removed before the rows that they refer to
+    """Remove all rows of a deleted surrogate, given its id. A repeat does nothing."""
+    for table in reversed(metadata.sorted_tables):  # rows with a foreign key come before the rows they refer to
         if "surrogate_id" in table.c:
             database.write_in_batches(partial(_remove_some, table, id))
     with database.write() as connection:

@@ -1,7 +1,7 @@
-"""The tables. Vectors are little-endian float64 bytes, so that they are read back bit for bit; JSON is text.
+"""The tables of the database. Vectors are little-endian float64 bytes, which keeps all bits; JSON is text.
 
-Rows of a surrogate are deleted with it (``ON DELETE CASCADE``). Ids are never used twice. A feature
-defines its tables in its own folder, on the same ``metadata``.
+Rows of a surrogate are deleted with it (``ON DELETE CASCADE``). Ids are never used twice. An optional feature defines
+its tables in its own folder, with the same ``metadata``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ metadata = sa.MetaData(
     }
 )
 
-AT_ONCE = "at once"  # mark in the ``info`` of tables whose rows are removed together with the surrogate's name
+AT_ONCE = "at once"  # key in the ``info`` of tables whose rows are removed in the first transaction of a deletion
 
 Id = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
 
@@ -55,7 +55,7 @@ class Floats(sa.types.TypeDecorator[Vector]):
 
 
 class Json(sa.types.TypeDecorator[Any]):
-    """Column type of any JSON value; ``place`` names table and column in errors."""
+    """Column type of any JSON value, stored as text. ``place`` is the name of table and column for error messages."""
 
     impl = sa.Text
     cache_ok = True
@@ -75,7 +75,9 @@ class Json(sa.types.TypeDecorator[Any]):
 
 
 class Word(sa.types.TypeDecorator[str]):
-    """Column type of one of the words of a ``Literal``; ``place`` names table and column in errors."""
+    """Column type of text that is one of the words of a ``Literal``. ``place`` is the name of table and column for
+    error
+    messages."""
 
     impl = sa.Text
     cache_ok = True
@@ -100,9 +102,9 @@ PLAIN: dict[type[sa.types.TypeEngine[Any]], tuple[str, tuple[type, ...]]] = {
 
 
 class Checked(sa.types.TypeDecorator[Any]):
-    """Column type of numbers or text, which checks the type of each value that it reads.
+    """Column type of numbers or text that checks the type of each value when it is read.
 
-    SQLite stores any value in any column, so a damaged file may hold a value of another type.
+    SQLite stores values of any type in any column, so a damaged file may contain a value of a wrong type.
     """
 
     impl = sa.Text
@@ -121,9 +123,10 @@ class Checked(sa.types.TypeDecorator[Any]):
 
 
 def checked(table: sa.Table) -> sa.Table:
-    """Let a table's columns of plain SQL types check the values that they read (see ``Checked``), and return the table.
-    ``Floats``, ``Json`` and ``Word`` check their values by themselves. Ids are not checked, because they only refer to
-    rows."""
+    """Replace the types of a table's plain columns by ``Checked``, so that values are checked when they are read.
+
+    Returns the table. Columns of ids are not checked. ``Floats``, ``Json`` and ``Word`` check their values themselves.
+    """
     for column in table.columns:
         if type(column.type) in PLAIN and column.type is not Id:
             column.type = Checked(f"{table.name}.{column.name}", column.type)
@@ -131,12 +134,12 @@ def checked(table: sa.Table) -> sa.Table:
 
 
 def row_id() -> sa.Column[int]:
-    """Return the column of a row's id, the primary key."""
+    """Return the column ``id`` of a table, its primary key."""
     return sa.Column("id", Id, primary_key=True, autoincrement=True)
 
 
 def owner(**options: Any) -> sa.Column[int]:
-    """Return the column with the id of a row's surrogate. Rows are deleted with their surrogate."""
+    """Return the column ``surrogate_id`` of a table, a foreign key. Rows are deleted with their surrogate."""
     key = sa.ForeignKey("surrogates.id", ondelete="CASCADE")
     return sa.Column("surrogate_id", Id, key, nullable=False, **options)
 
@@ -161,12 +164,12 @@ surrogates = sa.Table(
     sa.Column("fitted_revision", sa.BigInteger, nullable=False),  # revision at the last fit
     sa.Column(
         "logged_revision", sa.BigInteger, nullable=False, server_default="0"
-    ),  # revision from which on the last log is complete
+    ),  # revision with which the last log was complete
     sa.Column("fit_token", sa.Text),
     sa.Column("fit_owner", sa.Text),
     sa.Column("fit_expires", sa.Double),
-    sa.Column("fit_seconds", sa.Double),  # duration of the last right to fit
-    sa.Column("policy_versions", sa.Integer, nullable=False, server_default="0"),  # number of versions ever used
+    sa.Column("fit_seconds", sa.Double),  # duration of the last lease of a fit
+    sa.Column("policy_versions", sa.Integer, nullable=False, server_default="0"),  # number of policy versions ever used
     sa.Column("created_at", sa.Double, nullable=False),
     sqlite_autoincrement=True,
 )
@@ -181,10 +184,10 @@ queries = sa.Table(
     sa.Column("round", sa.Integer, nullable=False),
     sa.Column("kind", Word("queries.kind", QueryKind), nullable=False, server_default="step"),
     sa.Column("coordinates", Floats, nullable=False),  # empty for a rollout
-    sa.Column("action", Floats, nullable=False),  # all actions, one after the other
+    sa.Column("action", Floats, nullable=False),  # all actions of a rollout, concatenated
     sa.Column("steps", sa.Integer, nullable=False, server_default="1"),
-    sa.Column("snapshot", sa.Text),  # where a rollout begins; NULL: at a reset
-    sa.Column("extra", sa.Boolean, nullable=False, server_default=sa.false()),  # requested by ``improve``
+    sa.Column("snapshot", sa.Text),  # name of the snapshot at which a rollout begins; NULL: a reset
+    sa.Column("extra", sa.Boolean, nullable=False, server_default=sa.false()),  # chosen only because of ``improve``
     sa.Column("attempts", sa.Integer, nullable=False),
     sa.Column("sampler", sa.Text),
     sa.Column("error", sa.Text),
@@ -244,7 +247,7 @@ samples = sa.Table(
     sqlite_autoincrement=True,
 )
 
-snapshots = sa.Table(  # snapshots that samplers keep
+snapshots = sa.Table(  # names and coordinates of snapshots that samplers hold
     "snapshots",
     metadata,
     row_id(),
@@ -267,7 +270,7 @@ evaluations = sa.Table(
     sqlite_autoincrement=True,
 )
 
-requests = sa.Table(  # what an idempotency key was used for, and what it returned
+requests = sa.Table(  # results of requests by idempotency key
     "requests",
     metadata,
     owner(primary_key=True),
@@ -290,10 +293,10 @@ models = sa.Table(
     sa.Column("fit_seconds", sa.Double, nullable=False),
     sa.Column("blob", sa.LargeBinary, nullable=False),
     sa.Column("checksum", sa.Text, nullable=False, server_default=""),  # SHA-256 of the blob
-    sa.Column("damage", sa.Text),  # description of the damage; NULL: none was found
+    sa.Column("damage", sa.Text),  # description of damage that was found; NULL: none
 )
 
-priors = sa.Table(  # what is known of a surrogate's environment beforehand; NULL: the design waits for it
+priors = sa.Table(  # prior model of a surrogate; if its blob is NULL, the design waits for it
     "priors",
     metadata,
     owner(primary_key=True),
@@ -349,7 +352,7 @@ policies = sa.Table(
 
 
 def policy_key() -> sa.ForeignKeyConstraint:
-    """Return the key to a row's policy. Rows are deleted with their policy."""
+    """Return the foreign key of a table to the policy of a row. Rows are deleted with their policy."""
     columns = ["surrogate_id", "version"]
     return sa.ForeignKeyConstraint(columns, [f"policies.{name}" for name in columns], ondelete="CASCADE")
 
@@ -373,7 +376,7 @@ policy_evaluations = sa.Table(
     sa.Column("created_at", sa.Double, nullable=False),
     sa.Column("summary", Json("policy_evaluations.summary"), nullable=False),
     sa.Column("bytes", sa.BigInteger, nullable=False),
-    sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of its episodes
+    sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of the file of episodes
     sa.Column("blob", sa.Text),  # NULL: no file is stored
     sa.UniqueConstraint("surrogate_id", "version", "key"),
     policy_key(),

@@ -1,1 +1,1 @@
-"""Alembic's scripts; ``surrogym_server.storage.sql.migrate`` runs them."""
+"""Migrations of the database's schema as Alembic scripts, which ``storage.sql.storage.migrate`` runs."""

@@ -1,4 +1,4 @@
-"""The script Alembic executes for every command; the connection comes from ``migrate``."""
+"""Script that Alembic executes for each command. The function ``migrate`` passes the connection."""
 
 from alembic import context
 

@@ -1,1 +1,1 @@
-"""Migrations of the schema, a file each. A migration never changes after its release."""
+"""Migrations of the schema, one file each. A released migration must never change."""
