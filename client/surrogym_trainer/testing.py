@@ -28,7 +28,7 @@ OBSERVATIONS = 200
 
 
 class LawBroken(AssertionError):
-    """A policy search breaks an invariant. The message says what was expected and what the search did."""
+    """A policy search breaks an invariant; the message says what was expected and what the search did."""
 
 
 def same_seed_gives_same_policy(port: SurrogatePort, settings: TrainSettings, folder: Path) -> None:
@@ -59,7 +59,7 @@ def interruption_keeps_the_policy(port: SurrogatePort, settings: TrainSettings, 
     watched, out = _Watched(port), folder / "policy.zip"
     try:
         train(watched, out, settings, _interrupt)
-        raise LawBroken("expected a search to end on Ctrl-C, got one that came to its end")
+        raise LawBroken("expected the search to stop on Ctrl-C, got one that continued to its end")
     except TrainingInterrupted as interruption:
         _actions(port, interruption.result)
     except KeyboardInterrupt:
@@ -85,7 +85,7 @@ def unknown_hyperparameters_are_refused(port: SurrogatePort, settings: TrainSett
     except ValueError as error:
         _require("no_such_hyperparameter" in str(error), "an error that names the hyperparameter", str(error))
     else:
-        raise LawBroken("expected ValueError for an unknown hyperparameter, got a policy")
+        raise LawBroken("expected ValueError for an unknown hyperparameter, got a trained policy")
     _require(not list(folder.iterdir()), "no file", sorted(path.name for path in folder.iterdir()))
 
 
@@ -100,7 +100,7 @@ def start_is_taken_or_refused(port: SurrogatePort, settings: TrainSettings, fold
         train(port, folder / "policy.zip", resumed)
     except ValueError:
         return
-    raise LawBroken("expected ValueError for a policy to start from, got a policy")
+    raise LawBroken("expected ValueError for start_from, as the search is not resumable, got a trained policy")
 
 
 def policy_is_read_without_trust(port: SurrogatePort, settings: TrainSettings, folder: Path) -> None:
@@ -123,11 +123,11 @@ POLICY_SEARCH_LAWS = (
 
 
 class _Failure(Exception):
-    """Error that the check's own progress callback raises."""
+    """The error that the check's own progress callback raises."""
 
 
 class _Watched:
-    """A port that records which sessions are open."""
+    """A port that passes all calls on, and records which sessions are open."""
 
     def __init__(self, port: SurrogatePort) -> None:
         self._port = port
@@ -150,7 +150,7 @@ class _Watched:
 
 
 def _actions(port: SurrogatePort, result: TrainResult) -> NDArray[np.float64]:
-    """Return actions (OBSERVATIONS, F) of a policy file, each within the action space."""
+    """Return the actions (OBSERVATIONS, F) of a policy file for random observations."""
     spec = port.spec()
     rng = np.random.default_rng(0)
     observations = rng.normal(size=(OBSERVATIONS, len(spec.observation))).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Figures of real episodes, and of predictions with measurements. Lines have different strokes, so that they can be
+"""Figures of real episodes, and of predictions with measurements. Their lines differ in stroke, so that they can be
 distinguished in black and white."""
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TURN = 2 * np.pi
 
 
 class Stroke(NamedTuple):
-    """How a line is drawn."""
+    """The look of a line: colour, style and width."""
 
     colour: str
     style: str
@@ -31,7 +31,7 @@ STROKES = (Stroke("black", "-", 1.6), Stroke("#2457c5", "--", 1.4), Stroke("#b32
 
 
 class Range(NamedTuple):
-    """A number with its interval, of one kind of episodes."""
+    """A mean return of one kind of episodes, with its interval."""
 
     label: str
     value: float
@@ -40,9 +40,10 @@ class Range(NamedTuple):
 
 
 def draw_episodes(spec: EnvironmentSpec, shown: Sequence[tuple[str, EpisodeTrace]], meet: Meet = "end") -> Figure:
-    """Coordinates and actions over the steps, one line for each of at most three episodes.
+    """Draw coordinates and actions over the steps, one line for each of at most three episodes.
 
-    Full turns of an angle are counted. At the step ``meet`` the lines are as near to each other as full turns allow.
+    Angles are drawn without jumps. At the step ``meet`` (the first or the last), the lines of an angle are shifted by
+    full turns to be as near to each other as possible.
     """
     actions = len(shown[0][1].action[0]) if shown[0][1].action else 0
     labels = [
@@ -69,14 +70,14 @@ def draw_episodes(spec: EnvironmentSpec, shown: Sequence[tuple[str, EpisodeTrace
 
 
 def turns(spec: EnvironmentSpec) -> str:
-    """How angles are drawn, in a sentence; empty without an angle."""
+    """Return a sentence about how angles are drawn; empty if there is no angle."""
     if all(coordinate.kind != "angle" for coordinate in spec.coordinates):
         return ""
     return "Angles are drawn without a jump after a full turn: values that are 6.28 rad apart are the same position."
 
 
 def draw_ranges(ranges: Sequence[Range], label: str) -> Figure:
-    """Draw numbers with their intervals below each other, on one axis."""
+    """Draw numbers with their intervals one below the other, on one axis."""
     figure = Figure(figsize=(1.5 * WIDTH, 0.55 * len(ranges) + 0.9), layout="constrained")
     axes = figure.add_subplot()
     places = list(range(len(ranges)))[::-1]
@@ -92,7 +93,8 @@ def draw_ranges(ranges: Sequence[Range], label: str) -> Figure:
 
 
 def unbroken(coordinate: Coordinate, values: Array, meet: Meet, to: float) -> Array:
-    """Values (n,) of a coordinate, for an angle without jumps from pi to -pi, and nearest to ``to`` where they meet."""
+    """Return the values (n,) of a coordinate; an angle without jumps from pi to -pi, and at the step ``meet`` as near
+    to ``to`` as full turns allow."""
     if coordinate.kind != "angle":
         return values
     turned = np.unwrap(values)
@@ -102,5 +104,5 @@ def unbroken(coordinate: Coordinate, values: Array, meet: Meet, to: float) -> Ar
 
 
 def _place(meet: Meet) -> int:
-    """Number of the step, as an index."""
+    """Return the index of the step at which lines meet."""
     return 0 if meet == "start" else -1

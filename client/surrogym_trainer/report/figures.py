@@ -1,4 +1,5 @@
-"""Figures of a surrogate: the certainty of each model, the uncertainty of the latest, and the starts of real steps."""
+"""Figures of a surrogate: the certainty of each model, the uncertainty of the latest one, and the starts of
+real steps."""
 
 from __future__ import annotations
 
@@ -21,14 +22,15 @@ from surrogym_trainer.report.coverage import Coverage, columns_shown
 from surrogym_trainer.report.maps import Cut, pairs
 
 COLOURS = {"logged": "#8c8c8c", "initial": "#4c72b0", "adaptive": "#dd8452", "manual": "#55a868", "audit": "#c44e52"}
-WIDTH = 6.0  # inches
-SMALLEST = 1e-9  # of what is drawn on a logarithmic axis
-DECADES = 6  # of the index: smaller shares of its highest value are not drawn
+WIDTH = 6.0  # width of a figure in inches
+SMALLEST = 1e-9  # smallest value that is drawn on a logarithmic axis
+DECADES = 6  # powers of ten below the largest index that are drawn
 LOG_10 = math.log(10)
 
 
 def draw_fidelity(models: Sequence[ModelView], target: float) -> Figure:
-    """Confidence index of every output, and its leave-one-out error in tolerances, against the real samples."""
+    """Draw the confidence index of every output, and its leave-one-out error in tolerances, against the number of real
+    samples."""
     figure = Figure(figsize=(WIDTH, WIDTH), layout="constrained")
     sure, wrong = figure.subplots(2, 1, sharex=True)
     names = [output.name for output in models[-1].fidelity.outputs] if models else []
@@ -47,13 +49,14 @@ def draw_fidelity(models: Sequence[ModelView], target: float) -> Figure:
 
 
 def _in_tolerances(output: OutputFidelity) -> float:
-    """Leave-one-out error; NaN, which is not drawn, if the family of models can't compute it."""
+    """Return the leave-one-out error of an output in tolerances; NaN, which is not drawn, if the family of models can't
+    compute it."""
     error = output.leave_one_out_error
     return math.nan if error is None else max(error / output.tolerance, SMALLEST)
 
 
 def draw_samples(view: SurrogateView, samples: Sequence[SampleView]) -> Figure:
-    """Draw where the real steps began, two coordinates in each picture."""
+    """Draw the states in which the real steps began, two coordinates in each picture."""
     coordinates, shown = view.spec.coordinates, pairs(view.spec)
     figure = Figure(figsize=(WIDTH, 0.8 * WIDTH * len(shown)), layout="constrained")
     for n, (i, j) in enumerate(shown):
@@ -72,7 +75,7 @@ def draw_samples(view: SurrogateView, samples: Sequence[SampleView]) -> Figure:
 
 
 def draw_coverage(coverage: Coverage) -> Figure:
-    """Draw how often a log visited each cell of two columns; unvisited cells are white."""
+    """Draw how often a log visited each cell of two columns; cells without steps are white."""
     shown = columns_shown(coverage.names)
     figure = Figure(figsize=(WIDTH, WIDTH), layout="constrained")
     grid = figure.subplots(len(shown) - 1, len(shown) - 1, squeeze=False)
@@ -104,7 +107,7 @@ def draw_coverage(coverage: Coverage) -> Figure:
 
 
 def draw_maps(view: SurrogateView, cuts: Sequence[Cut]) -> Figure:
-    """Uncertainty, occupancy and index over two coordinates, a row for each cut."""
+    """Draw uncertainty, occupancy and the design's index over two coordinates, one row for each cut."""
     figure = Figure(figsize=(1.5 * WIDTH, 0.45 * WIDTH * len(cuts)), layout="constrained")
     rows = figure.subplots(len(cuts), 3, squeeze=False)
     for row, cut in zip(rows, cuts, strict=True):
@@ -124,12 +127,12 @@ def draw_maps(view: SurrogateView, cuts: Sequence[Cut]) -> Figure:
 
 
 def with_unit(coordinate: Coordinate) -> str:
-    """The name of a coordinate's axis."""
+    """Return the label of a coordinate's axis: its name, with the unit if it has one."""
     return f"{coordinate.name} ({coordinate.unit})" if coordinate.unit else coordinate.name
 
 
 def svg(figure: Figure) -> str:
-    """The figure as an SVG element; the same figure gives the same text."""
+    """Return a figure as the text of an SVG element; equal figures give equal texts."""
     text = StringIO()
     with matplotlib.rc_context({"svg.hashsalt": "surrogym", "svg.fonttype": "path"}):
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})

@@ -18,7 +18,7 @@ class NoPdf(SurrogymClientError):
 
 
 def write(out: Path, page: str) -> int:
-    """Write a page in the format of the file's ending. Returns the size in bytes.
+    """Write a page in the format of the file's ending, and return the size in bytes.
 
     Raises:
         NoPdf: Chromium is not installed, or it failed; nothing was written.
@@ -31,7 +31,7 @@ def write(out: Path, page: str) -> int:
 
 
 def as_pdf(page: str) -> bytes:
-    """A page printed by a headless Chromium. Raises ``NoPdf``."""
+    """Return a page as PDF, printed by a headless Chromium. Raises ``NoPdf`` if it is not installed or fails."""
     browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if browser is None:
         raise NoPdf("a PDF needs Chromium, which is not installed; --out report.html needs nothing")

@@ -1,5 +1,5 @@
-"""HTML that loads nothing: pictures are embedded, the one style sheet is allowed by its hash, and there is no
-script."""
+"""HTML of the report, which loads nothing: pictures are embedded, the style sheet is allowed by its hash, and there is
+no script."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pre { overflow-x: auto; font-size: 0.85em; }
 
 
 def document(title: str, body: str) -> str:
-    """Build a page that loads nothing: pictures are embedded, the style sheet is allowed by its hash, and there is no
+    """Return a page that loads nothing: pictures are embedded, the style sheet is allowed by its hash, and there is no
     script."""
     digest = base64.b64encode(hashlib.sha256(STYLE.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; media-src data:; style-src 'sha256-{digest}'"
@@ -43,12 +43,12 @@ def document(title: str, body: str) -> str:
 
 
 def paragraph(text: str, kind: str = "") -> str:
-    """Plain text as a paragraph, with a class of the style sheet."""
+    """Return plain text as a paragraph in HTML, with a class ``kind`` of the style sheet."""
     return f'<p class="{kind}">{escape(text)}</p>' if kind else f"<p>{escape(text)}</p>"
 
 
 def bullets(items: Iterable[str]) -> str:
-    """Plain texts as a list."""
+    """Return plain texts as a list in HTML."""
     return f"<ul>{''.join(f'<li>{escape(item)}</li>' for item in items)}</ul>"
 
 
@@ -61,7 +61,7 @@ def picture(image: str, alt: str) -> str:
 
 
 def moving(kind: str, content: bytes, alt: str) -> str:
-    """Return HTML that embeds a video or an animated picture in the page. ``kind`` is its media type."""
+    """Return HTML that embeds a video or an animated picture in the page; ``kind`` is its media type."""
     source = f"data:{kind};base64,{base64.b64encode(content).decode()}"
     if kind.startswith("image/"):
         return f'<img alt="{escape(alt)}" src="{source}">'
@@ -69,7 +69,7 @@ def moving(kind: str, content: bytes, alt: str) -> str:
 
 
 def on_screen(content: str) -> str:
-    """Content that is left out where the page is printed."""
+    """Return HTML content that is hidden when the page is printed."""
     return f'<div class="moving">{content}</div>'
 
 

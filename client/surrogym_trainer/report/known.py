@@ -1,4 +1,4 @@
-"""The data of a report: everything that a server knows of a surrogate and of one of its policies."""
+"""The data of a report: everything that a server knows about a surrogate and about one of its policies."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from surrogym_trainer.report.maps import Cut, cuts
 
 PREFERRED = "production"
 VIDEOS: dict[PolicyForm, str] = {"mp4": "video/mp4", "gif": "image/gif"}
-MOST_VIDEO_BYTES = 8 * 1024 * 1024  # inside a report
+MOST_VIDEO_BYTES = 8 * 1024 * 1024  # largest size of a video that is embedded in a report
 
 
 @dataclass(frozen=True)
@@ -38,14 +38,14 @@ class Known:
         view: the surrogate.
         models: all fits, oldest first.
         samples: all real steps.
-        server: its address and version.
+        server: the server's address and version.
         policy: the policy of the report; None if there is none.
         real: its newest real episodes in the surrogate's own environment from the declared starts.
         without: real episodes without the policy, from the same starts.
         reference: real episodes of a reference controller, from the same starts.
-        video: its form and content, as a browser plays it; None: there is none.
+        video: media type and content of the policy's video; None if there is none.
         others: the other versions of the surrogate's policies.
-        check: of the policy's deployed controller; None: there is none.
+        check: check of the policy's deployed controller; None if there is none.
         missing: sentences about what could not be read.
     """
 
@@ -64,12 +64,12 @@ class Known:
 
 
 def collect(api: Api, name: str, which: str | None = None, controller: Path | None = None) -> Known:
-    """Collect the data of a report. It names data that can't be read.
+    """Collect the data of a report; what can't be read is listed in ``missing``.
 
     Args:
-        api: the server.
-        name: of the surrogate.
-        which: version or alias of the policy. None: the one in production, otherwise the newest.
+        api: the connection to the server.
+        name: name of the surrogate.
+        which: version or alias of the policy. None takes the one in production, or else the newest.
         controller: folder of the policy's deployed controller, with its check.
 
     Raises:
@@ -81,7 +81,9 @@ def collect(api: Api, name: str, which: str | None = None, controller: Path | No
     policy, missing = _policy(api, name, which), list[str]()
     if policy is None:
         if controller is not None:
-            raise UnusableCheck(f"expected a stored policy of {name!r} for the check in {controller}, got none")
+            raise UnusableCheck(
+                f"expected a stored policy of surrogate {name!r} for the check in {controller}, got none: push it first"
+            )
         return Known(view, models, samples, server)
     check = None
     if controller is not None:
@@ -103,7 +105,8 @@ def collect(api: Api, name: str, which: str | None = None, controller: Path | No
 
 
 def with_whole_traces(detail: EvaluationDetail, spec: EnvironmentSpec, missing: list[str]) -> EvaluationDetail:
-    """Leave out the traces that don't have the shape of this specification. Earlier servers took them."""
+    """Return an evaluation without the traces that don't have the shape of this specification, which earlier servers
+    accepted. The number of those is added to ``missing``."""
     whole = [
         trace
         for trace in detail.traces
@@ -117,7 +120,8 @@ def with_whole_traces(detail: EvaluationDetail, spec: EnvironmentSpec, missing: 
 
 
 def _video(api: Api, name: str, policy: PolicyDetail) -> tuple[tuple[str, bytes] | None, list[str]]:
-    """The video of a policy, and a sentence about each one that could not be read."""
+    """Return media type and content of a policy's video, or None, and a sentence about each video that could not be
+    read."""
     missing = []
     for form, kind in VIDEOS.items():
         file = next((one for one in policy.files if one.form == form), None)
@@ -139,7 +143,7 @@ def _video(api: Api, name: str, policy: PolicyDetail) -> tuple[tuple[str, bytes]
 
 
 def cuts_of(api: Api, known: Known) -> tuple[list[Cut], str]:
-    """The latest model's maps over two coordinates, or the reason why there are none."""
+    """Return the latest model's maps over two coordinates, and an empty text; or no maps, and the reason."""
     try:
         return cuts(known.view, partial(api.query_uncertainty, known.view.name)), ""
     except NotInstalled as error:
@@ -147,19 +151,21 @@ def cuts_of(api: Api, known: Known) -> tuple[list[Cut], str]:
 
 
 def chosen_real(policy: PolicyView) -> EvaluationView | None:
-    """The newest evaluation of the policy in the surrogate's own environment: from the declared starts, or else from
-    others."""
+    """Return the newest evaluation of the policy in the surrogate's own environment: from the declared starts, or else
+    from other ones; None if there is none."""
     own = [one for one in policy.evaluations if one.controller == "policy" and one.own]
     return next((one for one in reversed(own) if one.declared), own[-1] if own else None)
 
 
 def chosen_without(policy: PolicyDetail, real: EvaluationView | None) -> EvaluationView | None:
-    """The newest evaluation without the policy in the same environment that has the same starts."""
+    """Return the newest evaluation without the policy, in the same environment and from the same starts; None if there
+    is none."""
     return _beside(policy, real, ("zero", "random"))
 
 
 def chosen_reference(policy: PolicyDetail, real: EvaluationView | None) -> EvaluationView | None:
-    """The newest evaluation of a reference controller in the same environment that has the same starts."""
+    """Return the newest evaluation of a reference controller, in the same environment and from the same starts; None if
+    there is none."""
     return _beside(policy, real, ("reference",))
 
 

@@ -1,5 +1,4 @@
-"""Maps of a model over two coordinates, with the others and the action in the middle of their ranges, like the server's
-page without its sliders.
+"""Maps of a model over two coordinates. The other coordinates and the action are in the middle of their ranges.
 
 Shapes: S cells along a side.
 """
@@ -16,30 +15,32 @@ from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 from surrogym_shared.wire import SurrogateView, Uncertainty
 
 Array = NDArray[np.float64]
-Ask = Callable[[list[list[float]], list[list[float]]], Uncertainty]  # of coordinates (n, C) and action (n, F)
+# Returns the model's uncertainty at coordinates (n, C) and actions (n, F).
+Ask = Callable[[list[list[float]], list[list[float]]], Uncertainty]
 
 SIDE = 33
 
 
 @dataclass(frozen=True)
 class Cut:
-    """A map over coordinates ``across`` and ``up``, given by their numbers; the largest value over the outputs."""
+    """A map over the coordinates with the indices ``across`` and ``up``. Each value is the largest over the outputs."""
 
     across: int
     up: int
-    uncertainty: Array  # (S, S), in tolerances; rows go up
+    uncertainty: Array  # (S, S), in tolerances; the rows go upwards
     occupancy: Array  # (S, S)
-    log_index: Array  # (S, S), natural logarithm
+    log_index: Array  # (S, S) natural logarithm of the design's index
 
 
 def pairs(spec: EnvironmentSpec) -> list[tuple[int, int]]:
-    """Numbers of coordinates to show together: each once. If one is left over, it is paired with itself."""
+    """Return the indices of coordinates to show together, each coordinate once. If one is left over, it is paired with
+    itself."""
     last = len(spec.coordinates) - 1
     return [(i, min(i + 1, last)) for i in range(0, last + 1, 2)]
 
 
 def cuts(view: SurrogateView, ask: Ask) -> list[Cut]:
-    """A map for each pair of coordinates; none without a model."""
+    """Return a map for each pair of coordinates; none if there is no model. ``ask`` returns the model's uncertainty."""
     if view.fidelity is None:
         return []
     tolerances = np.array([output.tolerance for output in view.fidelity.outputs])
@@ -62,7 +63,7 @@ def _cut(spec: EnvironmentSpec, across: int, up: int, tolerances: Array, ask: As
 
 
 def _middle(spec: EnvironmentSpec) -> Array:
-    """An action (F,): the middle of a box, or the first of the choices."""
+    """Return an action (F,): the middle of the bounds, or zeros if the actions are discrete."""
     action = spec.action
     if not isinstance(action, BoxAction):
         return np.zeros(action.size)

@@ -1,4 +1,4 @@
-"""The page of the report: embedded pictures, tables, and a content security policy that lets it load nothing."""
+"""The page of the report: embedded pictures, tables, and a content security policy by which it loads nothing."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ PHASES: dict[Phase, str] = {
 
 
 def page(known: Known, cuts: Sequence[Cut] = ()) -> str:
-    """The whole page of a surrogate, HTML in one file: first the part for decisions, then the details.
+    """Return the page of a surrogate as HTML in one file: first the part for decisions, then the details.
 
     Args:
-        known: what the server knows of the surrogate and of one of its policies.
+        known: what the server knows about the surrogate and about one of its policies.
         cuts: the latest model's maps over two coordinates.
     """
     view, now = known.view, datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
@@ -88,7 +88,7 @@ def _details(known: Known, cuts: Sequence[Cut]) -> list[str]:
 
 
 def _covered(view: SurrogateView, samples: Sequence[SampleView]) -> str:
-    """The coverage of the log; nothing without logged steps."""
+    """Return the coverage of the log as HTML; empty if there are no logged steps."""
     logged = [sample for sample in samples if sample.purpose == "logged"]
     if not logged:
         return ""
@@ -126,7 +126,8 @@ def _fidelity(view: SurrogateView, models: Sequence[ModelView]) -> str:
 
 
 def _predicted(outputs: Sequence[OutputFidelity]) -> str:
-    """The table of samples that were predicted before the model learned from them; nothing without any."""
+    """Return the table of samples that were predicted before the model learned from them, as HTML; empty if there are
+    none."""
     scored = [{"name": o.name, **o.prequential.model_dump()} for o in outputs if o.prequential is not None]
     said = "New samples, predicted before the model learned from them: shares in intervals, or within the tolerance"
     return table(tuple(PREQUENTIAL), [[one[f] for f in PREQUENTIAL.values()] for one in scored], said) if scored else ""
@@ -170,7 +171,7 @@ def _structure(model: ModelView, spec: EnvironmentSpec) -> str:
 
 
 def _without_angles(described: Any) -> Any:
-    """Replace the encoding of angles in the names of input maps, for an environment that has none."""
+    """Return a description whose input maps are not called ``cos_sin``, for an environment without angles."""
     if isinstance(described, str):
         return described.replace("cos_sin", "coordinates")
     if isinstance(described, dict):

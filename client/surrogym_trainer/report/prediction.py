@@ -1,4 +1,4 @@
-"""Comparison of the predicted return with the real one."""
+"""The section of the report that compares the predicted return with the real one."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from surrogym_trainer.report.wording import number
 
 
 class Outcome(NamedTuple):
-    """Result of a prediction.
+    """The result of comparing a prediction with reality.
 
-    ``verdict`` is ``better`` or ``worse`` if the interval of the real average lies beyond the predicted one,
-    ``perhaps worse`` if only the real average itself lies below, and ``as predicted`` otherwise. ``beyond`` is the
-    distance of the real average from the predicted interval.
+    Attributes:
+        verdict: ``better`` or ``worse`` if the interval of the real average lies beyond the predicted one, ``perhaps
+            worse`` if only the real average itself lies below, and ``as predicted`` otherwise.
+        beyond: distance of the real average from the predicted interval.
     """
 
     verdict: Literal["as predicted", "better", "worse", "perhaps worse"]
@@ -27,7 +28,8 @@ class Outcome(NamedTuple):
 
 
 def outcome(promise: PolicyPromise, real: EvaluationView) -> Outcome:
-    """Judge a prediction by real episodes from the declared starts. Differences that vanish by rounding don't count."""
+    """Compare a prediction with real episodes from the declared starts. Differences that vanish by rounding don't
+    count."""
     low, high = _ends(real.mean_interval)
     below, above = promise.low - real.mean, real.mean - promise.high
     if below > 0 and number(real.mean) != number(promise.low):
@@ -38,13 +40,14 @@ def outcome(promise: PolicyPromise, real: EvaluationView) -> Outcome:
 
 
 def outcome_of(known: Known) -> Outcome | None:
-    """The outcome for the policy of a report; None without a promise, or without episodes that it is about."""
+    """Return the outcome for the policy of a report; None if there is no promise, or no episodes to which
+    it applies."""
     promise = None if known.policy is None else known.policy.promise
     return outcome(promise, known.real) if promise and known.real and known.real.declared else None
 
 
 def prediction(known: Known) -> str:
-    """The section, as HTML."""
+    """Return the section as HTML."""
     policy, real, title = known.policy, known.real, "Was it predicted?"
     promise = None if policy is None else policy.promise
     if policy is None or promise is None:

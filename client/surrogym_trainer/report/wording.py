@@ -1,4 +1,4 @@
-"""Numbers and specifications of a report, in words."""
+"""Words for numbers and specifications in a report."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from surrogym_shared.words import counted
 
 
 def number(value: float) -> str:
-    """A return in readable form: large ones without decimals, small ones with three digits."""
+    """Return a return in readable form: large numbers without decimals, small ones with three digits."""
     size = abs(value)
     return f"{value:,.0f}" if size >= 1_000 else f"{value:.1f}" if size >= 10 else f"{value:.3g}"
 
 
 def mean(evaluation: EvaluationView) -> str:
-    """A mean with its interval."""
+    """Return the mean return of an evaluation with its interval, as text."""
     interval = evaluation.mean_interval
     return number(evaluation.mean) + (f" ({number(interval.low)} to {number(interval.high)})" if interval else "")
 
 
 def successes(evaluation: EvaluationView) -> str:
-    """Number of successful episodes, with the interval of the share."""
+    """Return the number of successful episodes with the interval of their share, as text."""
     if evaluation.success_rate is None:
         return "-"
     count, interval = round(evaluation.success_rate * evaluation.episodes), evaluation.success_interval
@@ -32,7 +32,7 @@ def successes(evaluation: EvaluationView) -> str:
 
 
 def share(value: float) -> str:
-    """A share as percent. It is never rounded up to 100."""
+    """Return a share as a percentage. It is never rounded up to 100."""
     if value >= 1:
         return "100 %"
     percent = 100 * value
@@ -44,14 +44,14 @@ def steps(count: int) -> str:
 
 
 def starts_of(evaluation: EvaluationView) -> str:
-    """The starts and the machine of some episodes, without the number of the first start. The environment is named
+    """Return the starts and the machine of some episodes in words, without the first seed. The environment is named
     unless it is the surrogate's own."""
     said = evaluation.note.replace(f", from seed {evaluation.first_seed}", "") or "starts unknown"
     return said if evaluation.own else f"in {evaluation.environment}: {said}"
 
 
 def original(environment: str) -> str:
-    """The meaning of "real", in a sentence."""
+    """Return a sentence about what "real" means for this environment."""
     if not environment:
         what = "which has no name here. Only its owner knows whether it is the machine itself or a simulator of it"
     elif is_known(environment):
@@ -65,7 +65,7 @@ def original(environment: str) -> str:
 
 
 def criterion(success: Success) -> str:
-    """The meaning of success, in a sentence, from the specification."""
+    """Return a sentence about when an episode succeeds, from the specification."""
     last = "at its end" if success.hold_steps == 1 else f"in each of its last {success.hold_steps} steps"
     conditions = [
         *([f"{' and '.join(map(_inequality, success.hold))} {last}"] if success.hold else []),
@@ -86,7 +86,7 @@ def _inequality(one: Inequality) -> str:
 
 
 def term(one: Term) -> str:
-    """A sum of functions of coordinates, such as "cos(theta) + 2 speed"."""
+    """Return a sum of functions of coordinates in words, such as "cos(theta) + 2 speed"."""
     words = " + ".join(map(_part, one.parts)).replace("+ -", "- ")
     ends = [f"at {what} {value:g}" for what, value in (("least", one.low), ("most", one.high)) if value is not None]
     return f"({words}, {' and '.join(ends)})" if ends else words
@@ -110,7 +110,7 @@ def _times(factor: float, words: str) -> str:
 
 
 def starts(spec: EnvironmentSpec) -> str:
-    """The declared starts, such as "theta 3.14 rad, speed -1 to 1 rad/s"."""
+    """Return the declared starts in words, such as "theta 3.14 rad, speed -1 to 1 rad/s"."""
     if spec.starts:
         return f"one of {counted(len(spec.starts), 'state')}"
     return ", ".join(f"{one.name} {_spread(spec.start[one.name])} {one.unit}".rstrip() for one in spec.coordinates)

@@ -1,4 +1,4 @@
-"""A training that audits its policy, and continues if the audit fails or lowers the promise clearly."""
+"""Training with an audit of the policy; it continues if the audit fails or lowers the promise clearly."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ from surrogym_trainer.training.trainer import train
 class AuditedTraining:
     """Train a policy, audit it, and hand it over.
 
-    If an audit fails and the budget has steps left, or rounds that the model seemed not to need, their steps are
-    taken where the policy goes, the training continues, and the policy is audited again. Such a round is also taken
-    after a passed audit if the promise is wide, or if the model that has learned from it is no longer certain
-    there. The training also continues if the model that has learned from an audit promises clearly less than the
-    training imagined, or than the model before, unless the user limited the virtual steps. This takes no step of
-    the budget. In all other cases the policy is handed over, also with a failed audit.
+    If an audit fails, further steps are taken in states that the policy visits, as far as the budget or unused rounds
+    of the closed loop allow; then the training continues, and the policy is audited again. Such a round is also taken
+    after a passed audit if the promise is wide, or if the model that has learned from it is no longer certain there.
+    The training also continues if the model that has learned from an audit promises clearly less than the training
+    imagined, or than the model before, unless the user limited the virtual steps. This takes no step of the budget. In
+    all other cases the policy is handed over, also with a failed audit.
 
     Attributes:
-        api: the server.
+        api: the connection to the server.
         name: name of the surrogate.
         port: the surrogate.
         out: file to write the policy to.
@@ -62,15 +62,19 @@ class AuditedTraining:
     progress: Callable[[TrainProgress], None] | None = None
     waiting: Callable[[SurrogateView], None] | None = None
     candidates: Candidates = field(default_factory=Candidates, init=False)
-    _unspent: int = field(default=0, init=False)  # rounds of the closed loop that took no real step
+    _unspent: int = field(default=0, init=False)  # number of rounds of the closed loop that took no real step
 
     def train(self) -> tuple[TrainResult, Handover]:
         """Train and audit, and train further if the audit fails or lowers the promise clearly.
 
+        Returns:
+            The result of the training, and the promise with its audit.
+
         Raises:
             DesignUnfinished: queries were not answered in time.
             TrainingInterrupted: Ctrl-C was pressed when there was a policy already.
-            ValueError, SurrogymClientError: as ``train``.
+            ValueError: the settings don't fit the search.
+            SurrogymClientError: the server can't be reached, or refuses a request.
         """
         result = self._first()
         self.candidates.keep(result)
@@ -99,7 +103,7 @@ class AuditedTraining:
         return self._best(result)
 
     def _best(self, result: TrainResult) -> TrainResult:
-        """Return the policy that is best in the model of all real steps so far."""
+        """Return the candidate that is best in the model of all real steps so far."""
         return self.candidates.best(self.port, result, self._chosen)
 
     @property
@@ -122,11 +126,12 @@ class AuditedTraining:
         return longer and disappointed(audit, result.untrained, result.imagined_return)
 
     def _asked_more(self, result: TrainResult, taken: int, number: int, *, needed: bool) -> bool:
-        """Spend the rest of the budget, or a round that took no real step, where the policy goes.
+        """Take the remaining steps of the budget, or an unused round of the closed loop, in states that the policy
+        visits.
 
-        Unless they are ``needed`` anyway, the steps are only taken if the model is not certain there. Only a token of
-        role admin may raise the budget for such a round. Returns whether the budget's real steps are now more than
-        ``taken``.
+        Unless they are ``needed`` anyway, the steps are only taken if the model is not certain in these states. Only a
+        token of the role admin may raise the budget for such a round. Returns whether the number of real steps in the
+        budget is now larger than ``taken``.
         """
         view = self.api.surrogate(self.name)
         if not needed and view.phase == "ready" and (view.confidence_index or 0.0) >= view.target:
@@ -146,7 +151,7 @@ class AuditedTraining:
         return view.ledger.total > taken
 
     def _train_on(self, result: TrainResult) -> TrainResult:
-        """Train further, from the present policy, in the model that includes the audit's samples."""
+        """Train further, from the current policy, in the model that includes the audit's samples."""
         now = self._chosen
         if search_for(self.settings).resumable:
             now = replace(now, start_from=self.out, trust_policy=False)
@@ -155,7 +160,7 @@ class AuditedTraining:
         return self._best(_joined(result, later))
 
     def _shifted(self, done: int) -> Callable[[TrainProgress], None] | None:
-        """The progress of a training after ``done`` virtual steps."""
+        """Return a function that reports the progress of a training that follows ``done`` virtual steps."""
         progress = self.progress
         return None if progress is None else lambda now: progress(after(now, done))
 

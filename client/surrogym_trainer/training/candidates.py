@@ -1,4 +1,4 @@
-"""Policies of one training, compared in the latest model so that the best one is handed over."""
+"""Comparison of one training's policies in the latest model, so that the best one is handed over."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from surrogym_trainer.policies.files import load_policy
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training.settings import TrainResult, TrainSettings
 
-EPISODES = 128  # virtual episodes of each policy, from the same starts
-CLEARLY = 2.0  # standard errors of a mean difference: less may be chance
+EPISODES = 128  # number of virtual episodes of each policy, from the same starts
+CLEARLY = 2.0  # standard errors of a mean difference; a smaller difference may be chance
 
 
 @dataclass
 class Candidates:
-    """Policies that the trainings so far ended with, and their files.
+    """The final policies of the trainings so far, with the content of their files.
 
     Real steps between two trainings change the model. A policy that was better in an earlier model can be worse in the
     new one.
@@ -30,13 +30,13 @@ class Candidates:
     _kept: list[tuple[TrainResult, bytes]] = field(default_factory=list)
 
     def keep(self, result: TrainResult) -> None:
-        """Remember a policy before the next training overwrites its file."""
+        """Store a policy before the next training overwrites its file."""
         self._kept.append((result, Path(result.path).read_bytes()))
 
     def best(self, port: SurrogatePort, latest: TrainResult, settings: TrainSettings) -> TrainResult:
-        """Return the latest result, or an earlier one whose policy earns clearly more in the present model.
+        """Return the latest result, or an earlier one whose policy earns clearly more in the current model.
 
-        The policy's file is restored if it is an earlier one.
+        If it is an earlier one, its policy is written to the latest result's file.
         """
         others = [(result, content) for result, content in self._kept if content != Path(latest.path).read_bytes()]
         if not others:

@@ -1,4 +1,4 @@
-"""The card of a policy that a training has made."""
+"""The card of a trained policy."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def card_of(
         result: result of the training.
         handover: promise and audit; None if the training was interrupted before.
         surrogate: name of the surrogate.
-        spec: its specification.
+        spec: specification of the surrogate.
         url: address of its server.
         seed: seed of the training.
         curve: points of the training's curve, of which the card keeps some.

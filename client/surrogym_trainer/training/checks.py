@@ -1,4 +1,5 @@
-"""Checks of a training: whole virtual episodes of a policy, from the same starts each time, and what they decide."""
+"""Checks during a training: whole virtual episodes of the policy, always from the same starts, and the decisions that
+follow."""
 
 from __future__ import annotations
 
@@ -14,18 +15,18 @@ from surrogym_trainer.training.settings import CHECK_EPISODES, TrainSettings
 
 Returns = NDArray[np.float64]
 
-GAIN = 0.01  # of the second half of a cycle: a smaller share of the gain over an untrained network is none
-CLEARLY = 2.0  # standard errors
-LEARNED = 0.01  # share of the best episode's gain over an untrained network: below, nothing was learned
-MANY = 0.25  # share of the episodes that has to earn this: a few do by luck of their posterior samples
-SATURATED = 3  # checks in a row in which every episode earned as much as the best one ever did
+GAIN = 0.01  # share of the gain over an untrained network; a smaller gain in the second half of a cycle counts as none
+CLEARLY = 2.0  # number of standard errors above which a difference is clear
+LEARNED = 0.01  # share of the best episode's gain over an untrained network, below which nothing was learned
+MANY = 0.25  # share of the episodes that must show a gain; a few may succeed by a lucky posterior sample
+SATURATED = 3  # number of checks in a row in which every episode earned the highest return so far
 
 
 class Checks:
     """The best policy of a training so far, by its imagined return, and whether a further gain is likely.
 
     Args:
-        untrained: returns of a network that has learned nothing yet.
+        untrained: returns of an untrained network.
         saved: returns of the policy of an earlier training. A new network has learned something if it reaches half of
             that policy's gain.
     """
@@ -33,12 +34,13 @@ class Checks:
     def __init__(self, untrained: Returns, saved: Returns | None = None) -> None:
         self.untrained = float(untrained.mean())
         self.latest: float | None = None  # imagined return of the last check
-        self.returns_of_best: Returns | None = None  # (episodes,) of the best policy so far
+        self.returns_of_best: Returns | None = None  # (episodes,) returns of the best policy so far
         self._half_way = self.untrained if saved is None else (self.untrained + float(saved.mean())) / 2
-        self._few = self._many = _of_many(untrained)  # of an untrained network, and the highest so far
+        # returns that the best quarter exceeds: untrained, and the highest so far
+        self._few = self._many = _of_many(untrained)
         self._seen = self.untrained  # highest return of a training episode
         self._most = float(untrained.max())  # highest return of an episode of a check
-        self._full = 0  # checks in a row whose returns nothing can exceed
+        self._full = 0  # number of checks in a row with the highest possible return
 
     @property
     def best(self) -> float | None:
@@ -50,7 +52,7 @@ class Checks:
         self._seen = max([self._seen, *earned])
 
     def add(self, returns: Returns) -> bool:
-        """Record a check of the present policy. Returns whether it is the best so far."""
+        """Record the returns of a check of the current policy. Returns whether it is the best so far."""
         imagined, most = float(returns.mean()), float(returns.max())
         self._many = max(self._many, _of_many(returns))
         rose, self._most = most > self._most, max(self._most, most)
@@ -66,9 +68,9 @@ class Checks:
     def learned(self) -> bool:
         """Whether the best policy has learned something.
 
-        A quarter of the episodes has to earn more than with an untrained network. Under posterior samples of an
-        uncertain model a few episodes succeed by themselves. Where the best quarter leaves no room for a gain, as from
-        starts next to the goal, the mean alone decides.
+        A quarter of the episodes has to earn more than with an untrained network, because under posterior samples of an
+        uncertain model a few episodes succeed by chance. If the best quarter of an untrained network leaves no room for
+        a gain, as from starts next to the goal, the mean alone decides.
         """
         best, room = self.best, self._seen - self._few
         many = room <= LEARNED * (self._seen - self.untrained) or self._many > self._few + LEARNED * room
@@ -77,15 +79,15 @@ class Checks:
     @property
     def saturated(self) -> bool:
         """Whether no further gain is possible: in the last checks, each episode's return equalled the highest one so
-        far, of the training and of all checks."""
+        far, in the training and in all checks."""
         return self._full >= SATURATED
 
     def gained(self, before: Returns | None) -> bool:
-        """Whether the best policy gains clearly over an earlier one, from the same starts: the mean of the paired
-        differences exceeds twice its standard error, and ``GAIN`` of the gain over an untrained network.
+        """Return whether the best policy gains clearly over an earlier one, from the same starts: the mean of the
+        paired differences exceeds twice its standard error, and ``GAIN`` of the gain over an untrained network.
 
         Args:
-            before: returns (episodes,) of the best policy before; None: of an untrained network.
+            before: returns (episodes,) of the earlier policy; None stands for an untrained network.
         """
         best = self.returns_of_best
         if best is None or not self.learned:
@@ -98,12 +100,12 @@ class Checks:
 
     @property
     def _nothing(self) -> float:
-        """Imagined return up to which a network counts as having learned nothing."""
+        """The imagined return up to which a network counts as having learned nothing."""
         return self.untrained + LEARNED * (self._seen - self.untrained)
 
 
 def checked(port: SurrogatePort, predict: Predict, settings: TrainSettings) -> Returns:
-    """Return the returns of a policy's check."""
+    """Return the returns (episodes,) of a policy in a check: whole virtual episodes from always the same starts."""
     return imagined_returns(port, predict, CHECK_EPISODES, settings.seed, **settings.judging)
 
 

@@ -1,4 +1,5 @@
-"""The closed loop: train for a while, query where the policy goes, fit again, and train further."""
+"""The closed loop: train for a while, query in states that the policy visits, fit the model again, and
+train further."""
 
 from __future__ import annotations
 
@@ -26,36 +27,36 @@ from surrogym_trainer.training.trainer import train
 
 ROUND_SHARE = 0.25  # virtual steps of each round before the last, as a share of a whole training
 VISIT_LANES = 32
-VISIT_STEPS = 1_000  # length of a visit if the specification has no time limit
+VISIT_STEPS = 1_000  # number of steps of a visit if the specification has no time limit
 
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """Number of rounds, and of queries in each.
+    """The number of rounds of the closed loop, and of queries in each.
 
     The rounds end early if the design is ready, or if the confidence index over the states that the policy visits
     reaches the design's target.
     """
 
-    queries: int  # real steps of one round
+    queries: int  # number of real steps in one round
     rounds: int = 3
-    patience_seconds: float = 3_600.0  # longest time that the sampler may take for one round
+    patience_seconds: float = 3_600.0  # seconds that the sampler may take for one round
 
 
 @dataclass
 class ClosedLoop:
-    """Learn a policy in rounds, with queries where it goes, until the model is certain there or the design is ready.
+    """Train a policy in rounds, with queries in states that it visits, until the model is certain there or the design
+    is ready.
 
     Each round submits the states that the policy visits from the declared starts, as a checkpoint that no other
     training shares. So the queries of a round depend on this training alone, and the same seeds choose the same
-    queries. The rounds end once the confidence index over
-    these states reaches the target that the design has for the whole range. In the rounds, lanes move by the mean, so
-    that a policy goes where the model predicts the highest return. The settings of the last training are ``chosen_for``
-    the phase that the design then has. Only the last training may be prolonged, because a later round makes up for a
-    short earlier one.
+    queries. The rounds end once the confidence index over these states reaches the target that the design has for the
+    whole range. In the rounds, lanes move by the mean, so that a policy goes where the model predicts the highest
+    return. The settings of the last training depend on the phase that the design has then, see ``chosen_for``. Only the
+    last training may be prolonged, because a later round makes up for a short earlier one.
 
     Attributes:
-        api: the server.
+        api: the connection to the server.
         name: name of the surrogate.
         port: the surrogate.
         out: file to write the policy to, after every round.
@@ -77,7 +78,7 @@ class ClosedLoop:
     waiting: Callable[[SurrogateView], None] | None = None
     trained: list[TrainResult] = field(default_factory=list, init=False)
     candidates: Candidates = field(default_factory=Candidates)
-    _visited: int = field(default=0, init=False)  # virtual steps that collected occupancies
+    _visited: int = field(default=0, init=False)  # number of virtual steps that collected visited states
     _known: list[float | None] = field(
         default_factory=list, init=False
     )  # confidence index over each round's visited states
@@ -100,7 +101,8 @@ class ClosedLoop:
         Raises:
             DesignUnfinished: the queries of a round were not answered in time.
             TrainingInterrupted: Ctrl-C was pressed when there was a policy already.
-            ValueError, SurrogymClientError: as ``train``.
+            ValueError: the settings don't fit the search.
+            SurrogymClientError: the server can't be reached, or refuses a request.
         """
         try:
             for _ in range(self.rounds.rounds):
@@ -117,8 +119,8 @@ class ClosedLoop:
         return self.result()
 
     def round(self) -> bool:
-        """Run one round: train for a while, submit the visited states, and query there. Returns whether another
-        round may follow."""
+        """Run one round: train for a while, submit the visited states, and query there. Returns whether another round
+        may follow."""
         view = self.api.surrogate(self.name)
         if view.phase == "ready":
             return False
@@ -155,8 +157,8 @@ class ClosedLoop:
 
     @property
     def unspent(self) -> int:
-        """Number of rounds that took no real step, because the design was ready, or the model was certain where the
-        policy went."""
+        """Number of rounds that took no real step, because the design was ready, or the model was certain in the states
+        that the policy visits."""
         return self.rounds.rounds - len(self._known) + int(self._region_known)
 
     @property
@@ -176,9 +178,9 @@ class ClosedLoop:
 def _for_use(view: SurrogateView, settings: TrainSettings, *, region_known: bool) -> TrainSettings:
     """Return the settings of the last training.
 
-    If the model is certain where the last round's policy goes, training continues from that policy. Otherwise it begins
-    with a new network and the variant of draws, because a network that has learned from wrong models keeps what they
-    taught it.
+    If the model is certain in the states that the last round's policy visits, training continues from that policy.
+    Otherwise it begins with a new network and the variant with posterior samples, because a network that has learned
+    from wrong models keeps what they taught it.
     """
     last = chosen_for(view, settings)
     anew = last is not settings and settings.start_from is None and not region_known
@@ -186,11 +188,11 @@ def _for_use(view: SurrogateView, settings: TrainSettings, *, region_known: bool
 
 
 def shares(settings: TrainSettings, rounds: int) -> tuple[int, int]:
-    """Return the virtual steps of the whole training, all rounds included, and of each round.
+    """Return the virtual steps of the whole training, including all rounds, and of each round.
 
-    Steps that collect occupancies are not included. Requested steps limit the whole training. Suggested steps are those
-    of the last training; the rounds add to them, up to the paper's maximum. In both cases a round has the same share of
-    the last training.
+    Steps that collect visited states are not included. If the user requested a number of steps, it limits the whole
+    training. Otherwise the last training has the suggested number; the rounds add to it, up to the paper's maximum. In
+    both cases a round has the same share of the last training.
     """
     planned, share = planned_steps(settings), min(ROUND_SHARE, 1 / (rounds + 1))
     if settings.total_steps is not None:
@@ -204,7 +206,14 @@ def visit(
 ) -> tuple[int, float | None]:
     """Run the policy of a round from the declared starts, and submit the visited states.
 
-    Returns the number of virtual steps that this took, and the confidence index over the visited states.
+    Args:
+        port: the surrogate.
+        learned: result of the round's training.
+        settings: settings of the training.
+        checkpoint: name under which the states are submitted.
+
+    Returns:
+        The number of virtual steps that this took, and the confidence index over the visited states.
     """
     spec = port.spec()
     act = search_for(settings).explorer(learned.path, learned.algorithm, VISIT_LANES)

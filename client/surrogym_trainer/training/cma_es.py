@@ -1,4 +1,5 @@
-"""CMA-ES on the lanes of a session: it searches the parameters of a small network by the returns of virtual episodes.
+"""CMA-ES in the virtual environment: a search over the parameters of a small network by the returns of virtual
+episodes.
 
 This is the approach of Black-DROPS (Chatzilygeroudis et al., 2017): a policy of few parameters, no gradient, no value
 function. All candidates of a generation are stepped together, each from the same starts.
@@ -26,17 +27,18 @@ from surrogym_trainer.training.checks import checked
 from surrogym_trainer.training.search import Found, PolicySearch, SearchTask
 from surrogym_trainer.training.settings import CHECKS, TrainProgress, TrainSettings
 
-FULL_COVARIANCE = 200  # most parameters with a full covariance; beyond, it is diagonal (separable CMA-ES)
+# largest number of parameters with a full covariance; with more, it is diagonal (separable CMA-ES)
+FULL_COVARIANCE = 200
 
 
 @dataclass(frozen=True)
 class CmaEs(PolicySearch):
-    """Policy search by CMA-ES over the parameters of a network. Returns the distribution's mean with the best
+    """Policy search by CMA-ES over the parameters of a network. The result is the distribution's mean with the best
     imagined return."""
 
-    population: int = 24  # candidates of each generation
-    starts: int = 16  # episodes of each candidate
-    units: int = 10  # hidden units of the network; 0 for a policy without a hidden layer
+    population: int = 24  # number of candidates in each generation
+    starts: int = 16  # number of episodes of each candidate
+    units: int = 10  # number of hidden units of the network; 0 for a policy without a hidden layer
     sigma: float = 1.0  # initial standard deviation of a parameter
 
     suggested_steps = 10_000_000
@@ -51,13 +53,13 @@ class CmaEs(PolicySearch):
 
 
 class _Run:
-    """Generations of one search, and the best mean so far."""
+    """The generations of one search, and the best mean of the distribution so far."""
 
     def __init__(self, task: SearchTask, choices: CmaEs) -> None:
         self._task, self._choices = task, choices
         self._distribution = _Distribution(task.port, task.settings, choices)
         limit = task.port.spec().time_limit or LONGEST_EPISODE
-        self._cost = choices.population * choices.starts * limit  # virtual steps of a generation
+        self._cost = choices.population * choices.starts * limit  # number of virtual steps in a generation
         self.generations = max(task.steps // self._cost, 1)
         self._done = 0
         self._kept: Network | None = None
@@ -66,7 +68,7 @@ class _Run:
         self._penalty: float | None = None
 
     def generation(self, number: int) -> None:
-        """Run one generation. The mean is evaluated ``CHECKS`` times in a search."""
+        """Run one generation. In ``CHECKS`` of all generations, evenly spread, the mean is evaluated."""
         seen = self._distribution.generation(number)
         self._done, self._penalty = number, seen.episode_penalty
         if number * CHECKS // self.generations > (number - 1) * CHECKS // self.generations:
@@ -92,7 +94,7 @@ class _Run:
 
 
 class _Distribution:
-    """Distribution of parameters, and the virtual episodes that evaluate them."""
+    """The distribution of the network's parameters, and the virtual episodes that evaluate them."""
 
     def __init__(self, port: SurrogatePort, settings: TrainSettings, choices: CmaEs) -> None:
         self.choices = choices
@@ -105,11 +107,11 @@ class _Distribution:
 
     @property
     def policy(self) -> Network:
-        """Return the network at the mean of the distribution."""
+        """The network at the mean of the distribution."""
         return self._network(np.array(self._cma.mean))
 
     def generation(self, number: int) -> Imagined:
-        """Draw a population, run each candidate from the same starts, and update the distribution from their mean
+        """Draw a population, run each candidate from the same starts, and update the distribution by their mean
         returns."""
         choices = self.choices
         drawn = [self._cma.ask() for _ in range(choices.population)]
@@ -128,7 +130,7 @@ class _Distribution:
         return seen
 
     def imagined(self) -> float:
-        """Imagined return of the mean."""
+        """Return the imagined return of the network at the mean."""
         return float(checked(self._port, self.policy, self._settings).mean())
 
     def _network(self, vector: NDArray[np.float64]) -> Network:
@@ -141,6 +143,8 @@ def _first(settings: TrainSettings, size: int) -> NDArray[np.float64]:
     vector = Network.load(settings.start_from).vector
     if len(vector) != size:
         raise ValueError(
-            f"{settings.start_from}: expected a network with {size} parameters, as this training has, got {len(vector)}"
+            f"{settings.start_from}: expected a network with {size} parameters, as this training has, got "
+            f"{len(vector)}: "
+            "start without it"
         )
     return vector

@@ -1,4 +1,4 @@
-"""How much of a training is done, as a bar shows it: a share that never falls, and the time left."""
+"""The progress of a training for a progress bar: a share that never falls, and the time left."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ from surrogym_trainer.training.settings import TrainProgress
 
 
 class Course:
-    """Share of a training that is done.
+    """The share of a training that is done.
 
     A training may be extended: by a round, after an audit, or because it still gains. The rest of the bar then stands
     for the steps that are left, so that the share never falls.
     """
 
     def __init__(self) -> None:
-        self._share = self._base = 0.0  # done, and done when the total last changed
-        self._steps = self._begun = 0  # virtual steps so far, and when the total last changed
+        self._share = self._base = 0.0  # the share that is done, now and when the total last changed
+        self._steps = self._begun = 0  # virtual steps, now and when the total last changed
         self._total = 0
-        self._first: tuple[int, float] | None = None  # virtual steps and seconds when the time left was first asked for
+        # virtual steps and seconds at the first call of words_of_time_left
+        self._first: tuple[int, float] | None = None
 
     def share(self, steps: int, total: int) -> float:
-        """Return the share that is done, in [0, 1], after ``steps`` virtual steps of ``total``."""
+        """Return the share that is done, in [0, 1], after ``steps`` of ``total`` virtual steps."""
         if total != self._total:
             self._begun, self._base, self._total = self._steps, self._share, total
         self._steps = max(self._steps, steps)
@@ -31,10 +32,10 @@ class Course:
         return self._share
 
     def words_of_time_left(self, steps: int, total: int, seconds: float) -> str:
-        """Estimate in words how long a training of ``total`` virtual steps still takes.
+        """Return in words an estimate of how long a training of ``total`` virtual steps still takes.
 
-        The pace is that since the first call: what comes before the first steps, such as compiling, comes once. So the
-        first call gives no estimate, which is an empty text.
+        The pace is measured since the first call, because work before the first steps, such as compiling, happens only
+        once. So the first call gives no estimate, which is an empty text.
 
         Args:
             steps: virtual steps taken.

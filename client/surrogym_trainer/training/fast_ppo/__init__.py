@@ -1,1 +1,1 @@
-"""Proximal policy optimisation in NumPy, with gradients written out. It needs no torch."""
+"""Proximal policy optimisation in NumPy, with derivatives written by hand. It does not need torch."""

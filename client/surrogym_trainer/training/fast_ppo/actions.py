@@ -1,4 +1,4 @@
-"""Learning the action distributions of ``surrogym_shared.distributions``: initial parameters and derivatives."""
+"""Initial parameters and derivatives of the action distributions in ``surrogym_shared.distributions``, for learning."""
 
 from __future__ import annotations
 
@@ -15,25 +15,31 @@ from surrogym_trainer.policies.defaults import EXPLORATION
 
 
 class Distribution(Sampled, Protocol):
-    """Distribution of actions (B, F) with the derivatives that a learner needs."""
+    """A distribution of actions (B, F) with the derivatives that a learner needs."""
 
     @property
     def activation(self) -> Activation:
-        """Activation of the hidden layers of actor and critic."""
+        """The activation of the hidden layers of actor and critic."""
         ...
 
     def further(self) -> Array:
-        """Initial values of the parameters besides the network's, (K,)."""
+        """Return the initial values (K,) of the distribution's parameters that are not outputs of the network."""
         ...
 
     def arrays(self) -> tuple[tuple[int, ...], Array, Array]:
-        """Return the numbers of choices, the centre and the reach, as compiled code expects them. Absent ones are
-        empty."""
+        """Return the numbers of choices, the centre and the reach, in the form that compiled code expects; empty if
+        there are none."""
         ...
 
     def slopes(self, outputs: Array, further: Array, actions: Array, by: Array) -> tuple[Array, Array]:
-        """Return a loss's derivatives by outputs and further parameters, given those by log probabilities, ``by``
-        (B,)."""
+        """Return a loss's derivatives by the outputs and by the further parameters.
+
+        Args:
+            outputs: outputs of the actor (B, A).
+            further: the distribution's further parameters (K,).
+            actions: the actions taken (B, F).
+            by: the loss's derivatives by the log probabilities (B,).
+        """
         ...
 
 
@@ -44,7 +50,7 @@ class Bounded(distributions.Bounded):
     activation: Activation = "tanh"
 
     def further(self) -> Array:
-        """Initial logarithms of the standard deviations."""
+        """Return the initial logarithms of the standard deviations (F,)."""
         logarithms: Array = np.log(EXPLORATION * self.reach).astype(np.float32)
         return logarithms
 
@@ -60,7 +66,7 @@ class Bounded(distributions.Bounded):
 
 @dataclass(frozen=True)
 class Choices(distributions.Choices):
-    """Discrete actions."""
+    """Discrete actions, with a softmax for each entry."""
 
     activation: Activation = "relu"
 
@@ -80,7 +86,8 @@ class Choices(distributions.Choices):
 
 
 def distribution_of(counts: tuple[int, ...], low: NDArray[np.float64], high: NDArray[np.float64]) -> Distribution:
-    """Return the action distribution for numbers of choices, or for continuous actions within bounds (F,)."""
+    """Return the distribution of discrete actions with these numbers of choices, or of continuous actions within bounds
+    (F,)."""
     if counts:
         return Choices(counts)
     return Bounded(*middle_and_reach(low, high, np.dtype(np.float32)))

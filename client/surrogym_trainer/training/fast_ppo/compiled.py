@@ -1,4 +1,4 @@
-"""One update of PPO in compiled code. ``learner.Learner.update`` is the same in NumPy, and the reference.
+"""One update of PPO in compiled code. ``learner.Learner.update`` computes the same in NumPy, and is the reference.
 
 A batch passes through the networks in blocks of rows, so that activations stay in the processor's cache. BLAS computes
 the matrix products. All arrays are float32.
@@ -23,8 +23,8 @@ from surrogym_trainer.training.fast_ppo.adam import EPSILON, FIRST_DECAY, SECOND
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-BLOCK = 128  # rows; 64 and 256 were slower
-LARGEST_TANH = np.float32(7.90531110763549805)  # from here on tanh is 1 in float32
+BLOCK = 128  # number of rows in a block; 64 and 256 were slower
+LARGEST_TANH = np.float32(7.90531110763549805)  # for larger arguments, tanh is 1 in float32
 NONE, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 CONSTANT = np.float32(HALF_LOG_TAU)
 
@@ -34,7 +34,7 @@ SIZES = types.int64[::1]
 
 @inlined
 def bent(x: np.float32) -> np.float32:
-    """Compute tanh x to 4 units in the last place, by the rational approximation that Eigen uses."""
+    """Return tanh x to 4 units in the last place, by the rational approximation that Eigen uses."""
     x = min(max(x, -LARGEST_TANH), LARGEST_TANH)
     s = x * x
     p = np.float32(-2.76076847742355e-16)
@@ -53,7 +53,7 @@ def bent(x: np.float32) -> np.float32:
 
 @compiled
 def activate(y: Floats, bias: Floats, relu: bool) -> None:
-    """Apply bias and activation to y (n, O) in place."""
+    """Add the bias to y (n, O) and apply the activation, in place."""
     rows, columns = y.shape
     for i in range(rows):
         if relu:
@@ -66,7 +66,7 @@ def activate(y: Floats, bias: Floats, relu: bool) -> None:
 
 @compiled
 def through(slope: Floats, y: Floats, relu: bool) -> None:
-    """Multiply a derivative by the activation's derivative, in place. The activation's output is y (n, O)."""
+    """Multiply a derivative by the activation's derivative, in place; y (n, O) is the activation's output."""
     rows, columns = y.shape
     for i in range(rows):
         if relu:
@@ -81,8 +81,12 @@ def through(slope: Floats, y: Floats, relu: bool) -> None:
 def forward(parameters: Floats, sizes: Ints, relu: bool, x: Floats, passed: Floats) -> Floats:
     """Return the outputs (n, O) of a network for inputs (n, I).
 
-    ``passed`` is a flat buffer. It receives the outputs (n, units) of all layers but the input, one after the other.
-    Hidden units are rectified if ``relu``, and tanh otherwise.
+    Args:
+        parameters: parameters of the network.
+        sizes: sizes of the layers, from inputs to outputs.
+        relu: whether the hidden units are rectified; otherwise tanh.
+        x: inputs (n, I).
+        passed: flat buffer that receives the outputs (n, units) of all layers but the input, one after the other.
     """
     rows, begin, at, last = len(x), 0, 0, sizes.size - 2
     for layer in range(last + 1):
@@ -118,8 +122,17 @@ def turned(parameters: Floats, sizes: Ints) -> Floats:
 def backward(
     transposed: Floats, gradient: Floats, sizes: Ints, relu: bool, x: Floats, passed: Floats, slope: Floats
 ) -> None:
-    """Add to ``gradient`` (P,) that of a loss whose derivative by the outputs of the last forward pass is ``slope``
-    (n, O)."""
+    """Add the gradient of a loss to ``gradient`` (P,).
+
+    Args:
+        transposed: the parameters, with each layer's weights transposed.
+        gradient: the gradient that is added to.
+        sizes: sizes of the layers, from inputs to outputs.
+        relu: whether the hidden units are rectified; otherwise tanh.
+        x: inputs (n, I) of the last forward pass.
+        passed: the buffer that the last forward pass filled.
+        slope: the loss's derivative by the outputs of that pass (n, O).
+    """
     rows, end, at = len(x), len(gradient), len(x) * sizes[1:].sum()
     spare = np.empty((2, rows * sizes.max()), dtype=np.float32)
     product = np.empty(len(gradient), dtype=np.float32)
@@ -150,7 +163,7 @@ def add(total: Floats, more: Floats) -> None:
 
 @inlined
 def slope_of(log: np.float32, before: np.float32, advantage: np.float32, clip: np.float32) -> np.float32:
-    """Return the derivative of a row's loss by its log probability. It is zero where the ratio is clipped."""
+    """Return the derivative of a row's loss by its log probability; it is zero if the ratio is clipped."""
     ratio = np.float32(math.exp(log - before))
     free = ratio <= ONE + clip if advantage > NONE else ratio >= ONE - clip
     return -advantage * ratio if free else NONE
@@ -168,8 +181,8 @@ def bounded(
     further: Floats,
     by_further: Floats,
 ) -> None:
-    """Replace outputs y (n, F) by the derivatives of the loss, for continuous actions. Adds to those by log
-    deviations."""
+    """Replace the outputs y (n, F) for continuous actions by the loss's derivatives by them, and add its derivatives by
+    the log deviations to ``by_further`` (F,)."""
     inverse = np.empty_like(further)
     for j in range(further.size):
         inverse[j] = math.exp(-further[j])
@@ -201,7 +214,7 @@ def log_softmax(scores: Floats) -> None:
 
 @compiled
 def choices(y: Floats, actions: Floats, logs: Floats, advantages: Floats, clip: np.float32, counts: Ints) -> None:
-    """Replace outputs y (n, A) by the derivatives of the loss, for discrete actions."""
+    """Replace the outputs y (n, A) for discrete actions by the loss's derivatives by them."""
     for i in range(len(y)):
         log, begin = NONE, 0
         for k in range(counts.size):
@@ -219,7 +232,8 @@ def choices(y: Floats, actions: Floats, logs: Floats, advantages: Floats, clip: 
 
 @summing
 def normalised(advantages: Floats) -> Floats:
-    """Scale advantages (B,) to mean 0 and standard deviation 1 over B. A single advantage keeps its size."""
+    """Return advantages (B,) shifted to mean 0, scaled to standard deviation 1 and divided by B. A single advantage is
+    unchanged."""
     size, mean, variance = advantages.size, 0.0, 0.0
     if size == 1:
         return advantages
@@ -237,7 +251,8 @@ def normalised(advantages: Floats) -> Floats:
 def adam(
     parameters: Floats, gradient: Floats, first: Floats, second: Floats, updates: int, largest: float, rate: float
 ) -> None:
-    """Take step number ``updates`` of Adam, with a gradient (P,) that is scaled to a norm of at most ``largest``."""
+    """Take step number ``updates`` of Adam, with the gradient (P,) scaled to a norm of at most ``largest``,
+    in place."""
     squares = NONE
     for i in range(gradient.size):
         squares += gradient[i] * gradient[i]
@@ -286,12 +301,23 @@ def update(
     """Take one step of Adam on the loss of a batch. Changes the parameters (P,) and both moments (P,) in place.
 
     Args:
+        parameters: all parameters: the actor's, the critic's, and further ones (K,).
+        first: Adam's first moments.
+        second: Adam's second moments.
         actor: sizes of the actor's layers, from inputs to outputs.
-        critic: sizes of the critic's layers, likewise.
-        ends: two indices into the parameters. The actor's are those before the first, and the critic's those between
-            the two.
+        critic: sizes of the critic's layers, from inputs to outputs.
+        ends: two indices into the parameters: the ends of the actor's and of the critic's.
         counts: numbers of choices of each entry of a discrete action; empty for continuous actions.
         relu: whether the hidden layers use ReLU; otherwise tanh.
+        centre, reach: middle and half width of the bounds (F,) of continuous actions.
+        observations: standardised observations (B, D).
+        actions: actions (B, F).
+        logs: log probabilities (B,) of the actions when they were taken.
+        advantages: advantages (B,).
+        returns: targets of the critic (B,).
+        updates: number of this step of Adam, from 1.
+        clip_range, vf_coef, max_grad_norm: as in Stable-Baselines3's PPO.
+        rate: learning rate.
     """
     gradient, clip = np.zeros_like(parameters), np.float32(clip_range)
     ours, theirs = slice(0, ends[0]), slice(ends[0], ends[1])

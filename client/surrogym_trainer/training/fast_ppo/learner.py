@@ -1,11 +1,11 @@
-"""Actor, critic and Adam: one update of proximal policy optimisation.
+"""Actor, critic and Adam: the update of proximal policy optimisation.
 
 Loss of a batch, with ratio r = p(a) / p_old(a) and advantages A of mean 0 and deviation 1 in the batch:
 
     -mean(min(r A, clip(r, 1 - c, 1 + c) A)) + v mean((V - R)^2)
 
-References: Schulman et al. (2017), arXiv 1707.06347, eq. 7; Kingma and Ba (2015). Constants are those of
-Stable-Baselines3, whose update this is but for rounding.
+References: Schulman et al. (2017), arXiv 1707.06347, eq. 7; Kingma and Ba (2015). The constants are those of
+Stable-Baselines3; the update equals its update, apart from rounding.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from surrogym_trainer.training.fast_ppo.adam import EPSILON, FIRST_DECAY, SECOND
 from surrogym_trainer.training.fast_ppo.mlp import Array, Mlp, orthogonal
 
 HIDDEN_GAIN, ACTION_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0
-NARROWEST = 0.1  # smallest new deviation of an input, as a share of the one before
-LEARNER = "learner.npz"  # entry of a policy's file from which training can continue
+NARROWEST = 0.1  # smallest new standard deviation of an input, as a share of the previous one
+LEARNER = "learner.npz"  # entry of a policy's file with which training can continue
 VECTORS = ("parameters", "first", "second")
 
 
@@ -50,14 +50,14 @@ def compiled_update() -> Update | None:
         return None
     try:
         from surrogym_trainer.training.fast_ppo.compiled import update
-    except ImportError:  # no SciPy, or a NumPy that numba does not know
+    except ImportError:  # SciPy is not installed, or numba does not support this version of NumPy
         return None
     return update
 
 
 @dataclass(frozen=True)
 class Objective:
-    """Constants of the loss and of one optimiser step."""
+    """The constants of the loss and of one optimiser step."""
 
     clip_range: float = 0.2
     vf_coef: float = 0.5
@@ -66,11 +66,11 @@ class Objective:
 
 @dataclass(frozen=True)
 class Batch:
-    """Transitions to learn from."""
+    """Transitions to learn from, one in each of B rows."""
 
     observations: Array  # (B, D) standardised
     actions: Array  # (B, F)
-    log_probabilities: Array  # (B,) at the time of acting
+    log_probabilities: Array  # (B,) when the actions were taken
     advantages: Array  # (B,)
     returns: Array  # (B,) targets of the critic, from scaled rewards
 
@@ -80,7 +80,7 @@ class Batch:
 
 
 class Learner:
-    """Actor, critic and Adam, with all parameters in one vector so that each update is a few operations."""
+    """Actor, critic and Adam, with all parameters in one vector so that each update takes few operations."""
 
     def __init__(
         self,
@@ -92,9 +92,15 @@ class Learner:
         *,
         compiled: bool = True,
     ) -> None:
-        """
+        """Make a learner with new networks.
+
         Args:
-            compiled: update in compiled code, where this installation can.
+            spec: specification of the environment.
+            mean: mean (D,) by which observations are standardised.
+            deviation: standard deviation (D,) by which observations are standardised.
+            units: numbers of units in the actor's hidden layers.
+            rng: draws the initial parameters.
+            compiled: whether to update in compiled code, if this installation can.
         """
         self._spec = spec
         self.mean, self.deviation = mean.astype(np.float32), deviation.astype(np.float32)
@@ -133,7 +139,7 @@ class Learner:
         return self.critic.forward(x)[:, 0].copy()
 
     def update(self, batch: Batch, objective: Objective, rate: float) -> None:
-        """Take one step of Adam on the loss of a batch."""
+        """Take one step of Adam, with a learning rate, on the loss of a batch."""
         self._updates += 1
         if self._update is not None:
             moments = self._first, self._second
@@ -148,7 +154,7 @@ class Learner:
         log = self.distribution.log_probability(outputs, self.further, batch.actions)
         ratio = np.exp(log - batch.log_probabilities)
         clip = np.float32(objective.clip_range)
-        free = np.where(advantages > 0, ratio <= 1 + clip, ratio >= 1 - clip)  # elsewhere the loss is flat
+        free = np.where(advantages > 0, ratio <= 1 + clip, ratio >= 1 - clip)  # outside of this the loss is flat
         by = -(advantages * ratio * free) / np.float32(size)
         by_outputs, self._further_gradient[:] = self.distribution.slopes(outputs, self.further, batch.actions, by)
         self.actor.backward(by_outputs)
@@ -157,8 +163,8 @@ class Learner:
         self._adam(objective.max_grad_norm, rate)
 
     def limit_noise(self, logarithms: Array, share: float) -> None:
-        """Lower the standard deviations of continuous actions to at most this share of others, given by their
-        logarithms."""
+        """Lower the standard deviations of continuous actions to at most ``share`` of other ones, whose ``logarithms``
+        (F,) are given."""
         np.minimum(self.further, logarithms + np.float32(np.log(share)), out=self.further)
 
     def _adam(self, largest: float, rate: float) -> None:
@@ -177,18 +183,18 @@ class Learner:
         self.parameters -= step * self._first / root
 
     def take_up(self, learned: LearnedNetwork) -> None:
-        """Take the place of another learner of the same network."""
+        """Take over parameters, statistics and Adam's moments of another learner of the same network."""
         self.mean, self.deviation = learned.policy.mean.astype(np.float32), learned.policy.deviation.astype(np.float32)
         self.restore(learned.state)
 
     def standardise_anew(self, x: Array, rng: np.random.Generator) -> None:
         """Standardise inputs by other observations, without a change of the actor's outputs.
 
-        The critic and Adam's moments begin anew.
+        The critic and Adam's moments start afresh.
 
         Args:
-            x: these observations (B, D), standardised as before. The new deviations are at least ``NARROWEST`` of those
-                before.
+            x: these observations (B, D), standardised as before. Each new deviation is at least ``NARROWEST`` of the
+                previous one.
             rng: generator of the critic's initial parameters.
         """
         middle, spread = x.mean(0), np.maximum(x.std(0), NARROWEST)
@@ -200,7 +206,7 @@ class Learner:
         self._first[:], self._second[:], self._updates = 0, 0, 0
 
     def policy(self) -> Network:
-        """Return the policy of the actor's most probable actions, with the present parameters."""
+        """Return the policy of the actor's most probable actions, with the current parameters."""
         layers = self.actor.layers
         return Network(
             self.mean.astype(np.float64),
@@ -231,7 +237,9 @@ class Learner:
         shapes = {**dict.fromkeys(VECTORS, self.parameters.shape), "updates": ()}
         found = {name: header.shape for name, header in headers.items()}
         if found != shapes:
-            raise ValueError(f"expected the state of a training of {self.parameters.size} parameters, got {found}")
+            raise ValueError(
+                f"expected the state of a training of {self.parameters.size} parameters, got arrays of {found}"
+            )
 
 
 @dataclass(frozen=True)
@@ -254,6 +262,11 @@ class LearnedNetwork:
 def restored(path: Path, spec: EnvironmentSpec, units: tuple[int, ...]) -> Learner:
     """Restore the learner from a policy's file.
 
+    Args:
+        path: the policy's file.
+        spec: specification of the environment.
+        units: numbers of units in the actor's hidden layers.
+
     Raises:
         UnusablePolicy: the file contains no learner, or one of another network.
     """
@@ -264,8 +277,8 @@ def restored(path: Path, spec: EnvironmentSpec, units: tuple[int, ...]) -> Learn
 
 
 def noisy(path: Path) -> Predict:
-    """Load a policy that acts with its noise. The noise is the same each time the file is read. Raises as
-    ``restored``."""
+    """Load a policy that acts with its noise, which is the same each time the file is read. Raises ``UnusablePolicy``
+    if the file contains no learner."""
     policy = load_network(path)
     distribution = distribution_of(policy.counts, policy.low, policy.high)
     parameters, rng = _state(path, _require_parameters)["parameters"], np.random.default_rng(0)
@@ -285,7 +298,8 @@ def _state(path: Path, require: Callable[[Mapping[str, Header]], None]) -> dict[
         entries = read_entries(path, MAX_BYTES)
         if LEARNER not in entries:
             raise ValueError(
-                "it has no state of a training by fastppo; give a policy that surrogym train saved with this algorithm"
+                "the file has no state of a training by fastppo; give a policy that surrogym train saved with this "
+                "algorithm"
             )
         return read_arrays(entries[LEARNER], MAX_BYTES, require)
     except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""A multilayer perceptron with forward and backward passes, on arrays that are reused."""
+"""A multilayer perceptron with forward and backward passes, whose arrays are reused."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.floating[Any]]  # float32
 
 
 class Mlp:
-    """Network of hidden layers and a linear last layer.
+    """A network of hidden layers and a linear last layer.
 
     ``parameters`` and ``gradient`` are vectors that the caller owns; the layers are views of them.
 
@@ -24,14 +24,14 @@ class Mlp:
         sizes: numbers of inputs, of units in each hidden layer, and of outputs.
         activation: activation of the hidden layers.
         parameters: vector of the parameters, with ``count(sizes)`` entries.
-        gradient: vector that receives their gradient.
+        gradient: vector that receives the gradient.
     """
 
     def __init__(self, sizes: Sequence[int], activation: Activation, parameters: Array, gradient: Array) -> None:
         self.activation = activation
         self.layers = layers_of(sizes, parameters)
         self._gradients = layers_of(sizes, gradient)
-        self._passed: list[Array] = []  # inputs of each layer in the last pass that was kept
+        self._passed: list[Array] = []  # inputs of each layer in the last forward pass
         self._made: dict[tuple[int, int], Array] = {}
 
     @staticmethod
@@ -39,7 +39,7 @@ class Mlp:
         return sum((inputs + 1) * outputs for inputs, outputs in pairwise(sizes))
 
     def forward(self, x: Array) -> Array:
-        """Return the outputs (B, O) for inputs (B, I). The next pass with as many rows reuses the array."""
+        """Return the outputs (B, O) for inputs (B, I). The next pass with the same number of rows reuses the array."""
         self._passed = [x]
         for number, (weights, bias) in enumerate(self.layers):
             y = self._array(2 * number, len(x), weights.shape[1])
@@ -53,7 +53,7 @@ class Mlp:
         raise AssertionError("unreachable: a network has a layer")
 
     def backward(self, slope: Array) -> None:
-        """Write the gradient of a loss whose derivative by the outputs of the last pass is ``slope`` (B, O)."""
+        """Write the gradient of a loss whose derivative by the outputs of the last forward pass is ``slope`` (B, O)."""
         for number in reversed(range(len(self.layers))):
             weights, _ = self.layers[number]
             by_weights, by_bias = self._gradients[number]
@@ -77,8 +77,8 @@ class Mlp:
         return slope
 
     def _array(self, place: int, rows: int, columns: int) -> Array:
-        """Return the reusable array of one place in the passes. New memory for each batch would take as long as the
-        products."""
+        """Return the reusable array with this number ``place``. Allocating memory for each batch would take as long as
+        the matrix products."""
         key = (place, rows)
         if key not in self._made:
             self._made[key] = np.empty((rows, columns), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Rollouts of N lanes for T steps, with scaled rewards and estimated advantages."""
+"""Rollouts of N lanes (environments that step together) for T steps, with scaled rewards and estimated advantages."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from surrogym_shared.port import PolicyRollout
 from surrogym_trainer.training.fast_ppo.learner import Batch, Learner
 from surrogym_trainer.training.fast_ppo.mlp import Array
 
-LARGEST_REWARD = 10.0  # after scaling
+LARGEST_REWARD = 10.0  # largest absolute reward after scaling
 LATEST_EPISODES = 100
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """Result of T steps of N lanes. Its T N rows are transitions, ordered by step and then by lane."""
+    """The result of T steps of N lanes. Its T N rows are transitions, ordered by step and then by lane."""
 
     rows: Batch
     earned: list[float]  # unscaled returns of the episodes that ended
-    penalty_share: float  # size of the penalty as a share of the reward's size
-    lost: int  # episodes cut because the server lost the session
+    penalty_share: float  # sum of the penalties as a share of the sum of absolute rewards
+    lost: int  # number of episodes that were cut because the server lost the session
 
 
 class Collector:
@@ -35,7 +35,7 @@ class Collector:
 
     Args:
         lanes: lanes of an open session with autoreset in the same step.
-        gamma: discount.
+        gamma: discount factor.
         gae_lambda: lambda of the generalised advantage estimate (Schulman et al. 2016).
         seed: seed of the actions' noise.
     """
@@ -45,17 +45,17 @@ class Collector:
         self._lanes, self._penalised = ActingLanes(lanes), lanes.penalised
         self._lanes.reset()
         self._scale = RewardScale(lanes.num_envs, gamma)
-        self._earned = np.zeros(lanes.num_envs)  # returns of the running episodes
-        self._penalty = np.zeros(lanes.num_envs)  # penalties subtracted from them
+        self._earned = np.zeros(lanes.num_envs)  # (N,) returns of the running episodes
+        self._penalty = np.zeros(lanes.num_envs)  # (N,) penalties that were subtracted from these returns
         self._penalties: deque[float] = deque(maxlen=LATEST_EPISODES)
 
     @property
     def episode_penalty(self) -> float | None:
-        """Mean penalty of the last episodes, summed over an episode; None in a session without a penalty."""
+        """The mean penalty of the last episodes, summed over each; None if the session has no penalty."""
         return float(np.mean(self._penalties)) if self._penalties else None
 
     def collect(self, learner: Learner, steps: int, hold: int = 1) -> Rollout:
-        """Step every lane ``steps`` times. The policy acts with noise that ``hold`` steps share."""
+        """Take ``steps`` steps in every lane. The policy acts with noise that stays the same for ``hold`` steps."""
         taken = self._lanes.take(learner.acting(), steps, self._noise._replace(hold=hold))
         self._noise = self._noise.later(steps)
         rollout = taken.rollout
@@ -108,7 +108,14 @@ class Collector:
         rewards[at[0][short], at[1][short]] += np.float32(self._gamma) * beyond
 
     def _advantages(self, rewards: Array, ended: NDArray[np.bool_], values: Array, last: Array) -> Array:
-        """Generalised advantage estimates (T, N)."""
+        """Return generalised advantage estimates (T, N).
+
+        Args:
+            rewards: scaled rewards (T, N).
+            ended: whether each step ended its episode (T, N).
+            values: the critic's values before each step (T, N).
+            last: the critic's values after the last step (N,).
+        """
         advantages, following, running = np.empty_like(rewards), last, np.zeros_like(last)
         gamma, decay = np.float32(self._gamma), np.float32(self._gamma * self._lambda)
         for t in reversed(range(len(rewards))):
@@ -119,8 +126,8 @@ class Collector:
 
 
 class RewardScale:
-    """Divide rewards by the running standard deviation of discounted returns, as Stable-Baselines3's
-    ``VecNormalize`` does."""
+    """Scaling of rewards by the running standard deviation of discounted returns, as in Stable-Baselines3's
+    ``VecNormalize``."""
 
     def __init__(self, lanes: int, gamma: float) -> None:
         self._gamma = gamma
@@ -136,7 +143,7 @@ class RewardScale:
         return np.asarray(scaled, dtype=np.float64)
 
     def _learn(self) -> None:
-        """Update mean and variance by the present returns (Chan et al. 1979)."""
+        """Update mean and variance by the current returns (Chan et al. 1979)."""
         new, n = self._returns, len(self._returns)
         delta, count = float(new.mean()) - self._mean, self._count + n
         between = delta**2 * self._count * n / count

@@ -35,7 +35,7 @@ from surrogym_trainer.training.proportions import even_batch
 from surrogym_trainer.training.search import REFERENCE, SEARCHES, Found, PolicySearch, SearchTask
 from surrogym_trainer.training.settings import CHECKS, TrainProgress
 
-RANGES = {  # whole numbers have whole bounds
+RANGES = {  # Allowed range of each setting; settings with integer bounds must be integers.
     "n_steps": (1, 100_000),
     "n_epochs": (1, 1_000),
     "batch_size": (1, 10_000_000),
@@ -47,15 +47,15 @@ RANGES = {  # whole numbers have whole bounds
     "max_grad_norm": (0.0, 1e6),
 }
 
-CYCLES = 3  # of the stage ``learn`` in the suggested steps
-LEARNING = 2  # times the suggested steps: the most that a training takes before the stage ``refine``
-REFINING = 1 / 2  # length of the stage ``refine``, as a share of a cycle of the stage ``learn``
-PATIENT_ROLLOUTS = 32  # fewest rollouts before a network is replaced
-HELD = 16  # steps that share the noise of every second network
-FINE = 0.1  # learning rate of the stage ``refine``, as a share of the usual one
-QUIET = 0.1  # noise at its end, as a share of that at its beginning
+CYCLES = 3  # number of cycles of the stage learn in the suggested steps
+LEARNING = 2  # largest multiple of the suggested steps that a training takes before the stage refine
+REFINING = 1 / 2  # length of the stage refine, as a share of a cycle of the stage learn
+PATIENT_ROLLOUTS = 32  # smallest number of rollouts before a network is replaced
+HELD = 16  # number of steps for which every second network's noise stays the same
+FINE = 0.1  # learning rate of the stage refine, as a share of the usual one
+QUIET = 0.1  # noise at the end of the stage refine, as a share of that at its beginning
 LOOKS = 1 / 8  # largest share of the suggested steps that only collects observations
-CRITIC_ROLLOUTS = 8  # next rollouts, from which the critic alone learns
+CRITIC_ROLLOUTS = 8  # number of rollouts in the stage refine from which only the critic learns
 STAGE_SEED = 2_000_003  # difference between the noise seeds of two stages
 
 
@@ -63,23 +63,26 @@ STAGE_SEED = 2_000_003  # difference between the noise seeds of two stages
 class FastPpo(PolicySearch):
     """Policy search by PPO in NumPy, with updates that take a sixth of the time of Stable-Baselines3's.
 
-    Networks, loss, Adam, scaled rewards and advantages are those of the search ``PPO``. A training has two stages, of
-    cycles in which the learning rate falls. Module ``stages`` says what their episodes are, and why.
+    Networks, loss, Adam, scaled rewards and advantages are those of the search ``PPO``. A training has two stages, each
+    with cycles in which the learning rate falls. The module ``stages`` describes their episodes, and the reasons.
 
-    1. *learn*: short episodes that look a little ahead. A cycle follows while the second half of the one before gained.
-       A network that has learned nothing in its first cycle is replaced. The noise of every second network is held for
-       ``HELD`` steps where actions are continuous, because a first success may need a steady push.
-    2. *refine*: whole episodes from the declared starts. Inputs are standardised by the observations that the policy
-       meets, and the critic is a new one. It is one cycle.
+    1. *learn*: short episodes with a small discount horizon. Another cycle follows if the second half of the previous
+    one gained.
+       A network that has learned nothing in its first cycle is replaced. The noise of every second network stays the
+           same for
+       ``HELD`` steps if actions are continuous, because a first success may need a steady push.
+    2. *refine*: whole episodes from the declared starts, in one cycle. Inputs are standardised by the observations that
+    the policy
+       meets, and the critic is a new one.
 
-    If the number of steps was chosen, they are one cycle of the first stage.
+    If the user chose the number of steps, they form one cycle of the first stage.
     """
 
-    n_steps: int = 16  # steps of each lane in a rollout
+    n_steps: int = 16  # number of steps of each lane in a rollout
     n_epochs: int = 10
-    batch_size: int | None = None  # None: about 1,024
-    learning_rate: float | None = None  # None: decreases from 3e-3 to a fiftieth of it
-    gamma: float | None = None  # None: derived from the time limit, or from that of short training episodes
+    batch_size: int | None = None  # None takes about 1,024
+    learning_rate: float | None = None  # None decreases it from 3e-3 to a fiftieth of that
+    gamma: float | None = None  # None derives it from the time limit, or from that of short training episodes
     gae_lambda: float = 0.97
     clip_range: float = 0.2
     vf_coef: float = 0.5
@@ -93,13 +96,13 @@ class FastPpo(PolicySearch):
         for name, (low, high) in RANGES.items():
             value = getattr(self, name)
             if value is not None and not (type(value) in (int, type(low)) and low <= value <= high):
-                raise ValueError(f"{name}: expected {low} to {high}, got {value!r}")
+                raise ValueError(f"hyperparameter {name}: expected {low} to {high}, got {value!r}")
 
     def search(self, task: SearchTask) -> Found:
         start = task.settings.start_from
         if start is not None and not Network.is_at(start):
-            return _reference().search(task)  # only Stable-Baselines3 can train its own policies further
-        compiled_update()  # loads a linear algebra library now, so that its threads are limited as well
+            return _reference().search(task)  # only Stable-Baselines3 can continue to train its own policies
+        compiled_update()  # loads the linear algebra library now, so that its threads are limited as well
         with threadpool_limits(limits=task.settings.threads):
             return _Training(self, task).run()
 
@@ -110,7 +113,7 @@ class FastPpo(PolicySearch):
 
 
 class _Training:
-    """Networks of one training, and the checks that compare them."""
+    """One training: its networks, and the checks that compare them."""
 
     def __init__(self, search: FastPpo, task: SearchTask) -> None:
         self._search, self._task, self._spec = search, task, task.port.spec()
@@ -122,12 +125,13 @@ class _Training:
         start = settings.start_from
         self._saved = None if start is None else restored(start, self._spec, units_of(self._spec))
         self._num_envs = settings.num_envs or LANES
-        self._rollout = self._num_envs * search.n_steps  # virtual steps
+        self._rollout = self._num_envs * search.n_steps  # number of virtual steps in a rollout
         self._batch = search.batch_size or even_batch(self._rollout)
         self._objective = Objective(search.clip_range, search.vf_coef, search.max_grad_norm)
         self._planned = max(task.steps // self._rollout, 1)  # rollouts
         self._cycle = max(self._planned // CYCLES, 1) if task.prolong else self._planned
-        self._left = self._planned * (LEARNING if task.prolong else 1)  # rollouts before the stage ``refine``
+        # number of rollouts left before the stage refine
+        self._left = self._planned * (LEARNING if task.prolong else 1)
         saved = self._imagined(self._saved) if settings.anew and self._saved is not None else None
         self._checks = Checks(self._imagined(self._new), saved)
         self._kept: LearnedNetwork | None = None
@@ -154,11 +158,11 @@ class _Training:
 
     @property
     def _patience(self) -> int:
-        """Rollouts after which a network that has learned nothing is replaced."""
+        """Number of rollouts after which a network that has learned nothing is replaced."""
         return max(self._planned // CYCLES, PATIENT_ROLLOUTS)
 
     def _learn(self, learner: Learner, hold: int) -> None:
-        """Train a network in cycles, while it gains."""
+        """Train a network in cycles, as long as it gains; its noise stays the same for ``hold`` steps."""
         own, stage = 0, learn(self._task)
         self._gaining = True
         with self._open(stage):
@@ -168,7 +172,7 @@ class _Training:
                 own, self._left = own + taken, self._left - taken
 
     def _refine(self) -> None:
-        """Train the best policy further."""
+        """Run the stage refine: train the best policy further."""
         assert self._kept is not None
         learner, stage = self._made(), refine(self._task)
         learner.take_up(self._kept)
@@ -191,9 +195,9 @@ class _Training:
         Args:
             stage: stage of the training.
             learner: the network.
-            own: rollouts that it has learned from in this stage. The rate of its next cycle begins lower.
+            own: rollouts that it has learned from in this stage. With more of them, the rate of the cycle starts lower.
             rollouts: rollouts of this cycle.
-            hold: steps that share the noise of its actions.
+            hold: number of steps for which the noise of its actions stays the same.
         """
         fine, noise, before = stage.name == "refine", learner.further.copy(), self._checks.returns_of_best
         self._expect(rollouts + (self._task.prolong and not fine) * int(REFINING * self._cycle))
@@ -216,12 +220,12 @@ class _Training:
         return number, not self._checks.saturated and self._checks.gained(before)
 
     def _hopeless(self, own: int, left: int) -> bool:
-        """Whether the network has learned nothing in its first rollouts, and another one has time to."""
+        """Return whether the network has learned nothing in its first rollouts, and there is time for another one."""
         return own == self._patience <= left and not self._checks.learned
 
     def _candidates(self) -> Iterator[tuple[Learner, int]]:
-        """Iterate over networks to train, each with the number of steps that share its noise: new ones, and in its turn
-        the saved one if it had learned anything."""
+        """Yield networks to train, each with the number of steps for which its noise stays the same: new ones, and the
+        saved one if it had learned anything."""
         anew = self._task.settings.anew
         if anew or self._saved is None:
             yield self._new, 1
@@ -257,11 +261,11 @@ class _Training:
         return stage.gamma if self._search.gamma is None else self._search.gamma
 
     def _expect(self, rollouts: int) -> None:
-        """Let the progress show that this many rollouts are left."""
+        """Set the number of rollouts that are left, for the progress."""
         self._expected = self._taken + rollouts
 
     def _collect(self, learner: Learner, hold: int = 1) -> Batch:
-        """Collect a rollout, check the policy if that is due, and report the progress."""
+        """Collect a rollout, check the policy if a check is due, and report the progress."""
         rollout = self._collector.collect(learner, self._search.n_steps, hold)
         self._checks.saw(rollout.earned)
         self._lost += rollout.lost
@@ -322,6 +326,6 @@ def _reference() -> PolicySearch:
     """Return the ``PPO`` search of Stable-Baselines3.
 
     Raises:
-        ModuleNotFoundError: it is not installed.
+        ModuleNotFoundError: Stable-Baselines3 is not installed.
     """
     return SEARCHES.get(REFERENCE)()

@@ -1,4 +1,4 @@
-"""The stages of a training: where their episodes begin, how long they are, and how far the policy looks ahead."""
+"""The stages of a training: the starts and lengths of their episodes, and the discount factor."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from surrogym_trainer.training.proportions import suggested_gamma
 from surrogym_trainer.training.search import SearchTask
 from surrogym_trainer.training.settings import TrainSettings
 
-SHORTER = 5  # times: a training episode
-SHORTEST = 40  # steps
-SIGHT = 1 / 2  # horizon of the discount of short episodes, 1 / (1 - gamma), as a share of their length
+SHORTER = 5  # factor by which a training episode of the stage learn is shorter than the time limit
+SHORTEST = 40  # smallest number of steps in such an episode
+SIGHT = 1 / 2  # discount horizon of short episodes, 1 / (1 - gamma), as a share of their length
 
 
 @dataclass(frozen=True)
@@ -20,18 +20,17 @@ class Stage:
     """One stage of a training."""
 
     name: str
-    settings: TrainSettings  # of its lanes
+    settings: TrainSettings  # settings of its episodes
     gamma: float
 
 
 def learn(task: SearchTask) -> Stage:
-    """Return the stage of short episodes, half of which begin anywhere, with a discount that looks half an episode
-    ahead.
+    """Return the stage of short episodes, half of which begin anywhere, with a discount horizon of half an episode.
 
-    A model can start anywhere, which a machine can't. In short episodes each lane sees many states, those near success
-    included, and a short sight finds a first policy in a tenth of the steps. The last reward of a truncated episode
-    includes the critic's value of its last state, so short episodes don't change what is optimal. Starts and lengths
-    that the user chose are kept, with the discount of whole episodes; so are those of preset ``paper``.
+    A model can start anywhere, which a machine can't. In short episodes each lane sees many states, including those
+    near success, and a short horizon finds a first policy in a tenth of the steps. The last reward of a truncated
+    episode includes the critic's value of its last state, so short episodes don't change what is optimal. Starts and
+    lengths that the user chose are kept, with the discount of whole episodes; so are those of preset ``paper``.
     """
     spec, settings = task.port.spec(), task.settings
     ways = settings.start_box, settings.start_visited, settings.horizon
@@ -48,7 +47,7 @@ def learn(task: SearchTask) -> Stage:
 def refine(task: SearchTask) -> Stage:
     """Return the stage of whole episodes from the declared starts.
 
-    Returns from anywhere can be a thousand times those from the declared starts. Critic and advantages then do not
+    Returns from anywhere can be a thousand times those from the declared starts. Then critic and advantages can't
     resolve the latter.
     """
     settings = task.settings
