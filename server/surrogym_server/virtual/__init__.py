@@ -1,4 +1,4 @@
-"""The virtual environment: N lanes at once, frozen state in, new state out. Noise is a pure function of its key."""
+"""The virtual environment: N lanes step at once, from a frozen state to a new one. Noise depends on its key alone."""
 
 from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, create, expected_bytes, reset
 from surrogym_server.virtual.lanes import LaneState

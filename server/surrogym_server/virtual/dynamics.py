@@ -16,20 +16,20 @@ from surrogym_server.models.guard import require_shapes
 from surrogym_server.models.port import DynamicsModel, Transition
 from surrogym_shared.kinds import Weighting
 
-WEIGHT_FLOOR = 1e-12  # of the reward's variance, so that a certain particle's weight stays finite
-LEAST_VARIANCE = 1e-290  # smaller, because a hidden reward's variance may be 0
+WEIGHT_FLOOR = 1e-12  # added to a reward's variance, as a share of the samples' reward variance, so weights stay finite
+LEAST_VARIANCE = 1e-290  # lower limit of this sum, because the samples' reward variance may be 0
 
 
 @dataclass(frozen=True)
 class Moved:
-    """The model's prediction for one step of N lanes."""
+    """Prediction of the model for one step of N lanes."""
 
-    q: Tensor  # (N, C) output state
-    particles: Tensor  # (N, P, C)
-    reward_mean: Tensor  # (N,)
-    reward: Tensor  # (N,) penalised, eq. 14
+    q: Tensor  # (N, C) state after the step
+    particles: Tensor  # (N, P, C) particles after the step; P is 0 except in variant probabilistic
+    reward_mean: Tensor  # (N,) reward without penalty
+    reward: Tensor  # (N,) penalised reward, eq. 14
     terminated: Tensor  # (N,) bool
-    std: Tensor | None  # (N, O)
+    std: Tensor | None  # (N, O) standard deviation of each output, if needed
 
 
 def move_mean(
@@ -46,9 +46,14 @@ def move_mean(
     """AUR-D: move q (N, C) under u (N, F) to the mean of the next state, or along each lane's sampled function.
 
     Args:
-        paths: (N, W), the drawn functions.
-        functions: number of functions that the lanes share.
-        process: (N, M), standard normal; adds the learned noise.
+        model: the model.
+        q: states before the step.
+        u: actions.
+        penalty: number of standard deviations to subtract from the reward (eq. 14).
+        stds: whether the standard deviations of the outputs are needed.
+        process: (N, M) standard normal numbers that add the learned noise, or None.
+        paths: (N, W) the function that each lane follows, or None for the mean.
+        functions: number of functions that the lanes share, or None if each lane has its own.
     """
     step = model.transition if paths is None else partial(function_draws(model, functions).transition_along, paths)
     transition = step(q, u, process=process, stds=stds, reward_std=stds or penalty > 0)
@@ -75,9 +80,18 @@ def move_particles(
 ) -> Moved:
     """AUR-P: move particles (N, P, C) under one action for each lane, u (N, F).
 
-    With ``noise`` (N, P, M) each particle moves by a draw, otherwise by the mean. ``process`` (N, P, M) adds the
-    learned noise. Both are standard normal. The output state is the particles' mean. The reward is the mean of their
-    penalised rewards, weighted by 1/U with U the variance of eq. 7. With ``steps`` particles move in compiled code.
+    The output state is the particles' mean. The reward is the mean of their penalised rewards, weighted by 1/U with U
+    the variance of eq. 7.
+
+    Args:
+        model: the model.
+        particles: particles before the step.
+        u: actions.
+        penalty: number of standard deviations to subtract from each particle's reward (eq. 14).
+        noise: (N, P, M) standard normal numbers by which each particle samples its next state; None for the mean.
+        weighting: weights of the particles' rewards; `uniform` replaces 1/U by equal weights.
+        process: (N, P, M) standard normal numbers that add the learned noise, or None.
+        steps: compiled steps to use, or None.
     """
     lanes, count, size = particles.shape
     q, action = particles.flatten(0, 1), u.repeat_interleave(count, 0)
@@ -115,7 +129,7 @@ def _compiled_transition(
     stds: bool,
     reward_std: bool,
 ) -> Transition:
-    """Predict like ``DynamicsModel.transition``, in compiled code."""
+    """Predict as ``DynamicsModel.transition`` does, in compiled code."""
     shaken, shaped = (None if n is None else n.contiguous().numpy() for n in (noise, process))
     moved = steps(
         q.contiguous().numpy(),
@@ -131,12 +145,13 @@ def _compiled_transition(
 
 
 def penalised(reward: Tensor, penalty: float, std: Tensor) -> Tensor:
-    """Subtract ``penalty`` standard deviations (m,) from rewards (m,)."""
+    """Return rewards (m,) less ``penalty`` times their standard deviations (m,), eq. 14."""
     return reward - penalty * std  # eq. 14
 
 
 def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:
-    """Mean of particles (N, P, C), (N, C). An angle's mean is the direction of the mean of its cosines and sines."""
+    """Return the mean (N, C) of particles (N, P, C). The mean of an angle is the direction of the mean of its cosines
+    and sines."""
     mean = particles.mean(1)
     for index in definition.angles:
         angle = particles[..., index]
@@ -145,7 +160,10 @@ def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:
 
 
 def _weights(spread: Tensor, scale: Tensor, weighting: Weighting) -> Tensor:
-    """Normalised weights (N, P) of particles with reward standard deviations ``spread`` (N, P)."""
+    """Return normalised weights (N, P) of particles with reward standard deviations ``spread`` (N, P).
+
+    ``scale`` is the standard deviation of the reward over the samples.
+    """
     if weighting == "uniform":
         return torch.full_like(spread, 1 / spread.shape[1])
     precision = 1 / (spread.square() + WEIGHT_FLOOR * scale**2).clamp_min(LEAST_VARIANCE)

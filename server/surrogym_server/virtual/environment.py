@@ -1,4 +1,4 @@
-"""Reset and step N lanes, with autoreset in Gymnasium's three modes."""
+"""Reset and step of N lanes, with autoreset in Gymnasium's three modes."""
 
 from __future__ import annotations
 
@@ -31,27 +31,27 @@ Ints = NDArray[np.integer[Any]]
 
 @dataclass(frozen=True)
 class VirtualSettings:
-    """Options of a session, chosen when it was opened."""
+    """Options of a session, fixed when it is opened."""
 
     num_envs: int
     variant: Variant = "deterministic"
     autoreset_mode: AutoresetMode = "next_step"
     time_limit: int | None = None
-    penalty: float = 0.0  # k of eq. 14
+    penalty: float = 0.0  # standard deviations to subtract from each reward, k of eq. 14
     start_box: float = 0.0  # share of episodes that start anywhere in the sampling range
     start_visited: float = 0.0  # share of episodes that start at one of the states ``visited``
     particles: int = 1_000
     propagation: Propagation = "sample"
     weighting: Weighting = "inverse_variance"
-    spread: float = 0.01  # first standard deviation of particles, as a share of each coordinate's range
+    spread: float = 0.01  # initial standard deviation of particles, as a share of each coordinate's range
     functions: int | None = None  # number of functions that lanes of variant pathwise share; None: one for each lane
     residual: Residual | None = None  # systematic errors that are added to each prediction
-    process_noise: bool = False  # the learned noise moves the state, w of eq. 2
-    sensor_noise: SensorNoise = ()  # errors of observed coordinates, which don't move the state
-    reward_limits: tuple[float, float] | None = None  # of mean rewards; None: none
-    trust: float | None = None  # truncate at a predicted std above this multiple of that of the samples
-    caution: float = 0.0  # doubts that are subtracted from each reward, see ``_doubted``
-    compiled: bool = False  # compute steps in compiled code if the model offers it; chosen when the session opens
+    process_noise: bool = False  # whether the learned noise moves the state, w of eq. 2
+    sensor_noise: SensorNoise = ()  # noise of observed coordinates, which does not move the state
+    reward_limits: tuple[float, float] | None = None  # limits of mean rewards, or None for none
+    trust: float | None = None  # truncate if a predicted std exceeds this multiple of the output's std over the samples
+    caution: float = 0.0  # multiple of the doubt that is subtracted from each reward, see ``_doubted``
+    compiled: bool = False  # whether steps use the model's compiled code; decided when the session opens
     visited: Tensor | None = field(default=None, compare=False, repr=False)  # (k, C) states of real steps
 
     @property
@@ -62,31 +62,31 @@ class VirtualSettings:
 
 @dataclass(frozen=True)
 class LaneTransition:
-    """Results of one step of N lanes, as numpy. Lanes outside the mask have reward 0 and no flags."""
+    """Results of one step of N lanes, as NumPy arrays. Lanes that the mask excludes have reward 0 and no flags."""
 
     observation: Floats  # (N, D) float32
     reward: Floats  # (N,)
     terminated: Bools  # (N,)
     truncated: Bools  # (N,)
-    final_lanes: Ints  # (K,) lanes that ended and were reset within this step (same_step)
-    final_observation: Floats  # (K, D) float32
+    final_lanes: Ints  # (K,) indices of lanes that ended and were reset in this step (same_step only)
+    final_observation: Floats  # (K, D) float32, last observations of these lanes' episodes
     reset_lanes: Bools  # (N,) lanes in which a new episode began
-    reward_mean: Floats  # (N,)
-    std: Floats | None  # (N, O)
-    untrusted: Bools | None  # (N,) truncated for leaving the trusted range; None without one
-    left: Bools | None = None  # (N,) ended with the outside reward; None if no lane can leave the sampling range
+    reward_mean: Floats  # (N,) reward without penalty
+    std: Floats | None  # (N, O) standard deviation of each output, if requested
+    untrusted: Bools | None  # (N,) lanes truncated because they left the trusted range; None if there is no such range
+    left: Bools | None = None  # (N,) lanes that ended with the outside reward; None if leaving does not end an episode
 
 
 def expected_bytes(definition: EnvironmentDefinition, settings: VirtualSettings, path_size: int) -> int:
-    """Approximate memory of a session's lanes, in bytes: coordinates, particles, and functions of ``path_size``
-    numbers."""
+    """Return the approximate memory of a session's lanes, in bytes: coordinates, particles, and the ``path_size``
+    weights of each lane's function."""
     particles = settings.particles if settings.variant == "probabilistic" else 0
     path = path_size if settings.variant == "pathwise" else 0
     return 8 * settings.num_envs * (len(definition.coordinates) * (1 + particles) + path)
 
 
 def create(definition: EnvironmentDefinition, settings: VirtualSettings, seed: int) -> LaneState:
-    """Create N lanes that have not been reset yet."""
+    """Create the state of N lanes that have not been reset yet; ``seed`` is the key of their noise."""
     count, size = settings.num_envs, len(definition.coordinates)
     particles = settings.particles if settings.variant == "probabilistic" else 0
     zeros = torch.zeros(count, dtype=torch.int64, device=definition.device)
@@ -110,13 +110,13 @@ def reset(
     seed: int | Sequence[int] | None = None,
     mask: Bools | None = None,
 ) -> tuple[LaneState, Floats]:
-    """Begin new episodes in all lanes, or in those of the mask (N,). Returns lanes and observations (N, D).
+    """Begin new episodes in all lanes, or in those of the mask (N,). Return the lanes and their observations (N, D).
 
     An int seed s gives lane i the key (s, i), and a list gives lane i the key (s_i, 0), both from episode 0 on. Without
     a seed each lane begins its next episode. Lanes outside the mask keep their state.
 
     Raises:
-        InvalidInput: the mask or the list of seeds has another length, or a seed is negative or too large.
+        InvalidInput: the mask or the list of seeds has a wrong length, or a seed is negative or too large.
     """
     chosen = chosen_lanes(mask, lanes)
     if seed is not None:
@@ -125,7 +125,7 @@ def reset(
     return lanes, _observe(definition, settings, lanes)
 
 
-@torch.inference_mode()  # without records for gradients, which saves a sixth of the time
+@torch.inference_mode()  # no records for gradients, which saves a sixth of the time
 def step(
     model: DynamicsModel,
     settings: VirtualSettings,
@@ -135,7 +135,8 @@ def step(
     stds: bool = False,
     particle_steps: ArraySteps | None = None,
 ) -> tuple[LaneState, LaneTransition]:
-    """Step lanes in torch: the reference form of ``virtual.step``, with the same arguments and errors.
+    """Step lanes in torch. This is the reference implementation of ``virtual.step``, with the same arguments and
+    errors.
 
     With ``particle_steps`` particles move in compiled code.
     """
@@ -184,8 +185,14 @@ def step(
 
 
 def divided(settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> tuple[Chosen, Tensor | None]:
-    """Divide the chosen lanes into those that this step moves, and those (N,) that it resets, None if there
-    are none."""
+    """Divide the chosen lanes by what this step does with them.
+
+    Returns:
+        The lanes to move, and the lanes (N,) to reset because their episode has ended; None if there are none.
+
+    Raises:
+        NotReset: a chosen lane has no running episode, and autoreset does not start one in this step.
+    """
     running = lanes.phase == RUNNING
     if bool(running.all()):
         return chosen, None
@@ -198,7 +205,7 @@ def divided(settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> tupl
     if bool(refused.any()):
         which = refused.nonzero()[:, 0].tolist()
         shown = f"{which[:8]}{' and more' if len(which) > 8 else ''}"
-        raise NotReset(f"lanes {shown} have no running episode: reset them before stepping")
+        raise NotReset(f"lanes {shown} have no running episode; reset these lanes before you step them")
     return chosen & ~waiting, waiting
 
 
@@ -242,8 +249,11 @@ def _move(
 
 
 def _doubted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> Moved:
-    """The move with rewards lowered by ``caution`` times the doubt: the largest standard deviation of an output, in its
-    standard deviations over the samples, times the standard deviation of the reward over the samples."""
+    """Subtract ``caution`` times a doubt from the rewards of a move.
+
+    The doubt is the largest standard deviation of an output, relative to that output's standard deviation over the
+    samples, times the standard deviation of the reward over the samples.
+    """
     if settings.caution == 0:
         return moved
     assert moved.std is not None
@@ -252,8 +262,8 @@ def _doubted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> M
 
 
 def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> Tensor | None:
-    """Which lanes (N,) left the trusted range: the standard deviation of an output exceeds ``trust`` of its own
-    standard deviations."""
+    """Return which lanes (N,) left the trusted range: an output's standard deviation exceeds ``trust`` times its
+    standard deviation over the samples. None if there is no such range."""
     if settings.trust is None:
         return None
     assert moved.std is not None
@@ -261,7 +271,8 @@ def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) ->
 
 
 def _left(definition: EnvironmentDefinition, moved: Moved, untrusted: Tensor | None) -> Tensor | None:
-    """Which lanes (N,) end because they left the sampling range or the trusted range; None if no lane can end so."""
+    """Return which lanes (N,) end because they left the sampling range or the trusted range; None if that does not end
+    an episode."""
     if definition.outside_reward is None:
         return None
     left = ~definition.in_range(moved.q)
@@ -271,8 +282,10 @@ def _left(definition: EnvironmentDefinition, moved: Moved, untrusted: Tensor | N
 def _paid_outside(
     definition: EnvironmentDefinition, settings: VirtualSettings, before: LaneState, moved: Moved, left: Tensor
 ) -> Moved:
-    """The move, in which the lanes (N,) that left have ended. They get the outside reward for this step and for each
-    missing step up to the time limit. In a session without a time limit they get it for this step."""
+    """Terminate the lanes ``left`` (N,) and give them the outside reward.
+
+    They get it for this step and for each missing step up to the time limit; without a time limit for this step only.
+    """
     lacking = torch.ones_like(moved.reward)
     if settings.time_limit is not None:
         lacking = (settings.time_limit - before.elapsed).clamp(min=1).to(moved.reward.dtype)
@@ -285,8 +298,8 @@ def _paid_outside(
 def _advanced(
     settings: VirtualSettings, before: LaneState, moved: Moved, untrusted: Tensor | None
 ) -> tuple[LaneState, Tensor]:
-    """Lanes after their move, and which of them were truncated. As in Gymnasium, a step may both terminate and
-    truncate."""
+    """Return the lanes after their move, and which of them were truncated. As in Gymnasium, a step may both terminate
+    and truncate."""
     elapsed = before.elapsed + 1
     cut = torch.zeros_like(moved.terminated) if settings.time_limit is None else elapsed >= settings.time_limit
     cut = cut if untrusted is None else cut | untrusted
@@ -310,7 +323,7 @@ def _begin(definition: EnvironmentDefinition, settings: VirtualSettings, lanes: 
 def _seeded(lanes: LaneState, seed: int | Sequence[int], chosen: Chosen) -> LaneState:
     outside = [s for s in ([seed] if isinstance(seed, int) else seed) if not 0 <= s < 2**63]
     if outside:
-        raise InvalidInput(f"seed: expected 0 to 2^63 - 1, got {outside[0]}")
+        raise InvalidInput(f"seed: expected a whole number from 0 to 2^63 - 1, got {outside[0]}")
     if isinstance(seed, int):
         seeds, numbers = torch.full_like(lanes.seed, seed), torch.arange(len(lanes), device=lanes.seed.device)
     else:
@@ -333,13 +346,14 @@ def _observe(definition: EnvironmentDefinition, settings: VirtualSettings, lanes
 
 
 def _array(values: Tensor) -> NDArray[Any]:
-    """Convert a tensor of any device to the array that the wire takes."""
+    """Return a tensor of any device as a NumPy array."""
     array: NDArray[Any] = values.cpu().numpy()
     return array
 
 
 def chosen_lanes(mask: Bools | None, lanes: LaneState) -> Chosen:
-    """The lanes of a mask (N,), or all lanes."""
+    """Return the lanes of a mask (N,), or all lanes if it is None. Raises ``InvalidInput`` for a mask of another
+    length."""
     if mask is None:
         return EVERY
     if len(mask) != len(lanes):
@@ -348,7 +362,7 @@ def chosen_lanes(mask: Bools | None, lanes: LaneState) -> Chosen:
 
 
 def _scatter(chosen: Chosen, values: Tensor) -> Tensor:
-    """Spread values of the chosen lanes over all N lanes, with zero elsewhere."""
+    """Spread values of the chosen lanes over all N lanes, with 0 in the others."""
     if isinstance(chosen, slice):
         return values
     full = values.new_zeros(len(chosen), *values.shape[1:])

@@ -1,7 +1,6 @@
-"""Episodes from a given state under given actions: one along the mean, and some along functions sampled from the
-posterior.
+"""Imagined episodes from a given state under given actions: one along the mean, and some along sampled functions.
 
-Shapes: C coordinates, F action entries, T actions, K draws.
+Shapes: C coordinates, F action entries, T actions, K sampled functions.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ImaginedEpisode:
-    coordinates: Array  # (t + 1, C), the start included; t < T where it terminated
+    coordinates: Array  # (t + 1, C) states, the start included; t < T if the episode terminated
     reward: NDArray[np.floating[Any]]  # (t,)
     terminated: bool
 
@@ -34,7 +33,14 @@ class Imagined:
 
 
 def imagine(model: DynamicsModel, q: Array, u: Array, *, draws: int, seed: int) -> Imagined:
-    """Imagine episodes from q (C,) under u (T, F), the model's actions. The same seed draws the same functions."""
+    """Imagine episodes from the state q (C,) under the model's actions u (T, F).
+
+    Args:
+        model: the model.
+        q, u: first state and actions.
+        draws: number of episodes along sampled functions.
+        seed: seed of the functions.
+    """
     mean = _episodes(model, VirtualSettings(1, autoreset_mode="disabled"), q, u, seed)[0]
     if not draws:
         return Imagined(mean, ())

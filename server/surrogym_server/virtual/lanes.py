@@ -1,4 +1,4 @@
-"""LaneState: everything the next step of N lanes depends on, as tensors."""
+"""LaneState: everything that the next step of N lanes depends on, as tensors."""
 
 from __future__ import annotations
 
@@ -11,40 +11,40 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
-NEW, RUNNING, ENDED = 0, 1, 2  # phase of a lane
-EVERY = slice(None)  # replaces a mask of all lanes, so that nothing is copied
-Chosen = Tensor | slice  # a mask (N,), or EVERY
+NEW, RUNNING, ENDED = 0, 1, 2  # phases of a lane
+EVERY = slice(None)  # stands for a mask of all lanes, so that no array is copied
+Chosen = Tensor | slice  # selection of lanes: a mask (N,), or EVERY
 
 
 @dataclass(frozen=True)
 class LaneState:
-    """State of N lanes. P is 0 except in variant probabilistic, W is 0 except in variant pathwise.
+    """State of N lanes, with P particles and W weights of a function each.
 
-    Functions of models of different sizes lie side by side. Shorter rows are filled up with zeros, and a model reads as
-    many of the W numbers as it has.
+    P is 0 except in variant probabilistic, W is 0 except in variant pathwise. Functions of models of different sizes
+    are rows of one tensor: shorter rows are padded with zeros, and a model reads as many weights as it has.
     """
 
-    seed: Tensor  # (N,) int64, key of the noise
-    lane: Tensor  # (N,) int64, key of the noise
-    episode: Tensor  # (N,) int64, -1 before the first
-    elapsed: Tensor  # (N,) int64, steps in this episode
+    seed: Tensor  # (N,) int64, part of the noise's key
+    lane: Tensor  # (N,) int64, part of the noise's key
+    episode: Tensor  # (N,) int64, number of the episode; -1 before the first
+    elapsed: Tensor  # (N,) int64, number of steps in this episode
     phase: Tensor  # (N,) int8: NEW, RUNNING, or ENDED and waiting for a reset
-    q: Tensor  # (N, C) output state: what observation and termination are read from
+    q: Tensor  # (N, C) state, which determines observation and termination
     particles: Tensor  # (N, P, C)
-    path: Tensor  # (N, W) weights of the function the episode follows; drawn in its first step
+    path: Tensor  # (N, W) weights of the function that the episode follows; sampled in its first step
 
     def __len__(self) -> int:
         return len(self.seed)
 
     def take(self, index: NDArray[Any] | Chosen) -> LaneState:
-        """Select the lanes of an index or mask, in its order."""
+        """Return the lanes of an index array or mask, in its order."""
         if isinstance(index, slice):
             return self
         at = torch.as_tensor(index, device=self.seed.device)
         return LaneState(*(getattr(self, f.name)[at] for f in fields(self)))
 
     def put(self, index: NDArray[Any] | Chosen, other: LaneState) -> LaneState:
-        """Replace the lanes of an index or mask by ``other``."""
+        """Return the state with the lanes of an index array or mask replaced by ``other``."""
         if isinstance(index, slice):
             return other
         at = torch.as_tensor(index, device=self.seed.device)
@@ -62,7 +62,7 @@ class LaneState:
 
     @property
     def nbytes(self) -> int:
-        """Memory in bytes."""
+        """Memory of all tensors, in bytes."""
         return sum(int(getattr(self, f.name).nbytes) for f in fields(self))
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
@@ -74,5 +74,5 @@ class LaneState:
 
 
 def _widened(path: Tensor, width: int) -> Tensor:
-    """Fill weights (n, W) up with zeros to ``width``."""
+    """Pad weights (n, W) with zeros to ``width`` columns."""
     return path if path.shape[1] == width else pad(path, (0, width - path.shape[1]))

@@ -14,8 +14,11 @@ Limits = tuple[float, float]
 
 
 def reward_limits(low: float, high: float) -> Limits:
-    """Limits of virtual rewards, from the smallest and largest reward of all samples. On each side they lie beyond
-    these by the distance between them, or by their distance from 0, whichever is larger. They always include 0."""
+    """Return the limits of virtual rewards, given the smallest and the largest reward of all samples.
+
+    They lie beyond these rewards by their difference or by their largest absolute value, whichever is larger, so they
+    always include 0.
+    """
     room = max(high - low, abs(low), abs(high))
     return low - room, high + room
 

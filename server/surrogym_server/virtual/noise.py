@@ -13,11 +13,11 @@ from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.philox import MASK, normals, philox, uniforms
 from surrogym_shared import compiled
 
-STEP_BITS = 24  # of the counter's third word; the purpose has the other eight
+STEP_BITS = 24  # bits of the step in the counter's third word; the purpose has the other eight
 
 
 class Purpose(IntEnum):
-    """Purpose of a random number, so that no two uses share one."""
+    """Purpose of a random number, part of its key, so that no two purposes share a number."""
 
     START = 0
     BOX_START = 1
@@ -29,17 +29,17 @@ class Purpose(IntEnum):
 
 
 def uniform_noise(lanes: LaneState, purpose: Purpose, size: int) -> Tensor:
-    """Uniform numbers in (0, 1), (N, size)."""
+    """Return uniform numbers in (0, 1) for each lane, (N, size)."""
     return uniforms(_words(lanes, purpose, 1, size)).flatten(-2)[:, 0, :size]
 
 
 def normal_noise(lanes: LaneState, purpose: Purpose, particles: int, size: int) -> Tensor:
-    """Standard normal numbers, (N, particles, size)."""
+    """Return standard normal numbers for each particle of each lane, (N, particles, size)."""
     return normals(_words(lanes, purpose, particles, size)).flatten(-2)[..., :size]
 
 
 def _words(lanes: LaneState, purpose: Purpose, particles: int, size: int) -> Tensor:
-    """Random words, (N, particles, ceil(size / 4), 4): one counter gives four words."""
+    """Return random words, (N, particles, ceil(size / 4), 4): each counter value gives four words."""
     blocks = -(-size // 4)
     third = lanes.elapsed | (int(purpose) << STEP_BITS)
     if lanes.seed.device == CPU and compiled.available():

@@ -12,11 +12,11 @@ from surrogym_server.virtual.noise import Purpose, normal_noise
 
 
 def with_paths(model: DynamicsModel, lanes: LaneState, functions: int | None = None) -> LaneState:
-    """Draw the functions of the lanes that are in the first step of their episode, under the model of that episode.
+    """Sample the functions of those lanes that are in the first step of their episode.
 
-    A draw is a pure function of model, seed, lane and episode. With a number of ``functions`` the lane counts modulo
-    that number, so that lanes share functions. The draw is still kept in the state, because solving for other lanes in
-    the same batch could change its last bits.
+    A function depends on model, seed, lane and episode alone. With a number of ``functions`` the lane counts modulo
+    that number, so that lanes share functions. Its weights are still kept in the state, because computing them with
+    other lanes in the same batch could change their last bits.
     """
     fresh = lanes.elapsed == 0
     if not bool(fresh.any()):

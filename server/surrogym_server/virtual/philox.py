@@ -11,14 +11,15 @@ import math
 import torch
 from torch import Tensor
 
-MASK = 0xFFFFFFFF
-MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
-WEYL = (0x9E3779B9, 0xBB67AE85)
+MASK = 0xFFFFFFFF  # lower 32 bits
+MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # constants M_0 and M_1 of the reference
+WEYL = (0x9E3779B9, 0xBB67AE85)  # increments of the key in each round
 ROUNDS = 10
 
 
 def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Tensor]) -> Tensor:
-    """Four random words for each counter and key. Tensors broadcast; the result (..., 4) is int64 in [0, 2^32)."""
+    """Return four random words for each counter and key. Tensors broadcast; the result (..., 4) is int64 in
+    [0, 2^32)."""
     c0, c1, c2, c3 = counter
     k0, k1 = key
     for _ in range(ROUNDS):
@@ -30,12 +31,13 @@ def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Te
 
 
 def uniforms(words: Tensor) -> Tensor:
-    """Uniform numbers in (0, 1), float64, from words in [0, 2^32)."""
+    """Return uniform numbers in (0, 1), float64, computed from words in [0, 2^32)."""
     return words.to(torch.float64).add_(0.5).mul_(2.0**-32)
 
 
 def normals(words: Tensor) -> Tensor:
-    """Standard normal numbers (..., 4) from random 32-bit words (..., 4), two from each pair (Box and Muller 1958)."""
+    """Return standard normal numbers (..., 4) from random 32-bit words (..., 4), two from each pair (Box and Muller
+    1958)."""
     u = uniforms(words)
     radius = (-2 * u[..., 0::2].log()).sqrt()
     angle = 2 * math.pi * u[..., 1::2]

@@ -1,6 +1,6 @@
 """Systematic errors of a model that a session adds to its predictions.
 
-Shapes: N lanes, C coordinates, F action entries, O outputs, P inputs: see ``inputs``.
+Shapes: N lanes, C coordinates, F action entries, O outputs, P inputs of a residual (see ``inputs``).
 """
 
 from __future__ import annotations
@@ -19,30 +19,32 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.dynamics import Moved
 from surrogym_server.virtual.lanes import LaneState
 
-FARTHEST = 3.0  # standard deviations to which a standardised input is limited
+FARTHEST = 3.0  # limit of a standardised input, in standard deviations
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Affine functions of standardised inputs, one for each output; lane i has those of row i modulo K."""
+    """Errors as affine functions of standardised inputs, one for each output.
 
-    centre: tuple[float, ...]  # (P,)
-    scale: tuple[float, ...]  # (P,)
-    weights: tuple[tuple[tuple[float, ...], ...], ...]  # (K, O, 1 + P)
+    There are K sets of functions; lane i uses set i modulo K.
+    """
+
+    centre: tuple[float, ...]  # (P,) mean of each input
+    scale: tuple[float, ...]  # (P,) standard deviation of each input
+    weights: tuple[tuple[tuple[float, ...], ...], ...]  # (K, O, 1 + P) constant and slopes
 
     @classmethod
     def from_saved(cls, saved: Mapping[str, Any]) -> Self:
-        """Restore what JSON made of a residual."""
+        """Build a residual from its JSON form."""
         weights = tuple(tuple(map(tuple, rows)) for rows in saved["weights"])
         return cls(tuple(saved["centre"]), tuple(saved["scale"]), weights)
 
     def check(self, definition: EnvironmentDefinition) -> None:
-        """Raise ``InvalidInput`` if the residual does not fit the environment."""
+        """Raise ``InvalidInput`` unless the residual fits the environment."""
         if definition.moves_observation:
             raise InvalidInput(
                 "residual: expected a surrogate that models coordinates, got one of preset 'paper', which models "
-                "observations: "
-                "leave the residual out"
+                "observations; leave the residual out"
             )
         outputs = len(definition.outputs)
         size = len(definition.coordinates) + len(definition.angles) + definition.action.size
@@ -50,13 +52,13 @@ class Residual:
         if shapes != {size} or {len(rows) for rows in self.weights} != {outputs}:
             raise InvalidInput(
                 f"residual: expected centre and scale with {size} numbers each, one for each input of the model, and "
-                f"weights with {size + 1} numbers for each of {outputs} outputs, got other numbers of them"
+                f"weights with {size + 1} numbers for each of {outputs} outputs; got arrays of other sizes"
             )
         if min(self.scale) <= 0:
             raise InvalidInput(f"residual: expected each entry of scale above 0, got {min(self.scale)}")
 
     def of(self, definition: EnvironmentDefinition, lanes: LaneState, u: Tensor) -> Tensor:
-        """Errors (N, O) of the step of lanes under u (N, F)."""
+        """Return the errors (N, O) of the step of lanes under u (N, F)."""
         x = inputs(definition, lanes.q, u)
         x = ((x - x.new_tensor(self.centre)) / x.new_tensor(self.scale)).clamp(-FARTHEST, FARTHEST)
         x = torch.cat([torch.ones_like(x[:, :1]), x], 1)
@@ -65,7 +67,8 @@ class Residual:
 
 
 def inputs(definition: EnvironmentDefinition, q: Tensor, u: Tensor) -> Tensor:
-    """Coordinates q (N, C), with cosine and sine in place of an angle, and actions u (N, F): (N, P)."""
+    """Return the inputs of a residual, (N, P): coordinates q (N, C), with cosine and sine in place of an angle, and
+    actions u (N, F)."""
     columns: list[Tensor] = []
     for index in range(q.shape[1]):
         value = q[:, index]
@@ -74,7 +77,7 @@ def inputs(definition: EnvironmentDefinition, q: Tensor, u: Tensor) -> Tensor:
 
 
 def with_residual(model: DynamicsModel, residual: Residual, lanes: LaneState, u: Tensor, moved: Moved) -> Moved:
-    """The move of lanes under u (N, F) with the errors of ``residual`` added, and the environment's rules applied."""
+    """Add the errors of ``residual`` to a move of lanes under u (N, F), and apply the environment's rules."""
     definition = model.definition
     errors = residual.of(definition, lanes, u)
     q = settle(definition, moved.q + placed(definition, errors[:, :-1]))

@@ -1,4 +1,4 @@
-"""Noise of the sensors: observations show states with an error, and the error does not move the state."""
+"""Sensor noise: observations show the state with an error, which does not move the state."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 
-SensorNoise = tuple[tuple[str, float], ...]  # name of a coordinate, standard deviation of one measurement
-MEASURED = 2.0  # variances of a measurement in that of a step's noise: one at its start, and one at its end
+SensorNoise = tuple[tuple[str, float], ...]  # pairs: name of a coordinate, standard deviation of one measurement
+MEASURED = 2.0  # how many measurement errors a step's noise contains: one at its start, one at its end
 
 
 def sensed(definition: EnvironmentDefinition, noise: SensorNoise, lanes: LaneState) -> Tensor:
-    """States of the lanes as the sensors show them, (N, C). Each step of a lane has its own error."""
+    """Return the states of the lanes as the sensors measure them, (N, C). Each step of a lane has its own error."""
     if not noise:
         return lanes.q
     drawn = normal_noise(lanes, Purpose.SENSOR, 1, len(definition.coordinates))[:, 0]
@@ -25,7 +25,7 @@ def sensed(definition: EnvironmentDefinition, noise: SensorNoise, lanes: LaneSta
 
 
 def driving(model: DynamicsModel, noise: SensorNoise, process: Tensor) -> Tensor:
-    """Standard normal noise of the process (N, ..., M), without the share of the learned noise that is the sensors'."""
+    """Scale standard normal process noise (N, ..., M) down by the share of the learned noise that sensors cause."""
     able = offers(model, LearnedNoise)
     if not noise or able is None or model.definition.moves_observation:
         return process
@@ -36,11 +36,11 @@ def driving(model: DynamicsModel, noise: SensorNoise, process: Tensor) -> Tensor
 
 
 def check(definition: EnvironmentDefinition, noise: SensorNoise) -> None:
-    """Raise ``InvalidInput`` for noise of a coordinate that the dynamics don't move, or that does not exist."""
+    """Raise ``InvalidInput`` unless each coordinate with sensor noise exists and is moved by the dynamics."""
     moving = [definition.coordinate_names[i] for i in definition.moving]
     for name, _ in noise:
         if name not in moving:
-            raise InvalidInput(f"sensor_noise: expected coordinates of {', '.join(moving)}, got {name!r}")
+            raise InvalidInput(f"sensor_noise: expected coordinates among {', '.join(moving)}, got {name!r}")
 
 
 def _spread(definition: EnvironmentDefinition, noise: SensorNoise) -> Tensor:

@@ -1,4 +1,4 @@
-"""The stateless transition, as numpy arrays."""
+"""Prediction of single steps without a session, as NumPy arrays."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class PointPrediction:
     next_coordinates: Array  # (n, C)
     next_observation: Array  # (n, D)
     reward: Array  # (n,) mean, without the penalty
-    reward_std: Array  # (n,)
+    reward_std: Array  # (n,) standard deviation of the reward
     terminated: NDArray[Any]  # (n,) bool
 
 
 def predict_points(model: DynamicsModel, q: Array, u: Array) -> PointPrediction:
-    """Predict one mean step from each of q (n, C) under u (n, F)."""
+    """Predict one mean step from each of n states q (n, C) under u (n, F)."""
     at, action = torch.from_numpy(q), torch.from_numpy(u)
     predicted = model.transition(at, action, reward_std=True)
     require_shapes(model, predicted, at)

@@ -1,4 +1,4 @@
-"""Start of an episode: from the declared distribution or anywhere in the sampling range, and the initial particles."""
+"""Start of an episode: states from the declared distribution or elsewhere, and initial particles."""
 
 from __future__ import annotations
 
@@ -20,8 +20,15 @@ def start_coordinates(
     visited_share: float = 0.0,
     visited: Tensor | None = None,
 ) -> Tensor:
-    """Start of each lane's current episode, (N, C). A share of the episodes starts anywhere in the sampling range, and
-    another share at one of the states ``visited`` (k, C)."""
+    """Draw the start of each lane's current episode, (N, C).
+
+    Args:
+        definition: the environment.
+        lanes: the lanes, whose keys determine the draw.
+        box_share: share of the episodes that start anywhere in the sampling range.
+        visited_share: share of the episodes that start at one of the states ``visited``.
+        visited: (k, C), or None if ``visited_share`` is 0.
+    """
     coordinates = definition.coordinates
     p = uniform_noise(lanes, Purpose.START, len(coordinates))
     if definition.starts:
@@ -38,15 +45,15 @@ def start_coordinates(
 
 
 def _one_of(states: Tensor, p: Tensor) -> Tensor:
-    """The state (N, C) of ``states`` (k, C) at each of the shares p (N,), in [0, 1)."""
+    """Return the state (N, C) of ``states`` (k, C) that each number p (N,) in [0, 1) selects."""
     return states[(p * len(states)).long().clamp_(max=len(states) - 1)]
 
 
 def start_particles(
     definition: EnvironmentDefinition, lanes: LaneState, q: Tensor, count: int, spread: float
 ) -> Tensor:
-    """Initial particles (N, P, C) around starts q (N, C): normal, with a fixed small standard deviation in each
-    dimension (section 4)."""
+    """Draw initial particles (N, P, C) around starts q (N, C): normal, with standard deviation ``spread`` times the
+    range of each coordinate (section 4)."""
     each = [_std(definition, i, spread) for i in range(len(definition.coordinates))]
     std = torch.tensor(each, dtype=q.dtype, device=q.device)
     noise = normal_noise(lanes, Purpose.SPREAD, count, len(definition.coordinates))

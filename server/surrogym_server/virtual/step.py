@@ -1,4 +1,4 @@
-"""Step N lanes, in the form that the session chose when it was opened."""
+"""Step of N lanes, in torch or in compiled code, as the session chose when it was opened."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ logger = logging.getLogger(__name__)
 
 
 def in_fastest_form(settings: VirtualSettings, model: DynamicsModel) -> VirtualSettings:
-    """Settings of a new session, with compiled steps if they work here and are faster.
+    """Return the settings of a new session, with compiled steps if they work on this machine and are faster.
 
-    Compiled steps know no residual.
+    Compiled steps don't support a residual.
     """
     stds = settings.variant == "probabilistic" or settings.penalty > 0 or settings.doubts
     able = None if settings.residual is not None else offers(model, CompiledSteps)
@@ -26,7 +26,7 @@ def in_fastest_form(settings: VirtualSettings, model: DynamicsModel) -> VirtualS
         return settings
     try:
         return replace(settings, compiled=_array_steps(model, replace(settings, compiled=True)) is not None)
-    except Exception:  # of numba or its compiler, on an unsupported platform
+    except Exception:  # numba or its compiler may fail in any way on an unsupported platform
         logger.warning("steps can't be compiled on this machine, so torch computes them", exc_info=True)
         return settings
 
@@ -39,11 +39,22 @@ def step(
     mask: Bools | None = None,
     stds: bool = False,
 ) -> tuple[LaneState, LaneTransition]:
-    """Step all lanes, or those of the mask (N,), under u (N, F), the model's actions.
+    """Step all lanes, or those of the mask (N,), under the model's actions u (N, F).
+
+    Args:
+        model: the model.
+        settings: settings of the session.
+        lanes: state of the lanes.
+        u: actions.
+        mask: lanes to step, or None for all.
+        stds: whether to return the standard deviation of each output.
+
+    Returns:
+        The state after the step, and its results.
 
     Raises:
-        InvalidInput: a mask of another length.
-        NotReset: a lane that was never reset, or that ended under autoreset disabled.
+        InvalidInput: the mask has a wrong length.
+        NotReset: a lane was never reset, or its episode ended under autoreset `disabled`.
     """
     move = _array_steps(model, settings)
     if move is None or settings.variant == "probabilistic":

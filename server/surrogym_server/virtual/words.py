@@ -24,8 +24,10 @@ LOW, HALF = np.uint64(0xFFFFFFFF), np.uint64(32)
     types.int64[:, :, ::1],
 )
 def fill(seed: Ints, lane: Ints, episode: Ints, third: Ints, words: Ints) -> None:
-    """Fill in words (N, counters, 4). The counters of a lane are the words (0, 1, ...), lane, episode and third, (N,);
-    its key is ``seed`` (N,)."""
+    """Fill ``words`` (N, counters, 4) with random words.
+
+    The counter of lane n's i-th four words is (lane[n], episode[n], third[n], i), and its key is ``seed[n]``.
+    """
     for n in range(len(words)):
         key0, key1 = np.uint64(seed[n]) & LOW, (np.uint64(seed[n]) >> HALF) & LOW
         for i in range(words.shape[1]):

@@ -1,2 +1,2 @@
-"""Steps of lanes in compiled code, for models that offer ``CompiledTransitions``; ``virtual.environment`` is the
+"""Steps of lanes in compiled code, for models that offer ``CompiledSteps``; ``virtual.environment`` is the
 reference."""

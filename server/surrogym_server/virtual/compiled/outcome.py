@@ -1,4 +1,4 @@
-"""Outcome of a move: state, rewards, ends and observations of lanes."""
+"""Outcome of a step in compiled code: states, rewards, terminations and observations of lanes."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Phases = NDArray[np.int8]
 
-BLOCK = 64
+BLOCK = 64  # number of lanes computed at once
 
 
 @entry(types.float64[::1], types.int64[:, ::1], types.float64[:, ::1], types.float32[:, ::1])
 def observe(numbers: Floats, places: Ints, q: Floats, observation: Singles) -> None:
-    """Observations (N, D) of coordinates q (N, C)."""
+    """Write the observations (N, D) of coordinates q (N, C) to ``observation``; ``numbers`` and ``places`` are tables
+    of its terms."""
     size = q.shape[1]
     for begin in range(0, len(q), BLOCK):
         lanes = min(BLOCK, len(q) - begin)
@@ -45,7 +46,8 @@ def _exceeds(std: Floats, trust: float, scales: Floats) -> bool:
 
 @inlined
 def _doubt(std: Floats, scales: Floats) -> float:
-    """The largest standard deviation, in standard deviations over the samples, times that of the reward."""
+    """Return the largest of the standard deviations relative to those over the samples, times the reward's standard
+    deviation over the samples."""
     most = 0.0
     for o in range(len(std)):
         most = max(most, std[o] / scales[o])
@@ -54,8 +56,10 @@ def _doubt(std: Floats, scales: Floats) -> float:
 
 @inlined
 def _penalised(mean: float, std: Floats, penalty: float, caution: float, scales: Floats) -> float:
-    """A mean reward less penalties of the standard deviations (O,), that of the reward last. Those of weight 0 are not
-    read."""
+    """Return a mean reward less its penalties for the standard deviations ``std`` (O,), the reward's last.
+
+    ``std`` is not read where ``penalty`` and ``caution`` are 0.
+    """
     paid = mean if penalty == 0 else mean - penalty * std[-1]
     return float(paid - caution * _doubt(std, scales) if caution > 0 else paid)
 
@@ -108,16 +112,20 @@ def conclude(
     rewards: Floats,
     ends: Bools,
 ) -> int:
-    """Complete the step of the moving lanes (N,), whose moves are given in rows (K, ...), in place.
+    """Complete the step of the moving lanes, given by the mask ``moving`` (N,). Change arrays in place.
 
     Args:
-        trust, time_limit: infinite and -1 if there is none.
+        moving: lanes that move; row k of q_next, pay, std and over belongs to the k-th of these.
+        q_next, pay, std, over: predicted coordinates, rewards, standard deviations and terminations of these lanes.
+        scales: (O,) standard deviation of each output over the samples.
+        terminal_reward: reward that terminating steps pay in addition.
+        penalty, trust, caution, time_limit: as in ``VirtualSettings``; trust is infinite and time_limit -1 for None.
         inside: ends of the sampling range, (2, C). A lane outside of it has left. Not read if the next one is NaN.
         outside_reward: what a lane that has left, or is untrusted, gets for this step and each missing one; NaN if such
             a lane does not end.
-        q, elapsed, phase: of all lanes.
-        rewards: penalised rewards and means, (2, N).
-        ends: terminated, truncated, untrusted, terminated or truncated, left, (5, N).
+        q, elapsed, phase: state of all lanes, updated.
+        rewards: (2, N) penalised rewards and mean rewards, written.
+        ends: (5, N) terminated, truncated, untrusted, terminated or truncated, left; written.
 
     Returns:
         The number of lanes that ended.

@@ -1,4 +1,4 @@
-"""Step N lanes in compiled code; ``virtual.environment.step`` is the reference.
+"""Step of N lanes in compiled code; ``virtual.environment.step`` is the reference.
 
 Arrays here share memory with the tensors of a lane state. A step copies whatever it changes.
 """
@@ -31,8 +31,8 @@ Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
-MODELS = 64  # whose tables are kept
-ANYWHERE = np.zeros((0, 0))  # in the place of the ends of the sampling range
+MODELS = 64  # number of models whose observation tables are cached
+ANYWHERE = np.zeros((0, 0))  # passed as the ends of the sampling range where these are not needed
 NO_LANES = np.zeros(0, dtype=np.int64)
 
 
@@ -44,7 +44,7 @@ class _Changed:
     episode: Ints  # (N,)
     elapsed: Ints  # (N,)
     phase: NDArray[np.int8]  # (N,)
-    rewards: Floats  # (2, N) penalised, and mean
+    rewards: Floats  # (2, N) penalised rewards, and mean rewards
     ends: Bools  # (5, N) terminated, truncated, untrusted, terminated or truncated, left
 
     @classmethod
@@ -67,7 +67,7 @@ def compiled_step(
     mask: Bools | None,
     stds: bool,
 ) -> tuple[LaneState, LaneTransition]:
-    """Step lanes as ``virtual.environment.step`` does; ``move`` holds the model's compiled steps."""
+    """Step lanes as ``virtual.environment.step`` does; ``move`` is the model's compiled step."""
     definition, changed = model.definition, _Changed.of(lanes)
     running, moving, beginning = _divided(settings, lanes, changed.phase, mask)
     if settings.variant == "pathwise":
@@ -101,7 +101,12 @@ def compiled_step(
 def _divided(
     settings: VirtualSettings, lanes: LaneState, phase: NDArray[np.int8], mask: Bools | None
 ) -> tuple[Bools, Chosen, Bools | None]:
-    """The lanes (N,) that this step moves, twice, and those that it resets instead, None if there are none."""
+    """Divide the lanes by what this step does with them.
+
+    Returns:
+        A mask (N,) of the lanes to move, the same as a mask or EVERY, and the lanes (N,) to reset; None if there are
+        none.
+    """
     running = phase == RUNNING
     if mask is None and running.all():
         return running, EVERY, None
@@ -119,7 +124,7 @@ def _moved(
     moving: Chosen,
     stds: bool,
 ) -> ArrayTransition:
-    """Move the moving lanes, in their order."""
+    """Predict the step of the moving lanes, in their order."""
     wanted, process = stds or settings.doubts, None
     if settings.process_noise:
         drawn = normal_noise(lanes, Purpose.PROCESS, 1, len(model.definition.outputs) - 1)[:, 0]
@@ -142,7 +147,7 @@ def _rows(moving: Chosen, values: NDArray[Any]) -> NDArray[Any]:
 def _concluded(
     model: DynamicsModel, settings: VirtualSettings, moving: Bools, moved: ArrayTransition, changed: _Changed
 ) -> int:
-    """Complete the step of the moving lanes, and return how many of them ended."""
+    """Complete the step of the moving lanes in ``changed``, and return the number of lanes that ended."""
     trust, limit, outside = settings.trust, settings.time_limit, model.definition.outside_reward
     scales = model.scales.numpy() if settings.doubts else np.zeros(0)
     return conclude(
@@ -170,7 +175,7 @@ def _concluded(
 def _begin(
     definition: EnvironmentDefinition, settings: VirtualSettings, lanes: LaneState, chosen: Bools, changed: _Changed
 ) -> None:
-    """Begin new episodes in the chosen lanes."""
+    """Begin new episodes in the chosen lanes (N,), in ``changed``."""
     at = torch.from_numpy(chosen)
     fresh = lanes.take(at)
     fresh = replace(fresh, episode=fresh.episode + 1, elapsed=torch.zeros_like(fresh.elapsed))
@@ -188,7 +193,7 @@ def _shown(
     changed: _Changed,
     chosen: Ints | None = None,
 ) -> Floats:
-    """States of all lanes, or of the chosen ones, as the sensors show them, (n, C)."""
+    """Return the states of all lanes, or of the chosen ones, as the sensors measure them, (n, C)."""
     if not settings.sensor_noise or (chosen is not None and not len(chosen)):
         return changed.q if chosen is None else changed.q[chosen]
     lanes = changed.lanes(before)
@@ -210,7 +215,7 @@ def _observation_tables(steps: ArraySteps) -> Tables:
 
 
 def _scattered(moving: Bools, values: Floats) -> Floats:
-    """Spread values of the moving lanes over all N lanes, with zero elsewhere."""
+    """Spread values of the moving lanes over all N lanes, with 0 in the others."""
     if len(values) == len(moving):
         return values
     full: Floats = np.zeros((len(moving), *values.shape[1:]))
