@@ -1,8 +1,8 @@
-"""Elementary functions of whole arrays, in forms that the compiler turns into vector instructions.
+"""Elementary functions of whole arrays, in forms that the compiler can turn into vector instructions.
 
-Each reduces its argument by a multiple k of log 2 or pi / 2, with k from the low bits of x / step + 1.5 2^52, and
-evaluates a polynomial of the rest. Errors are below 2 units in the last place. The scalar functions of the C library,
-which compiled code would call for each entry, take five to ten times as long.
+Each function reduces its argument by a multiple k of log 2 or pi / 2, with k from the low bits of x / step + 1.5 2^52,
+and evaluates a polynomial of the rest. Errors are below 2 units in the last place. The scalar functions of the C
+library, which compiled code would call for each entry, take five to ten times as long.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from surrogym_shared.compiled.jit import compiled, summing
 
 Floats = NDArray[np.float64]
 
-ROUNDING = 1.5 * 2.0**52  # added to a number below 2^51, it leaves the rounded number in the low bits
-PER_LOG2 = 1.4426950408889634
-LOG2_HIGH, LOG2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
-LEAST_EXPONENT = -708.0  # e to this power is the smallest normal number
-PER_RIGHT_ANGLE = 0.63661977236758134
+ROUNDING = 1.5 * 2.0**52  # if it is added to a number below 2^51, the low bits hold the rounded number
+PER_LOG2 = 1.4426950408889634  # 1 / log 2
+LOG2_HIGH, LOG2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # log 2 in two parts
+LEAST_EXPONENT = -708.0  # e to this power is about the smallest normal number
+PER_RIGHT_ANGLE = 0.63661977236758134  # 2 / pi
 # pi / 2 in three parts, of which the first two have 33 bits, so that their products with k are exact
 RIGHT_ANGLE = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
-LARGEST_ANGLE = 1e5  # for larger angles, the C library reduces the argument
+LARGEST_ANGLE = 1e5  # larger angles are left to the C library, which reduces them exactly
 
 
 def _keep_bits(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -41,8 +41,8 @@ def _float_of(_: Any, _bits: Any) -> Any:
     return types.float64(types.int64), _keep_bits
 
 
-bits_of: Any = intrinsic(_bits_of)  # of a float64, as an int64
-float_of: Any = intrinsic(_float_of)  # of 64 bits
+bits_of: Any = intrinsic(_bits_of)  # function: the bits of a float64, as an int64
+float_of: Any = intrinsic(_float_of)  # function: the float64 with the bits of an int64
 
 
 @compiled
@@ -53,7 +53,7 @@ def exponential(x: Floats) -> None:
         t = v * PER_LOG2 + ROUNDING
         k = t - ROUNDING
         r = (v - k * LOG2_HIGH) - k * LOG2_LOW
-        # (e^r - 1 - r) / r^2 of |r| <= log(2) / 2, interpolated at Chebyshev nodes, to 1e-17
+        # (e^r - 1 - r) / r^2 for |r| <= log(2) / 2, interpolated at Chebyshev nodes, with an error of 1e-17
         p = 2.510038549551032e-08
         p = p * r + 2.7620088445409746e-07
         p = p * r + 2.7557268459997064e-06
@@ -65,12 +65,12 @@ def exponential(x: Floats) -> None:
         p = p * r + 0.16666666666666669
         p = p * r + 0.5000000000000001
         p = p * r + 1.0
-        x[i] = float_of(bits_of(p * r + 1.0) + (bits_of(t) << 52))  # times 2^k
+        x[i] = float_of(bits_of(p * r + 1.0) + (bits_of(t) << 52))  # multiplies by 2^k
 
 
 @compiled
 def sine_and_cosine(x: Floats, sine: Floats, cosine: Floats) -> None:
-    """Write sin x and cos x of x (n,) to arrays of the same size."""
+    """Write the sines and cosines of x (n,) to the arrays ``sine`` and ``cosine`` of the same size."""
     large = False
     for i in range(x.size):
         large |= not abs(x[i]) < LARGEST_ANGLE
@@ -104,7 +104,7 @@ def sine_and_cosine(x: Floats, sine: Floats, cosine: Floats) -> None:
 
 @compiled
 def wrapped(angle: float) -> float:
-    """Wrap an angle to [-pi, pi), like ``environment.definition.wrap``."""
+    """Return an angle, wrapped to [-pi, pi), as ``environment.definition.wrap`` does."""
     turned = angle + math.pi
     if not 0.0 <= turned < 2 * math.pi:
         turned %= 2 * math.pi
@@ -113,7 +113,7 @@ def wrapped(angle: float) -> float:
 
 @summing
 def dot(a: Floats, b: Floats) -> float:
-    """Sum of a_i b_i, (n,) each, in any order."""
+    """Return the sum of a_i b_i for a and b (n,). The order of summation is free, so the compiler may vectorise it."""
     total = 0.0
     for i in range(len(a)):
         total += a[i] * b[i]

@@ -1,4 +1,4 @@
-"""Many matrices in one array, so that a compiled function takes only two arguments for all its data."""
+"""Tables: many matrices in one array, so that a compiled function takes only two arguments for all its data."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ from surrogym_shared.compiled.jit import compiled
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Tables = tuple[Floats, Ints]  # numbers (K,), and begin, rows and columns of each matrix in them (S, 3)
+Tables = tuple[Floats, Ints]  # all numbers (K,); and for each matrix (S, 3) its offset there, its rows and columns
 
 
 class TablesBuilder:
-    """Collects matrices. A vector is a matrix of one row. Whole numbers are stored as float64."""
+    """Builder that collects matrices into tables. A vector is a matrix of one row; whole numbers are stored as
+    float64."""
 
     def __init__(self) -> None:
         self._matrices: list[NDArray[Any]] = []
 
     def add(self, *matrices: ArrayLike) -> int:
-        """Append matrices, and return the place of the first."""
+        """Append matrices, and return the index of the first."""
         first = len(self._matrices)
         self._matrices += [np.atleast_2d(np.asarray(matrix, dtype=np.float64)) for matrix in matrices]
         return first
 
     def reserve(self) -> int:
-        """Reserve a place that ``fill`` fills later."""
+        """Append an empty matrix, to be replaced by ``fill``, and return its index."""
         return self.add(np.zeros((1, 0)))
 
     def fill(self, place: int, matrix: ArrayLike) -> None:
@@ -44,6 +45,6 @@ class TablesBuilder:
 
 @compiled
 def matrix(numbers: Floats, places: Ints, place: int) -> Floats:
-    """The matrix at a place, (rows, columns), as a view."""
+    """Return the matrix with index ``place``, (rows, columns), as a view."""
     begin, rows, columns = places[place, 0], places[place, 1], places[place, 2]
     return numbers[begin : begin + rows * columns].reshape((rows, columns))

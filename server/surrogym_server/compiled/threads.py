@@ -1,4 +1,4 @@
-"""Rows of one call, computed in several threads. Compiled code holds no lock of the interpreter."""
+"""Computation of the rows of one call in several threads. Compiled code does not hold the interpreter's lock."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 def side_by_side(function: Callable[[slice], None], rows: int, block: int, threads: int) -> None:
     """Call ``function`` for all ``rows``, divided into as many slices as threads, each of whole blocks of rows.
 
-    The caller's thread computes one slice. The other threads are new, because a process that is forked keeps none.
+    The calling thread computes one slice. The other threads are new ones, because a forked process inherits none.
     """
     blocks = -(-rows // block)
     share = block * -(-blocks // threads)

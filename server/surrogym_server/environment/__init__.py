@@ -1,1 +1,1 @@
-"""One environment as the core represents it: definition, terms, actions, features, samples, and the rules of a step."""
+"""Representation of one environment in the core: definition, terms, actions, features, samples, and rules of a step."""

@@ -1,4 +1,4 @@
-"""Actions: those of a policy, those of the model, and the checks and conversions between them."""
+"""Actions of a policy and of the model: checks, and conversions between them."""
 
 from __future__ import annotations
 
@@ -11,14 +11,22 @@ from surrogym_server.environment.definition import ActionDefinition
 from surrogym_server.errors import InvalidInput
 
 Array = NDArray[np.float64]
-FLOAT32_SLACK = 1e-6
+FLOAT32_SLACK = 1e-6  # accepted excess over a limit, as a share of the range, because policies compute in float32
 
 
 def policy_actions(action: ActionDefinition, raw: NDArray[Any], num_envs: int) -> Array:
-    """Check a policy's actions, (N, F) or (N,) if F = 1, and convert them to the model's, (N, F).
+    """Check a policy's actions, and convert them to the model's.
+
+    Args:
+        action: definition of the action.
+        raw: (N, F), or (N,) if F = 1.
+        num_envs: N.
+
+    Returns:
+        The model's actions, (N, F).
 
     Raises:
-        InvalidInput: wrong shape, not finite, not an integer, or out of bounds.
+        InvalidInput: the array has a wrong shape, or an entry is not finite, not a whole number or out of bounds.
     """
     rows = _rows(raw, (num_envs, action.size))
     if counts := action.policy_counts:
@@ -28,10 +36,10 @@ def policy_actions(action: ActionDefinition, raw: NDArray[Any], num_envs: int) -
 
 
 def model_actions(action: ActionDefinition, raw: NDArray[Any]) -> Array:
-    """Check actions of queries and samples, (n, F): continuous values, or numbers of discrete actions.
+    """Check actions of queries and samples, (n, F): continuous values, or the numbers of discrete actions.
 
     Raises:
-        InvalidInput: wrong shape, not finite, not an integer, or out of bounds.
+        InvalidInput: the array has a wrong shape, or an entry is not finite, not a whole number or out of bounds.
     """
     rows = _rows(raw, (len(raw), action.size))
     if action.nvec:
@@ -41,14 +49,14 @@ def model_actions(action: ActionDefinition, raw: NDArray[Any]) -> Array:
 
 
 def decode_bins(action: ActionDefinition, rows: Array) -> Array:
-    """Convert numbers of equally spaced bins (n, F) to continuous values (n, F)."""
+    """Convert the numbers of equally spaced bins, (n, F), to continuous values, (n, F)."""
     low, high = action.limits
     values: Array = low + rows * (high - low) / (np.array(action.bins) - 1)
     return values
 
 
 def _rows(raw: NDArray[Any], expected: tuple[int, int]) -> Array:
-    rows = np.array(raw, dtype=np.float64)  # a frame's array is a view, neither aligned nor writable
+    rows = np.array(raw, dtype=np.float64)  # a copy, because an array from a frame may be unaligned and read-only
     if rows.ndim == 1 and expected[1] == 1:
         rows = rows[:, None]
     if rows.shape != expected:
@@ -64,7 +72,7 @@ def _require_finite(rows: Array) -> None:
 def _require_counts(rows: Array, counts: tuple[int, ...]) -> None:
     _require_finite(rows)
     if (rows != np.floor(rows)).any():
-        raise InvalidInput(f"action: expected integers, got {rows[rows != np.floor(rows)][0]:g}")
+        raise InvalidInput(f"action: expected whole numbers, got {rows[rows != np.floor(rows)][0]:g}")
     bad = (rows < 0) | (rows >= np.array(counts))
     if bad.any():
         row, entry = np.argwhere(bad)[0]
@@ -75,10 +83,10 @@ def _require_counts(rows: Array, counts: tuple[int, ...]) -> None:
 
 def _in_box(action: ActionDefinition, rows: Array) -> Array:
     low, high = action.limits
-    if ((rows >= low) & (rows <= high)).all():  # limits are finite, so these are as well
+    if ((rows >= low) & (rows <= high)).all():  # so all are finite, as the limits are
         return rows
     _require_finite(rows)
-    slack = FLOAT32_SLACK * (high - low)  # a policy's float32 bound may round to just outside
+    slack = FLOAT32_SLACK * (high - low)  # an action at a limit may be rounded beyond it in float32
     bad = (rows < low - slack) | (rows > high + slack)
     if bad.any():
         row, entry = np.argwhere(bad)[0]

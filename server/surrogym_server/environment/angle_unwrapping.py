@@ -3,7 +3,7 @@
 A fast joint with a slow clock looks like a slow one, with a jump wherever its increment crosses half a turn. No smooth
 function predicts such jumps. The true increment of an angle is close to linear in the speeds, so the missing turns are
 those that make it linear: linear regression on a circle (Fisher & Lee, Biometrics 48, 1992), in which wrong turns leave
-residuals all round the circle.
+residuals all around the circle.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition, wrap
 from surrogym_server.environment.distributions import scaling
 
-POINTS_A_WEIGHT = 3
-MAX_TURNS = 3  # within a step
-STARTS_A_TURN = 8
-ROUNDS = 10
-CLEARLY = 0.25  # of the squared residuals without turns
+POINTS_A_WEIGHT = 3  # least number of steps for each weight of the regression
+MAX_TURNS = 3  # greatest number of turns within a step
+STARTS_A_TURN = 8  # number of start slopes of the search for each turn
+ROUNDS = 10  # number of iterations of the search
+CLEARLY = 0.25  # turns are added only if they reduce the squared residuals to less than this share
 
 
 def angle_increments(definition: EnvironmentDefinition, q: Tensor, q_next: Tensor) -> Tensor:
-    """Increments of each angle in the steps from q (n, C) to q_next (n, C), with whole turns, (n, A) in radians."""
+    """Return the increments of each angle in the steps from q (n, C) to q_next (n, C), whole turns included, (n, A) in
+    radians."""
     change = wrap((q_next - q)[:, definition.angles])
     moved_by = [i for i in definition.moving if definition.coordinates[i].kind == "linear"]
     if not moved_by or len(q) < POINTS_A_WEIGHT * (len(moved_by) + 1):
@@ -33,8 +34,8 @@ def angle_increments(definition: EnvironmentDefinition, q: Tensor, q_next: Tenso
 
 
 def _unwrapped(speeds: Tensor, change: Tensor) -> Tensor:
-    """Add the turns to increments (n,) that make them most linear in the speeds (n, L). Leave them if no turns clearly
-    do.
+    """Add whole turns to increments (n,) so that they become most linear in the speeds (n, L), if this clearly reduces
+    the residuals.
 
     The search starts from every slope of every speed that explains up to ``MAX_TURNS`` turns, alternates between turns
     and least squares, and takes the start with the smallest final residual.

@@ -16,7 +16,7 @@ from surrogym_shared.kinds import Relation
 
 @dataclass(frozen=True)
 class InequalityDefinition:
-    """Condition ``term relation value``."""
+    """Inequality ``term relation value``, such as x > 0.5."""
 
     term: TermDefinition
     relation: Relation
@@ -25,18 +25,18 @@ class InequalityDefinition:
 
 @dataclass(frozen=True)
 class Conditions:
-    """G groups of K inequalities in all, compiled: each one as sign * term >= threshold, exactly."""
+    """G groups of K inequalities in total, compiled: each inequality as sign * term >= threshold, exactly."""
 
-    terms: TermSet
-    sign: Tensor  # (K,)
+    terms: TermSet  # the K terms
+    sign: Tensor  # (K,) 1 or -1
     threshold: Tensor  # (K,)
-    membership: Tensor  # (K, G)
+    membership: Tensor  # (K, G) 1 if the inequality belongs to the group, otherwise 0
 
     @classmethod
     def of(
         cls, groups: Sequence[Sequence[InequalityDefinition]], coordinates: int, device: torch.device = CPU
     ) -> Conditions:
-        """Compile groups over C coordinates on a device. An empty group always holds."""
+        """Compile groups of inequalities over C coordinates. An empty group always holds."""
         inequalities = [i for group in groups for i in group]
         belongs = [g for g, group in enumerate(groups) for _ in group]
         sign = np.array([1.0 if i.relation in (">", ">=") else -1.0 for i in inequalities])
@@ -49,6 +49,6 @@ class Conditions:
         return to_device(compiled, device)
 
     def __call__(self, q: Tensor) -> Tensor:
-        """Which groups hold at q (..., C), (..., G)."""
+        """Return which groups hold at q (..., C): (..., G) bool."""
         holds = self.sign * self.terms(q) >= self.threshold
         return (~holds).to(self.membership.dtype) @ self.membership == 0

@@ -1,4 +1,4 @@
-"""A declared reward: a sum of weighted shapes of quantities of state and action. It is data, never code."""
+"""A declared reward: a sum of weighted shapes of quantities of state and action. It is data and runs no user code."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from surrogym_shared.kinds import RewardShape
 
 @dataclass(frozen=True)
 class QuantityDefinition:
-    """Quantity of a declared reward, x = term(q) + action . u."""
+    """Quantity of state and action in a declared reward, x = term(q) + action . u."""
 
     term: TermDefinition
-    action: tuple[float, ...]  # (F,)
+    action: tuple[float, ...]  # (F,) weight of each action entry
 
 
 @dataclass(frozen=True)
 class RewardTermDefinition:
-    """weight * shape(x_1, x_2, ...) if every inequality in ``when`` holds, else 0; see ``spec.RewardTerm``."""
+    """Term of a declared reward: weight * shape(x_1, x_2, ...) if every inequality in ``when`` holds, else 0; see
+    ``spec.RewardTerm``."""
 
     weight: float
     shape: RewardShape
@@ -33,18 +34,19 @@ class RewardTermDefinition:
 
 @dataclass(frozen=True)
 class DeclaredRewardDefinition:
-    """The sum of its terms at the action and the state, before or after the step."""
+    """Declared reward: the sum of its terms, which depend on the action and on the state before or after the step."""
 
     terms: tuple[RewardTermDefinition, ...]
-    after: bool
+    after: bool  # whether the state is the one after the step
     terminal: float  # added to the reward of a step that ends the episode
-    coordinates: int
-    device: torch.device = CPU  # where its tensors are
+    coordinates: int  # number of coordinates, C
+    device: torch.device = CPU  # device of its tensors
 
     def __call__(self, q: Tensor, u: Tensor) -> Tensor:
-        """Reward (m,) of the state q (m, C), before or after the step, and the action u (m, F)."""
+        """Return the reward (m,) of states q (m, C), before or after the step as ``after`` says, and actions u (m, F),
+        without ``terminal``."""
         values, weights, conditions = self._compiled
-        x = values(q) + u @ weights if weights.numel() else values(q)  # no quantity: the number of actions is unknown
+        x = values(q) + u @ weights if weights.numel() else values(q)  # without quantities, weights have no shape
         holds = conditions(q)
         total = q.new_zeros(len(q))
         begin = 0
@@ -56,7 +58,7 @@ class DeclaredRewardDefinition:
 
     @cached
     def _compiled(self) -> tuple[TermSet, Tensor, Conditions]:
-        """All quantities' terms and action weights (F, X), and the conditions of each term."""
+        """Terms and action weights (F, X) of all X quantities, and the conditions of each term."""
         quantities = [quantity for term in self.terms for quantity in term.of]
         weights = torch.tensor([quantity.action for quantity in quantities], dtype=torch.float64)
         terms = compile_terms([quantity.term for quantity in quantities], self.coordinates)

@@ -1,8 +1,8 @@
-"""EnvironmentDefinition: one environment as the core computes with it.
+"""EnvironmentDefinition: one environment in the form with which the core computes.
 
 A specification (``surrogym_shared.spec``) is what a person writes: it names coordinates, leaves defaults open, and is
-checked when it is made. A definition is derived from it, in ``convert.definitions`` alone: it has an index in the place
-of each name, a weight for each coordinate, infinity in the place of an open limit, and every default. Classes of a
+checked when it is made. A definition is derived from it, only in ``convert.definitions``: it has an index in place of
+each name, a weight for each coordinate, infinity in place of an open limit, and every default. Names of classes of a
 definition end in ``Definition``, those of a specification do not: ``spec.Term``, ``TermDefinition``.
 """
 
@@ -29,8 +29,8 @@ from surrogym_shared.kinds import CoordinateKind, LagKind, RewardTiming
 from surrogym_shared.presets import InputProbability, Moves, Stopping, Tolerance
 
 REWARD = "reward"
-REACH = 1e6
-SCALING_POINTS = 4_096
+REACH = 1e6  # a coordinate without a bound is limited this many widths beyond its sampling range
+SCALING_POINTS = 4_096  # number of states from which the scale of the observation is computed
 Array = NDArray[np.float64]
 
 
@@ -44,15 +44,15 @@ class LagDefinition:
 
 @dataclass(frozen=True)
 class CoordinateDefinition:
-    """One entry of q: its name, its distributions in queries and at the start of episodes, its limits and its lag."""
+    """One coordinate, an entry of q: its name, distributions, limits and lag."""
 
     name: str
     kind: CoordinateKind
-    sampling: Distribution
-    start: Distribution
-    low: float = -np.inf  # saturation bounds
-    high: float = np.inf
-    stops: int | None = None  # index of the coordinate that a bound sets to zero
+    sampling: Distribution  # distribution in queries
+    start: Distribution  # distribution at the start of episodes
+    low: float = -np.inf  # lower saturation bound
+    high: float = np.inf  # upper saturation bound
+    stops: int | None = None  # index of the coordinate that becomes zero at a bound, such as the speed at a wall
     lag: LagDefinition | None = None
 
     @property
@@ -61,15 +61,16 @@ class CoordinateDefinition:
 
     @property
     def settable(self) -> tuple[float, float]:
-        """The values to which the original environment can be set: the bounds, or the sampling range if there
-        are none."""
+        """Range of values to which the original environment can be set: the bounds, or the sampling range if there are
+        none."""
         low = self.low if np.isfinite(self.low) else self.sampling.low
         return low, self.high if np.isfinite(self.high) else self.sampling.high
 
 
 @dataclass(frozen=True)
 class ActionDefinition:
-    """A box (low, high), offered to policies as ``bins`` if these are given, or discrete counts ``nvec``."""
+    """Action of an environment: a box (low, high), offered to policies as ``bins`` if these are given, or discrete
+    values with counts ``nvec``."""
 
     kind: Literal["box", "discrete", "multi_discrete"]
     low: tuple[float, ...] = ()
@@ -79,7 +80,7 @@ class ActionDefinition:
 
     @cached_property
     def limits(self) -> tuple[Array, Array]:
-        """``low`` and ``high`` as arrays, (F,) each; cached, because every step of a policy is checked against them."""
+        """``low`` and ``high`` as arrays, (F,) each; cached, because every action of a policy is compared with them."""
         return np.array(self.low), np.array(self.high)
 
     @property
@@ -88,18 +89,18 @@ class ActionDefinition:
 
     @property
     def policy_counts(self) -> tuple[int, ...]:
-        """Number of values in each entry of a policy's action; empty for a continuous policy."""
+        """Number of values of each entry of a policy's action; empty if its actions are continuous."""
         return self.nvec or self.bins or ()
 
 
 @dataclass(frozen=True)
 class LearningDefinition:
-    """Settings of a model, every default resolved.
+    """Settings of model learning, with every default filled in.
 
     Attributes:
         model: family of models, by its name in ``models.registry``, and its settings.
-        moves: what the transition outputs are increments of; under ``observation`` the coordinates are read back from
-            the observation, as in the paper.
+        moves: the quantity whose increments the transition outputs are; under ``observation`` the coordinates are read
+            back from the observation, as in the paper.
         limits_rewards: whether virtual rewards are limited by those of the samples.
     """
 
@@ -110,21 +111,21 @@ class LearningDefinition:
 
 @dataclass(frozen=True)
 class DesignDefinition:
-    """Settings of the adaptive design, every default resolved.
+    """Settings of the adaptive design, with every default filled in.
 
     Attributes:
-        initial: queries of the initial design.
-        hypercube_tries: Latin hypercubes to choose the most spread one from.
+        initial: number of queries of the initial design.
+        hypercube_tries: number of random Latin hypercubes, of which the most spread one is used.
         acquisition: criterion of the adaptive queries.
         tolerance: ``relative`` to an output's standard deviation over the initial design, or ``raw``: 1 in the
             output's unit.
-        monte_carlo: points that estimate the confidence index (eq. 8).
+        monte_carlo: number of points that estimate the confidence index (eq. 8).
         visited_candidates: whether visited states join the candidates and the reference.
-        input_probability: P_i (eq. 11) while no policy has visited anything: ``uniform``, or the density of the
-            ``predicted`` next states, as printed.
-        stopping: ``confidence`` stops at the target of the index, as printed; ``tested_confidence`` also asks
-            leave-one-out errors within the tolerances and adaptive queries that tried to disprove it.
-        seed: of all random choices of the design.
+        input_probability: P_i (eq. 11) before a policy has visited any state: ``uniform``, or the density of the
+            ``predicted`` next states, as in the paper.
+        stopping: ``confidence`` stops at the target of the index, as in the paper; ``tested_confidence`` also requires
+            leave-one-out errors within the tolerances, and adaptive queries that tried to disprove the model.
+        seed: seed of all random choices of the design.
     """
 
     initial: int
@@ -140,7 +141,7 @@ class DesignDefinition:
 
 @dataclass(frozen=True)
 class EnvironmentDefinition:
-    """One environment. C coordinates, D observation entries, F action entries."""
+    """One environment, with C coordinates, D observation entries and F action entries."""
 
     coordinates: tuple[CoordinateDefinition, ...]
     observation_names: tuple[str, ...]
@@ -155,30 +156,31 @@ class EnvironmentDefinition:
     tolerances: tuple[tuple[str, float], ...]
     learning: LearningDefinition
     design: DesignDefinition
-    learns_termination: bool = False  # from samples; no groups are declared then
+    learns_termination: bool = False  # whether termination is learned from samples; then no groups are declared
     declared_reward: DeclaredRewardDefinition | None = None
-    max_rollout: int | None = None  # longest action sequence of a query; None where any state can be set
-    snapshots: bool = False  # whether such a sequence may begin at a saved state
-    starts: tuple[tuple[float, ...], ...] = ()  # states at which episodes start; empty: the coordinates' distributions
+    max_rollout: int | None = None  # greatest number of actions of a query; None if any state can be set
+    snapshots: bool = False  # whether such a query may begin at a saved state
+    starts: tuple[tuple[float, ...], ...] = ()  # states at which episodes start; if empty, by their distributions
     outside_reward: float | None = None  # for each step that an episode misses after it left the sampling range
-    device: torch.device = CPU  # of its tensors, and of the states and actions that it is given
+    device: torch.device = CPU  # device of its tensors, and of the states and actions that it is given
 
     def on(self, device: torch.device) -> EnvironmentDefinition:
-        """The same definition for states on another device."""
+        """Return the same definition for states on another device."""
         return self if device == self.device else to_device(self, device)
 
     def tolerances_or(self, defaults: Sequence[float]) -> tuple[float, ...]:
-        """Tolerance of each output (O,): the declared one, or else the one in ``defaults`` (O,)."""
+        """Return the tolerance of each output (O,): the declared one, or the one in ``defaults`` (O,) if there is
+        none."""
         declared = dict(self.tolerances)
         return tuple(declared.get(name, value) for name, value in zip(self.outputs, defaults, strict=True))
 
     def with_tolerances(self, tolerances: Mapping[str, float]) -> EnvironmentDefinition:
-        """The same definition with these tolerances, by output."""
+        """Return the same definition with these tolerances, by name of the output; others stay as declared."""
         return replace(self, tolerances=tuple((dict(self.tolerances) | dict(tolerances)).items()))
 
     @property
     def moves_observation(self) -> bool:
-        """Whether the transition outputs are increments of the observation, not of the coordinates."""
+        """Whether the transition outputs are increments of the observation instead of the coordinates."""
         return self.learning.moves == "observation"
 
     @cached_property
@@ -187,17 +189,17 @@ class EnvironmentDefinition:
 
     @cached_property
     def moving(self) -> tuple[int, ...]:
-        """Indices of the coordinates that the dynamics move, without lags."""
+        """Indices of the coordinates that the dynamics move: no constants and no lags."""
         return tuple(i for i, c in enumerate(self.coordinates) if c.kind != "constant" and c.lag is None)
 
     @cached_property
     def lags(self) -> tuple[int, ...]:
-        """Indices of the coordinates that repeat the past."""
+        """Indices of the coordinates that repeat a past value."""
         return tuple(i for i, c in enumerate(self.coordinates) if c.lag is not None)
 
     @cached_property
     def ages(self) -> tuple[int, ...]:
-        """How many steps each coordinate looks back, (C,); 0 for those that are no lags."""
+        """Number of steps that each coordinate looks back, (C,); 0 for coordinates that are no lags."""
         ages: list[int] = []
         for c in self.coordinates:
             if c.lag is None or c.lag.kind == "steps":
@@ -208,29 +210,29 @@ class EnvironmentDefinition:
 
     @cached_property
     def counter(self) -> int | None:
-        """Index of the coordinate that counts the steps since a reset."""
+        """Index of the coordinate that counts the steps since a reset; None if there is none."""
         counting = [i for i in self.lags if (lag := self.coordinates[i].lag) is not None and lag.kind == "steps"]
         return counting[0] if counting else None
 
     @property
     def unknown_steps(self) -> int:
-        """Number of first steps of an episode that a model does not learn from, because lags are not known yet."""
+        """Number of first steps of an episode from which a model does not learn, because lags are not known yet."""
         return 0 if self.counter is None else math.ceil(self.coordinates[self.counter].high)
 
     def known(self, q: Tensor) -> Tensor:
-        """Whether the lags of states q (..., C) are known, (...) bool."""
+        """Return whether the lags of states q (..., C) are known, (...) bool."""
         if self.counter is None:
             return torch.ones(q.shape[:-1], dtype=torch.bool, device=q.device)
         return q[..., self.counter] >= self.unknown_steps
 
     @cached
     def lag_columns(self) -> Tensor:
-        """``lags`` as a tensor on the device."""
+        """Indices ``lags`` as a tensor on the device."""
         return torch.tensor(self.lags, device=self.device)
 
     @cached
     def moving_columns(self) -> Tensor:
-        """``moving`` as a tensor on the device."""
+        """Indices ``moving`` as a tensor on the device."""
         return torch.tensor(self.moving, device=self.device)
 
     @cached_property
@@ -242,7 +244,7 @@ class EnvironmentDefinition:
 
     @cached
     def observe(self) -> TermSet:
-        """Observation of coordinates: q (..., C) -> o (..., D)."""
+        """Function that computes the observations o (..., D) of coordinates q (..., C)."""
         return to_device(compile_terms(self.observation_terms, len(self.coordinates)), self.device)
 
     @cached_property
@@ -264,27 +266,29 @@ class EnvironmentDefinition:
 
     @cached
     def bounds(self) -> tuple[Tensor, Tensor]:
-        """Saturation bounds, (C,) each."""
+        """Lower and upper saturation bounds, (C,) each."""
         low, high = self._columns([(c.low, c.high) for c in self.coordinates])
         return low, high
 
     @cached
     def reach(self) -> tuple[Tensor, Tensor]:
-        """Saturation bounds, (C,) each. A side without a bound has one ``REACH`` widths of the sampling range beyond
-        that range, so that a diverging model stays finite."""
+        """Lower and upper limits of the coordinates, (C,) each, so that a diverging model stays finite.
+
+        They are the saturation bounds. A side without a bound has a limit ``REACH`` widths beyond the sampling range.
+        """
         low, high = self.bounds
         begin, end = self.sampled
         room = REACH * (end - begin)
         return torch.maximum(low, begin - room), torch.minimum(high, end + room)
 
     def in_range(self, q: Tensor) -> Tensor:
-        """Whether states q (..., C) lie in the sampling range, (...) bool."""
+        """Return whether states q (..., C) lie in the sampling range, (...) bool."""
         low, high = self.sampled
         inside: Tensor = ((q >= low) & (q <= high)).all(-1)
         return inside
 
     def can_be_set(self, q: Tensor) -> Tensor:
-        """Whether the original environment can be set to states q (n, C), (n,) bool."""
+        """Return whether the original environment can be set to states q (n, C), (n,) bool."""
         low, high = torch.tensor([c.settable for c in self.coordinates], dtype=q.dtype, device=q.device).T
         inside: Tensor = ((q >= low) & (q <= high)).all(-1)
         return inside
@@ -294,7 +298,7 @@ class EnvironmentDefinition:
         return tuple(i for i, c in enumerate(self.coordinates) if c.kind == "angle")
 
     def terminated(self, q: Tensor) -> Tensor:
-        """Whether the declared termination holds at q (..., C), shape (...): in any group all inequalities hold."""
+        """Return whether the declared termination holds at q (..., C), (...) bool: all inequalities of any group."""
         if not self.termination_groups:
             return torch.zeros(q.shape[:-1], dtype=torch.bool, device=q.device)
         return self._termination(q).any(-1)
@@ -305,12 +309,12 @@ class EnvironmentDefinition:
 
     @cached
     def start_states(self) -> Tensor:
-        """States at which episodes start, (k, C)."""
+        """States at which episodes start, (k, C); k is 0 if starts have a distribution."""
         return torch.tensor(self.starts, dtype=torch.float64, device=self.device).reshape(-1, len(self.coordinates))
 
     @cached
     def sampled(self) -> tuple[Tensor, Tensor]:
-        """Ends of the sampling range, (C,) each."""
+        """Lower and upper ends of the sampling range, (C,) each."""
         low, high = self._columns([(c.sampling.low, c.sampling.high) for c in self.coordinates])
         return low, high
 

@@ -17,29 +17,30 @@ from surrogym_server.environment.points import Points
 from surrogym_server.tensors import bend
 
 State = Literal["cos_sin", "wrapped", "both", "observation", "none"]
-Encoding = Literal["value", "one_hot", "none"]  # of actions; one-hot of discrete ones
+Encoding = Literal["value", "one_hot", "none"]  # encodings of actions; one_hot is for discrete actions
 Parity = Literal["", "odd", "even"]
-Drift = tuple[tuple[float, ...], ...]  # weights (C,) of q for each angle
+Drift = tuple[tuple[float, ...], ...]  # for each angle, weights (C,) of the coordinates
 
 
 @dataclass(frozen=True)
 class FeatureMap:
-    """Encoding of (q, u) for one output's process.
+    """Encoding of coordinates q and action u as inputs of one output's process.
 
     Attributes:
-        state: angles as cos and sin, as the wrapped angle, or both; or the observation, standardised except in preset
-            paper; or no coordinates and no action, only the lead.
+        state: angles as cos and sin, as the wrapped angle, or both; or ``observation``, standardised except in preset
+            paper; or ``none``: no coordinates and no action, only the lead.
         action: discrete actions as evenly spaced values, or one-hot, or no action at all.
-        lead: the predicted, clipped next value of saturating coordinates is an input too. Then an output that follows
-            from it (an angle from its speed) has no kink.
-        after: encode the state after the step instead of the one before it; for the reward alone.
-        drift: weights (C,) of q for each angle; cos and sin of the angle that they predict are inputs too.
+        lead: whether the predicted, clipped next value of the leading coordinates is an input too. Then an output that
+            follows from it (an angle from its speed) has no kink.
+        after: whether to encode the state after the step instead of the one before; only for the reward.
+        drift: for each angle, weights (C,) of q that predict its increment; cos and sin of the angle after this
+            increment are inputs too.
+        parity: how the output changes if every coordinate and the action change their sign: it changes its sign too
+            (odd), it stays (even), or there is no rule (empty).
         history: only lags that look back at most this many steps are inputs; None: all lags.
-        dropped: places of features that the output does not read, counted in the map without this, ascending.
-        rates: of each feature that is left (d,), along which the output changes the faster the further, or none; see
-            ``gp.growth``.
-        parity: how the output changes if every coordinate and the action change their sign: without a rule, its sign
-            changes too (odd), or it stays (even).
+        rates: for each feature that is not dropped (d,), the rate at which the output changes faster further along it;
+            empty for none; see ``gp.growth``.
+        dropped: indices of features that the output does not read, in the map without ``dropped``, ascending.
     """
 
     state: State = "cos_sin"
@@ -60,7 +61,7 @@ class FeatureMap:
 
 
 def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
-    """Coordinates with two finite limits at which only they themselves stop, such as a limited speed.
+    """Return the coordinates with two finite limits that affect no other coordinate, such as a limited speed.
 
     They are predicted first, because their next value can be an input of other outputs.
     """
@@ -72,20 +73,20 @@ def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
 
 
 class Feature(NamedTuple):
-    """One input: a function of one entry of [q, u], of the lead, of weights . q, or one observation entry."""
+    """One input of a process: function of an entry of [q, u], of the lead, of weights . q, or an observation entry."""
 
     function: Literal[
         "affine", "cos", "sin", "turned_cos", "turned_sin", "wrapped", "equal", "observed", "lead", "grown"
     ]
     entry: int
-    centre: float = 0.0  # "equal": the value that it is compared with
+    centre: float = 0.0  # for "equal": the value with which the entry is compared
     scale: float = 1.0
-    weights: tuple[float, ...] = ()  # (C,), "turned"
-    rate: float = 0.0  # "grown"
+    weights: tuple[float, ...] = ()  # (C,) for "turned_cos" and "turned_sin"
+    rate: float = 0.0  # for "grown"
 
 
 def feature_names(definition: EnvironmentDefinition, feature_map: FeatureMap) -> list[str]:
-    """What each feature of a map reads, in order, for people."""
+    """Return the name of what each feature of a map reads, in order, for display."""
     entries = (*definition.coordinate_names, *(f"action {place}" for place in range(definition.action.size)))
     names = []
     for function, entry, centre, *_ in features(definition, feature_map):
@@ -103,7 +104,7 @@ def feature_names(definition: EnvironmentDefinition, feature_map: FeatureMap) ->
 
 
 def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tuple[Feature, ...]:
-    """The features of a map, in order."""
+    """Return the features of a map, in order."""
     result = [] if feature_map.state == "none" else _of_point(definition, feature_map)
     if feature_map.lead:
         result += [
@@ -118,7 +119,7 @@ def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tupl
 
 
 def distances(definition: EnvironmentDefinition, a: Points, b: Points) -> Tensor:
-    """Distances of points a (m) and b (n), in standard deviations of the sampling range, (m, n)."""
+    """Return the distances of m points a and n points b, in standard deviations of the sampling range, (m, n)."""
     plain = FeatureMap()
     return torch.cdist(encode(definition, plain, a.q, a.u), encode(definition, plain, b.q, b.u))
 
@@ -126,7 +127,10 @@ def distances(definition: EnvironmentDefinition, a: Points, b: Points) -> Tensor
 def encode(
     definition: EnvironmentDefinition, feature_map: FeatureMap, q: Tensor, u: Tensor, lead: Tensor | None = None
 ) -> Tensor:
-    """Features of coordinates q (..., C), actions u (..., F) and, if the map reads it, the lead (..., L): (..., d)."""
+    """Return the features (..., d) of coordinates q (..., C) and actions u (..., F).
+
+    ``lead`` (..., L) is the next value of the leading coordinates, needed if the map reads it.
+    """
     encoder = Encoder.of(definition, (feature_map,))
     x = encoder(q, u)
     if feature_map.lead:
@@ -137,16 +141,16 @@ def encode(
 
 @dataclass(frozen=True)
 class Encoder:
-    """The features of several maps. Each is computed once, and all features of one function are computed together."""
+    """Encoder of the features of several maps. It computes each feature once, and features of one function together."""
 
     definition: EnvironmentDefinition
-    # function, entries (weights), centres, scales, rates
+    # Features by function: its name, entries (or weights), centres, scales, rates.
     groups: tuple[tuple[str, slice | Tensor, Tensor, Tensor, Tensor], ...]
     columns: Mapping[Feature, int]
 
     @classmethod
     def of(cls, definition: EnvironmentDefinition, maps: Iterable[FeatureMap]) -> Encoder:
-        """Compile maps: their features grouped by function, those of the lead last."""
+        """Compile maps: group their features by function, those of the lead last."""
         wanted = {feature for feature_map in maps for feature in features(definition, feature_map)}
         ordered = sorted(wanted, key=lambda f: (f.function == "lead", f))
         groups = tuple(
@@ -156,21 +160,21 @@ class Encoder:
         return cls(definition, groups, {feature: column for column, feature in enumerate(ordered)})
 
     def inputs(self, feature_map: FeatureMap) -> tuple[int, ...]:
-        """Columns of a map's features, in the map's order."""
+        """Return the columns of a map's features, in the map's order."""
         return tuple(self.columns[feature] for feature in features(self.definition, feature_map))
 
     def width(self, lead: bool) -> int:
-        """Number of features, with or without those of the lead."""
+        """Return the number of features, with or without those of the lead."""
         return sum(lead or feature.function != "lead" for feature in self.columns)
 
     def __call__(self, q: Tensor, u: Tensor) -> Tensor:
-        """All features of coordinates q (..., C) and actions u (..., F), except those of the lead."""
+        """Return all features of coordinates q (..., C) and actions u (..., F), except those of the lead."""
         raw = torch.cat([q, u], -1)
         values = [self._values(*group, raw) for group in self.groups if group[0] != "lead"]
         return torch.cat(values, -1) if values else raw[..., :0]
 
     def with_lead(self, x: Tensor, lead: Tensor) -> Tensor:
-        """All features: x (..., d) of a call, with those of the lead (..., L) added."""
+        """Append the features of the lead (..., L) to x (..., d), the result of a call."""
         return torch.cat([x, *(self._values(*group, lead) for group in self.groups if group[0] == "lead")], -1)
 
     def _values(
@@ -203,7 +207,7 @@ class Encoder:
 
 
 def _of_point(definition: EnvironmentDefinition, feature_map: FeatureMap) -> list[Feature]:
-    """Features of coordinates and action, without those of the lead."""
+    """Return the features of coordinates and action that a map reads, without those of the lead."""
     result: list[Feature] = []
     if feature_map.state == "observation":
         result += _of_observation(definition)
@@ -219,7 +223,7 @@ def _of_point(definition: EnvironmentDefinition, feature_map: FeatureMap) -> lis
 
 
 def _read(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Iterator[int]:
-    """Indices of the coordinates that a map reads."""
+    """Yield the indices of the coordinates that a map reads."""
     for index, age in enumerate(definition.ages):
         if index != definition.counter and (feature_map.history is None or age <= feature_map.history):
             yield index
@@ -252,7 +256,8 @@ def _of_action(definition: EnvironmentDefinition, feature_map: FeatureMap, entry
 
 
 def _group(same: tuple[Feature, ...], device: torch.device) -> tuple[slice | Tensor, Tensor, Tensor, Tensor]:
-    """Entries, as a slice if they are neighbours, or weights (C, k); centres, scales and rates."""
+    """Return the parameters of features of one function: entries (a slice if they are neighbours) or weights (C, k),
+    centres, scales and rates."""
     numbers = torch.tensor([(f.centre, f.scale, f.rate) for f in same], dtype=torch.float64, device=device)
     centre, scale, rate = numbers.T
     if same[0].weights:

@@ -1,4 +1,4 @@
-"""Read coordinates back from an observation, for models whose outputs move the observation.
+"""Inverse of the observation: coordinates read back from it, for models whose outputs move the observation.
 
 An angle needs both its cosine and its sine among the entries. Their mean leaves the circle, but the angle is still
 defined. A linear coordinate needs an entry that is the coordinate itself.
@@ -18,17 +18,19 @@ from surrogym_server.errors import InvalidSpec
 
 @dataclass(frozen=True)
 class ObservationInverse:
-    """For each moving coordinate, the entries from which it is read: (value,) or (cos, sin)."""
+    """Where each moving coordinate is found in an observation: the indices (value,) or (cos, sin) of its entries."""
 
-    sources: tuple[tuple[int, tuple[int, ...]], ...]
+    sources: tuple[tuple[int, tuple[int, ...]], ...]  # pairs: index of the coordinate, indices of its entries
 
     @classmethod
     def of(cls, definition: EnvironmentDefinition) -> ObservationInverse:
-        """Find the entries. Raises ``InvalidSpec`` if the observation does not determine a coordinate."""
+        """Find the entries of each moving coordinate. Raises ``InvalidSpec`` if the observation does not determine
+        one."""
         return cls(tuple((i, _source(definition, i)) for i in definition.moving))
 
     def __call__(self, o: Tensor, q: Tensor) -> Tensor:
-        """Coordinates (m, C) of observations o (m, D). Constants are taken from q (m, C)."""
+        """Return the coordinates (m, C) of observations o (m, D). Coordinates that don't move are taken from q (m,
+        C)."""
         recovered = q.clone()
         for index, entries in self.sources:
             if len(entries) == 2:
@@ -54,7 +56,8 @@ def _source(definition: EnvironmentDefinition, index: int) -> tuple[int, ...]:
 
 
 def _entry(definition: EnvironmentDefinition, part: PartDefinition, low: float, high: float) -> int | None:
-    """Index of the observation entry that is this part alone, not clipped within [low, high]."""
+    """Return the index of the observation entry that consists of this part alone and is not clipped within [low,
+    high]."""
     for position, term in enumerate(definition.observation_terms):
         if term.parts == (part,) and term.low <= low and term.high >= high:
             return position

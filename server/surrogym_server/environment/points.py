@@ -27,14 +27,14 @@ class Points:
 
     @classmethod
     def of(cls, definition: EnvironmentDefinition, queries: Sequence[Query]) -> Points:
-        """Return the states and actions of queries for single steps."""
+        """Return the states and actions of queries, each for a single step."""
         q = torch.tensor([query.coordinates for query in queries], dtype=torch.float64)
         u = torch.tensor([query.action for query in queries], dtype=torch.float64)
         return cls(q.reshape(-1, len(definition.coordinates)), u.reshape(-1, definition.action.size))
 
     @property
     def queries(self) -> tuple[Query, ...]:
-        """A query of a single step for each point."""
+        """Query for a single step at each point."""
         return tuple(Query.step(*step) for step in zip(self.q.tolist(), self.u.tolist(), strict=True))
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Samples: the real steps from which a model is learned."""
+"""Samples: the real steps from which a model learns."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from surrogym_shared.nouns import RealSteps
 class Samples:
     """n real steps, float64."""
 
-    q: Tensor  # (n, C) coordinates
+    q: Tensor  # (n, C) coordinates before the step
     u: Tensor  # (n, F) actions
-    q_next: Tensor  # (n, C)
+    q_next: Tensor  # (n, C) coordinates after the step
     reward: Tensor  # (n,)
     terminated: Tensor  # (n,) bool
 
@@ -29,12 +29,12 @@ class Samples:
 
     @classmethod
     def of(cls, steps: RealSteps) -> Self:
-        """Return real steps as tensors, which share their memory."""
+        """Return real steps as tensors that share the memory of their arrays."""
         columns = (steps.coordinates, steps.action, steps.next_coordinates, steps.reward, steps.terminated)
         return cls(*map(torch.from_numpy, columns))
 
     def at(self, rows: Tensor) -> Samples:
-        """Return the samples of these rows: numbers, or a mask (n,)."""
+        """Return the samples with the indices ``rows``, or those that a mask (n,) selects."""
         return Samples(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     @property
@@ -47,8 +47,8 @@ class Samples:
 
 
 def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """Targets of the transition outputs, (n, M): q' - q of the moving coordinates, angles with whole turns; or o' - o
-    if the outputs move the observation."""
+    """Return the targets of the transition outputs, (n, M): q' - q of the moving coordinates, whole turns of angles
+    included; or o' - o if the outputs move the observation."""
     if definition.moves_observation:
         return definition.observe(samples.q_next) - definition.observe(samples.q)
     change = samples.q_next - samples.q
@@ -57,8 +57,10 @@ def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def preceding(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """Row of the step that each sample (n,) continues, -1 if there is none: it ended, as measured, where this one
-    starts."""
+    """Return the row of the step that each sample continues, (n,), or -1 if it continues none.
+
+    A sample continues the row before it if that row did not end an episode and its next coordinates equal the sample's.
+    """
     columns = list(definition.moving)
     follows = torch.full((len(samples),), -1)
     same = (samples.q[1:, columns] == samples.q_next[:-1, columns]).all(-1) & ~samples.terminated[:-1]
@@ -67,12 +69,13 @@ def preceding(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def saturated(definition: EnvironmentDefinition, q_next: Tensor) -> Tensor:
-    """Which samples (n,) ended at a declared bound. Their increments are cut, so they say little about the dynamics."""
+    """Return which samples (n,) ended at a declared bound, which cuts their increments off."""
     return (limit_sides(definition, q_next) != 0).any(-1)
 
 
 def limit_sides(definition: EnvironmentDefinition, q_next: Tensor) -> Tensor:
-    """1 where a coordinate of q_next (n, C) is at its upper bound, -1 at its lower bound, else 0: (n, C)."""
+    """Return 1 where a coordinate of q_next (n, C) is at its upper bound, -1 at its lower bound, otherwise 0: (n,
+    C)."""
     low, high = definition.bounds
     slack = 1e-9 * torch.where(torch.isfinite(high - low), high - low, 1.0)
     return (q_next >= high - slack).to(q_next.dtype) - (q_next <= low + slack).to(q_next.dtype)

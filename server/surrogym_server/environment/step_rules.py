@@ -1,4 +1,4 @@
-"""Rules of a step for every model: limits, walls, wrapped angles, and the reward of an ending."""
+"""Rules of a step that apply to every model: limits, walls, wrapped angles, lags, and the terminal reward."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ from surrogym_server.environment.observation_inverse import ObservationInverse
 
 
 def paid(terminal_reward: float, reward: Tensor, terminated: Tensor) -> Tensor:
-    """Add to the rewards (m,) what terminating steps, terminated (m,), pay in addition."""
+    """Add the terminal reward to the rewards (m,) of those steps that terminate, terminated (m,)."""
     return reward + terminal_reward * terminated if terminal_reward else reward
 
 
 def clip(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Clip coordinates q (..., C) to their saturation bounds, or to their reach if a model diverges."""
+    """Clip coordinates q (..., C) to their saturation bounds, or to the definition's ``reach`` where there is none."""
     low, high = definition.reach
     return torch.clamp(q, low, high)
 
 
 def settle(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Apply the rules of the environment to coordinates q (..., C): clipped, stopped at walls, angles wrapped."""
+    """Apply the rules of the environment to coordinates q (..., C): clip to bounds, stop speeds at walls, wrap
+    angles."""
     inside = clip(definition, q)
     for index, coordinate in enumerate(definition.coordinates):
         if coordinate.stops is not None:
@@ -35,8 +36,8 @@ def settle(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
 
 
 def placed(definition: EnvironmentDefinition, change: Tensor) -> Tensor:
-    """Convert changes (m, M) of the moving coordinates to changes (m, C) of all coordinates, as ``moved`` takes them.
-    Changes of the observation stay unchanged."""
+    """Convert changes (m, M) of the moving coordinates to changes (m, C) of all coordinates, as ``moved`` needs them.
+    Changes of the observation are returned unchanged."""
     if definition.moves_observation:
         return change
     every = change.new_zeros(len(change), len(definition.coordinates))
@@ -46,14 +47,22 @@ def placed(definition: EnvironmentDefinition, change: Tensor) -> Tensor:
 def moved(
     definition: EnvironmentDefinition, inverse: ObservationInverse | None, q: Tensor, u: Tensor, change: Tensor
 ) -> Tensor:
-    """Next coordinates after a change (m, C) of coordinates q (m, C) under u (m, F), or after a change (m, D) of their
-    observation, given its inverse. The rules of the environment are applied, and lags repeat the step."""
+    """Return the next coordinates (m, C), given predicted changes, with the environment's rules applied and lags set.
+
+    Args:
+        definition: the environment.
+        inverse: inverse of the observation if the outputs move the observation, otherwise None.
+        q: coordinates (m, C) before the step.
+        u: actions (m, F).
+        change: change of the coordinates, (m, C), or of the observation, (m, D).
+    """
     arrived = q + change if inverse is None else inverse(definition.observe(q) + change, q)
     return with_lags(definition, q, u, settle(definition, arrived))
 
 
 def with_lags(definition: EnvironmentDefinition, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
-    """Set the lags of next coordinates q_next (m, C) to what they repeat of the step from q (m, C) under u (m, F)."""
+    """Set the lags of next coordinates q_next (m, C) to the values of the step from q (m, C) under u (m, F) that they
+    repeat."""
     if not definition.lags:
         return q_next
     repeated = [_repeated(definition, index, q, u, q_next) for index in definition.lags]
@@ -61,7 +70,7 @@ def with_lags(definition: EnvironmentDefinition, q: Tensor, u: Tensor, q_next: T
 
 
 def _repeated(definition: EnvironmentDefinition, index: int, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
-    """Next value (m,) of a lag."""
+    """Return the next value (m,) of the lag with coordinate index ``index``."""
     lag = definition.coordinates[index].lag
     assert lag is not None
     match lag.kind:

@@ -15,7 +15,7 @@ from surrogym_shared.kinds import Function
 
 @dataclass(frozen=True)
 class PartDefinition:
-    """Part of a term, coefficient * phi(weights . q), with a weight for each coordinate (C,)."""
+    """Part of a term: coefficient * function(weights . q), with a weight for each coordinate (C,)."""
 
     function: Function
     coefficient: float
@@ -33,16 +33,16 @@ class TermDefinition:
 
 @dataclass(frozen=True)
 class TermSet:
-    """T terms over q (..., C), compiled: value = constant + [q, sin(q W), cos(q W)] A, clipped."""
+    """T compiled terms over q (..., C): value = constant + [q, sin(q W), cos(q W)] A, clipped."""
 
     constant: Tensor  # (T,)
     frequencies: Tensor  # W (C, P)
     coefficients: Tensor  # A^T (T, C + 2 P)
-    low: Tensor | None  # (T,), None where no term is clipped
-    high: Tensor | None  # (T,)
+    low: Tensor | None  # (T,) lower limits; None if no term is clipped
+    high: Tensor | None  # (T,) upper limits
 
     def __call__(self, q: Tensor) -> Tensor:
-        """Values at q (..., C), shape (..., T)."""
+        """Return the values of all terms at q (..., C), shape (..., T)."""
         basis = q
         if self.frequencies.shape[1]:
             phase = q @ self.frequencies
@@ -52,7 +52,7 @@ class TermSet:
 
 
 def compile_terms(terms: Sequence[TermDefinition], coordinates: int) -> TermSet:
-    """Compile terms over C coordinates. Equal frequencies are computed once."""
+    """Compile terms over C coordinates. Each distinct frequency is computed once."""
     frequencies = sorted({p.weights for t in terms for p in t.parts if p.function in ("sin", "cos")})
     first = {"sin": coordinates, "cos": coordinates + len(frequencies)}
     constant = torch.zeros(len(terms), dtype=torch.float64)

@@ -58,7 +58,7 @@ def test_a_discrete_action_out_of_range_is_refused_with_its_entry_and_row(count)
         (BOX, np.array([[0, np.inf], [0, 0]]), "finite"),
         (BOX, np.array([[0, 0.5], [0, -0.1]]), r"entry 1 in \[0, 1\], got -0.1 in row 1"),
         (BINS, np.array([[0, 0], [5, 0]]), r"entry 0 in 0\.\.4, got 5 in row 1"),
-        (BINS, np.array([[0, 0], [0.5, 0]]), "expected integers, got 0.5"),
+        (BINS, np.array([[0, 0], [0.5, 0]]), "expected whole numbers, got 0.5"),
         (SEVERAL, np.array([[0, 0], [0, 2]]), r"entry 1 in 0\.\.1, got 2 in row 1"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Features of coordinates and action, as ``environment.features.Encoder`` computes them."""
+"""Features of coordinates and action in compiled code, as ``environment.features.Encoder`` computes them."""
 
 from __future__ import annotations
 
@@ -18,15 +18,19 @@ from surrogym_shared.compiled.jit import compiled
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-ROWS, WEIGHTS = range(2)  # function, entry, centre, scale and rate of each feature; weights of the coordinates
+# Matrices of an encoder: one row (function, entry, centre, scale, rate) for each feature; and the coordinates' weights.
+ROWS, WEIGHTS = range(2)
 FUNCTIONS = ("affine", "cos", "sin", "turned_cos", "turned_sin", "wrapped", "equal", "observed", "grown")
 CODES = {function: code for code, function in enumerate(FUNCTIONS)}
 AFFINE, COS, SIN, TURNED_COS, TURNED_SIN, WRAPPED, EQUAL, OBSERVED, GROWN = CODES.values()
-UNIT_ANGLE = math.sqrt(3) / math.pi
+UNIT_ANGLE = math.sqrt(3) / math.pi  # gives an angle that is uniform on the circle a standard deviation of 1
 
 
 def add_features(tables: TablesBuilder, definition: EnvironmentDefinition, encoder: Encoder) -> int:
-    """Add an encoder's features, and return their place. Features of the lead read it behind coordinates and action."""
+    """Add the features of an encoder to the tables, and return the index of their first matrix.
+
+    Features of the lead read entries behind those of coordinates and action.
+    """
     size = len(definition.coordinates)
     rows, weights = np.zeros((len(encoder.columns), 5)), np.zeros((len(encoder.columns), size))
     for feature, column in encoder.columns.items():
@@ -42,8 +46,17 @@ def add_features(tables: TablesBuilder, definition: EnvironmentDefinition, encod
 def encode(
     numbers: Floats, places: Ints, at: int, observe: int, raw: Floats, size: int, x: Floats, begin: int, end: int
 ) -> None:
-    """Compute features ``begin`` to ``end`` of coordinates, action and lead, raw (C + F + L, B), into the same rows of
-    x (d, B). ``size`` is C, and ``observe`` is the place of the observation's terms."""
+    """Compute features ``begin`` to ``end``, and write them to the same rows of x (d, B).
+
+    Args:
+        numbers, places: the tables.
+        at: index of the encoder's first matrix.
+        observe: index of the terms of the observation.
+        raw: coordinates, action and lead, (C + F + L, B).
+        size: number of coordinates, C.
+        x: array for the features.
+        begin, end: range of the features.
+    """
     rows, weights = matrix(numbers, places, at + ROWS), matrix(numbers, places, at + WEIGHTS)
     lanes = raw.shape[1]
     other, phase = np.empty(lanes), np.empty(lanes)

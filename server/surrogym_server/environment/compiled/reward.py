@@ -16,11 +16,13 @@ Ints = NDArray[np.int64]
 
 SHAPES = {"one": 0, "linear": 1, "absolute": 2, "square": 3, "bump": 4, "ball": 5}
 ONE, LINEAR, ABSOLUTE, SQUARE, BUMP, BALL = SHAPES.values()
-HEAD, WEIGHTS, TERMS = range(3)  # places of terms and conditions; action weights (F, X); weight, shape, quantities
+# Matrices of a declared reward: indices of its terms and conditions; weights of the action (F, X); and one row (weight,
+# shape, number of quantities) for each term.
+HEAD, WEIGHTS, TERMS = range(3)
 
 
 def add_reward(tables: TablesBuilder, reward: DeclaredRewardDefinition) -> int:
-    """Add a declared reward, and return its place."""
+    """Add a declared reward to the tables, and return the index of its first matrix."""
     values, weights, conditions = reward._compiled
     head = [add_terms(tables, values), add_conditions(tables, conditions)]
     terms = [(term.weight, SHAPES[term.shape], len(term.of)) for term in reward.terms]
@@ -29,7 +31,8 @@ def add_reward(tables: TablesBuilder, reward: DeclaredRewardDefinition) -> int:
 
 @inlined
 def add_declared(numbers: Floats, places: Ints, at: int, q: Floats, u: Floats, total: Floats) -> None:
-    """Add the reward of states q (C, B) and actions u (F, B) to ``total`` (B,)."""
+    """Add the declared reward of states q (C, B) and actions u (F, B) to ``total`` (B,); ``at`` is the index of its
+    first matrix."""
     head, weights = matrix(numbers, places, at + HEAD), matrix(numbers, places, at + WEIGHTS)
     terms = matrix(numbers, places, at + TERMS)
     lanes = q.shape[1]

@@ -16,14 +16,16 @@ from surrogym_shared.compiled.jit import compiled, inlined
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Of each coordinate: ends of its reach, its bounds, the coordinate that they stop or -1, whether it is an angle, and
-# for a lag what it repeats, and of which row of coordinates and action; -1 otherwise.
+# Columns of the rules, one row for each coordinate: ends of its reach, its bounds, the coordinate that they stop or -1,
+# and whether it is an angle; then, for a lag, how it repeats a value, and from which row of coordinates and action (-1
+# if it is no lag).
 REACH_LOW, REACH_HIGH, LOW, HIGH, STOPS, ANGLE, LAG, SOURCE = range(8)
-CHANGE, TURN, REPEAT, COUNT = range(4)  # of a coordinate, of an angle, a row as it was before the step, or one more
+# How a lag repeats: change of a coordinate, change of an angle, value before the step, or value before the step plus 1.
+CHANGE, TURN, REPEAT, COUNT = range(4)
 
 
 def add_rules(tables: TablesBuilder, definition: EnvironmentDefinition) -> int:
-    """Add the data that ``settle`` reads, and return its place."""
+    """Add the matrix that ``settle`` and ``repeat`` read to the tables, and return its index."""
     low, high = (end.tolist() for end in definition.reach)
     return tables.add(
         [
@@ -49,7 +51,8 @@ def _lag(definition: EnvironmentDefinition, index: int, lag: LagDefinition) -> t
 
 
 def add_inverse(tables: TablesBuilder, inverse: ObservationInverse | None) -> int:
-    """Add the entries from which moving coordinates are read, -1 for none, and return their place."""
+    """Add the entries from which moving coordinates are read back to the tables, -1 for none, and return their
+    index."""
     sources = () if inverse is None else inverse.sources
     rows = [(index, *entries, *[-1] * (2 - len(entries))) for index, entries in sources]
     return tables.add(np.array(rows).reshape(-1, 3))
@@ -57,14 +60,14 @@ def add_inverse(tables: TablesBuilder, inverse: ObservationInverse | None) -> in
 
 @compiled
 def clipped(rules: Floats, c: int, value: float) -> float:
-    """Clip a value of coordinate c to its reach."""
+    """Return a value of coordinate c, clipped to its reach."""
     low, high = rules[c, REACH_LOW], rules[c, REACH_HIGH]
     return low if value < low else (high if value > high else value)
 
 
 @inlined
 def settle(rules: Floats, q: Floats) -> None:
-    """Apply the rules of the environment to coordinates q (C, B)."""
+    """Apply the rules of the environment to coordinates q (C, B) in place: clip, stop at walls, wrap angles."""
     size, lanes = q.shape
     for c in range(size):
         for b in range(lanes):
@@ -83,7 +86,8 @@ def settle(rules: Floats, q: Floats) -> None:
 
 @inlined
 def repeat(rules: Floats, raw: Floats, q: Floats) -> None:
-    """Set the lags of next coordinates q (C, B) to what they repeat of coordinates and action, raw (C + F, B)."""
+    """Set the lags of next coordinates q (C, B) to the values of coordinates and action, raw (C + F, B), that they
+    repeat."""
     size, lanes = q.shape
     for c in range(size):
         lag, source = int(rules[c, LAG]), int(rules[c, SOURCE])
@@ -100,7 +104,8 @@ def repeat(rules: Floats, raw: Floats, q: Floats) -> None:
 
 @inlined
 def recover(numbers: Floats, places: Ints, at: int, o: Floats, q: Floats) -> None:
-    """Read moving coordinates back from observations o (D, B), into q (C, B)."""
+    """Read the moving coordinates back from observations o (D, B), and write them to q (C, B); ``at`` is the index of
+    the inverse."""
     sources = matrix(numbers, places, at)
     for s in range(len(sources)):
         c, first, second = int(sources[s, 0]), int(sources[s, 1]), int(sources[s, 2])

@@ -14,26 +14,28 @@ from surrogym_shared.compiled.jit import compiled
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-CONSTANT, FREQUENCIES, COEFFICIENTS, LIMITS = range(4)  # places of a term set's matrices
-TERMS, RULES = range(2)  # of conditions: where their term set is; sign, threshold and group of each inequality
+CONSTANT, FREQUENCIES, COEFFICIENTS, LIMITS = range(4)  # matrices of a term set, in this order
+# Matrices of conditions: index of their term set, and number of groups; one row (sign, threshold, group) for each
+# inequality.
+TERMS, RULES = range(2)
 
 
 def add_terms(tables: TablesBuilder, terms: TermSet) -> int:
-    """Add a term set, and return its place."""
+    """Add a term set to the tables, and return the index of its first matrix."""
     unlimited = np.full((2, len(terms.constant)), np.inf) * [[-1], [1]]
     limits = unlimited if terms.low is None or terms.high is None else [terms.low.numpy(), terms.high.numpy()]
     return tables.add(terms.constant, terms.frequencies.T, terms.coefficients, limits)
 
 
 def tables_of(terms: TermSet) -> Tables:
-    """The tables of a single term set, at place 0."""
+    """Return the tables of a single term set, whose index is 0."""
     tables = TablesBuilder()
     add_terms(tables, terms)
     return tables.build()
 
 
 def add_conditions(tables: TablesBuilder, conditions: Conditions) -> int:
-    """Add conditions, and return their place."""
+    """Add conditions to the tables, and return the index of their first matrix."""
     terms = add_terms(tables, conditions.terms)
     group = conditions.membership.numpy().argmax(1) if conditions.membership.numel() else np.zeros(0)
     rules = np.stack([conditions.sign, conditions.threshold, group], 1)
@@ -42,7 +44,7 @@ def add_conditions(tables: TablesBuilder, conditions: Conditions) -> int:
 
 @compiled
 def evaluate(numbers: Floats, places: Ints, at: int, q: Floats) -> Floats:
-    """Values of terms at coordinates q (C, B), (T, B)."""
+    """Return the values of the terms at index ``at`` for coordinates q (C, B), shape (T, B)."""
     constant, frequencies = matrix(numbers, places, at + CONSTANT), matrix(numbers, places, at + FREQUENCIES)
     coefficients, limits = matrix(numbers, places, at + COEFFICIENTS), matrix(numbers, places, at + LIMITS)
     size, lanes = q.shape
@@ -75,7 +77,7 @@ def evaluate(numbers: Floats, places: Ints, at: int, q: Floats) -> Floats:
 
 @compiled
 def holding(numbers: Floats, places: Ints, at: int, q: Floats) -> NDArray[np.bool_]:
-    """Which groups of conditions hold at q (C, B), (G, B)."""
+    """Return which groups of the conditions at index ``at`` hold for coordinates q (C, B), (G, B) bool."""
     head, rules = matrix(numbers, places, at + TERMS), matrix(numbers, places, at + RULES)
     values = evaluate(numbers, places, int(head[0, 0]), q)
     holds = np.ones((int(head[0, 1]), q.shape[1]), dtype=np.bool_)
