@@ -69,7 +69,7 @@ def calm(server: RestartingServer, tmp_path_factory: pytest.TempPathFactory) -> 
     return disturbed_training(server.url, tmp_path_factory.mktemp("calm") / "calm.zip", FAULTS)
 
 
-def test_killed_session_hosts_change_no_bit_of_the_policy(
+def test_a_training_learns_the_same_policy_although_session_hosts_are_killed(
     server: RestartingServer, database: str, calm: TrainResult, tmp_path: Path
 ):
     source, engine = random.Random(SEED), sa.create_engine(database.replace("postgresql:", "postgresql+psycopg:"))
@@ -86,7 +86,7 @@ def test_killed_session_hosts_change_no_bit_of_the_policy(
         engine.dispose()
 
 
-def test_a_killed_front_server_changes_no_bit_of_the_policy(
+def test_a_training_learns_the_same_policy_although_the_front_server_is_killed(
     server: RestartingServer, calm: TrainResult, tmp_path: Path
 ):
     def strike() -> None:
@@ -96,7 +96,7 @@ def test_a_killed_front_server_changes_no_bit_of_the_policy(
     require_same_policy(disturbed_training(server.url, tmp_path / "killed.zip", FAULTS, strike), calm)
 
 
-def test_a_cluster_that_is_killed_whole_and_begun_again_goes_on_with_its_sessions(tmp_path: Path):
+def test_sessions_continue_after_the_whole_ray_cluster_was_killed_and_restarted(tmp_path: Path):
     """With its front server, which ends or is started again when its cluster is gone. PostgreSQL has the sessions."""
     actions = np.random.default_rng(SEED).uniform(-2, 2, (200, 2, 1))
     with running_postgresql() as postgresql, TemporaryDirectory(prefix="ray") as folder:

@@ -94,7 +94,7 @@ def judge(api: Api, name: str, reported: dict[str, int], ends: int, noted: Count
         pytest.param(program, 1_000, 200, id="thousand"),  # its models are fitted fast
     ],
 )
-def test_crashes_of_a_program_lose_nothing(
+def test_crashes_of_an_environment_program_lose_no_sample_and_no_query(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], plant: Callable[[Path], str], crashes: int, queries: int
 ):
     command, total, designs = plant(tmp_path), Counter[str](), 0

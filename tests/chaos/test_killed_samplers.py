@@ -33,7 +33,9 @@ def kill_one(source: random.Random, samplers: NotingSamplers) -> bool:
 
 
 @pytest.mark.timeout(3_600)
-def test_every_query_ends_answered_or_set_aside_with_its_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_with_killed_samplers_every_query_ends_answered_or_set_aside(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     source, tally = random.Random(SEED), Tally()
     with running_server(tmp_path) as server, Api(server.url) as api:
         while tally.kills < KILLS:
@@ -53,7 +55,7 @@ def test_every_query_ends_answered_or_set_aside_with_its_error(tmp_path: Path, c
         print(f"\nsamplers, {tally}")
 
 
-def test_a_sampler_that_slept_beyond_its_lease_takes_no_step_that_others_have_taken(tmp_path: Path):
+def test_a_sampler_suspended_beyond_its_lease_repeats_no_step_of_others(tmp_path: Path):
     """As after closing a laptop: it holds six queries, and is stopped in the first step."""
     with running_server(tmp_path) as server, Api(server.url) as api:
         create(api, "slept", budget=6)

@@ -27,7 +27,7 @@ LEASE_SECONDS = 4.0  # a restart takes as long, so that some leases end meanwhil
         pytest.param(times(short=1, full=20), True, id="with-its-samplers"),
     ],
 )
-def test_nothing_acknowledged_is_lost_and_the_ledger_is_true(
+def test_a_killed_server_loses_no_acknowledged_sample_and_keeps_a_correct_ledger(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], kills: int, with_samplers: bool
 ):
     source, tally = random.Random(SEED), Tally()

@@ -54,7 +54,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
 
 
 @pytest.mark.parametrize("what", STRIKES)
-def test_kills_under_load_lose_no_sample_and_repeat_no_step(
+def test_kills_of_cluster_processes_under_load_lose_no_sample_and_repeat_no_step(
     stage: Stage, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     """Designs complete and trainings end. Only kills of what holds sessions may cut episodes short."""
@@ -74,7 +74,7 @@ def test_kills_under_load_lose_no_sample_and_repeat_no_step(
     assert not (cut and what in HARMLESS)
 
 
-def test_front_servers_killed_every_five_seconds_change_no_bit_of_the_policy(
+def test_a_training_learns_the_same_policy_while_front_servers_are_killed_repeatedly(
     stage: Stage, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     calm = disturbed_training(stage.url, tmp_path / "calm.zip", TRAININGS)

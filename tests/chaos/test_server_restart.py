@@ -58,7 +58,7 @@ def await_rollout(url: str) -> None:
             assert time.monotonic() < deadline
 
 
-def test_a_clean_restart_goes_unnoticed(restarting: RestartingServer):
+def test_a_clean_server_restart_does_not_affect_a_running_training(restarting: RestartingServer):
     touched, undisturbed = vec_env(restarting), vec_env(restarting)
     expected = [undisturbed.reset(), *(undisturbed.step(action) for action in actions(10))]
     undisturbed.close()
@@ -74,7 +74,7 @@ def test_a_clean_restart_goes_unnoticed(restarting: RestartingServer):
     touched.close()
 
 
-def test_a_stop_lets_long_polls_end_and_running_steps_finish(restarting: RestartingServer):
+def test_a_stopping_server_ends_waiting_requests_and_finishes_running_steps(restarting: RestartingServer):
     design = pendulum().design.model_copy(update={"initial": 2, "budget": 2})
     with (
         Api(restarting.url) as api,
@@ -97,7 +97,7 @@ def test_a_stop_lets_long_polls_end_and_running_steps_finish(restarting: Restart
     restarting.start()
 
 
-def test_a_crash_truncates_the_episodes_and_training_continues(restarting: RestartingServer):
+def test_a_server_crash_truncates_the_episodes_and_training_continues(restarting: RestartingServer):
     envs = vec_env(restarting)
     envs.reset()
     last, *_ = envs.step(actions(1)[0])

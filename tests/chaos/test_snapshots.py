@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.timeout(3_600)
 @pytest.mark.parametrize("stays", [pytest.param(True, id="folder"), pytest.param(False, id="no-folder")])
-def test_killed_samplers_lose_no_sample_and_report_what_is_gone(
+def test_killed_samplers_lose_no_sample_and_report_lost_snapshots(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], stays: bool
 ):
     source, kills, steps = random.Random(SEED), 0, [0, 0, 0]
@@ -54,7 +54,9 @@ def test_killed_samplers_lose_no_sample_and_report_what_is_gone(
 
 
 @pytest.mark.timeout(3_600)
-def test_two_samplers_that_drop_each_others_snapshots_lose_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_two_samplers_that_drop_each_others_snapshots_lose_no_sample(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     told: dict[str, int] = {}
     with running_server(tmp_path) as server, Api(server.url) as api:
         for run in range(RACES):

@@ -71,7 +71,9 @@ def steps(envs: list[SurrogateVecEnv], enough: threading.Event) -> list[float]:
 
 
 @pytest.mark.timeout(1_200)
-def test_a_long_time_under_load(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_server_under_long_load_has_no_errors_and_no_memory_growth(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     with running_server(tmp_path) as server, ExitStack() as stack:
         api = stack.enter_context(Api(server.url))
         teach(api, "pendulum", pendulum(), queries=12)

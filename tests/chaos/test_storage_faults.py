@@ -224,7 +224,7 @@ def wait_for_readiness(client: httpx.Client, status: int) -> None:
         time.sleep(0.1)
 
 
-def test_a_storage_fault_is_logged_and_survived(place: Place, tmp_path: Path):
+def test_the_server_logs_and_survives_a_storage_fault(place: Place, tmp_path: Path):
     with running_server(tmp_path, "--database", place.database) as server:
         with Api(server.url) as api:
             teach(api, "pendulum", pendulum(), queries=6)

@@ -40,14 +40,14 @@ def trained(server: RestartingServer, out: Path, sig: int | None = None) -> Trai
     return disturbed_training(server.url, out, FAULTS, None if sig is None else strike)
 
 
-def test_a_restart_in_the_middle_changes_no_bit_of_the_policy(server: RestartingServer, tmp_path: Path):
+def test_a_training_learns_the_same_policy_although_the_server_restarts(server: RestartingServer, tmp_path: Path):
     calm = trained(server, tmp_path / "calm.zip")
     restarted = trained(server, tmp_path / "restarted.zip", signal.SIGTERM)
     require_same_policy(restarted, calm)
     assert "cut short" not in words_of_result(restarted)
 
 
-def test_kills_in_the_middle_are_counted_and_reported(server: RestartingServer, tmp_path: Path):
+def test_a_training_counts_and_reports_kills_of_the_server(server: RestartingServer, tmp_path: Path):
     killed = trained(server, tmp_path / "killed.zip", signal.SIGKILL)
     lost = LANES * FAULTS
     assert killed.lost_episodes == lost

@@ -51,7 +51,7 @@ def until(happened: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
-def test_the_training_of_a_killed_worker_is_done_by_the_next(server: RestartingServer, tmp_path: Path):
+def test_the_training_job_of_a_killed_worker_is_done_by_the_next_worker(server: RestartingServer, tmp_path: Path):
     with Api(server.url) as api:
         id = api.jobs.add(NAME, TASK).id
         command = [sys.executable, "-c", WORKER, server.url, str(tmp_path / "killed")]
@@ -66,7 +66,9 @@ def test_the_training_of_a_killed_worker_is_done_by_the_next(server: RestartingS
         assert [policy.version for policy in api.policies.list(NAME)] == [job.version] == [1]
 
 
-def test_a_result_reaches_a_server_that_was_killed_for_longer_than_the_lease(server: RestartingServer, tmp_path: Path):
+def test_a_worker_delivers_its_result_after_a_server_outage_longer_than_the_lease(
+    server: RestartingServer, tmp_path: Path
+):
     reports: list[WorkerReport] = []
 
     def run() -> None:

@@ -27,16 +27,16 @@ def view(noise: float, sensor: float = 0.0) -> SurrogateView:
     ],
     ids=["no noise", "confirmed after the training", "the user chose none", "compared along functions"],
 )
-def test_session_of_an_audit_has_the_noise_known_now(settings, noise, expected):
+def test_an_audit_session_uses_the_currently_established_noise(settings, noise, expected):
     assert session_of(PolicyCard(settings=settings), view(noise)) == expected
 
 
-def test_errors_of_a_sensor_are_observed():
+def test_an_audit_session_uses_the_established_sensor_noise():
     expected = {"process_noise": True, "sensor_noise": {"x": 0.07}}
     assert session_of(PolicyCard(settings={"session": {}}), view(0.1, sensor=0.07)) == expected
 
 
-def test_a_policy_of_another_surrogate_is_refused_before_a_real_step():
+def test_auditing_a_policy_of_another_surrogate_is_refused_before_a_real_step():
     own, other = pendulum(), cartpole()
     policy = Network.of(own, np.zeros(3), np.ones(3), 2, np.zeros(Network.size(own, 2)))
     _require_fit(policy, own, "p.zip does not fit 'a'")

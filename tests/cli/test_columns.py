@@ -18,7 +18,7 @@ where it was not.
 """
 
 
-def test_headings_are_broken_first():
+def test_a_table_wider_than_the_terminal_first_wraps_its_headings():
     assert columns(ROWS).splitlines() == ["name      a long heading", "pendulum  0.1235", "x         -"]
     assert columns(ROWS, 17).splitlines() == [
         "          a long",
@@ -28,7 +28,7 @@ def test_headings_are_broken_first():
     ]
 
 
-def test_then_cells():
+def test_a_table_still_too_wide_for_the_terminal_wraps_its_cells():
     assert columns([("name", "words"), ("pendulum", "one two three"), ("x", "four")], 17).splitlines() == [
         "name      words",
         "pendulum  one two",
@@ -37,7 +37,7 @@ def test_then_cells():
     ]
 
 
-def test_then_rows():
+def test_a_table_too_wide_even_when_wrapped_is_printed_row_by_row():
     assert columns(ROWS, 16).splitlines() == [
         "name            pendulum",
         "a long heading  0.1235",
@@ -48,12 +48,12 @@ def test_then_rows():
 
 
 @pytest.mark.parametrize("width", [30, 40, 60, 80])
-def test_markdown_fits_and_keeps_every_word(width):
+def test_markdown_is_wrapped_to_the_terminal_width_without_losing_words(width):
     shown = fitted(MARKDOWN, width)
     assert max(map(len, shown.splitlines())) <= width
     assert set(MARKDOWN.replace("|", " ").replace("---", "").split()) <= set(shown.split())
     assert "\n\nA sentence that is broken where" in fitted(MARKDOWN, 80).replace("was\n", "was ")
 
 
-def test_markdown_is_unchanged_in_a_file():
+def test_markdown_written_to_a_file_is_not_wrapped():
     assert fitted(MARKDOWN, ENDLESS) == MARKDOWN

@@ -46,7 +46,7 @@ def pendulum(on_server, name):
     return name
 
 
-def test_register_names_the_next_command(on_server, name):
+def test_register_prints_the_next_command(on_server, name):
     said = on_server("register", "CartPole-v1", "--name", name)
     assert said.code == 0
     assert said.out == (
@@ -55,14 +55,14 @@ def test_register_names_the_next_command(on_server, name):
     )
 
 
-def test_register_by_a_file_names_the_next_command_with_its_environment(on_server, name, tmp_path):
+def test_register_from_a_file_prints_the_next_command_with_its_environment(on_server, name, tmp_path):
     own = original.make("Pendulum-v1").spec().model_copy(update={"environment": "own_line:Env-v0"})
     (tmp_path / "env.json").write_text(own.model_dump_json())
     said = on_server("register", name, str(tmp_path / "env.json"))
     assert said.out.endswith(f"next: surrogym sample {name} --env own_line:Env-v0\n")
 
 
-def test_a_design_without_real_steps_sends_nobody_to_a_sampler(on_server, name):
+def test_a_surrogate_with_budget_0_recommends_import_instead_of_sample(on_server, name):
     """register named the sampler as the next step, and sample --until-done waited without a word."""
     words = "the design requests no real steps, and there is no log yet; next: surrogym import LOG --to " + name
     said = on_server("register", "Pendulum-v1", "--name", name, "--budget", "0")
@@ -74,7 +74,7 @@ def test_a_design_without_real_steps_sends_nobody_to_a_sampler(on_server, name):
     assert words in on_server("status", name).out
 
 
-def test_register_twice_is_harmless_and_another_specification_is_refused(on_server, pendulum):
+def test_registering_twice_is_harmless_and_another_specification_is_refused(on_server, pendulum):
     again = on_server("register", "Pendulum-v1", "--name", pendulum, "--budget", "8", "--initial", "4")
     assert again.code == 0
     other = on_server("register", "CartPole-v1", "--name", pendulum)
@@ -82,7 +82,7 @@ def test_register_twice_is_harmless_and_another_specification_is_refused(on_serv
     assert pendulum in other.err
 
 
-def test_tolerances_are_given_at_registration_and_changed_later(on_server, name):
+def test_tolerances_can_be_given_to_register_and_changed_later(on_server, name):
     registered = on_server("register", "Pendulum-v1", "--name", name, "--tolerance", "theta=0.01", "--json")
     assert registered.json["spec"]["tolerances"] == {"theta": 0.01}
     assert on_server("change", name, "--tolerance", "reward=0.5", "--json").json["tolerances"] == {"reward": 0.5}
@@ -101,7 +101,7 @@ def test_print_spec_needs_no_server_and_register_accepts_its_output(surrogym, on
     assert registered.json["spec"]["action"]["bins"] == [3]
 
 
-def test_status_lists_all_and_shows_one(on_server, pendulum):
+def test_status_lists_all_surrogates_or_shows_one(on_server, pendulum):
     everything = on_server("status", "--json").json
     assert pendulum in [s["name"] for s in everything["surrogates"]]
     assert f"{pendulum}" in on_server("status").out
@@ -110,7 +110,7 @@ def test_status_lists_all_and_shows_one(on_server, pendulum):
     assert "0 initial, 0 adaptive, 0 manual, 0 of 8 in all" in one.out
 
 
-def test_sample_answers_queries_which_status_and_export_show(on_server, pendulum, tmp_path):
+def test_samples_taken_by_the_sample_command_appear_in_status_and_export(on_server, pendulum, tmp_path):
     said = on_server("sample", pendulum, "--max-queries", "4", "--time-limit", "60", "--json")
     assert said.code == 0
     assert (said.json["answered"], said.json["failed"]) == (4, 0)
@@ -124,7 +124,7 @@ def test_sample_answers_queries_which_status_and_export_show(on_server, pendulum
         assert all(len(arrays[key]) == 4 for key in arrays.files if arrays[key].ndim == 2)
 
 
-def test_a_surrogate_leaves_and_enters_as_one_file(surrogym, pendulum_server, name):
+def test_a_surrogate_can_be_exported_to_a_file_and_imported(surrogym, pendulum_server, name):
     server = ("--server", pendulum_server.url)
     assert surrogym("export", "pendulum", "--out", "pendulum.surrogate", *server).code == 0
     entered = surrogym("import", "pendulum.surrogate", "--name", name, *server)
@@ -139,13 +139,13 @@ def test_a_surrogate_leaves_and_enters_as_one_file(surrogym, pendulum_server, na
     )
 
 
-def test_a_surrogate_without_a_model_can_not_be_exported(on_server, pendulum):
+def test_exporting_a_surrogate_without_a_model_is_refused(on_server, pendulum):
     said = on_server("export", pendulum, "--out", "pendulum.surrogate")
     assert (said.code, said.out) == (1, "")
     assert "has no model yet" in said.err
 
 
-def test_train_without_a_model_names_the_sampler_or_the_wait(on_server, pendulum):
+def test_train_without_a_model_recommends_sampling_or_waiting(on_server, pendulum):
     """It told a person to start a sampler while one was running."""
     missing = f"error: '{pendulum}' has no model yet, its phase is "
     said = on_server("train", pendulum, "--quiet")
@@ -159,11 +159,11 @@ def test_train_without_a_model_names_the_sampler_or_the_wait(on_server, pendulum
     )
 
 
-def test_improve_asks_for_more(on_server, pendulum):
+def test_the_improve_command_adds_queries(on_server, pendulum):
     assert on_server("improve", pendulum, "--queries", "3").code == 0
 
 
-def test_delete_asks_first(on_server, pendulum, monkeypatch):
+def test_the_delete_command_asks_for_confirmation(on_server, pendulum, monkeypatch):
     monkeypatch.setattr("typer.confirm", _no)
     assert on_server("delete", pendulum).code == 1
     assert on_server("status", pendulum).code == 0
@@ -171,13 +171,13 @@ def test_delete_asks_first(on_server, pendulum, monkeypatch):
     assert on_server("status", pendulum).code == 1
 
 
-def test_train_without_a_model_says_what_to_do(on_server, pendulum):
+def test_the_error_of_train_without_a_model_recommends_a_command(on_server, pendulum):
     said = on_server("train", pendulum)
     assert said.code == 1
     assert f"run surrogym sample {pendulum}" in said.err
 
 
-def test_ones_own_environment_has_to_be_named_by_the_person(on_server, name, tmp_path, monkeypatch):
+def test_sample_refuses_an_own_environment_class_unless_given_with_env(on_server, name, tmp_path, monkeypatch):
     """The server's word is never enough to import a module."""
     (tmp_path / "own_line.py").write_text(OWN)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -195,7 +195,7 @@ def test_ones_own_environment_has_to_be_named_by_the_person(on_server, name, tmp
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum, tmp_path):
+def test_sample_train_and_evaluate_work_in_sequence_on_the_command_line(on_server, server_process, pendulum, tmp_path):
     assert on_server("sample", pendulum, "--until-done", "--time-limit", "300", "--quiet").code == 0
     session = ("--variant", "pathwise", "--trust", "9", "--process-noise", "--start-box", "0.25")
     options = ("--steps", "2000", "--num-envs", "4", "--seed", "3", *session)
@@ -249,7 +249,7 @@ def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum
     assert "error: the policy does not fit the environment" in other.err
 
 
-def test_a_policy_of_bins_pushes_ones_own_machine_as_its_surrogate_was_pushed(surrogym, monkeypatch, tmp_path):
+def test_evaluating_a_policy_with_binned_actions_sends_the_decoded_actions(surrogym, monkeypatch, tmp_path):
     spec = with_choices(Machine.spec(None), {}, bins=5)
     (tmp_path / "policy.zip").write_bytes(stored({}))
     (tmp_path / "policy.json").write_text(PolicyCard(spec=spec).model_dump_json())
@@ -260,7 +260,7 @@ def test_a_policy_of_bins_pushes_ones_own_machine_as_its_surrogate_was_pushed(su
         assert set(diary.read_text().splitlines()) == {"open", "reset 10000", "step -0.5", "close"}
 
 
-def test_equal_episodes_are_told_as_such(surrogym, monkeypatch, tmp_path):
+def test_evaluate_reports_that_all_episodes_were_equal(surrogym, monkeypatch, tmp_path):
     """A hundred equal episodes of a deterministic plant looked like a hundred that agree."""
     (tmp_path / "policy.zip").write_bytes(stored({}))
     (tmp_path / "policy.json").write_text(PolicyCard().model_dump_json())

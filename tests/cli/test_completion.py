@@ -28,20 +28,20 @@ def complete(line: str, url: str) -> list[str]:
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_it_installs_itself(tmp_path, shell):
+def test_the_command_line_can_install_its_shell_completion(tmp_path, shell):
     quiet = {"HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
     assert f"{shell} completion installed" in run("--install-completion", shell, **quiet)
     written = [path.read_text() for path in tmp_path.rglob("*") if path.is_file()]
     assert any("_SURROGYM_COMPLETE=complete_" in text for text in written)
 
 
-def test_commands_and_names_of_surrogates_are_completed(pendulum_server):
+def test_shell_completion_completes_commands_and_surrogate_names(pendulum_server):
     assert "status" in complete("surrogym sta", pendulum_server.url)
     assert complete("surrogym train pend", pendulum_server.url) == ["pendulum"]
     assert complete("surrogym train xyz", pendulum_server.url) == []
 
 
-def test_without_a_server_there_is_no_offer_and_no_message():
+def test_shell_completion_without_a_server_is_silent():
     started = time.monotonic()
     assert complete("surrogym export pend", "http://127.0.0.1:9") == []
     assert time.monotonic() - started < QUICK + 10  # the start of Python on a busy machine included

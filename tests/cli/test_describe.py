@@ -22,7 +22,7 @@ def described(surrogym, tmp_path: Path) -> Path:
     return file
 
 
-def test_the_file_is_on_standard_output_and_the_words_beside_it(surrogym) -> None:
+def test_describe_prints_the_specification_on_stdout_and_explanations_on_stderr(surrogym) -> None:
     said = surrogym("describe", "Swimmer-v5", "--steps", "60")
     assert said.json["specification"]["environment"] == "Swimmer-v5"
     assert f"Swimmer-v5: described by {said.json['real_steps']} real steps and" in said.err
@@ -30,7 +30,7 @@ def test_the_file_is_on_standard_output_and_the_words_beside_it(surrogym) -> Non
     assert "to decide: success" in said.err
 
 
-def test_a_described_environment_is_registered_by_its_file_and_by_its_name(on_server, described: Path, name) -> None:
+def test_a_described_environment_can_be_registered_by_file_or_by_name(on_server, described: Path, name) -> None:
     by_file = on_server("register", name, str(described), "--budget", "20", "--json")
     assert by_file.code == 0, by_file.err
     assert (by_file.json["name"], by_file.json["environment"]) == (name, "Swimmer-v5")
@@ -44,7 +44,7 @@ def test_a_described_environment_is_registered_by_its_file_and_by_its_name(on_se
     )
 
 
-def test_registering_by_name_alone_describes_and_enters_the_steps(on_server, name) -> None:
+def test_registering_an_environment_by_name_describes_it_and_counts_the_real_steps(on_server, name) -> None:
     said = on_server("register", name, "--env", "Swimmer-v5")
     assert said.code == 0, said.err
     assert "described by" in said.err
@@ -57,7 +57,7 @@ def test_registering_by_name_alone_describes_and_enters_the_steps(on_server, nam
     assert "described by" not in again.err
 
 
-def test_a_name_of_no_environment_is_one_sentence(surrogym) -> None:
+def test_describing_an_unknown_environment_gives_a_one_sentence_error(surrogym) -> None:
     said = surrogym("describe", "nowhere")
     assert (said.code, said.out) == (1, "")
     assert said.err.startswith("error: no adapter knows the environment 'nowhere': expected a Gymnasium id")
@@ -77,7 +77,7 @@ def test_a_name_of_no_environment_is_one_sentence(surrogym) -> None:
         (json.dumps({"colour": 1}), "env.json is not a specification: colour: unknown entry; expected some of "),
     ],
 )
-def test_a_file_that_holds_no_specification_is_refused(surrogym, tmp_path, content: str, message: str) -> None:
+def test_registering_a_file_without_a_specification_is_refused(surrogym, tmp_path, content: str, message: str) -> None:
     (tmp_path / "env.json").write_text(content)
     said = surrogym("register", "swimmer", "env.json", "--print-spec")
     assert said.code == 1
@@ -85,7 +85,7 @@ def test_a_file_that_holds_no_specification_is_refused(surrogym, tmp_path, conte
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
-def test_a_described_environment_may_come_through_a_pipe(on_server, described: Path, tmp_path: Path, name) -> None:
+def test_register_reads_a_described_environment_from_a_pipe(on_server, described: Path, tmp_path: Path, name) -> None:
     """The file was read three times: ``surrogym register NAME <(surrogym describe ENV)`` ended in a traceback."""
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
@@ -98,13 +98,13 @@ def test_a_described_environment_may_come_through_a_pipe(on_server, described: P
     assert ledger["evaluation"] == json.loads(described.read_text())["real_steps"]
 
 
-def test_a_file_that_is_nested_too_deeply_is_no_specification(surrogym, tmp_path: Path) -> None:
+def test_registering_a_too_deeply_nested_file_is_refused(surrogym, tmp_path: Path) -> None:
     (tmp_path / "deep.json").write_text(100_000 * "[")
     said = surrogym("register", "a", str(tmp_path / "deep.json"))
     assert (said.code, "deep.json is not a specification: " in said.err) == (1, True), said.err
 
 
-def test_two_names_and_two_files_are_refused(surrogym, described: Path) -> None:
+def test_register_with_two_names_or_two_files_is_refused(surrogym, described: Path) -> None:
     said = surrogym("register", "a", str(described), "--name", "b", "--print-spec")
     assert "expected one name, got 'a' and --name 'b'" in said.err
     said = surrogym("register", "a", str(described), "--spec", str(described), "--print-spec")

@@ -38,7 +38,7 @@ gymnasium.register("Chatty-v0", entry_point=Chatty)
         ("register", "chatty", "--env", "chatty_env:Chatty-v0", "--print-spec"),
     ],
 )
-def test_output_stays_json_beside_an_environment_that_prints(surrogym, tmp_path, monkeypatch, command) -> None:
+def test_json_output_is_valid_although_the_environment_prints(surrogym, tmp_path, monkeypatch, command) -> None:
     (tmp_path / "chatty_env.py").write_text(CHATTY)
     monkeypatch.syspath_prepend(tmp_path)
     said = surrogym(*command)
@@ -46,7 +46,7 @@ def test_output_stays_json_beside_an_environment_that_prints(surrogym, tmp_path,
     assert "a step" in said.err
 
 
-def test_an_environment_that_exits_while_it_is_closed_is_one_sentence(surrogym, tmp_path, monkeypatch) -> None:
+def test_an_environment_that_calls_exit_on_close_gives_a_one_sentence_error(surrogym, tmp_path, monkeypatch) -> None:
     """The command ended without a word."""
     closes = "    def close(self):\n        raise SystemExit('licence expired')\n\ngymnasium.register("
     (tmp_path / "closing_env.py").write_text(CHATTY.replace("gymnasium.register(", closes).replace("Chatty-v0", "C-v0"))
@@ -73,7 +73,7 @@ class Pendulum:
 """
 
 
-def test_an_environment_in_a_process_of_its_own_prints_aside_too(tmp_path) -> None:
+def test_prints_of_an_environment_in_a_separate_process_stay_out_of_stdout(tmp_path) -> None:
     (tmp_path / "chatty_plant.py").write_text(FACTORY)
     command = [sys.executable, "-m", "surrogym", "doctor", "--server", "http://127.0.0.1:9"]
     said = subprocess.run(

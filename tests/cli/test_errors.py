@@ -35,13 +35,13 @@ def refused(said, code=1):
         ("delete", "pendulum", "--yes"),
     ],
 )
-def test_a_server_that_is_not_there(surrogym, quickly, arguments):
+def test_the_error_for_an_unreachable_server_recommends_serve(surrogym, quickly, arguments):
     said = refused(surrogym(*arguments, *NOBODY))
     assert "no Surrogym server answers at http://127.0.0.1:9" in said
     assert "start one with surrogym serve" in said
 
 
-def test_an_invalid_address_is_refused(surrogym):
+def test_an_invalid_server_address_is_refused(surrogym):
     assert "expected a server address" in refused(surrogym("status", "--server", "pendulum"))
 
 
@@ -87,7 +87,7 @@ def test_an_invalid_address_is_refused(surrogym):
         ),
     ],
 )
-def test_what_is_not_there_or_wrong(surrogym, tmp_path, arguments, message):
+def test_missing_or_invalid_files_give_a_one_sentence_error(surrogym, tmp_path, arguments, message):
     (tmp_path / "broken.json").write_text("{")
     (tmp_path / "crossed.json").write_text(
         '{"coordinates": [{"name": "x", "sampling": {"kind": "uniform", "low": 1, "high": -1}}]}'
@@ -103,7 +103,7 @@ def test_what_is_not_there_or_wrong(surrogym, tmp_path, arguments, message):
     "arguments",
     [("status", "--nonsense"), ("unknown",), ("sample",), ("train", "x", "--steps", "many"), ("demo", "chess")],
 )
-def test_wrong_usage(surrogym, arguments):
+def test_wrong_command_line_usage_exits_with_code_2_and_without_traceback(surrogym, arguments):
     said = surrogym(*arguments)
     assert said.code == 2
     assert "Traceback" not in said.err
@@ -111,7 +111,7 @@ def test_wrong_usage(surrogym, arguments):
 
 
 @pytest.mark.parametrize("command", ["sample", "train", "status", "improve", "report"])
-def test_an_unknown_surrogate(on_server, command):
+def test_the_error_for_an_unknown_surrogate_recommends_status(on_server, command):
     said = refused(on_server(command, "nobody"))
     assert "nobody" in said
     assert said.endswith("; surrogym status lists the existing ones\n")
@@ -126,7 +126,7 @@ def test_an_unknown_surrogate(on_server, command):
     ],
     ids=["no token", "a token of another role", "another program"],
 )
-def test_the_way_out_stands_beside_what_is_wrong(surrogym, answer, way_out):
+def test_errors_from_the_server_end_with_the_recommended_remedy(surrogym, answer, way_out):
     with scripted_server(answer) as server:
         assert refused(surrogym("status", "--server", server.url)).endswith(f"{way_out}\n")
 
@@ -140,7 +140,7 @@ def test_the_way_out_stands_beside_what_is_wrong(surrogym, answer, way_out):
         ("evaluate", "policy.zip", "--perturb", "nan"),
     ],
 )
-def test_options_that_are_no_finite_numbers(surrogym, arguments):
+def test_options_with_nan_or_infinite_values_are_refused(surrogym, arguments):
     """NaN passes every range, because each comparison with it is false."""
     said = surrogym(*arguments)
     assert said.code == 2

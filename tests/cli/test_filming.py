@@ -21,7 +21,7 @@ def opened():
     return open_episode("CartPole-v1", make("CartPole-v1").spec(), lambda: make("CartPole-v1"))
 
 
-def test_a_new_video_replaces_one_of_another_form(tmp_path: Path) -> None:
+def test_a_new_evaluation_video_replaces_one_of_another_format(tmp_path: Path) -> None:
     policy = tmp_path / "policy.zip"
     for form in ("mp4", "gif"):
         policy.with_suffix(f".{form}").write_bytes(b"older")
@@ -38,7 +38,7 @@ def test_a_new_video_replaces_one_of_another_form(tmp_path: Path) -> None:
         ("support.machine:Machine", "no video: KeyError: "),  # its factory fails here
     ],
 )
-def test_a_picture_that_fails_is_said(
+def test_a_failed_evaluation_video_is_reported_without_failing_the_evaluation(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, expected: str
 ) -> None:
     policy = tmp_path / "policy.zip"

@@ -37,7 +37,7 @@ def mark(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("arguments", [EVALUATE, EXPORT])
-def test_a_pickled_policy_is_refused_in_one_sentence(surrogym, tmp_path, mark, arguments):
+def test_a_pickled_policy_file_is_refused_in_one_sentence(surrogym, tmp_path, mark, arguments):
     gift(tmp_path / "policy.zip", mark)
     ended = surrogym(*arguments)
     assert not mark.exists()
@@ -50,14 +50,14 @@ def test_a_pickled_policy_is_refused_in_one_sentence(surrogym, tmp_path, mark, a
 
 
 @pytest.mark.parametrize("arguments", [EVALUATE, EXPORT])
-def test_a_pickled_policy_is_read_when_it_is_trusted(surrogym, tmp_path, mark, arguments):
+def test_a_pickled_policy_file_is_read_with_trust_policy(surrogym, tmp_path, mark, arguments):
     gift(tmp_path / "policy.zip", mark)
     assert surrogym(*arguments, "--trust-policy").code == 1  # it is no policy after all
     assert mark.exists()
 
 
 @pytest.mark.parametrize("arguments", [EVALUATE, EXPORT])
-def test_the_trust_of_a_training_reads_no_pickled_policy(surrogym, tmp_path, mark, arguments):
+def test_the_removed_option_trust_is_refused_and_reads_no_pickled_policy(surrogym, tmp_path, mark, arguments):
     gift(tmp_path / "policy.zip", mark)
     ended = surrogym(*arguments, "--trust")
     assert ended.code == 2
@@ -66,7 +66,7 @@ def test_the_trust_of_a_training_reads_no_pickled_policy(surrogym, tmp_path, mar
 
 
 @pytest.mark.parametrize("options", [(), ("--json",), ("--quiet",)])
-def test_a_server_that_a_card_names_is_not_contacted(surrogym, tmp_path, monkeypatch, options):
+def test_a_server_named_only_in_a_policy_file_is_not_contacted(surrogym, tmp_path, monkeypatch, options):
     monkeypatch.setenv("SURROGYM_TOKEN", SECRET)
     with scripted_server(problem(Code.FORBIDDEN)) as server:
         network(tmp_path, surrogate="pendulum", server=server.url)
@@ -78,7 +78,7 @@ def test_a_server_that_a_card_names_is_not_contacted(surrogym, tmp_path, monkeyp
     assert not options or "--json" not in options or ended.json["steps"] == 200
 
 
-def test_a_server_that_a_person_names_gets_the_real_steps_and_the_token(surrogym, tmp_path, monkeypatch):
+def test_a_server_given_with_server_gets_the_real_steps_and_the_token(surrogym, tmp_path, monkeypatch):
     monkeypatch.setenv("SURROGYM_TOKEN", SECRET)
     with scripted_server(problem(Code.FORBIDDEN)) as noted, scripted_server(problem(Code.FORBIDDEN)) as given:
         network(tmp_path, surrogate="pendulum", server=noted.url)
@@ -90,7 +90,7 @@ def test_a_server_that_a_person_names_gets_the_real_steps_and_the_token(surrogym
 
 
 @pytest.mark.parametrize("name", ["..", "a/b", "", "a b", "pendulum/../other", "pendulum\n"])
-def test_a_card_with_an_invalid_name_is_refused(surrogym, tmp_path, name):
+def test_a_policy_description_with_an_invalid_surrogate_name_is_refused(surrogym, tmp_path, name):
     network(tmp_path, surrogate=name)
     ended = surrogym(*EVALUATE)
     assert ended.code == 1
@@ -105,7 +105,7 @@ def test_a_card_with_an_invalid_name_is_refused(surrogym, tmp_path, name):
         (50, 50, ""),
     ],
 )
-def test_a_card_may_only_shorten_the_environments_time_limit(surrogym, tmp_path, limit, steps, said):
+def test_a_policy_description_can_only_shorten_the_environments_time_limit(surrogym, tmp_path, limit, steps, said):
     """A limit of the card's own would let a gift take as many real steps as it wants."""
     spec = pendulum().model_copy(update={"time_limit": limit})
     network(tmp_path, spec=spec.model_dump(mode="json"))
@@ -116,7 +116,7 @@ def test_a_card_may_only_shorten_the_environments_time_limit(surrogym, tmp_path,
     assert bool(said) == ("time limit" in ended.err)
 
 
-def test_a_specification_that_a_person_gives_may_lengthen_the_time_limit(surrogym, tmp_path):
+def test_a_specification_given_with_spec_can_lengthen_the_time_limit(surrogym, tmp_path):
     longer = pendulum().model_copy(update={"time_limit": 300})
     network(tmp_path)
     (tmp_path / "spec.json").write_text(longer.model_dump_json())

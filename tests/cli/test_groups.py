@@ -36,19 +36,19 @@ def app() -> typer.Typer:
     return made
 
 
-def test_the_fields_of_a_group_are_options_of_the_command():
+def test_fields_of_an_option_group_become_options_of_the_command():
     ended = CliRunner().invoke(app(), ["picture", "--width", "4", "-t", "5", "--loud"])
     assert ended.output == "4 picture Size(width=4, height=5) True\n"
 
 
-def test_a_field_without_a_default_is_required_and_bounds_are_kept():
+def test_an_option_group_field_without_default_is_a_required_option():
     runner = CliRunner()
     assert "Missing option '--width'" in runner.invoke(app(), ["picture"]).output
     assert "not in the range x>=1" in runner.invoke(app(), ["picture", "--width", "0"]).output
 
 
 @pytest.mark.parametrize("name", sorted(set(COMMANDS) - WITHOUT_A_SERVER))
-def test_every_command_that_asks_a_server_takes_it_in_the_same_way(name: str):
+def test_every_command_that_uses_a_server_has_the_same_server_options(name: str):
     command = command_line().commands[name]
     found = {parameter.name: parameter for parameter in command.params}
     assert found.keys() >= SHARED
@@ -56,5 +56,5 @@ def test_every_command_that_asks_a_server_takes_it_in_the_same_way(name: str):
     assert found["token_file"].opts == ["--token-file"]
 
 
-def test_the_options_of_a_session_are_fields_of_its_opening():
+def test_session_options_of_the_command_line_are_fields_of_the_open_request():
     assert {field.name for field in fields(SessionOptions)} <= set(OpenSession.model_fields)

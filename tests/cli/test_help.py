@@ -11,13 +11,13 @@ from surrogym.cli.commands import ADVANCED, GROUPS
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, "serve"])
-def test_help_has_an_example(surrogym, command):
+def test_the_help_of_every_command_contains_an_example(surrogym, command):
     said = surrogym(*command.split(), "--help")
     assert said.code == 0
     assert f"Example: surrogym {command} " in said.out
 
 
-def test_the_command_alone_lists_all_commands(surrogym):
+def test_surrogym_without_arguments_lists_all_commands(surrogym):
     said = surrogym("--help")
     assert said.code == 0
     assert all(f"  {command} " in said.out for command in (*COMMANDS, "serve"))
@@ -26,23 +26,23 @@ def test_the_command_alone_lists_all_commands(surrogym):
     assert [line for line in listed.splitlines() if line.endswith(":")] == ["Loop:", "After:", "Operate:"]
 
 
-def test_every_command_of_a_group_exists():
+def test_every_command_listed_in_a_help_group_exists():
     assert {name for names in GROUPS.values() for name in names} <= set(command_line().commands)
 
 
 @pytest.mark.parametrize("command", ADVANCED)
-def test_options_for_experts_come_last_under_a_heading_of_their_own(surrogym, command):
+def test_expert_options_are_listed_last_under_their_own_heading(surrogym, command):
     usual, _, advanced = surrogym(command, "--help").out.partition("\nAdvanced:\n")
     for option in ADVANCED[command]:
         assert f"\n  {option} " in f"\n{advanced}"
         assert f"\n  {option} " not in usual.partition("\nOptions:\n")[2]
 
 
-def test_version(surrogym):
+def test_the_version_option_prints_the_version(surrogym):
     assert surrogym("--version").out.startswith("surrogym 0.")
 
 
-def test_help_imports_nothing_heavy():
+def test_printing_help_imports_no_heavy_package():
     script = (
         "import sys, surrogym.cli as cli; cli.build();"
         "print([m for m in ('torch', 'httpx', 'fastapi', 'stable_baselines3') if m in sys.modules])"
@@ -51,7 +51,7 @@ def test_help_imports_nothing_heavy():
     assert ended.stdout.strip() == "[]"
 
 
-def test_a_missing_extra_is_named():
+def test_the_error_for_a_missing_optional_dependency_names_it():
     script = "import sys; sys.modules['uvicorn'] = None; import surrogym.cli as cli; cli.main(['serve'])"
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert ended.returncode == 1

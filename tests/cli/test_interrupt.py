@@ -31,7 +31,7 @@ def said(terminal: Terminal) -> str:
     return " ".join(terminal.shown.split())
 
 
-def test_sampling_shows_the_design_and_keeps_every_real_step(surrogym, pendulum_server, surrogym_on_terminal, name):
+def test_interrupted_sampling_keeps_every_real_step(surrogym, pendulum_server, surrogym_on_terminal, name):
     register = ("register", "Pendulum-v1", "--name", name, "--budget", "6", "--initial", "4")
     assert surrogym(*register, "--server", pendulum_server.url).code == 0
     with surrogym_on_terminal("sample", name) as terminal:
@@ -46,7 +46,9 @@ def test_sampling_shows_the_design_and_keeps_every_real_step(surrogym, pendulum_
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_training_saves_its_policy(pendulum_server: ServerProcess, surrogym_on_terminal, tmp_path: Path, number: int):
+def test_an_interrupted_training_saves_its_policy(
+    pendulum_server: ServerProcess, surrogym_on_terminal, tmp_path: Path, number: int
+):
     """Ctrl-C, the stop of a service manager, and a terminal that is closed."""
     options = ("--steps", "900000", "--num-envs", "16", "--set", "n_steps=64", "--variant", "pathwise")
     with surrogym_on_terminal("train", "pendulum", *options, "--out", "policy.zip") as terminal:
@@ -68,7 +70,7 @@ def test_training_saves_its_policy(pendulum_server: ServerProcess, surrogym_on_t
         (EvaluationFailed(7, RuntimeError("no motor")), 1, "failed after 7 real steps: RuntimeError: no motor"),
     ],
 )
-def test_an_evaluation_that_does_not_end_enters_its_real_steps(
+def test_an_interrupted_or_failed_evaluation_reports_its_real_steps(
     on_server, server_process, name, monkeypatch, tmp_path, ending, code, words
 ):
     assert on_server("register", "Pendulum-v1", "--name", name).code == 0
@@ -110,7 +112,7 @@ gymnasium.register("Interrupts-v0", entry_point=Interrupts)
 """
 
 
-def test_a_description_says_how_many_real_steps_it_took(surrogym, tmp_path, monkeypatch):
+def test_an_interrupted_describe_reports_its_real_steps(surrogym, tmp_path, monkeypatch):
     """They ended without a word."""
     (tmp_path / "interrupts.py").write_text(INTERRUPTS)
     monkeypatch.syspath_prepend(tmp_path)
@@ -123,7 +125,7 @@ def test_a_description_says_how_many_real_steps_it_took(surrogym, tmp_path, monk
         assert ended.err == f"interrupted after 7 real steps, which no ledger counts; {outcome}\n"
 
 
-def test_an_interruption_before_the_first_real_step_says_so(surrogym, monkeypatch):
+def test_an_interruption_before_the_first_real_step_reports_none_taken(surrogym, monkeypatch):
     def interrupts(*_, **__):
         raise KeyboardInterrupt
 
@@ -134,7 +136,7 @@ def test_an_interruption_before_the_first_real_step_says_so(surrogym, monkeypatc
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_training_takes_a_polite_kill_like_ctrl_c(capsys, number: int):
+def test_sigterm_stops_a_training_like_ctrl_c(capsys, number: int):
     before = signal.getsignal(number)
     with pytest.raises(KeyboardInterrupt), _keeping(lambda _: None, "pendulum"):
         signal.raise_signal(number)

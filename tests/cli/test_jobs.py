@@ -15,7 +15,7 @@ def api(pendulum_server):
         yield opened
 
 
-def test_a_job_is_listed_shown_and_cancelled(on_server, api):
+def test_the_jobs_command_lists_shows_and_cancels_a_job(on_server, api):
     id = api.jobs.add("pendulum", wire.TrainTask(kind="train", algorithm="ppo", steps=5_000)).id
     job = api.jobs.claim("pendulum", "trainer-1")
     point = wire.JobPoint(steps=1_024, imagined_return=-800.5)
@@ -31,7 +31,7 @@ def test_a_job_is_listed_shown_and_cancelled(on_server, api):
     assert on_server("jobs", "pendulum", "--json").json["jobs"][0]["status"] == "cancelled"
 
 
-def test_what_is_missing_is_said(on_server, api, name):
+def test_the_jobs_command_reports_unknown_surrogates_and_jobs(on_server, api, name):
     assert on_server("register", "Pendulum-v1", "--name", name).code == 0
     assert f"no worker is connected; to start one: surrogym work {name}" in on_server("jobs", name).out
     ended = on_server("jobs", name, "--cancel")

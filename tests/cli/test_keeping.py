@@ -22,7 +22,7 @@ def episodes(returns: list[float]) -> Evaluation:
     [([np.inf, -1.0], "reward.0"), ([0.0] * 10_001, "returns")],
     ids=["a return that is not finite", "more episodes than one request holds"],
 )
-def test_episodes_that_no_server_takes_are_named_and_lose_no_result(
+def test_real_episodes_refused_by_the_server_are_kept_in_a_file_and_reported(
     returns: list[float], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     policy = tmp_path / "policy.zip"
@@ -33,7 +33,7 @@ def test_episodes_that_no_server_takes_are_named_and_lose_no_result(
     assert not waiting_path(policy).exists()
 
 
-def test_episodes_of_all_controllers_wait_beside_the_policy(tmp_path: Path):
+def test_unsent_real_episodes_of_all_controllers_are_kept_beside_the_policy(tmp_path: Path):
     policy, result = tmp_path / "policy.zip", episodes([-1.0, -2.0])
     _keep(policy, [("policy", result), ("zero", result)], EvaluationSettings(episodes=2), "Line-v0", None, quiet=True)
     assert waiting_path(policy).read_text().count('"controller"') == 2

@@ -41,7 +41,7 @@ def diary(tmp_path, monkeypatch):
         yield file
 
 
-def test_a_wait_for_no_model_is_refused():
+def test_evaluate_with_wait_but_without_learn_is_refused():
     """It was ignored, and a person took the model of before for the one that had learned."""
     with pytest.raises(CommandError, match="expected --wait with --learn or --learn-all, got neither"):
         Differences(wait=5.0).check(EvaluationSettings())
@@ -50,7 +50,7 @@ def test_a_wait_for_no_model_is_refused():
 
 
 @pytest.mark.parametrize("option", [("--learn-all",), ("--learn", "3")])
-def test_an_unknown_surrogate_is_refused_before_the_first_real_step(on_server, policy, diary, option):
+def test_evaluate_learn_refuses_an_unknown_surrogate_before_the_first_real_step(on_server, policy, diary, option):
     """All real steps were taken, went nowhere, and the exit status was 0."""
     said = on_server("evaluate", policy, *MACHINE, *option, "--surrogate", "nosuch")
     assert (said.code, "'nosuch'" in said.err) == (1, True), said.err
@@ -58,7 +58,7 @@ def test_an_unknown_surrogate_is_refused_before_the_first_real_step(on_server, p
     assert "reset" not in diary.read_text()
 
 
-def test_a_server_that_does_not_answer_is_told_before_the_first_real_step(surrogym, policy, diary):
+def test_evaluate_learn_reports_an_unreachable_server_before_the_first_real_step(surrogym, policy, diary):
     """Without --learn-all, it does not stop an evaluation."""
     nowhere = ("--server", "http://127.0.0.1:9")
     said = surrogym("evaluate", policy, *MACHINE, *nowhere, "--learn-all")
@@ -68,14 +68,16 @@ def test_a_server_that_does_not_answer_is_told_before_the_first_real_step(surrog
     assert "step" in diary.read_text()
 
 
-def test_a_policy_of_no_surrogate_has_none_that_learns(surrogym, policy, diary, tmp_path):
+def test_evaluate_learn_all_without_a_surrogate_is_refused(surrogym, policy, diary, tmp_path):
     (tmp_path / "policy.json").write_text(PolicyCard(spec=Machine.spec(None)).model_dump_json())
     said = surrogym("evaluate", policy, *MACHINE, "--learn-all")
     assert (said.code, "expected --surrogate with --learn-all, got none" in said.err) == (1, True), said.err
     assert "step" not in diary.read_text()
 
 
-def test_a_surrogate_of_another_system_is_refused_before_the_first_real_step(on_server, policy, diary, name):
+def test_evaluate_learn_refuses_a_surrogate_of_another_system_before_the_first_real_step(
+    on_server, policy, diary, name
+):
     """All real steps were taken, and not added: their coordinates were others."""
     assert on_server("register", "Pendulum-v1", "--name", name).code == 0
     said = on_server("evaluate", policy, *MACHINE, "--learn-all")
@@ -83,7 +85,7 @@ def test_a_surrogate_of_another_system_is_refused_before_the_first_real_step(on_
     assert set(diary.read_text().split()) == {"open", "close"}
 
 
-def test_a_surrogate_without_a_model_has_no_differing_steps(on_server, server_process, policy, diary, name):
+def test_evaluate_learn_is_refused_for_a_surrogate_without_a_model(on_server, server_process, policy, diary, name):
     """--learn was ignored without a word."""
     with Api(server_process.url) as api:
         api.create_surrogate(name, Machine.spec(None))
@@ -92,7 +94,9 @@ def test_a_surrogate_without_a_model_has_no_differing_steps(on_server, server_pr
     assert "step" not in diary.read_text()
 
 
-def test_every_step_is_added_to_a_surrogate_without_a_model(on_server, server_process, policy, diary, name):
+def test_evaluate_learn_all_adds_every_step_to_a_surrogate_without_a_model(
+    on_server, server_process, policy, diary, name
+):
     """--learn-all was ignored without a word until there was a model to compare with."""
     with Api(server_process.url) as api:
         api.create_surrogate(name, Machine.spec(None))
@@ -106,7 +110,7 @@ def test_every_step_is_added_to_a_surrogate_without_a_model(on_server, server_pr
 
 
 @pytest.mark.timeout(600)
-def test_steps_that_a_killed_server_did_not_store_are_kept_and_stored_once_later(
+def test_real_steps_a_killed_server_did_not_store_are_kept_and_stored_later(
     surrogym, policy, diary, name, tmp_path, monkeypatch
 ):
     """They were lost, and the exit status was 0."""
@@ -146,7 +150,7 @@ def test_steps_that_a_killed_server_did_not_store_are_kept_and_stored_once_later
         server.stop()
 
 
-def test_kept_steps_of_before_are_not_replaced(tmp_path):
+def test_a_file_of_kept_real_steps_is_not_overwritten(tmp_path):
     spec = Machine.spec(None)
     step = NewSample(coordinates=[0.0], action=[1.0], next_coordinates=[0.1], reward=0.0, terminated=False)
     files = [write_steps(tmp_path / "policy.zip", spec, [step] * count) for count in (1, 2)]
@@ -154,13 +158,13 @@ def test_kept_steps_of_before_are_not_replaced(tmp_path):
     assert [len(read_log(file, Options(spec=spec)).table) for file in files] == [1, 2]
 
 
-def test_steps_of_a_folder_that_cannot_be_written_to_are_kept_here(tmp_path, monkeypatch):
+def test_kept_real_steps_go_to_the_working_folder_if_the_policys_is_unwritable(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     step = NewSample(coordinates=[0.0], action=[1.0], next_coordinates=[0.1], reward=0.0, terminated=False)
     assert write_steps(tmp_path / "gone" / "policy.zip", Machine.spec(None), [step]) == Path("policy.steps.npz")
 
 
-def test_interrupted_steps_are_kept_and_named(tmp_path, capsys):
+def test_real_steps_of_an_interrupted_evaluation_are_kept_in_a_reported_file(tmp_path, capsys):
     """Ctrl-C while the steps were sent lost the others."""
     learning = Learning("pend", "--learn-all", Machine.spec(None), "http://127.0.0.1:9")
     path = np.array([[0.0], [0.1], [0.2]])
@@ -172,7 +176,7 @@ def test_interrupted_steps_are_kept_and_named(tmp_path, capsys):
     assert f"0 of 2 real steps are known to be stored; all are in {tmp_path / 'policy.steps.npz'}" in said
 
 
-def test_steps_with_numbers_that_no_server_stores_do_not_lose_the_others(tmp_path, capsys):
+def test_real_steps_with_unstorable_numbers_do_not_prevent_storing_the_others(tmp_path, capsys):
     learning = Learning("pend", "--learn-all", Machine.spec(None))
     path = np.array([[0.0], [0.1], [0.2]])
     result = Evaluation(np.zeros(1), np.array([2]), None, (Trace(path, np.ones((2, 1)), np.array([0.0, np.inf])),))
@@ -181,7 +185,7 @@ def test_steps_with_numbers_that_no_server_stores_do_not_lose_the_others(tmp_pat
     assert "left out: 1 real step with numbers that are not finite" in capsys.readouterr().err
 
 
-def test_angles_are_sent_as_an_import_sends_them():
+def test_angles_of_real_steps_are_wrapped_exactly_as_by_a_log_import():
     """The server knows a log by its numbers, so one with another last bit would be stored twice."""
     spec = original.make("Pendulum-v1").spec()
     angles = np.random.default_rng(0).uniform(-20, 20, size=(500, 2))

@@ -36,7 +36,7 @@ def diary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         yield diary
 
 
-def test_a_policy_of_another_environment_moves_no_machine(surrogym, policy, diary) -> None:
+def test_evaluating_a_policy_of_another_environment_is_refused_before_any_step(surrogym, policy, diary) -> None:
     """Saturated actions went to the plant, and the result was stored under the policy."""
     policy(pendulum())
     said = surrogym("evaluate", "policy.zip", *MACHINE)
@@ -48,14 +48,14 @@ def test_a_policy_of_another_environment_moves_no_machine(surrogym, policy, diar
     assert diary.read_text().splitlines() == ["open", "close"]
 
 
-def test_nor_does_one_whose_actions_the_machine_would_cut_off(surrogym, policy, diary) -> None:
+def test_evaluating_a_policy_with_larger_action_bounds_is_refused_before_any_step(surrogym, policy, diary) -> None:
     policy(Machine.spec(None).model_copy(update={"action": BoxAction(low=(-5.0,), high=(5.0,))}))
     said = surrogym("evaluate", "policy.zip", *MACHINE)
     assert "it is for a rail: expected actions from [-5] to [5], got [-1] to [1]\n" in said.err
     assert diary.read_text().splitlines() == ["open", "close"]
 
 
-def test_a_reference_policy_of_another_environment_is_refused_too(surrogym, policy, diary) -> None:
+def test_a_reference_policy_of_another_environment_is_refused(surrogym, policy, diary) -> None:
     policy(Machine.spec(None))
     policy(pendulum(), "reference")
     said = surrogym("evaluate", "policy.zip", *MACHINE, "--reference", "reference.zip")
@@ -65,14 +65,16 @@ def test_a_reference_policy_of_another_environment_is_refused_too(surrogym, poli
 
 
 @pytest.mark.parametrize("card", [None, Machine.spec(None)], ids=["no card", "its own card"])
-def test_a_policy_without_a_card_and_one_that_fits_run(surrogym, policy, diary, card) -> None:
+def test_a_fitting_policy_and_one_without_description_are_evaluated(surrogym, policy, diary, card) -> None:
     policy(card)
     said = surrogym("evaluate", "policy.zip", *MACHINE)
     assert said.code == 0, said.err
     assert {"reset 10000", "reset 10001"} < set(diary.read_text().splitlines())
 
 
-def test_a_given_specification_that_the_policy_does_not_fit_opens_nothing(surrogym, policy, diary, tmp_path) -> None:
+def test_a_policy_that_does_not_fit_the_given_specification_opens_no_environment(
+    surrogym, policy, diary, tmp_path
+) -> None:
     policy(pendulum())
     (tmp_path / "rail.json").write_text(Machine.spec(None).model_dump_json())
     said = surrogym("evaluate", "policy.zip", *MACHINE, "--spec", "rail.json")
@@ -81,7 +83,7 @@ def test_a_given_specification_that_the_policy_does_not_fit_opens_nothing(surrog
 
 
 @pytest.mark.parametrize("given", [(), ("--spec", "other.json")], ids=["by its name", "with a specification"])
-def test_another_task_of_a_library_is_refused_by_what_the_policy_is_for(surrogym, policy, tmp_path, given) -> None:
+def test_evaluating_a_policy_on_another_task_of_the_same_library_is_refused(surrogym, policy, tmp_path, given) -> None:
     """It asked for a specification, and with one it ended in NumPy's words about operands."""
     pytest.importorskip("dm_control")
     policy(pendulum().model_copy(update={"environment": "dm_control:pendulum-swingup"}))
@@ -95,7 +97,7 @@ def test_another_task_of_a_library_is_refused_by_what_the_policy_is_for(surrogym
     assert "coordinates (theta, speed) and a box action of 1" in said.err
 
 
-def test_a_training_starts_from_no_policy_of_another_environment(on_server, policy, name, monkeypatch) -> None:
+def test_a_training_refuses_to_start_from_a_policy_of_another_environment(on_server, policy, name, monkeypatch) -> None:
     """It failed after 17 s, with the shapes of arrays."""
     policy(pendulum())
     trainable = (Machine.spec(None), "http://127.0.0.1:9")

@@ -20,7 +20,7 @@ from surrogym.cli.options import Quiet, Token, typed
         ("pendulum --set a=1 --set 'b=x y' --token secret -o p.zip", "pendulum --set a=1 --set 'b=x y'"),
     ],
 )
-def test_a_command_line_is_repeated_in_the_advice(line: str, said: str):
+def test_a_recommended_command_repeats_the_typed_options_without_secrets(line: str, said: str):
     app = typer.Typer()
 
     @app.command()

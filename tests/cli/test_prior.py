@@ -24,7 +24,7 @@ def hinge(server_process, name):
         api.delete_surrogate(name)
 
 
-def test_a_simulator_is_calibrated_and_the_design_ends_after_few_real_steps(on_server, server_process, hinge):
+def test_with_a_calibrated_simulator_prior_the_design_needs_few_real_steps(on_server, server_process, hinge):
     with Api(server_process.url) as api:
         PriorCalls(api.connection).wait(hinge)
         sampler = Sampler(api, hinge, Real(), SamplerSettings(until_done=True, wait_seconds=1.0))
@@ -44,7 +44,7 @@ def test_a_simulator_is_calibrated_and_the_design_ends_after_few_real_steps(on_s
     assert not [name for name in others if ".simulator-" in name]
 
 
-def test_a_simulator_that_fails_in_places_and_prints_is_still_a_prior(on_server, server_process, hinge):
+def test_a_simulator_that_prints_and_fails_in_some_states_works_as_prior(on_server, server_process, hinge):
     with Api(server_process.url) as api:
         PriorCalls(api.connection).wait(hinge)
         sampler = Sampler(api, hinge, Real(), SamplerSettings(until_done=True, wait_seconds=1.0))
@@ -56,7 +56,7 @@ def test_a_simulator_that_fails_in_places_and_prints_is_still_a_prior(on_server,
     assert json.loads(said.out)["prior"]["about"]["source"] == "support.hinge:Partial"
 
 
-def test_what_it_is_not_used_for_is_said_before_anything_changes(on_server, server_process, hinge):
+def test_invalid_uses_of_the_prior_command_are_refused_and_change_nothing(on_server, server_process, hinge):
     refused = {
         ("prior", hinge): "got none",
         ("prior", hinge, "support.hinge:Textbook", "--drop"): "got both",
@@ -79,7 +79,7 @@ def test_what_it_is_not_used_for_is_said_before_anything_changes(on_server, serv
         assert not PriorCalls(api.connection).get(hinge).awaited
 
 
-def test_waiting_ends_with_drop(on_server, server_process, hinge):
+def test_prior_drop_ends_waiting_for_a_prior(on_server, server_process, hinge):
     with Api(server_process.url) as api:
         PriorCalls(api.connection).wait(hinge)
         assert "waits for its prior" in on_server("status", hinge).out

@@ -19,7 +19,7 @@ from surrogym.cli.sample import _environment
         ("a rail", "--env pcgym:FILE.json, --env fmu:PLANT.fmu, or --exec COMMAND"),
     ],
 )
-def test_the_option_that_opens_a_surrogates_environment_is_named(name: str, expected: str) -> None:
+def test_the_refusal_to_open_a_surrogates_environment_names_the_option_that_allows_it(name: str, expected: str) -> None:
     """For a file of pc-gym it named every option but the one that is needed."""
     with pytest.raises(CommandError) as refused:
         _environment(None, None, SPEC.model_copy(update={"environment": name}))

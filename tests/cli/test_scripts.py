@@ -59,11 +59,13 @@ def all_commands(group: Any = command_line(), before: tuple[str, ...] = ()) -> I
 
 
 @pytest.mark.parametrize("command", list(all_commands()))
-def test_every_command_speaks_json_and_keeps_quiet(command: str) -> None:
+def test_every_command_has_the_options_json_and_quiet(command: str) -> None:
     assert {"--json", "--quiet"} <= options(*command.split())
 
 
-def test_a_script_reads_one_document_and_nothing_else(surrogym, pendulum_server: ServerProcess) -> None:
+def test_with_json_and_quiet_every_command_prints_only_one_json_document(
+    surrogym, pendulum_server: ServerProcess
+) -> None:
     name, server, run = f"script-{uuid.uuid4().hex[:8]}", ("--server", pendulum_server.url), set()
     for line in LINES.replace("NAME", name).strip().splitlines():
         words = line.split()
@@ -77,11 +79,11 @@ def test_a_script_reads_one_document_and_nothing_else(surrogym, pendulum_server:
 @pytest.mark.parametrize(
     ("line", "shown"), [("report pendulum", "report: done"), ("export pendulum -o s.csv", "export: done")]
 )
-def test_a_long_operation_shows_its_progress(surrogym, pendulum_server: ServerProcess, line, shown) -> None:
+def test_long_commands_show_their_progress(surrogym, pendulum_server: ServerProcess, line, shown) -> None:
     assert shown in surrogym(*line.split(), "--server", pendulum_server.url).err
 
 
-def test_a_wait_names_its_reason(surrogym, pendulum_server: ServerProcess, monkeypatch) -> None:
+def test_a_waiting_command_prints_what_it_waits_for(surrogym, pendulum_server: ServerProcess, monkeypatch) -> None:
     monkeypatch.setattr("surrogym_shared.terminal.FIRST_SECONDS", 0.05)
     server = ("--server", pendulum_server.url)
     said = surrogym("sample", "nowhere", "--wait", "0.5", *server)

@@ -32,13 +32,13 @@ def looks(monkeypatch):
     return press_after
 
 
-def test_quiet_gives_names_and_phases_for_scripts(on_server, name):
+def test_status_quiet_prints_name_and_phase(on_server, name):
     on_server("register", "Pendulum-v1", "--name", name)
     assert on_server("status", name, "--quiet").out == f"{name} collecting\n"
     assert f"{name} collecting" in on_server("status", "--quiet").out.splitlines()
 
 
-def test_all_say_what_was_spent_and_what_is_asked_for(on_server, server_process, name):
+def test_the_status_list_shows_used_budget_and_pending_queries(on_server, server_process, name):
     on_server("register", "Pendulum-v1", "--name", name, "--budget", "8", "--initial", "4")
     (line,) = (line for line in on_server("status").out.splitlines() if line.startswith(name))
     assert "0 of 8" in line
@@ -47,7 +47,7 @@ def test_all_say_what_was_spent_and_what_is_asked_for(on_server, server_process,
     assert (summary["budget"], summary["target"], summary["queries"]["pending"]) == (8, 0.999, 4)
 
 
-def test_a_design_that_failed_by_its_machine_names_the_way_on(on_server, server_process, name):
+def test_status_of_a_design_with_failed_queries_recommends_resume(on_server, server_process, name):
     on_server("register", "Pendulum-v1", "--name", name, "--budget", "8", "--initial", "4")
     with Api(server_process.url) as api:
         while api.surrogate(name).phase != "failed":
@@ -62,7 +62,7 @@ def test_a_design_that_failed_by_its_machine_names_the_way_on(on_server, server_
     assert "collecting" in on_server("change", name, "--resume").out
 
 
-def test_watching_shows_changes_alone_and_ends_cleanly(on_server, server_process, name, looks):
+def test_status_watch_prints_only_changes_and_ends_cleanly(on_server, server_process, name, looks):
     """Not on a terminal: as lines."""
     on_server("register", "Pendulum-v1", "--name", name)
     looks(5)
@@ -76,7 +76,7 @@ def test_watching_shows_changes_alone_and_ends_cleanly(on_server, server_process
     assert on_server("status", name, "--watch", "--quiet").out == f"{name} paused\n"
 
 
-def test_a_lost_server_is_reported_and_polled(surrogym, looks, monkeypatch):
+def test_status_watch_reports_a_lost_server_and_tries_again(surrogym, looks, monkeypatch):
     monkeypatch.setattr("surrogym.cli.options.QUICK", 0.0)
     looks(3)
     with scripted_server(EMPTY, lost_reply, EMPTY) as server:
@@ -87,12 +87,12 @@ def test_a_lost_server_is_reported_and_polled(surrogym, looks, monkeypatch):
     assert found.startswith("no surrogates yet")
 
 
-def test_watching_nothing_known_ends_at_once(on_server):
+def test_status_watch_of_an_unknown_surrogate_ends_at_once(on_server):
     said = on_server("status", "nobody", "--watch")
     assert (said.code, said.out) == (1, "")
 
 
-def test_new_samples_are_shown_with_the_intervals_that_they_were_predicted_in(on_server, server_process, name):
+def test_status_shows_how_well_new_samples_were_predicted(on_server, server_process, name):
     with Api(server_process.url) as api:
         teach(api, name, pendulum(), queries=8, initial=5)
     lines = on_server("status", name).out.splitlines()
@@ -106,7 +106,7 @@ def test_new_samples_are_shown_with_the_intervals_that_they_were_predicted_in(on
     assert max(output["prequential"]["predictions"] for output in scored) == seen["ledger"]["adaptive"] > 0
 
 
-def test_on_a_narrow_terminal_nothing_is_cut_and_ctrl_c_ends_it(pendulum_server):
+def test_status_watch_fits_a_narrow_terminal_and_ends_with_ctrl_c(pendulum_server):
     with on_terminal("status", "pendulum", "--watch", "--server", pendulum_server.url, width=60) as terminal:
         terminal.await_text("leave-one-out")
         assert terminal.interrupt() == 0

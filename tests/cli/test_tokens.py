@@ -42,7 +42,7 @@ def sent(server: ScriptedServer) -> str | None:
     ],
     ids=["none", "option", "variable", "the token before its file", "what was typed before the environment"],
 )
-def test_a_token_comes_from_the_environment_or_a_file(
+def test_the_token_is_read_from_an_environment_variable_or_a_file(
     surrogym, server, file, monkeypatch, options, environment, expected
 ):
     for name, value in environment.items():
@@ -51,7 +51,7 @@ def test_a_token_comes_from_the_environment_or_a_file(
     assert (said.code, said.err, sent(server)) == (0, "", expected)
 
 
-def test_a_typed_token_is_taken_with_a_warning(surrogym, server):
+def test_a_token_on_the_command_line_works_with_a_warning(surrogym, server):
     said = surrogym("status", "--server", server.url, "--token", "typed", "--json")
     assert said.json["surrogates"] == []
     assert sent(server) == "Bearer typed"
@@ -60,13 +60,13 @@ def test_a_typed_token_is_taken_with_a_warning(surrogym, server):
     assert surrogym("status", "--server", server.url, "--token", "typed", "--quiet").err == ""
 
 
-def test_two_typed_tokens_are_one_too_many(surrogym, server, file):
+def test_token_and_token_file_together_are_refused(surrogym, server, file):
     said = surrogym("status", "--server", server.url, "--token", "typed", "--token-file", "token")
     assert (said.code, server.received) == (1, [])
     assert said.err == "error: expected --token or --token-file, got both; give one of the two\n"
 
 
-def test_a_token_file_that_others_may_read_is_taken_with_a_warning(surrogym, server, file):
+def test_a_token_file_readable_by_others_works_with_a_warning(surrogym, server, file):
     file.chmod(0o644)
     said = surrogym("status", "--server", server.url, "--token-file", "token")
     assert (said.code, sent(server)) == (0, "Bearer in-a-file")
@@ -76,13 +76,13 @@ def test_a_token_file_that_others_may_read_is_taken_with_a_warning(surrogym, ser
     assert surrogym("status", "--server", server.url, "--token-file", "token", "--quiet").err == ""
 
 
-def test_a_missing_token_file_is_one_sentence(surrogym, server):
+def test_a_missing_token_file_gives_a_one_sentence_error(surrogym, server):
     said = surrogym("status", "--server", server.url, "--token-file", "missing")
     assert (said.code, server.received) == (1, [])
     assert said.err == "error: the token file 'missing' can't be read: No such file or directory\n"
 
 
-def test_help_says_where_a_token_shows(surrogym):
+def test_the_help_warns_that_a_token_on_the_command_line_is_visible(surrogym):
     said = " ".join(surrogym("status", "--help").out.split())
     assert "A token typed here shows in the list of processes." in said
     assert "--token-file" in said

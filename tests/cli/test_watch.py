@@ -40,7 +40,9 @@ def policy(server_process: ServerProcess, tank: str) -> Callable[[], Any]:
     return get
 
 
-def test_a_healthy_plant_keeps_the_trust(watch: Watch, policy: Callable[[], Any], tmp_path: Path):
+def test_watching_the_log_of_an_unchanged_plant_keeps_the_policy_trusted(
+    watch: Watch, policy: Callable[[], Any], tmp_path: Path
+):
     before = policy()
     said = watch(write(tmp_path / "log.csv", lines(1_500, seed=2)), "--json")
     assert said.code == 0, said.err
@@ -59,7 +61,7 @@ def test_a_healthy_plant_keeps_the_trust(watch: Watch, policy: Callable[[], Any]
     ],
     ids=["other units", "another period", "no reward", "one row"],
 )
-def test_a_log_that_cannot_be_compared_is_refused_and_changes_nothing(
+def test_watch_refuses_an_unusable_log_and_changes_nothing(
     watch: Watch, policy: Callable[[], Any], tmp_path: Path, spoiled: Callable[[list[str]], list[str]], named: list[str]
 ):
     before = policy()
@@ -74,7 +76,7 @@ def test_a_log_that_cannot_be_compared_is_refused_and_changes_nothing(
     assert list(tmp_path.iterdir()) == [log]
 
 
-def test_gaps_and_rows_out_of_order_are_said_and_not_compared(watch: Watch, tmp_path: Path):
+def test_watch_reports_and_skips_gaps_and_unordered_rows(watch: Watch, tmp_path: Path):
     rows = lines(400, seed=4)
     rows[200], rows[300] = rows[300], _with(rows[300], 1, lambda _: float("nan"))
     said = watch(write(tmp_path / "log.csv", [*rows[:100], *rows[110:]]), "--json")
@@ -85,7 +87,7 @@ def test_gaps_and_rows_out_of_order_are_said_and_not_compared(watch: Watch, tmp_
     assert 380 < result["compared"] < 389
 
 
-def test_a_worn_pump_costs_the_trust_once_and_is_said_everywhere(
+def test_drift_found_by_watch_makes_the_policy_untrusted_and_is_shown_everywhere(
     watch: Watch, on_server: Watch, policy: Callable[[], Any], tank: str, tmp_path: Path
 ):
     log = write(tmp_path / "log.csv", lines(400, seed=5, worn_from=200))
@@ -104,7 +106,7 @@ def test_a_worn_pump_costs_the_trust_once_and_is_said_everywhere(
         assert "drift: level is" in text
 
 
-def test_a_drift_is_shown_although_the_server_does_not_take_it(
+def test_watch_shows_drift_although_the_server_is_unreachable(
     watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     def gone(*_: object) -> None:
@@ -117,7 +119,9 @@ def test_a_drift_is_shown_although_the_server_does_not_take_it(
     assert "the server is gone" in said.err
 
 
-def test_a_column_that_changes_its_unit_is_no_drift(watch: Watch, policy: Callable[[], Any], tmp_path: Path):
+def test_watch_rejects_rows_after_a_change_of_unit_instead_of_reporting_drift(
+    watch: Watch, policy: Callable[[], Any], tmp_path: Path
+):
     before, rows = policy(), lines(300, seed=9)
     in_percent = [_with(row, 1, lambda level: 100 * level) for row in rows[250:]]
     said = watch(write(tmp_path / "log.csv", [*rows[:250], *in_percent]), "--json")
@@ -127,13 +131,15 @@ def test_a_column_that_changes_its_unit_is_no_drift(watch: Watch, policy: Callab
     assert policy() == before
 
 
-def test_a_log_of_another_machine_is_told_from_one_that_changed(watch: Watch, tmp_path: Path):
+def test_watch_distinguishes_a_log_of_another_machine_from_drift(watch: Watch, tmp_path: Path):
     said = [watch(write(tmp_path / "log.csv", lines(300, seed=5, worn_from=at))) for at in (0, 200)]
     assert [one.code for one in said] == [1, 1]
     assert ["another machine" in one.out for one in said] == [True, False]
 
 
-def test_a_log_is_followed_until_the_drift(watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_watch_follow_reads_a_growing_log_until_drift_is_found(
+    watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
     """Lines come in pieces, and a half-written line is no row yet."""
     monkeypatch.setattr("surrogym_trainer.watching.logs.LOOK_SECONDS", 0.02)
     monkeypatch.setattr("surrogym_trainer.watching.logs.LATEST", 20)
@@ -160,7 +166,7 @@ def test_a_log_is_followed_until_the_drift(watch: Watch, monkeypatch: pytest.Mon
     assert followed.json["drift"] == at_once.json["drift"]
 
 
-def test_lines_of_standard_input_are_watched_as_a_log(watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_watch_reads_a_log_from_standard_input(watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """The last line may lack its end."""
     log = write(tmp_path / "log.csv", lines(300, seed=6, worn_from=150))
     log.write_text(log.read_text(encoding="utf-8").rstrip("\n"), encoding="utf-8")
@@ -178,7 +184,7 @@ def test_lines_of_standard_input_are_watched_as_a_log(watch: Watch, monkeypatch:
     assert "got none" in said.err
 
 
-def test_what_has_become_shorter_is_another_log(watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_watch_follow_refuses_a_log_that_became_shorter(watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr("surrogym_trainer.watching.logs.LOOK_SECONDS", 0.0)
     log = write(tmp_path / "log.csv", lines(200, seed=7))
     threading.Timer(1.0, lambda: write(log, lines(20, seed=7))).start()
@@ -188,7 +194,7 @@ def test_what_has_become_shorter_is_another_log(watch: Watch, monkeypatch: pytes
 
 
 @pytest.mark.parametrize(("name", "which"), [("nobody", "1"), ("", "staging"), ("", "7")])
-def test_an_unknown_surrogate_or_policy_is_named(on_server: Watch, tank: str, tmp_path: Path, name: str, which: str):
+def test_watch_names_an_unknown_surrogate_or_policy(on_server: Watch, tank: str, tmp_path: Path, name: str, which: str):
     log = write(tmp_path / "log.csv", lines(50, seed=8))
     said = on_server("watch", name or tank, str(log), "--policy", which)
     assert said.code == 1

@@ -44,7 +44,7 @@ def ports(pendulum_server) -> Iterator[dict[str, PolicyPort]]:
         yield {"local": LocalSurrogate(stored, model), "json": json, "binary": binary, "stream": stream}
 
 
-def test_every_transport_ends_and_pays_alike(ports):
+def test_learned_termination_and_declared_reward_are_equal_over_every_transport(ports):
     told = {}
     for name, port in ports.items():
         session = port.open(OpenSession(num_envs=4, seed=3, autoreset_mode="same_step")).id
@@ -62,7 +62,7 @@ def test_every_transport_ends_and_pays_alike(ports):
 
 
 @pytest.mark.parametrize("noise", [None, NoiseKey(5)], ids=["most probable", "noisy"])
-def test_every_transport_lets_a_policy_choose_as_step_by_step(ports, noise):
+def test_a_discrete_policy_rollout_equals_single_steps_over_every_transport(ports, noise):
     policy = random_policy((4, 12, 2), continuous=False)
     actor = Actor(policy, 4, np.zeros(0), np.zeros(0), (2,), noisy=noise is not None)
     opening = OpenSession(num_envs=6, seed=3, autoreset_mode="same_step")

@@ -51,7 +51,7 @@ def actor_of(policy: ActingPolicy, noise: NoiseKey | None) -> Actor:
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("noise", [None, NoiseKey(11, 3), NoiseKey(11, 3, 4)], ids=["most probable", "noisy", "held"])
 @pytest.mark.parametrize("mode", ["same_step", "next_step"])
-def test_a_policy_acts_as_it_would_step_by_step(port: PolicyPort, opened: Opened, mode: str, noise, dtype):
+def test_a_policy_rollout_equals_single_steps_bit_for_bit(port: PolicyPort, opened: Opened, mode: str, noise, dtype):
     """Bit for bit: episodes end and begin within the rollout, and a penalty and a trusted range are on."""
     options = {"autoreset_mode": mode, "penalty": 1.5, "trust": 100.0}
     whole, single = opened(**options), opened(**options)
@@ -69,7 +69,7 @@ def test_a_policy_acts_as_it_would_step_by_step(port: PolicyPort, opened: Opened
 
 
 @pytest.mark.parametrize("variant", ["probabilistic", "pathwise"])
-def test_other_variants_act_as_step_by_step(port: PolicyPort, opened: Opened, variant: str):
+def test_a_policy_rollout_of_other_variants_equals_single_steps(port: PolicyPort, opened: Opened, variant: str):
     noisy = {"process_noise": True, "sensor_noise": {"speed": 0.1}}
     options = {"variant": variant, **noisy} | ({"particles": 9} if variant == "probabilistic" else {})
     whole, single, noise = opened(**options), opened(**options), NoiseKey(0)
@@ -80,7 +80,7 @@ def test_other_variants_act_as_step_by_step(port: PolicyPort, opened: Opened, va
     assert_same_rollout(ours, stepped(port, single, actor_of(policy, noise), start, 6, noise))
 
 
-def test_two_rollouts_are_one_where_the_noise_counts_on(port: PolicyPort, opened: Opened):
+def test_two_consecutive_rollouts_equal_one_if_the_noise_continues(port: PolicyPort, opened: Opened):
     once, twice, noise, policy = opened(), opened(), NoiseKey(2), random_policy(SIZES)
     port.reset(once)
     port.reset(twice)
@@ -90,7 +90,7 @@ def test_two_rollouts_are_one_where_the_noise_counts_on(port: PolicyPort, opened
         np.testing.assert_array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(whole, name))
 
 
-def test_a_rollout_stops_once_an_episode_has_ended_in_each_awaited_lane(port: PolicyPort, opened: Opened):
+def test_a_rollout_stops_once_every_awaited_environment_has_ended_an_episode(port: PolicyPort, opened: Opened):
     session, policy = opened(), random_policy(SIZES)
     port.reset(session)
     port.rollout_policy(session, policy, 1)
@@ -98,7 +98,7 @@ def test_a_rollout_stops_once_an_episode_has_ended_in_each_awaited_lane(port: Po
     assert len(port.rollout_policy(session, policy, 2, until=np.ones(N, dtype=bool))) == 2, "fewer than until"
 
 
-def test_a_repeated_seed_repeats_the_noise_and_another_does_not(port: PolicyPort, opened: Opened):
+def test_the_action_noise_of_a_rollout_is_reproducible_from_its_seed(port: PolicyPort, opened: Opened):
     policy, seeds = random_policy(SIZES), (4, 4, 5)
     actions = []
     for seed in seeds:
@@ -132,7 +132,9 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("what", list(BAD))
-def test_a_bad_policy_is_refused_and_changes_nothing(port: PolicyPort, opened: Opened, harness, what: str):
+def test_a_rollout_with_an_invalid_policy_is_refused_and_changes_nothing(
+    port: PolicyPort, opened: Opened, harness, what: str
+):
     touched, undisturbed = opened(), opened()
     port.reset(touched)
     port.reset(undisturbed)
@@ -144,12 +146,12 @@ def test_a_bad_policy_is_refused_and_changes_nothing(port: PolicyPort, opened: O
     assert_same_rollout(ours, theirs)
 
 
-def test_a_policy_before_the_first_reset_is_refused(port: PolicyPort, opened: Opened, harness):
+def test_a_policy_rollout_before_the_first_reset_is_refused(port: PolicyPort, opened: Opened, harness):
     with pytest.raises(harness.errors.NotReset):
         port.rollout_policy(opened(), GOOD, 2)
 
 
-def test_without_autoreset_a_rollout_past_an_end_is_refused_whole(port: PolicyPort, opened: Opened, harness):
+def test_with_autoreset_disabled_a_rollout_beyond_an_episode_end_is_refused(port: PolicyPort, opened: Opened, harness):
     touched, undisturbed = opened(autoreset_mode="disabled"), opened(autoreset_mode="disabled")
     port.reset(touched)
     port.reset(undisturbed)
@@ -159,14 +161,14 @@ def test_without_autoreset_a_rollout_past_an_end_is_refused_whole(port: PolicyPo
     assert_same_rollout(ours, theirs)
 
 
-def test_too_many_steps_of_all_lanes_are_refused(port: PolicyPort, opened: Opened, harness):
+def test_a_rollout_with_too_many_steps_over_all_environments_is_refused(port: PolicyPort, opened: Opened, harness):
     session = opened(num_envs=11)
     port.reset(session)
     with pytest.raises(harness.errors.TooLarge, match="1000000"):
         port.rollout_policy(session, GOOD, 100_000)
 
 
-def test_a_layer_too_wide_for_so_many_lanes_is_refused(port: PolicyPort, opened: Opened, harness):
+def test_a_policy_layer_too_wide_for_the_number_of_environments_is_refused(port: PolicyPort, opened: Opened, harness):
     session = opened(num_envs=20_000)
     port.reset(session)
     with pytest.raises(harness.errors.TooLarge, match="units times lanes"):
@@ -174,7 +176,7 @@ def test_a_layer_too_wide_for_so_many_lanes_is_refused(port: PolicyPort, opened:
 
 
 @pytest.mark.parametrize("episodes", [1, 7])
-def test_an_imagined_return_is_the_same_by_rollouts_and_by_steps(port: PolicyPort, episodes: int):
+def test_the_imagined_return_is_equal_by_rollouts_and_by_single_steps(port: PolicyPort, episodes: int):
     arrays = random_policy(SIZES, np.float64)
     network = Network(arrays.mean, arrays.deviation, arrays.layers, np.array([-2.0]), np.array([2.0]))
     ours = imagine(port, network, episodes, 3, penalty=1.0)

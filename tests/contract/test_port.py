@@ -55,7 +55,7 @@ def assert_same(ours: ResetResult | StepResult, theirs: ResetResult | StepResult
 # Opening
 
 
-def test_a_session_says_what_it_is(port: SurrogatePort):
+def test_an_opened_session_returns_its_settings(port: SurrogatePort):
     view = port.open(OpenSession(num_envs=2, seed=0, time_limit=9, penalty=1.5, autoreset_mode="same_step"))
     assert (view.num_envs, view.seed, view.time_limit, view.penalty) == (2, 0, 9, 1.5)
     assert view.autoreset_mode == "same_step"
@@ -65,13 +65,13 @@ def test_a_session_says_what_it_is(port: SurrogatePort):
     port.close(view.id)
 
 
-def test_what_is_left_out_is_the_specifications(port: SurrogatePort):
+def test_session_options_left_out_are_taken_from_the_specification(port: SurrogatePort):
     view = port.open(OpenSession())
     assert view.time_limit == port.spec().time_limit == 200
     port.close(view.id)
 
 
-def test_a_missing_seed_is_drawn_and_returned(port: SurrogatePort):
+def test_opening_a_session_without_seed_returns_a_random_one(port: SurrogatePort):
     views = [port.open(OpenSession()) for _ in range(2)]
     assert views[0].seed != views[1].seed
     starts = [port.reset(view.id).observation for view in views]
@@ -81,7 +81,7 @@ def test_a_missing_seed_is_drawn_and_returned(port: SurrogatePort):
         port.close(view.id)
 
 
-def test_the_same_key_opens_one_session(port: SurrogatePort, harness):
+def test_opening_twice_with_one_idempotency_key_opens_one_session(port: SurrogatePort, harness):
     request = OpenSession(seed=1, idempotency_key=f"key of {harness.name}")
     first, second = port.open(request), port.open(request)
     assert first.id == second.id
@@ -93,7 +93,7 @@ def test_the_same_key_opens_one_session(port: SurrogatePort, harness):
 # Shapes and values
 
 
-def test_results_have_the_shapes_and_types_of_the_port(port: SurrogatePort, opened: Opened):
+def test_session_results_have_the_declared_shapes_and_types(port: SurrogatePort, opened: Opened):
     session = opened()
     start = port.reset(session)
     result = port.step(session, actions(1)[0], deviations=True)
@@ -114,7 +114,7 @@ def test_results_have_the_shapes_and_types_of_the_port(port: SurrogatePort, open
     assert result.reward.dtype == np.float64
 
 
-def test_deviations_are_returned_only_on_request_without_other_effects(port: SurrogatePort, opened: Opened):
+def test_predictive_deviations_are_returned_only_on_request(port: SurrogatePort, opened: Opened):
     plain, asked = opened(), opened()
     assert_same(port.reset(plain), port.reset(asked))
     for action in actions(3):
@@ -125,7 +125,7 @@ def test_deviations_are_returned_only_on_request_without_other_effects(port: Sur
         np.testing.assert_array_equal(without.reward, beside.reward)
 
 
-def test_the_penalty_is_taken_from_the_mean_reward(port: SurrogatePort, opened: Opened):
+def test_the_uncertainty_penalty_is_subtracted_from_the_mean_reward(port: SurrogatePort, opened: Opened):
     session = opened(penalty=2.0)
     port.reset(session)
     result = port.step(session, actions(1)[0], deviations=True)
@@ -133,7 +133,7 @@ def test_the_penalty_is_taken_from_the_mean_reward(port: SurrogatePort, opened: 
     assert (result.reward < result.reward_mean).all()
 
 
-def test_one_number_a_lane_may_come_without_its_own_brackets(port: SurrogatePort, opened: Opened):
+def test_one_dimensional_actions_may_be_given_as_a_flat_array(port: SurrogatePort, opened: Opened):
     first, second = opened(), opened()
     port.reset(first)
     port.reset(second)
@@ -142,7 +142,7 @@ def test_one_number_a_lane_may_come_without_its_own_brackets(port: SurrogatePort
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_an_episode_ends_as_truncated_where_the_model_is_not_trusted(port: SurrogatePort, opened: Opened, mode: str):
+def test_an_episode_is_truncated_where_the_model_is_too_uncertain(port: SurrogatePort, opened: Opened, mode: str):
     session = opened(trust=1e-9, autoreset_mode=mode)
     port.reset(session)
     result = port.step(session, actions(1)[0])
@@ -153,7 +153,7 @@ def test_an_episode_ends_as_truncated_where_the_model_is_not_trusted(port: Surro
     assert len(result.final_lanes) == (N if mode == "same_step" else 0)
 
 
-def test_a_wide_trusted_range_ends_nothing_and_none_says_nothing(port: SurrogatePort, opened: Opened):
+def test_a_wide_trusted_range_ends_no_episode(port: SurrogatePort, opened: Opened):
     wide, none = opened(trust=1_000.0), opened()
     assert_same(port.reset(wide), port.reset(none))
     ours, theirs = port.step(wide, actions(1)[0]), port.step(none, actions(1)[0])
@@ -167,7 +167,7 @@ def test_a_wide_trusted_range_ends_nothing_and_none_says_nothing(port: Surrogate
 
 
 @pytest.mark.parametrize("variant", ["deterministic", "probabilistic", "pathwise"])
-def test_the_same_requests_give_the_same_replies(port: SurrogatePort, opened: Opened, variant: str):
+def test_the_same_seeded_requests_give_the_same_replies(port: SurrogatePort, opened: Opened, variant: str):
     options = {"variant": variant, "time_limit": 4, "process_noise": True}
     options |= {"particles": 20} if variant == "probabilistic" else {}
     first, second = opened(**options), opened(**options)
@@ -177,7 +177,7 @@ def test_the_same_requests_give_the_same_replies(port: SurrogatePort, opened: Op
             assert_same(port.step(first, action), port.step(second, action))
 
 
-def test_an_unseeded_reset_begins_the_next_episode(port: SurrogatePort, opened: Opened):
+def test_a_reset_without_seed_starts_the_next_episode(port: SurrogatePort, opened: Opened):
     session = opened()
     episodes = []
     for _ in range(2):
@@ -188,16 +188,16 @@ def test_an_unseeded_reset_begins_the_next_episode(port: SurrogatePort, opened: 
     assert not np.array_equal(episodes[0][0].observation, episodes[0][2].observation)
 
 
-def test_the_session_seed_is_that_of_its_first_reset(port: SurrogatePort, opened: Opened):
+def test_the_first_reset_uses_the_seed_of_the_session(port: SurrogatePort, opened: Opened):
     assert_same(port.reset(opened(seed=0)), port.reset(opened(seed=5), seed=0))
 
 
-def test_an_int_seed_gives_every_lane_its_own_start(port: SurrogatePort, opened: Opened):
+def test_resetting_with_an_integer_seed_gives_every_environment_its_own_start(port: SurrogatePort, opened: Opened):
     observation = port.reset(opened(), seed=3).observation
     assert len(np.unique(observation, axis=0)) == N
 
 
-def test_a_seed_list_gives_each_lane_the_first_key_of_its_seed(port: SurrogatePort, opened: Opened):
+def test_resetting_with_a_seed_list_starts_each_environment_by_its_own_seed(port: SurrogatePort, opened: Opened):
     session = opened()
     first = port.reset(session, seed=3).observation[0]
     observation = port.reset(session, seed=[3, 4, 3]).observation
@@ -205,7 +205,7 @@ def test_a_seed_list_gives_each_lane_the_first_key_of_its_seed(port: SurrogatePo
     assert not np.array_equal(observation[1], first)
 
 
-def test_a_start_does_not_depend_on_how_many_lanes_there_are(port: SurrogatePort, opened: Opened):
+def test_a_start_state_does_not_depend_on_the_number_of_environments(port: SurrogatePort, opened: Opened):
     few, many = opened(num_envs=1), opened(num_envs=17)
     start = port.reset(few).observation[0]
     np.testing.assert_allclose(port.reset(many).observation[0], start, atol=1e-6)
@@ -217,7 +217,7 @@ def test_a_start_does_not_depend_on_how_many_lanes_there_are(port: SurrogatePort
 # Masks
 
 
-def test_a_masked_reset_leaves_the_other_lanes_as_they_were(port: SurrogatePort, opened: Opened):
+def test_a_masked_reset_leaves_the_other_environments_unchanged(port: SurrogatePort, opened: Opened):
     touched, undisturbed = opened(), opened()
     port.reset(touched)
     port.reset(undisturbed)
@@ -233,7 +233,7 @@ def test_a_masked_reset_leaves_the_other_lanes_as_they_were(port: SurrogatePort,
     np.testing.assert_array_equal(ours.reward[~mask], theirs.reward[~mask])
 
 
-def test_a_masked_step_leaves_the_other_lanes_as_they_were(port: SurrogatePort, opened: Opened):
+def test_a_masked_step_leaves_the_other_environments_unchanged(port: SurrogatePort, opened: Opened):
     touched, undisturbed = opened(), opened()
     start = port.reset(touched)
     port.reset(undisturbed)
@@ -262,14 +262,14 @@ def run_to_the_limit(port: SurrogatePort, session: str) -> list[StepResult]:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_the_time_limit_truncates_and_does_not_terminate(port: SurrogatePort, opened: Opened, mode: str):
+def test_reaching_the_time_limit_truncates_and_does_not_terminate(port: SurrogatePort, opened: Opened, mode: str):
     results = run_to_the_limit(port, opened(time_limit=4, autoreset_mode=mode))
     assert [bool(r.truncated.any()) for r in results] == [False, False, False, True]
     assert results[-1].truncated.all()
     assert not any(r.terminated.any() for r in results)
 
 
-def test_next_step_shows_the_new_start_in_the_following_step(port: SurrogatePort, opened: Opened):
+def test_autoreset_mode_next_step_returns_the_new_start_in_the_following_step(port: SurrogatePort, opened: Opened):
     session = opened(time_limit=4, autoreset_mode="next_step")
     last = run_to_the_limit(port, session)[-1]
     following = port.step(session, actions(1, seed=5)[0])
@@ -280,7 +280,7 @@ def test_next_step_shows_the_new_start_in_the_following_step(port: SurrogatePort
     assert not np.array_equal(port.step(session, actions(1)[0]).observation, following.observation)
 
 
-def test_same_step_gives_the_last_observation_apart(port: SurrogatePort, opened: Opened):
+def test_autoreset_mode_same_step_returns_the_final_observation_separately(port: SurrogatePort, opened: Opened):
     last = run_to_the_limit(port, opened(time_limit=4, autoreset_mode="same_step"))[-1]
     reference = run_to_the_limit(port, opened(time_limit=4, autoreset_mode="next_step"))[-1]
     np.testing.assert_array_equal(last.final_lanes, np.arange(N))
@@ -289,7 +289,9 @@ def test_same_step_gives_the_last_observation_apart(port: SurrogatePort, opened:
     np.testing.assert_array_equal(last.reward, reference.reward)
 
 
-def test_disabled_wants_a_reset_of_the_finished_lanes(port: SurrogatePort, opened: Opened, harness):
+def test_autoreset_mode_disabled_requires_a_reset_of_finished_environments(
+    port: SurrogatePort, opened: Opened, harness
+):
     session = opened(time_limit=4, autoreset_mode="disabled")
     last = run_to_the_limit(port, session)[-1]
     with pytest.raises(harness.errors.NotReset):
@@ -307,7 +309,7 @@ def test_disabled_wants_a_reset_of_the_finished_lanes(port: SurrogatePort, opene
 
 
 @pytest.mark.parametrize("mode", ["next_step", "same_step"])
-def test_a_rollout_is_its_steps(port: SurrogatePort, opened: Opened, mode: str):
+def test_a_rollout_of_given_actions_equals_single_steps(port: SurrogatePort, opened: Opened, mode: str):
     options = {"time_limit": 3, "autoreset_mode": mode}
     stepped, rolled = opened(**options), opened(**options)
     assert_same(port.reset(stepped), port.reset(rolled))
@@ -347,7 +349,7 @@ BAD: dict[str, tuple[Callable[[SurrogatePort, str], object], str]] = {
 
 
 @pytest.mark.parametrize("what", list(BAD))
-def test_bad_input_is_refused_and_changes_nothing(port: SurrogatePort, opened: Opened, harness, what: str):
+def test_invalid_session_input_is_refused_and_changes_nothing(port: SurrogatePort, opened: Opened, harness, what: str):
     touched, undisturbed = opened(), opened()
     port.reset(touched)
     port.reset(undisturbed)
@@ -358,19 +360,19 @@ def test_bad_input_is_refused_and_changes_nothing(port: SurrogatePort, opened: O
         assert_same(port.step(touched, action), port.step(undisturbed, action))
 
 
-def test_a_step_before_the_first_reset_is_refused(port: SurrogatePort, opened: Opened, harness):
+def test_a_session_step_before_the_first_reset_is_refused(port: SurrogatePort, opened: Opened, harness):
     session = opened()
     with pytest.raises(harness.errors.NotReset):
         port.step(session, GOOD)
     assert_same(port.reset(session), port.reset(opened()))
 
 
-def test_a_model_that_is_not_there_is_refused(port: SurrogatePort, harness):
+def test_opening_a_session_with_an_unknown_model_version_is_refused(port: SurrogatePort, harness):
     with pytest.raises(harness.errors.UnknownModel):
         port.open(OpenSession(model=999))
 
 
-def test_a_closed_session_is_gone_and_closing_it_again_harmless(port: SurrogatePort, harness):
+def test_a_closed_session_is_unknown_and_closing_it_again_is_harmless(port: SurrogatePort, harness):
     session = port.open(OpenSession()).id
     port.close(session)
     port.close(session)

@@ -44,7 +44,7 @@ REQUESTS = [
 
 
 @pytest.mark.parametrize(("what", "body"), REQUESTS)
-def test_the_same_seq_and_body_get_the_same_bytes(post: Post, what: str, body: dict[str, Any]):
+def test_a_request_repeated_with_its_sequence_number_gets_the_same_bytes(post: Post, what: str, body: dict[str, Any]):
     first = post(what, body)
     assert first.status_code == 200
     assert post(what, body).content == first.content
@@ -53,7 +53,7 @@ def test_the_same_seq_and_body_get_the_same_bytes(post: Post, what: str, body: d
 
 
 @pytest.mark.parametrize("seq", [1, 4, 1000])
-def test_any_other_seq_is_refused_with_the_expected_one(post: Post, seq: int):
+def test_a_step_with_an_unexpected_sequence_number_is_refused_with_the_expected_one(post: Post, seq: int):
     post("step", {"seq": 2, "action": ACTION})
     refused = post("step", {"seq": seq, "action": ACTION})
     assert refused.status_code == 409
@@ -61,7 +61,7 @@ def test_any_other_seq_is_refused_with_the_expected_one(post: Post, seq: int):
     assert post("step", {"seq": 3, "action": ACTION}).json()["seq"] == 3
 
 
-def test_the_same_seq_with_another_body_is_refused(post: Post):
+def test_another_request_with_a_used_sequence_number_is_refused(post: Post):
     first = post("step", {"seq": 2, "action": ACTION})
     for what, body in REQUESTS[1:]:
         refused = post(what, body)
@@ -69,13 +69,13 @@ def test_the_same_seq_with_another_body_is_refused(post: Post):
     assert post("step", {"seq": 2, "action": ACTION}).content == first.content, "the kept reply is still there"
 
 
-def test_a_refused_request_takes_no_seq(post: Post):
+def test_a_refused_request_does_not_use_its_sequence_number(post: Post):
     refused = post("step", {"seq": 2, "action": [[9.0], [0.0]]})
     assert (refused.status_code, refused.json()["code"]) == (422, "invalid_request")
     assert post("step", {"seq": 2, "action": ACTION}).status_code == 200
 
 
-def test_a_repeat_that_overtakes_the_first_gets_its_reply(post: Post):
+def test_concurrent_repeats_of_a_request_all_get_the_same_reply(post: Post):
     """Also while the first is still being computed: all of them step once."""
     body = {"seq": 2, "actions": [ACTION] * 200}
     with ThreadPoolExecutor(4) as pool:
@@ -84,7 +84,7 @@ def test_a_repeat_that_overtakes_the_first_gets_its_reply(post: Post):
     assert post("step", {"seq": 3, "action": ACTION}).status_code == 200
 
 
-def test_a_call_by_hand_may_leave_seq_out(post: Post):
+def test_a_step_without_sequence_number_takes_the_next_one(post: Post):
     assert post("step", {"action": ACTION}).json()["seq"] == 2
     assert post("step", {"action": ACTION}).json()["seq"] == 3
     assert post("step", {"seq": 4, "action": ACTION}).json()["seq"] == 4

@@ -34,7 +34,7 @@ def server(tmp_path: Path) -> Iterator[RestartingServer]:
 
 
 @pytest.mark.e2e
-def test_the_page_follows_real_steps_and_a_server_that_goes_and_comes_back(
+def test_the_dashboard_shows_new_real_steps_and_survives_a_server_restart(
     server: RestartingServer, open_page: Open, complaints: list[str]
 ):
     expect.set_options(timeout=60_000)

@@ -13,7 +13,7 @@ from support.server import running_server
 Open = Callable[..., Page]
 
 
-def test_a_hundred_surrogates_are_shown_and_more_on_demand(tmp_path: Path, open_page: Open, complaints: list[str]):
+def test_the_dashboard_lists_100_surrogates_and_more_on_demand(tmp_path: Path, open_page: Open, complaints: list[str]):
     fill(tmp_path / "surrogym.db", 104)
     with running_server(tmp_path) as server:
         page = open_page(server.url)
@@ -25,7 +25,7 @@ def test_a_hundred_surrogates_are_shown_and_more_on_demand(tmp_path: Path, open_
     assert complaints == []
 
 
-def test_addresses_that_lead_nowhere_throw_nothing(tmp_path: Path, open_page: Open):
+def test_unknown_dashboard_addresses_raise_no_script_error(tmp_path: Path, open_page: Open):
     with running_server(tmp_path) as server:
         page = open_page(server.url)
         thrown: list[str] = []

@@ -45,7 +45,7 @@ def opened(page: Page) -> Page:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_a_surrogate_is_shown_whole_and_without_a_complaint(
+def test_the_dashboard_shows_a_surrogate_without_browser_errors(
     url: str, open_page: Open, complaints: list[str], scheme: str
 ):
     requested: list[str] = []
@@ -67,7 +67,7 @@ def test_a_surrogate_is_shown_whole_and_without_a_complaint(
     assert complaints == []
 
 
-def test_the_content_policy_lets_nothing_in(url: str):
+def test_the_dashboards_content_security_policy_blocks_foreign_content(url: str):
     reply = httpx.get(url)
     policy = reply.headers["content-security-policy"]
     assert "default-src 'none'" in policy
@@ -75,7 +75,7 @@ def test_the_content_policy_lets_nothing_in(url: str):
     assert not re.search(r"<script(?![^>]*src=)|style=|\son\w+=", reply.text)
 
 
-def test_a_click_on_a_map_moves_the_probe(url: str, open_page: Open):
+def test_clicking_on_a_dashboard_map_selects_the_predicted_point(url: str, open_page: Open):
     page = opened(open_page(f"{url}/#/s/pendulum"))
     canvas = page.locator(".heat canvas").first
     box = canvas.bounding_box()
@@ -90,7 +90,7 @@ def test_a_click_on_a_map_moves_the_probe(url: str, open_page: Open):
     expect(row).to_have_text(re.compile(f"^{said.next_coordinates[0][1]:.1f}"))
 
 
-def test_the_keyboard_reaches_a_surrogate_and_moves_its_point(url: str, open_page: Open):
+def test_a_surrogate_and_its_predicted_point_can_be_selected_by_keyboard(url: str, open_page: Open):
     page = open_page(url)
     row = page.get_by_role("link", name=re.compile("^pendulum"))
     expect(row).to_be_visible()
@@ -113,7 +113,7 @@ FOCUSABLE = """() => [...document.querySelectorAll("a[href], button, input, sele
     .filter((element) => !element.matches(":disabled") && element.checkVisibility())"""
 
 
-def test_tab_reaches_everything_that_can_be_operated_and_jumps_land_in_their_part(url: str, open_page: Open):
+def test_every_dashboard_control_is_reachable_with_the_tab_key(url: str, open_page: Open):
     page = opened(open_page(f"{url}/#/s/pendulum"))
     page.evaluate(f"window.wanted = new Set(({FOCUSABLE})())")
     for _ in range(page.evaluate("wanted.size") + 1):
@@ -126,7 +126,7 @@ def test_tab_reaches_everything_that_can_be_operated_and_jumps_land_in_their_par
     expect(page.get_by_label("queries to show")).to_be_focused()
 
 
-def test_the_queue_shows_the_holder_and_end_of_each_lease(url: str, open_page: Open):
+def test_the_dashboard_queue_shows_sampler_and_expiry_of_each_lease(url: str, open_page: Open):
     with Api(url) as api:
         api.create_surrogate("leased", pendulum())
         _, failed = api.claim("leased", "arm-7", max_queries=2, lease_seconds=600).queries
@@ -142,7 +142,7 @@ def test_the_queue_shows_the_holder_and_end_of_each_lease(url: str, open_page: O
 
 
 @pytest.mark.parametrize("width", [320, 390])
-def test_a_phone_needs_no_sideways_scrolling(url: str, open_page: Open, width: int):
+def test_the_dashboard_fits_a_phone_without_horizontal_scrolling(url: str, open_page: Open, width: int):
     page = open_page(url, width=width, height=800)
     expect(page.get_by_role("link", name=re.compile("^pendulum"))).to_be_visible()
     middles = page.locator(".top > :visible").evaluate_all(
@@ -155,7 +155,7 @@ def test_a_phone_needs_no_sideways_scrolling(url: str, open_page: Open, width: i
     assert opened(page).evaluate(overflow) <= 0
 
 
-def test_an_admin_pauses_asks_adds_and_deletes(url: str, open_page: Open, complaints: list[str]):
+def test_an_admin_can_pause_improve_query_and_delete_on_the_dashboard(url: str, open_page: Open, complaints: list[str]):
     with Api(url) as api:
         api.create_surrogate("steered", pendulum())
         page = open_page(f"{url}/#/s/steered")

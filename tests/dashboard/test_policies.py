@@ -49,7 +49,7 @@ def url(pendulum_server: ServerProcess) -> Iterator[str]:
             api.delete_surrogate(name)
 
 
-def test_promise_and_real_return_stand_beside_each_other(url: str, open_page: Open, complaints: list[str]):
+def test_the_dashboard_shows_promise_and_real_return_of_a_policy(url: str, open_page: Open, complaints: list[str]):
     page = open_page(f"{url}/#/s/better")
     part = page.locator("#policies")
     expect(part.locator("summary").first).to_contain_text(
@@ -69,7 +69,7 @@ def test_promise_and_real_return_stand_beside_each_other(url: str, open_page: Op
     assert complaints == []
 
 
-def test_drift_is_shown_as_soon_as_it_is_reported(url: str, open_page: Open, complaints: list[str]):
+def test_the_dashboard_shows_drift_as_soon_as_it_is_reported(url: str, open_page: Open, complaints: list[str]):
     page = open_page(f"{url}/#/s/worse")
     first = page.locator("#policies summary").last
     expect(first).to_contain_text("real mean return")
@@ -81,7 +81,7 @@ def test_drift_is_shown_as_soon_as_it_is_reported(url: str, open_page: Open, com
     assert complaints == []
 
 
-def test_axis_of_returns_has_round_numbers(url: str, open_page: Open):
+def test_the_return_axis_of_the_dashboard_has_round_numbers(url: str, open_page: Open):
     page = open_page(f"{url}/#/s/better")
     expect(page.locator(".ranges")).to_be_visible()
     ticks = [float(text.replace("−", "-")) for text in page.locator(".ranges line.axis ~ text").all_text_contents()]
@@ -91,7 +91,7 @@ def test_axis_of_returns_has_round_numbers(url: str, open_page: Open):
     assert steps.pop().strip("0.") in {"1", "2", "5"}
 
 
-def test_a_file_is_downloaded_as_it_came(url: str, open_page: Open, tmp_path: Path):
+def test_a_policy_file_downloaded_from_the_dashboard_is_unchanged(url: str, open_page: Open, tmp_path: Path):
     page = open_page(f"{url}/#/s/worse")
     page.locator("#policies summary").last.click()
     with page.expect_download() as downloading:
@@ -102,7 +102,9 @@ def test_a_file_is_downloaded_as_it_came(url: str, open_page: Open, tmp_path: Pa
         assert (tmp_path / "got.zip").read_bytes() == api.policies.file("worse", 1, "zip")
 
 
-def test_the_better_of_two_surrogates_is_named_with_its_interval(url: str, open_page: Open, complaints: list[str]):
+def test_the_dashboard_names_the_better_of_two_policies_with_its_interval(
+    url: str, open_page: Open, complaints: list[str]
+):
     page = open_page(f"{url}/#/compare/worse/better")
     said = page.locator(".big")
     by, low, high = (f"{value:.{0 if value >= 100 else 1}f}" for value in paired(pairs=6))
@@ -129,7 +131,7 @@ def paired(pairs: int) -> tuple[float, float, float]:
     return gaps.mean(), gaps.mean() - reach, gaps.mean() + reach
 
 
-def test_differences_on_other_starts_are_wider_and_one_surrogate_has_its_own_best(url: str, open_page: Open):
+def test_the_dashboard_difference_of_policies_is_paired_only_for_equal_start_seeds(url: str, open_page: Open):
     page = open_page(f"{url}/#/compare/better/better")
     expect(page.locator(".big")).to_contain_text(re.compile("^better@2.* is better than better@1 by"))
     found = page.evaluate("""async () => {
@@ -145,7 +147,7 @@ def test_differences_on_other_starts_are_wider_and_one_surrogate_has_its_own_bes
     assert found["z"] == pytest.approx([NormalDist().inv_cdf(1 - share) for share in (0.025, 0.025 / 9)], rel=1e-8)
 
 
-def test_a_surrogate_without_a_policy_or_a_model_says_how_to_get_one(url: str, open_page: Open):
+def test_the_dashboard_tells_how_to_get_a_missing_model_or_policy(url: str, open_page: Open):
     page = open_page(f"{url}/#/s/bare")
     expect(page.locator("#policies")).to_contain_text("No policy is stored. surrogym train bare")
     for empty in ("#learning", ".maps", "#probe .rolled"):
@@ -154,7 +156,7 @@ def test_a_surrogate_without_a_policy_or_a_model_says_how_to_get_one(url: str, o
     assert serious(page) == []
 
 
-def test_damaged_episodes_are_named_and_the_rest_is_shown(
+def test_the_dashboard_reports_damaged_episodes_and_shows_the_rest(
     url: str, open_page: Open, pendulum_server: ServerProcess, complaints: list[str]
 ):
     with Api(url) as api:
@@ -174,7 +176,9 @@ def test_damaged_episodes_are_named_and_the_rest_is_shown(
     assert [said for said in complaints if "500" not in said] == []
 
 
-def test_a_video_plays_on_the_page_and_a_broken_one_is_named(url: str, open_page: Open, pendulum_server: ServerProcess):
+def test_the_dashboard_plays_a_video_and_reports_a_broken_one(
+    url: str, open_page: Open, pendulum_server: ServerProcess
+):
     plain = cartpole()
     way = np.zeros((11, 4))
     way[:, 0] = np.linspace(0, 1, 11)
@@ -206,7 +210,9 @@ def test_a_video_plays_on_the_page_and_a_broken_one_is_named(url: str, open_page
     [("", "light", 1280), ("s/better", "dark", 1280), ("s/pendulum", "light", 390)]
     + [(where, "dark", 390) for where in ("compare/worse/better", "register", "s/absent")],
 )
-def test_axe_finds_nothing_serious(url: str, open_page: Open, where: str, scheme: str, width: int):
+def test_the_accessibility_checker_axe_finds_no_serious_fault_on_the_dashboard(
+    url: str, open_page: Open, where: str, scheme: str, width: int
+):
     page = open_page(f"{url}/#/{where}", scheme=scheme, width=width)
     if where == "register":
         page.get_by_text("Start from a log instead").click()
@@ -229,7 +235,7 @@ def test_axe_finds_nothing_serious(url: str, open_page: Open, where: str, scheme
         assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0  # no sideways scrolling
 
 
-def test_long_name_of_a_surrogate_fits_a_narrow_screen(url: str, open_page: Open):
+def test_a_long_surrogate_name_fits_a_narrow_screen_on_the_dashboard(url: str, open_page: Open):
     """The lists to choose from have the names of all surrogates, also of those that are not compared."""
     name = "w" * 64
     with Api(url) as api:

@@ -25,7 +25,7 @@ def url(server_process: ServerProcess) -> str:
     return server_process.url
 
 
-def test_a_drafted_specification_is_shown_and_then_registered(
+def test_a_drafted_specification_can_be_reviewed_and_registered_on_the_dashboard(
     url: str, open_page: Open, complaints: list[str], tmp_path: Path
 ):
     draft = {"real_steps": 400, "resets": 9, "found": ["theta turns"], "asked": ["is 8 the limit of speed?"]}
@@ -50,7 +50,7 @@ def test_a_drafted_specification_is_shown_and_then_registered(
     assert complaints == []
 
 
-def test_each_wrong_field_is_named_with_what_came(url: str, open_page: Open):
+def test_the_dashboard_names_each_invalid_specification_field_with_its_value(url: str, open_page: Open):
     spec = pendulum().model_dump(mode="json")
     spec["coordinates"][1]["sampling"]["high"] = "fast"
     spec["speed_limit"] = 8
@@ -68,7 +68,9 @@ def test_each_wrong_field_is_named_with_what_came(url: str, open_page: Open):
     expect(page.get_by_role("alert").filter(has_text="Expected JSON")).to_be_visible()
 
 
-def test_the_example_can_be_registered_as_it_stands(url: str, open_page: Open, complaints: list[str]):
+def test_the_example_specification_of_the_dashboard_can_be_registered_unchanged(
+    url: str, open_page: Open, complaints: list[str]
+):
     page = open_page(f"{url}/#/register")
     page.get_by_role("button", name=re.compile("^Insert an example")).click()
     page.get_by_role("button", name="Check", exact=True).click()
@@ -80,7 +82,7 @@ def test_the_example_can_be_registered_as_it_stands(url: str, open_page: Open, c
     assert complaints == []
 
 
-def test_everything_shown_can_be_downloaded(
+def test_every_download_button_of_the_dashboard_delivers_its_file(
     pendulum_server: ServerProcess, url: str, open_page: Open, complaints: list[str], tmp_path: Path
 ):
     page = open_page(f"{url}/#/s/pendulum")
@@ -99,7 +101,9 @@ def test_everything_shown_can_be_downloaded(
     assert complaints == []
 
 
-def test_a_log_becomes_a_surrogate_with_a_model(url: str, open_page: Open, complaints: list[str], tmp_path: Path):
+def test_a_log_uploaded_on_the_dashboard_becomes_a_surrogate_with_a_model(
+    url: str, open_page: Open, complaints: list[str], tmp_path: Path
+):
     file = reactor.log(runs=3, length=20).write(tmp_path / "reactor.csv")
     lines = file.read_text().splitlines()
     file.write_text("\n".join([*lines, lines[1], ""]))  # a row that repeats another
@@ -119,7 +123,9 @@ def test_a_log_becomes_a_surrogate_with_a_model(url: str, open_page: Open, compl
     assert complaints == []
 
 
-def test_a_log_with_other_columns_is_stored_by_a_mapping(url: str, open_page: Open, tmp_path: Path):
+def test_a_log_with_other_column_names_is_imported_on_the_dashboard_by_a_mapping(
+    url: str, open_page: Open, tmp_path: Path
+):
     file = tmp_path / "plant.csv"
     file.write_text("angle,rate,motor,profit\n0.1,0.0,1.5,-1\n0.115,0.3,0.5,-1\n0.13,9.9,0.5,-1\n0.14,0.1,0.5,-1\n")
     with Api(url) as api:
@@ -145,7 +151,7 @@ def test_a_log_with_other_columns_is_stored_by_a_mapping(url: str, open_page: Op
         api.delete_surrogate("plant")
 
 
-def test_selects_and_text_of_a_mapping_follow_each_other(url: str, open_page: Open, tmp_path: Path):
+def test_select_fields_and_text_of_a_column_mapping_stay_in_sync(url: str, open_page: Open, tmp_path: Path):
     file = tmp_path / "plant.csv"
     file.write_text('batch;"LT;101";LT-next;valve\n1;0.1;0.2;0.5\n1;0.2;0.3;0.5\n')
     page = open_page(f"{url}/#/register")

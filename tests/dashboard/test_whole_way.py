@@ -37,7 +37,7 @@ def running(folder: Path, *words: str) -> Iterator[None]:
 
 @pytest.mark.e2e
 @pytest.mark.timeout(1_800)
-def test_a_page_alone_leads_to_a_judged_policy_of_ones_own_environment(
+def test_the_dashboard_alone_suffices_from_registration_to_an_evaluated_policy(
     tmp_path: Path, open_page: Open, complaints: list[str]
 ):
     expect.set_options(timeout=600_000)

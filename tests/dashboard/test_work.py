@@ -54,7 +54,9 @@ def part(page: Page) -> Locator:
     return page.locator("#work")
 
 
-def test_without_a_worker_the_page_says_which_command_starts_one(api: Api, open_page: Open, complaints: list[str]):
+def test_without_a_worker_the_dashboard_shows_the_command_that_starts_one(
+    api: Api, open_page: Open, complaints: list[str]
+):
     api.create_surrogate("idle", pendulum())
     page = open_page(f"{api.url}/#/s/idle")
     expect(part(page)).to_contain_text(f"To start one: surrogym work idle --server {api.url}")
@@ -66,7 +68,7 @@ def test_without_a_worker_the_page_says_which_command_starts_one(api: Api, open_
     api.delete_surrogate("idle")
 
 
-def test_a_training_is_started_followed_and_cancelled_from_the_page(
+def test_a_training_can_be_started_followed_and_cancelled_on_the_dashboard(
     api: Api, open_page: Open, works: Callable[[], None], complaints: list[str]
 ):
     works()
@@ -94,7 +96,7 @@ def test_a_training_is_started_followed_and_cancelled_from_the_page(
     assert complaints == []
 
 
-def test_progress_is_on_the_page_within_two_seconds(api: Api, open_page: Open):
+def test_job_progress_appears_on_the_dashboard_within_two_seconds(api: Api, open_page: Open):
     id = api.jobs.add(NAME, wire.TrainTask(kind="train")).id
     job = api.jobs.claim(NAME, "by-hand")
     assert job is not None
@@ -112,7 +114,7 @@ def test_progress_is_on_the_page_within_two_seconds(api: Api, open_page: Open):
     expect(part(page).get_by_role("status")).to_contain_text("failed, the disk is full", timeout=2_000)
 
 
-def test_an_evaluation_is_started_and_its_result_shown(api: Api, open_page: Open, works: Callable[[], None]):
+def test_an_evaluation_started_on_the_dashboard_shows_its_result(api: Api, open_page: Open, works: Callable[[], None]):
     version = api.policies.push(NAME, wire.PushedCard(algorithm="CMAES"), [], "zip", network_file(seed=8)).version
     works()
     page = open_page(f"{api.url}/#/s/{NAME}")
@@ -130,7 +132,7 @@ def test_an_evaluation_is_started_and_its_result_shown(api: Api, open_page: Open
     expect(row).to_contain_text(re.compile(f"done.*version {version}: No promise; real mean return .* in 3 episodes"))
 
 
-def test_a_reference_controller_and_a_video_are_offered_and_asked_for(api: Api, open_page: Open):
+def test_the_dashboard_can_request_a_reference_controller_and_a_video(api: Api, open_page: Open):
     version = api.policies.push(NAME, wire.PushedCard(algorithm="CMAES"), [], "zip", network_file(seed=9)).version
     api.jobs.claim(NAME, "plain", most_episodes=50)
     page = open_page(f"{api.url}/#/s/{NAME}")
@@ -154,7 +156,7 @@ def test_a_reference_controller_and_a_video_are_offered_and_asked_for(api: Api, 
     assert job.task == asked
 
 
-def test_a_token_that_only_reads_sees_jobs_and_starts_none(api: Api, open_page: Open):
+def test_a_read_token_can_see_but_not_start_jobs_on_the_dashboard(api: Api, open_page: Open):
     id = api.jobs.add(NAME, wire.TrainTask(kind="train")).id
     page = open_page("about:blank")
     page.route("**/v1/access", lambda route: _as_reader(route))
@@ -169,7 +171,9 @@ def _as_reader(route: Route) -> None:
 
 
 @pytest.mark.parametrize(("scheme", "width"), [("dark", 1280), ("light", 320)])
-def test_it_is_readable_in_the_dark_and_on_a_phone(api: Api, open_page: Open, scheme: str, width: int):
+def test_the_dashboard_jobs_are_readable_in_dark_mode_and_on_a_phone(
+    api: Api, open_page: Open, scheme: str, width: int
+):
     id = api.jobs.add(NAME, wire.TrainTask(kind="train")).id
     job = api.jobs.claim(NAME, "by-hand")
     assert job is not None

@@ -74,7 +74,7 @@ def demo(tmp_path):
         one.process.communicate()
 
 
-def test_a_small_demo_from_start_to_run_folder(demo, tmp_path):
+def test_a_small_demo_runs_to_the_end_and_writes_its_run_folder(demo, tmp_path):
     metrics_file = tmp_path / "metrics.json"
     small = demo(*SMALL, "--steps", "2048", "--episodes", "3", "--seed", "1", "--json", str(metrics_file))
     out, err = small.process.communicate(timeout=SECONDS)
@@ -137,14 +137,14 @@ def test_an_interrupted_demo_ends_all_its_processes(demo, number):
     assert interrupted.family() == []
 
 
-def test_a_killed_demo_leaves_no_process_behind(demo):
+def test_a_killed_demo_leaves_no_child_process_behind(demo):
     killed = demo(*SMALL)
     killed.await_training()
     killed.process.kill()
     killed.await_(lambda: killed.family() == [], seconds=60)
 
 
-def test_a_child_that_dies_ends_the_demo_with_its_name(demo):
+def test_a_dead_child_process_ends_the_demo_with_its_name(demo):
     failing = demo(*SMALL)
     failing.await_training()
     (trainer,) = [pid for pid in failing.family() if b"--progress-file" in Path(f"/proc/{pid}/cmdline").read_bytes()]

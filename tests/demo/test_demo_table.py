@@ -52,11 +52,11 @@ def rows(**changed: Any) -> dict[str, str]:
         ),
     ],
 )
-def test_real_steps_name_what_they_were_taken_for(changed, expected):
+def test_the_demo_table_lists_real_steps_by_their_purpose(changed, expected):
     assert rows(**changed)["real steps"].strip() == expected
 
 
-def test_the_evaluation_comes_after_every_result_and_is_not_learned_from():
+def test_the_demo_table_counts_evaluation_steps_separately_at_its_end():
     shown = rows()
     names = list(shown)
     assert names.index("evaluation") == names.index("target") + 1

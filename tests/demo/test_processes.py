@@ -52,7 +52,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
-def test_stubborn_processes_end_with_all_they_started(
+def test_the_demo_ends_child_processes_that_ignore_signals_and_their_descendants(
     tmp_path: Path, program: Callable[[str], str], monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
 ):
     monkeypatch.setattr("surrogym.demo.processes.STOPPING_SECONDS", 0.5)
@@ -78,7 +78,7 @@ def failed(children: Children, child: Child) -> str:
     return str(said.value)
 
 
-def test_a_child_that_failed_is_named_with_its_last_words(tmp_path: Path, program: Callable[[str], str]):
+def test_the_demo_reports_a_failed_child_process_with_its_last_output(tmp_path: Path, program: Callable[[str], str]):
     with Children(tmp_path) as children:
         child = children.start("trainer", program(FAILING), [])
         log = tmp_path / "trainer.log"
@@ -87,7 +87,7 @@ def test_a_child_that_failed_is_named_with_its_last_words(tmp_path: Path, progra
             await_file(child, tmp_path / "never")
 
 
-def test_a_child_that_was_killed_is_named(tmp_path: Path, program: Callable[[str], str]):
+def test_the_demo_names_a_killed_child_process(tmp_path: Path, program: Callable[[str], str]):
     with Children(tmp_path) as children:
         child = children.start("server", program(STUBBORN), [str(tmp_path / "ready")])
         await_file(child, tmp_path / "ready")

@@ -44,7 +44,7 @@ def made(folder: Path, case: str) -> Controller:
 @pytest.mark.parametrize("flags", [(), ("-DARM_FLOAT",)], ids=["double", "float"])
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize("case", PLANTS)
-def test_vectors_pass_under_sanitizers_without_a_warning(tmp_path: Path, case: str, compiler: str, flags):
+def test_the_test_vectors_of_a_c_controller_pass_under_sanitizers(tmp_path: Path, case: str, compiler: str, flags):
     if shutil.which(compiler) is None:
         pytest.skip(f"{compiler} is not on this machine")
     folder = tmp_path / "c"
@@ -55,7 +55,7 @@ def test_vectors_pass_under_sanitizers_without_a_warning(tmp_path: Path, case: s
 
 
 @pytest.mark.skipif(shutil.which("size") is None, reason="size is not on this machine")
-def test_the_program_of_the_vectors_fits_a_board(tmp_path: Path):
+def test_the_c_test_program_fits_into_microcontroller_memory(tmp_path: Path):
     (tmp_path / "c").mkdir()
     write(made(tmp_path, "history"), tmp_path / "c")
     out = tmp_path / "main.o"
@@ -65,7 +65,7 @@ def test_the_program_of_the_vectors_fits_a_board(tmp_path: Path):
     assert data + bss <= 32_768, "a board of 64 kB has more to hold than the vectors"
 
 
-def test_a_wrong_weight_fails_the_vectors(tmp_path: Path):
+def test_a_c_controller_with_a_wrong_weight_fails_its_test_vectors(tmp_path: Path):
     folder = tmp_path / "c"
     folder.mkdir()
     write(made(tmp_path, "history"), folder)
@@ -82,7 +82,7 @@ def test_a_wrong_weight_fails_the_vectors(tmp_path: Path):
     [{"angle": (3.14, 3.15)}, {"angle": (-1e37, 1e37)}, {"slide": (300.0, 300.001)}, {"slide": (0.0, 1e30)}],
     ids=str,
 )
-def test_vectors_of_narrow_and_wide_sensors_pass_in_both_types(tmp_path: Path, ranges):
+def test_c_test_vectors_pass_for_narrow_and_wide_sensor_ranges_in_both_precisions(tmp_path: Path, ranges):
     path = network(tmp_path, plant(**HISTORY), (8,))
     controller = controller_of(path, choices=Choices(ranges=ranges))
     assert sum(vector.status == 0 for vector in vectors_of(controller)) >= 40
@@ -94,7 +94,9 @@ def test_vectors_of_narrow_and_wide_sensors_pass_in_both_types(tmp_path: Path, r
 
 @pytest.mark.parametrize(("single", "tolerance"), [(False, 1e-6), (True, 1e-4)], ids=["double", "float"])
 @pytest.mark.parametrize("case", PLANTS)
-def test_random_measurements_give_the_actions_of_the_reference(tmp_path: Path, case: str, single: bool, tolerance):
+def test_a_c_controller_gives_the_reference_actions_for_random_measurements(
+    tmp_path: Path, case: str, single: bool, tolerance
+):
     controller = made(tmp_path, case)
     compiled, rng = Compiled(controller, tmp_path / "c", single=single), np.random.default_rng(1)
     low, high = sensors_of(controller)
@@ -113,7 +115,7 @@ def test_random_measurements_give_the_actions_of_the_reference(tmp_path: Path, c
     assert np.mean(close) >= (0.98 if single else 1.0)
 
 
-def test_a_closed_loop_has_the_lags_exactly_and_the_same_actions_as_the_policy(tmp_path: Path):
+def test_a_c_controller_with_lagged_inputs_equals_its_policy_in_closed_loop(tmp_path: Path):
     spec = plant(**HISTORY)
     path = network(tmp_path, spec)
     compiled, policy = Compiled(controller_of(path), tmp_path / "c"), load_policy(path)
@@ -147,7 +149,7 @@ def test_stable_baselines3_policies_run_in_c(tmp_path: Path, case: str):
 
 
 @pytest.mark.parametrize("case", PLANTS)
-def test_the_source_has_no_heap_no_recursion_and_a_bounded_stack(tmp_path: Path, case: str):
+def test_the_generated_c_source_uses_no_heap_no_recursion_and_little_stack(tmp_path: Path, case: str):
     if shutil.which("gcc") is None:
         pytest.skip("gcc is not on this machine")
     folder = tmp_path / "c"
@@ -187,7 +189,7 @@ int main() {
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not on this machine")
-def test_a_program_in_cpp_runs_two_controllers_and_names_the_policy(tmp_path: Path):
+def test_a_cpp_program_can_run_two_generated_controllers(tmp_path: Path):
     path = network(tmp_path, plant(**HISTORY))
     controller = controller_of(path)
     (tmp_path / "c").mkdir()
@@ -205,7 +207,7 @@ def test_a_program_in_cpp_runs_two_controllers_and_names_the_policy(tmp_path: Pa
         assert float(action) == pytest.approx(decided.action[0, 0], abs=1e-6)
 
 
-def test_names_that_would_end_a_comment_do_no_harm(tmp_path: Path):
+def test_names_containing_comment_ends_do_not_break_the_generated_c_source(tmp_path: Path):
     spec = plant()
     text = spec.model_dump_json().replace('"slide"', r'"*/ int x; /* ??/\\"')
     path = network(tmp_path, type(spec).model_validate_json(text), model='*/ " ??/\n\\"')
@@ -214,7 +216,7 @@ def test_names_that_would_end_a_comment_do_no_harm(tmp_path: Path):
     run(compile_c("cc", sorted((tmp_path / "c").glob("*.c")), tmp_path / "vectors"))
 
 
-def test_a_folder_with_other_files_is_left_alone(tmp_path: Path):
+def test_deploying_c_into_a_folder_with_other_files_is_refused(tmp_path: Path):
     controller = made(tmp_path, "linear")
     written = deploy(controller, "c", tmp_path / "out")
     assert deploy(controller, "c", tmp_path / "out") == written, "the same files again change nothing"
@@ -228,7 +230,7 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_folder_that_can_not_be_written_keeps_none_of_the_files(tmp_path: Path):
+def test_a_failed_c_deployment_leaves_no_files(tmp_path: Path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "arm_main.c").symlink_to("/nonexistent/arm_main.c")  # written last
@@ -237,7 +239,7 @@ def test_a_folder_that_can_not_be_written_keeps_none_of_the_files(tmp_path: Path
     assert [path.name for path in out.iterdir()] == ["arm_main.c"]
 
 
-def test_the_arduino_layout_has_what_its_tools_read_and_a_sketch_that_compiles(tmp_path: Path):
+def test_the_generated_arduino_library_is_complete_and_its_sketch_compiles(tmp_path: Path):
     controller = controller_of(network(tmp_path, plant(DiscreteAction(n=3))), choices=Choices(fallback=(0.0,)))
     folder = tmp_path / "library"
     folder.mkdir()
@@ -286,7 +288,7 @@ int main() {
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not on this machine")
-def test_a_sketch_keeps_its_period_and_forgets_a_late_measurement_when_its_clock_begins_anew(tmp_path: Path):
+def test_an_arduino_sketch_keeps_its_period_when_its_clock_wraps_around(tmp_path: Path):
     path, choices = (
         network(tmp_path, plant().model_copy(update={"sampling_period": 0.0025})),
         Choices(fallback=(2.0, 0.0)),
@@ -303,7 +305,7 @@ def test_a_sketch_keeps_its_period_and_forgets_a_late_measurement_when_its_clock
     assert run(tmp_path / "main").split() == ["1", "0", "1", "1", "1", "1", "1"]
 
 
-def test_a_sketch_of_a_period_that_its_clock_can_not_count_is_refused(tmp_path: Path):
+def test_an_arduino_sketch_with_a_period_its_clock_cannot_count_is_refused(tmp_path: Path):
     path = network(tmp_path, plant().model_copy(update={"sampling_period": 3e6}))
     with pytest.raises(NotDeployable, match="up to 2,000,000 s, got 6e"):
         write_arduino(controller_of(path), tmp_path)

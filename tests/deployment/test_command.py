@@ -30,7 +30,7 @@ def policy_for(folder: Path, spec, surrogate: str | None) -> Path:
     return path
 
 
-def test_a_stored_policy_is_deployed_by_its_name_and_checked_in_the_virtual_environment(
+def test_a_stored_policy_is_deployed_by_name_and_checked_in_the_virtual_environment(
     surrogym, pendulum_server, tmp_path
 ):
     with Api(pendulum_server.url) as api:
@@ -56,7 +56,9 @@ def test_a_stored_policy_is_deployed_by_its_name_and_checked_in_the_virtual_envi
 
 
 @NEEDS_C
-def test_a_check_in_the_original_environment_enters_its_real_steps(surrogym, server_process, tmp_path):
+def test_checking_a_deployed_controller_in_the_original_environment_counts_real_steps(
+    surrogym, server_process, tmp_path
+):
     name = f"deploy-{uuid.uuid4().hex[:8]}"
     path = policy_for(tmp_path, cartpole(), name)
     deploy = ["deploy", str(path), "--target", "c", "--out", "c", "--fallback", "0", "--check", "--episodes", "3"]
@@ -69,7 +71,7 @@ def test_a_check_in_the_original_environment_enters_its_real_steps(surrogym, ser
 
 
 @pytest.mark.parametrize("trusted", [True, False, None])
-def test_a_policy_that_is_not_trusted_is_deployed_with_its_reason_and_the_next_step(surrogym, tmp_path, trusted):
+def test_deploying_an_untrusted_policy_prints_the_reason_and_the_next_step(surrogym, tmp_path, trusted):
     reason = "the audit failed: speed is off" if trusted is not None else ""
     path = network(tmp_path, pendulum(), (4,), trusted=trusted, reason=reason)
     deploy = ["deploy", str(path), "--target", "c", "--out", "c"]
@@ -81,7 +83,7 @@ def test_a_policy_that_is_not_trusted_is_deployed_with_its_reason_and_the_next_s
     assert surrogym(*deploy, "--json").json["trusted"] is trusted
 
 
-def test_what_can_not_be_written_or_checked_is_refused_and_nothing_is_written(surrogym, tmp_path):
+def test_a_deployment_that_cannot_be_written_or_checked_writes_nothing(surrogym, tmp_path):
     path = policy_for(tmp_path, pendulum(), None)
     to = ["--target", "c", "--out", "c"]
     for arguments, words in [
@@ -99,7 +101,7 @@ def test_what_can_not_be_written_or_checked_is_refused_and_nothing_is_written(su
         assert not (tmp_path / "c").exists()
 
 
-def test_a_report_takes_no_check_of_another_policy(surrogym, pendulum_server, tmp_path):
+def test_a_report_refuses_the_controller_check_of_another_policy(surrogym, pendulum_server, tmp_path):
     with Api(pendulum_server.url) as api:
         path = policy_for(tmp_path, api.surrogate("pendulum").spec, "pendulum")
         version = push(api, path).policy.version
@@ -114,7 +116,7 @@ def test_a_report_takes_no_check_of_another_policy(surrogym, pendulum_server, tm
     assert not (tmp_path / "report.html").exists()
 
 
-def test_a_check_without_a_compiler_says_what_is_missing(surrogym, tmp_path, monkeypatch):
+def test_checking_a_controller_without_a_compiler_tells_what_is_missing(surrogym, tmp_path, monkeypatch):
     path = policy_for(tmp_path, pendulum(), None)
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("PATH", "/nonexistent")
@@ -126,7 +128,7 @@ def test_a_check_without_a_compiler_says_what_is_missing(surrogym, tmp_path, mon
 
 
 @NEEDS_C
-def test_a_check_takes_the_compiler_that_cc_names(surrogym, tmp_path, monkeypatch):
+def test_checking_a_controller_uses_the_compiler_in_the_variable_cc(surrogym, tmp_path, monkeypatch):
     check = ["deploy", str(policy_for(tmp_path, pendulum(), None)), "--target", "c", "--out", "c"]
     check += ["--check", "--episodes", "1", "--env", "Pendulum-v1"]
     monkeypatch.setenv("CC", "/nonexistent/cc")
@@ -142,7 +144,7 @@ def test_a_check_takes_the_compiler_that_cc_names(surrogym, tmp_path, monkeypatc
 
 
 @NEEDS_C
-def test_a_folder_with_its_own_check_is_deployed_to_again(surrogym, tmp_path):
+def test_deploying_again_into_the_folder_of_the_same_controller_works(surrogym, tmp_path):
     path = policy_for(tmp_path, pendulum(), None)
     deploy = ["deploy", str(path), "--target", "c", "--out", "c"]
     check = ["--check", "--episodes", "1", "--env", "Pendulum-v1"]
@@ -158,7 +160,7 @@ def test_a_folder_with_its_own_check_is_deployed_to_again(surrogym, tmp_path):
     assert (said.code, "check.json: nothing was written" in said.err.replace("\n", " ")) == (1, True)
 
 
-def test_a_surrogate_where_a_policy_is_meant_is_refused_with_how_policies_are_named(surrogym, tmp_path):
+def test_deploying_a_surrogate_name_is_refused_with_the_form_of_policy_names(surrogym, tmp_path):
     for arguments, words in [
         (["pendulum", "--target", "c"], "pendulum@1 or pendulum@production"),
         (["twin.surrogate", "--target", "onnx"], "of a surrogate only an fmu"),
@@ -170,7 +172,7 @@ def test_a_surrogate_where_a_policy_is_meant_is_refused_with_how_policies_are_na
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-def test_a_full_disk_is_one_sentence_and_no_file_stays(surrogym, tmp_path, monkeypatch):
+def test_deploying_to_a_full_disk_gives_a_one_sentence_error_and_leaves_no_file(surrogym, tmp_path, monkeypatch):
     path, whole = policy_for(tmp_path, pendulum(), None), Path.open
 
     def full(self: Path, mode: str = "r", *arguments, **options):

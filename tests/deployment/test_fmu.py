@@ -24,7 +24,7 @@ pytestmark = needs_compiler
 PERIOD, ACTIONS = 0.05, ("action_0", "action_1")
 
 
-def test_the_fmu_decides_as_the_reference_does_and_takes_its_fallback(tmp_path: Path):
+def test_a_controller_fmu_gives_the_reference_actions_and_the_fallback_on_faults(tmp_path: Path):
     history = plant(changes=2, actions=2, largest={"angle": 0.5, "slide": 0.2}, at_start={"angle": 0.3})
     controller = controller_of(network(tmp_path, history, (8,)))
     (path,) = deploy(controller, "fmu", tmp_path / "out")
@@ -45,7 +45,7 @@ def test_the_fmu_decides_as_the_reference_does_and_takes_its_fallback(tmp_path: 
     assert deploy(controller, "fmu", tmp_path / "out") == [path]  # the same bytes
 
 
-def test_a_decision_holds_until_the_next_period(tmp_path: Path):
+def test_a_controller_fmu_holds_its_action_until_the_next_period(tmp_path: Path):
     controller = controller_of(network(tmp_path, plant(), (8,)))
     (path,) = deploy(controller, "fmu", tmp_path / "out")
     with opened(path) as one:
@@ -59,7 +59,7 @@ def test_a_decision_holds_until_the_next_period(tmp_path: Path):
         assert one.get(*ACTIONS) != first
 
 
-def test_a_controller_without_a_period_is_refused(tmp_path: Path):
+def test_deploying_a_controller_fmu_without_a_period_is_refused(tmp_path: Path):
     spec = plant().model_copy(update={"sampling_period": None})
     with pytest.raises(NotDeployable, match="--period"):
         deploy(controller_of(network(tmp_path, spec, (8,))), "fmu", tmp_path / "out")
@@ -72,7 +72,7 @@ def test_a_controller_without_a_period_is_refused(tmp_path: Path):
         controller_of(network(tmp_path, plant(), (8,)), choices=Choices(period=0.1))
 
 
-def test_measurements_have_names_that_c_reads_in_another_way(tmp_path: Path):
+def test_a_controller_fmu_supports_measurement_names_with_special_characters(tmp_path: Path):
     odd = 'a"b\\c??/ 😀'
     spec = plant()
     named = type(spec).model_validate_json(spec.model_dump_json().replace('"slide"', json.dumps(odd)))
@@ -86,7 +86,7 @@ def test_measurements_have_names_that_c_reads_in_another_way(tmp_path: Path):
         assert one.get("status") == [0.0]
 
 
-def test_a_measurement_called_time_or_with_control_characters_is_refused():
+def test_an_fmu_measurement_named_time_or_with_control_characters_is_refused():
     for name in ("time", "a\nb"):
         with pytest.raises(ValueError, match=r"time|control characters"):
             Block("b", "", (Variable(name, "Float64", "input", 0.0),), 1.0, None, {})

@@ -35,7 +35,7 @@ def run(controller, folder: Path, observations: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("case", ACTIONS)
-def test_the_file_gives_the_controllers_actions(tmp_path: Path, case: str):
+def test_the_exported_onnx_file_gives_the_controllers_actions(tmp_path: Path, case: str):
     action, fallback = ACTIONS[case]
     controller = controller_of(network(tmp_path, plant(action), (16, 16)), choices=Choices(fallback=fallback))
     observations = np.random.default_rng(0).normal(size=(300, 4)).astype(np.float32)
@@ -47,14 +47,14 @@ def test_the_file_gives_the_controllers_actions(tmp_path: Path, case: str):
     assert close.mean() > 0.99 if controller.counts else close.all()
 
 
-def test_a_stable_baselines3_policy_with_a_squashed_action_gives_its_actions(tmp_path: Path):
+def test_the_onnx_export_of_a_squashed_stable_baselines3_policy_gives_its_actions(tmp_path: Path):
     controller = controller_of(learner(tmp_path, "SAC", plant(LEARNERS["SAC"][2])), trust=True)
     observations = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
     expected, _ = act(controller, observations.astype(np.float64))
     np.testing.assert_allclose(run(controller, tmp_path, observations), expected, atol=1e-3)
 
 
-def test_ten_lines_of_the_page_read_the_description_with_onnxruntime_alone(tmp_path: Path):
+def test_the_documented_onnxruntime_example_reads_the_onnx_description(tmp_path: Path):
     spec = plant(changes=1, actions=1, largest={"angle": 0.5, "slide": 0.2})
     write(controller_of(network(tmp_path, spec)), tmp_path)
     (program,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
@@ -69,7 +69,7 @@ def test_ten_lines_of_the_page_read_the_description_with_onnxruntime_alone(tmp_p
     assert out.endswith("action from -2.0 to 2.0\naction from 0.0 to 10.0\n")
 
 
-def test_the_description_has_what_a_program_on_a_machine_needs(tmp_path: Path):
+def test_the_onnx_description_contains_inputs_outputs_limits_and_period(tmp_path: Path):
     spec = plant(changes=1, actions=1, largest={"angle": 0.5, "slide": 0.2})
     write(controller_of(network(tmp_path, spec)), tmp_path)
     session = onnxruntime.InferenceSession(tmp_path / "arm.onnx", providers=["CPUExecutionProvider"])

@@ -34,7 +34,7 @@ def readings(spec, steps, seed=0):
 
 
 @pytest.mark.parametrize("case", LEARNERS)
-def test_a_controller_decides_as_its_policy_in_every_step(tmp_path: Path, case: str):
+def test_a_controller_gives_the_actions_of_its_policy_in_every_step(tmp_path: Path, case: str):
     spec = plant(LEARNERS[case][2], **HISTORY)
     path = learner(tmp_path, case, spec)
     fallback = None if spec.action.kind == "box" else (0.0,) * spec.action.size
@@ -83,14 +83,14 @@ def test_a_linear_policy_and_a_network_of_arrays_become_controllers(tmp_path: Pa
         ([600.0, 4.9, 1.9], 0.1, 0),
     ],
 )
-def test_a_measurement_that_is_not_sound_leads_to_the_fallback(tmp_path: Path, read, age, status):
+def test_an_invalid_measurement_makes_the_controller_return_its_fallback(tmp_path: Path, read, age, status):
     controller = controller_of(network(tmp_path, plant()), choices=Choices(fallback=(0.5, 1.5)))
     decided = decide(controller, begin(controller), np.array([read]), age)
     assert decided.status == status
     assert (decided.action.tolist() == [[0.5, 1.5]]) == (status != 0)
 
 
-def test_after_a_fault_lags_of_measurements_begin_anew_and_those_of_actions_go_on(tmp_path: Path):
+def test_after_a_measurement_fault_only_measurement_lags_are_reset(tmp_path: Path):
     spec = plant(**HISTORY)
     controller = controller_of(network(tmp_path, spec))
     names, memory = spec.coordinate_names, begin(controller)
@@ -109,7 +109,7 @@ def test_after_a_fault_lags_of_measurements_begin_anew_and_those_of_actions_go_o
     assert rows[2]["action1.lag1"] == actions[1][1] != 0
 
 
-def test_policies_without_a_feed_forward_network_are_refused_with_what_can(tmp_path: Path):
+def test_deploying_a_policy_without_a_feed_forward_network_is_refused(tmp_path: Path):
     spec = plant()
     path = network(tmp_path, spec)
     (tmp_path / "policy.onnx").write_bytes(b"x")
@@ -131,7 +131,7 @@ def test_policies_without_a_feed_forward_network_are_refused_with_what_can(tmp_p
         controller_of(path)
 
 
-def test_a_controller_names_what_it_was_made_from(tmp_path: Path):
+def test_a_controller_contains_the_digests_of_its_policy_and_model(tmp_path: Path):
     spec = plant()
     path = network(tmp_path, spec)
     write_card(path, PolicyCard(spec=spec, model="5a" * 32))
@@ -140,19 +140,19 @@ def test_a_controller_names_what_it_was_made_from(tmp_path: Path):
     assert digests["samples of the model"] == "5a" * 32
 
 
-def test_a_policy_with_weights_that_are_not_numbers_is_refused(tmp_path: Path):
+def test_deploying_a_policy_with_nan_weights_is_refused(tmp_path: Path):
     for gain, refused in ((np.nan, UnusablePolicy), (1e200, NotDeployable)):
         path = network(tmp_path, plant(), (8,), gain)
         with pytest.raises(refused, match="finite numbers"):
             controller_of(path)
 
 
-def test_a_network_that_is_too_large_for_a_controller_is_refused(tmp_path: Path):
+def test_deploying_a_too_large_network_is_refused(tmp_path: Path):
     with pytest.raises(NotDeployable, match="at most 1,000,000 weights, got 1,008,002, which need 8 MB"):
         controller_of(network(tmp_path, plant(), (1000, 1000), 0.01))
 
 
-def test_a_policy_that_learned_in_a_vecnormalize_keeps_its_statistics_and_its_clip(tmp_path: Path):
+def test_a_controller_keeps_the_normalisation_and_clipping_of_vecnormalize(tmp_path: Path):
     spec, path = plant(), tmp_path / "policy.zip"
     env = VecNormalize(DummyVecEnv([lambda: Idle(spec)]))
     made = stable_baselines3.PPO("MlpPolicy", env, device="cpu", n_steps=8, batch_size=8, seed=0)
@@ -167,7 +167,7 @@ def test_a_policy_that_learned_in_a_vecnormalize_keeps_its_statistics_and_its_cl
     np.testing.assert_allclose(decided.action, decode_actions(spec, policy(shown), 20), atol=1e-5)
 
 
-def test_choices_that_do_not_fit_are_refused(tmp_path: Path):
+def test_deployment_options_that_do_not_fit_the_policy_are_refused(tmp_path: Path):
     path = network(tmp_path, plant())
     for wrong, words in [
         (Choices(fallback=(0.0,)), "fallback of 2 entries"),
@@ -193,7 +193,7 @@ def test_choices_that_do_not_fit_are_refused(tmp_path: Path):
         controller_of(path, plant(DiscreteAction(n=3)), choices=ANY)
 
 
-def test_a_file_with_a_wrong_checksum_is_no_policy(tmp_path: Path):
+def test_deploying_a_policy_file_with_a_wrong_checksum_is_refused(tmp_path: Path):
     path = network(tmp_path, plant())
     path.write_bytes(bytes(b ^ 0xFF if 200 < i < 260 else b for i, b in enumerate(path.read_bytes())))
     with pytest.raises(UnusablePolicy, match="not a policy of"):

@@ -32,7 +32,7 @@ def vessel():
 
 
 @pytest.mark.parametrize("target", [name for name, one in TARGETS.items() if one.running])
-def test_a_controller_with_lags_earns_the_returns_of_its_policy(tmp_path: Path, target: str):
+def test_a_deployed_controller_with_lagged_inputs_earns_its_policys_returns(tmp_path: Path, target: str):
     episode = vessel()
     path = network(tmp_path, episode.spec, (32,), 0.5)
     controller, shares = controller_of(path, choices=Choices(period=1.0)), []
@@ -44,7 +44,7 @@ def test_a_controller_with_lags_earns_the_returns_of_its_policy(tmp_path: Path, 
     assert len(set(checked.returns)) == 5
 
 
-def test_a_reading_outside_of_its_range_is_counted_as_a_fault(tmp_path: Path):
+def test_a_measurement_outside_its_range_counts_as_a_fault(tmp_path: Path):
     episode = vessel()
     path = network(tmp_path, episode.spec, (32,), 0.5)
     controller = controller_of(path, choices=Choices(ranges={"level": (-0.01, 0.01)}))

@@ -42,20 +42,20 @@ def decided(controller: Controller, real: str) -> list[float]:
 
 
 @pytest.mark.slow
-def test_lags_limits_and_faults_are_those_of_the_reference(tmp_path: Path):
+def test_the_structured_text_controller_equals_the_reference_for_lags_limits_and_faults(tmp_path: Path):
     controller = controller_of(network(tmp_path, plant(**PAST), (3,)))
     assert max(decided(controller, "LREAL")) <= 1e-6
 
 
 @pytest.mark.slow
-def test_choices_in_32_bits_are_those_of_the_reference(tmp_path: Path):
+def test_the_32_bit_structured_text_controller_chooses_the_reference_actions(tmp_path: Path):
     spec = plant(MultiDiscreteAction(nvec=(2, 5)))
     controller = controller_of(network(tmp_path, spec, (3,)), choices=Choices(fallback=(1.0, 3.0)))
     differences = np.array(decided(controller, "REAL"))
     assert (differences <= 1e-4).mean() >= 0.98  # two best choices may be equal up to rounding
 
 
-def test_both_widths_are_written_with_literals_that_have_a_point(tmp_path: Path):
+def test_structured_text_literals_of_both_precisions_have_a_decimal_point(tmp_path: Path):
     controller = controller_of(network(tmp_path, plant(), (64, 64)))
     written = deploy(controller, "st", tmp_path / "st")
     assert [path.name for path in written] == ["arm_controller.st", "arm_controller_real.st"]
@@ -69,7 +69,7 @@ def test_both_widths_are_written_with_literals_that_have_a_point(tmp_path: Path)
         np.testing.assert_array_equal(read, controller.decision.layers[1].weights.ravel().astype(kind))
 
 
-def test_names_with_the_end_of_a_comment_stay_in_it(tmp_path: Path):
+def test_names_containing_comment_ends_do_not_break_the_structured_text(tmp_path: Path):
     spec = plant()
     first, *others = spec.coordinates
     named = spec.model_copy(update={"coordinates": (first.model_copy(update={"unit": "*) x"}), *others)})
@@ -77,7 +77,7 @@ def test_names_with_the_end_of_a_comment_stay_in_it(tmp_path: Path):
     assert text.count("(*") == text.count("*)")
 
 
-def test_an_angle_of_more_turns_than_a_dint_counts_is_refused(tmp_path: Path):
+def test_a_structured_text_angle_range_beyond_dint_turns_is_refused(tmp_path: Path):
     choices = Choices(ranges={"angle": (-1e12, 1e12)})
     with pytest.raises(NotDeployable, match="turns"):
         source_of(controller_of(network(tmp_path, plant(), (3,)), choices=choices), "LREAL", "arm")

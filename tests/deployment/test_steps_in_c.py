@@ -32,7 +32,7 @@ def points(definition: EnvironmentDefinition) -> tuple[torch.Tensor, torch.Tenso
 
 
 @pytest.mark.parametrize("kind", [*CASES, *ENVIRONMENTS])
-def test_the_step_in_c_is_the_models(kind):
+def test_the_exported_c_step_equals_the_models_step(kind):
     if kind in CASES:
         model = gaussian_processes(CASES[kind].definition, CASES[kind].samples)
     else:

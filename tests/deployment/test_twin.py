@@ -60,7 +60,7 @@ def driven(one: OpenFmu, actions: np.ndarray, name: str = "action", period: floa
     return np.array(rows)
 
 
-def test_the_fmu_passes_the_checks_of_fmi_and_runs_in_a_simulation(twin):
+def test_a_surrogate_fmu_passes_the_fmi_checks_and_can_be_simulated(twin):
     assert validate_fmu(str(twin)) == []
     result = fmpy.simulate_fmu(str(twin), stop_time=200.0, start_values={"upper": 0.3, "action": 0.5})
     assert len(result) == 21
@@ -68,7 +68,7 @@ def test_the_fmu_passes_the_checks_of_fmi_and_runs_in_a_simulation(twin):
     assert fmpy.read_model_description(str(twin)).defaultExperiment.stepSize == str(PERIOD)
 
 
-def test_steps_are_those_of_the_served_model(surrogate, twin):
+def test_steps_of_a_surrogate_fmu_equal_those_of_the_served_model(surrogate, twin):
     model = LocalSurrogate.from_bytes(surrogate.spec, surrogate.model).model
     q, rows = torch.tensor([[0.3, 0.1]], dtype=torch.float64), []
     for action in pumped():
@@ -80,7 +80,7 @@ def test_steps_are_those_of_the_served_model(surrogate, twin):
         np.testing.assert_allclose(driven(one, pumped()), rows, rtol=1e-9, atol=1e-9)
 
 
-def test_observations_ends_and_rewards_are_those_of_a_session(tmp_path):
+def test_observations_terminations_and_rewards_of_a_surrogate_fmu_equal_a_sessions(tmp_path):
     """Cart-pole has discrete actions, declared ends and a reward beyond one of them."""
     file = exported("cart-pole", cartpole(), random_steps(cartpole(), 20, seed=0))
     names = file.spec.observation_names
@@ -102,7 +102,7 @@ def test_observations_ends_and_rewards_are_those_of_a_session(tmp_path):
 
 
 @pytest.mark.parametrize("share", [0.25, 1 / 3, 3.0])
-def test_other_communication_steps_show_the_same_at_the_sampling_instants(twin, share):
+def test_a_surrogate_fmu_gives_equal_samples_with_other_communication_steps(twin, share):
     """An input holds from one sampling instant to the next; a change in between waits."""
     with opened(twin) as one, opened(twin) as other:
         one.begin()
@@ -123,7 +123,7 @@ def test_other_communication_steps_show_the_same_at_the_sampling_instants(twin, 
                 assert other.get(*SHOWN) == one.get(*SHOWN)
 
 
-def test_a_saved_state_continues_as_before_also_from_bytes(twin):
+def test_a_surrogate_fmu_continues_from_a_saved_state(twin):
     with opened(twin) as one:
         one.begin({"upper": 0.2})
         driven(one, pumped(3))
@@ -138,7 +138,7 @@ def test_a_saved_state_continues_as_before_also_from_bytes(twin):
 
 
 @pytest.mark.parametrize("action", [float("nan"), float("inf"), -0.1, 1.1])
-def test_an_input_beyond_its_limits_is_refused_and_changes_no_state(twin, action):
+def test_a_surrogate_fmu_refuses_an_input_beyond_its_limits(twin, action):
     said: list[str] = []
     with opened(twin, said) as one:
         one.begin()
@@ -150,14 +150,14 @@ def test_an_input_beyond_its_limits_is_refused_and_changes_no_state(twin, action
 
 
 @pytest.mark.parametrize("level", [float("nan"), 1.5, -0.1])
-def test_a_start_beyond_its_bounds_is_refused(twin, level):
+def test_a_surrogate_fmu_refuses_a_start_state_outside_its_bounds(twin, level):
     said: list[str] = []
     with opened(twin, said) as one, pytest.raises(FMICallException):
         one.begin({"upper": level})
     assert "limits of the variable: upper" in said[-1]
 
 
-def test_what_is_no_input_is_not_set_during_the_simulation(twin):
+def test_a_surrogate_fmu_refuses_setting_outputs_during_the_simulation(twin):
     with opened(twin) as one:
         one.begin()
         for name in ("upper", "reward"):
@@ -165,7 +165,7 @@ def test_what_is_no_input_is_not_set_during_the_simulation(twin):
                 one.set(name, 0.5)
 
 
-def test_the_twin_is_an_original_environment_that_can_be_set(twin):
+def test_a_surrogate_fmu_can_be_used_as_an_original_environment(twin):
     """surrogym describe, doctor and sample open it like any other FMU."""
     environment = original.make(f"fmu:{twin}", spec=tanks().model_copy(update={"environment": f"fmu:{twin}"}))
     try:
@@ -178,7 +178,7 @@ def test_the_twin_is_an_original_environment_that_can_be_set(twin):
         assert step.next_coordinates.tolist() == one.get(*STATE)
 
 
-def test_functions_are_those_of_the_official_headers(surrogate, tmp_path):
+def test_the_fmu_c_functions_match_the_official_fmi3_headers(surrogate, tmp_path):
     block = twin_of(surrogate)
     folder = Path(fmpy.__file__).parent / "c-code"
     (tmp_path / "block.h").write_text(block.header())
@@ -188,7 +188,7 @@ def test_functions_are_those_of_the_official_headers(surrogate, tmp_path):
     subprocess.run([COMPILER, *strict, "fmi3.c"], cwd=tmp_path, check=True)
 
 
-def test_the_sources_inside_compile_without_a_warning(twin, tmp_path):
+def test_the_c_sources_in_a_surrogate_fmu_compile_without_warnings(twin, tmp_path):
     with zipfile.ZipFile(twin) as archived:
         archived.extractall(tmp_path)
     names = [n for n in os.listdir(tmp_path / "sources") if n.endswith(".c")]
@@ -198,7 +198,7 @@ def test_the_sources_inside_compile_without_a_warning(twin, tmp_path):
     subprocess.run([COMPILER, *strict, *names], cwd=tmp_path / "sources", check=True)
 
 
-def test_without_a_compiler_the_fmu_has_its_sources_alone(surrogate, tmp_path, monkeypatch):
+def test_without_a_compiler_a_surrogate_fmu_contains_only_sources(surrogate, tmp_path, monkeypatch):
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setattr(c_compiler.shutil, "which", lambda _: None)
     written = write_twin(surrogate.to_bytes(), tmp_path / "tanks.fmu")
@@ -208,7 +208,7 @@ def test_without_a_compiler_the_fmu_has_its_sources_alone(surrogate, tmp_path, m
         assert not any(name.startswith("binaries") for name in archived.namelist())
 
 
-def test_a_compiler_that_fails_leaves_the_earlier_file(surrogate, tmp_path, monkeypatch):
+def test_a_failing_compiler_leaves_the_earlier_fmu_file(surrogate, tmp_path, monkeypatch):
     monkeypatch.setenv("CC", "false")
     path = tmp_path / "tanks.fmu"
     path.write_bytes(b"earlier")
@@ -219,14 +219,14 @@ def test_a_compiler_that_fails_leaves_the_earlier_file(surrogate, tmp_path, monk
 
 
 @pytest.mark.skipif(shutil.which("arm-linux-gnueabihf-gcc") is None, reason="no compiler for another machine")
-def test_a_compiler_for_another_machine_is_refused(surrogate, tmp_path, monkeypatch):
+def test_a_compiler_for_another_architecture_is_refused_for_an_fmu(surrogate, tmp_path, monkeypatch):
     monkeypatch.setenv("CC", "arm-linux-gnueabihf-gcc")
     with pytest.raises(c_compiler.CannotCompile, match="for this machine"):
         write_twin(surrogate.to_bytes(), tmp_path / "tanks.fmu")
     assert os.listdir(tmp_path) == []
 
 
-def test_the_same_surrogate_gives_the_same_description_and_another_one_another_token(surrogate):
+def test_the_instantiation_token_of_an_fmu_depends_on_surrogate_and_period(surrogate):
     assert twin_of(surrogate).token == twin_of(surrogate).token
     assert twin_of(surrogate, 5.0).token != twin_of(surrogate).token
 
@@ -239,13 +239,13 @@ def test_the_same_surrogate_gives_the_same_description_and_another_one_another_t
         ({}, float("nan"), "above 0, got nan"),
     ],
 )
-def test_a_period_that_is_none_is_refused(surrogate, changes, period, said):
+def test_a_surrogate_fmu_with_an_invalid_period_is_refused(surrogate, changes, period, said):
     file = replace(surrogate, spec=surrogate.spec.model_copy(update=changes))
     with pytest.raises(InvalidInput, match=said):
         twin_of(file, period)
 
 
-def test_a_family_that_has_no_source_is_refused_with_those_that_have(tmp_path):
+def test_exporting_an_fmu_of_a_model_family_without_c_export_is_refused(tmp_path):
     spec = EnvironmentSpec.model_validate(
         tanks().model_dump() | {"design": {"model": {"name": "ensemble", "settings": {"members": 2, "steps": 1}}}}
     )
@@ -253,7 +253,7 @@ def test_a_family_that_has_no_source_is_refused_with_those_that_have(tmp_path):
         twin_of(exported("tanks", spec, drained(24)))
 
 
-def test_the_command_writes_the_twin_of_a_file_and_leaves_other_folders_alone(surrogate, tmp_path, capsys, monkeypatch):
+def test_the_command_writes_the_fmu_of_a_surrogate_file(surrogate, tmp_path, capsys, monkeypatch):
     surrogym = speaker(main, capsys, monkeypatch, tmp_path)
     (tmp_path / "tanks.surrogate").write_bytes(surrogate.to_bytes())
     command = ("deploy", "tanks.surrogate", "--target", "fmu", "--out")

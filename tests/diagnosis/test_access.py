@@ -87,20 +87,20 @@ def looked_at(rail=Rail, **options) -> Access:
         return examine(environment, factory().spec())
 
 
-def test_an_exact_environment_is_set_to_any_state_and_its_steps_are_counted() -> None:
+def test_an_exact_environment_is_diagnosed_as_settable_with_counted_steps() -> None:
     access = looked_at()
     assert (access.set_error, access.repeat_error, access.reset_error, access.memory_error) == (0, 0, 0, 0)
     assert access.mode == "set any state"
     assert (access.steps, access.resets) == (2 * 3 + 2 * 3 + 1, 2)
 
 
-def test_one_that_is_not_where_it_was_put_can_only_be_reset() -> None:
+def test_an_environment_set_inexactly_is_diagnosed_as_reset_only() -> None:
     access = looked_at(coarse=0.1)
     assert access.set_error == pytest.approx(0.05)
     assert access.mode == "reset only (--access reset)"
 
 
-def test_one_that_remembers_more_than_its_coordinates_can_only_be_reset() -> None:
+def test_an_environment_with_hidden_state_is_diagnosed_as_reset_only() -> None:
     access = looked_at(inertia=3.0)
     assert access.set_error == access.repeat_error == 0
     assert access.memory_error is not None
@@ -108,30 +108,30 @@ def test_one_that_remembers_more_than_its_coordinates_can_only_be_reset() -> Non
     assert not access.can_set
 
 
-def test_noise_alone_does_not_forbid_to_set_a_state() -> None:
+def test_a_noisy_environment_is_diagnosed_as_settable() -> None:
     access = looked_at(noise=0.05)
     assert access.noise > 0
     assert access.can_set
 
 
-def test_one_without_resets_is_looked_at_by_its_states_alone() -> None:
+def test_an_environment_without_resets_is_diagnosed_by_setting_states() -> None:
     access = looked_at(resets=False)
     assert (access.reset_error, access.resets, access.can_set) == (None, 0, True)
 
 
-def test_one_that_can_only_be_reset_is_not_set() -> None:
+def test_the_diagnosis_does_not_set_states_of_a_reset_only_environment() -> None:
     access = looked_at(query="rollout")
     assert (access.set_error, access.memory_error) == (None, None)
     assert (access.reset_error, access.mode) == (0, "reset only (--access reset)")
 
 
-def test_one_that_remembers_and_saves_all_of_it_returns_to_snapshots() -> None:
+def test_an_environment_with_hidden_state_and_exact_snapshots_is_diagnosed_as_restorable() -> None:
     access = looked_at(SavedRail, inertia=3.0)
     assert (access.can_set, access.restore_error) == (False, 0)
     assert access.mode == "snapshots (--access snapshot)"
 
 
-def test_one_that_can_do_everything_takes_the_real_steps_that_help_and_pages_name() -> None:
+def test_the_diagnosis_takes_the_number_of_real_steps_that_the_docs_state() -> None:
     """They said 14, and the check took 18."""
     with IsolatedEnvironment(SavedRail) as opened:
         said = [finding.said for finding in environment(lambda: opened)]
@@ -142,7 +142,7 @@ def test_one_that_can_do_everything_takes_the_real_steps_that_help_and_pages_nam
         assert "14 real steps at most" not in text
 
 
-def test_one_whose_snapshots_forget_can_only_be_reset() -> None:
+def test_an_environment_with_incomplete_snapshots_is_diagnosed_as_reset_only() -> None:
     access = looked_at(SavedRail, inertia=3.0, forgets=True)
     assert access.restore_error is not None
     assert access.restore_error > 0.01
@@ -174,7 +174,7 @@ class Spring(gymnasium.Env):
 
 
 @pytest.mark.parametrize("query", ["step", "rollout"])
-def test_one_that_ignores_its_seed_gets_a_note(query: str) -> None:
+def test_the_diagnosis_notes_an_environment_that_ignores_its_seed(query: str) -> None:
     opened = partial(IsolatedEnvironment, partial(Deaf, query=query))
     said = {finding.name: finding for finding in environment(opened)}
     assert "ignores its seed" in said["resets"].said
@@ -184,7 +184,7 @@ def test_one_that_ignores_its_seed_gets_a_note(query: str) -> None:
     assert not steady["resets"].notable
 
 
-def test_a_gymnasium_environment_that_can_only_be_reset_is_checked_in_that_mode() -> None:
+def test_a_reset_only_gymnasium_environment_is_diagnosed_in_that_mode() -> None:
     """Its simulator gave a state to save, and failed when it had to return to it."""
     simulator = ResetOnly("Spring", Spring(), 60)
     spec = Rail(query="rollout").spec().model_dump() | {
@@ -212,7 +212,7 @@ class Exits(Rail):
         return super().step_from(coordinates, action)
 
 
-def test_one_that_fails_says_after_how_many_real_steps() -> None:
+def test_the_diagnosis_of_a_failing_environment_reports_its_real_steps() -> None:
     with pytest.raises(CheckFailed, match="SystemExit: the licence has expired") as failed:
         looked_at(Exits)
     assert failed.value.steps == 3

@@ -26,7 +26,7 @@ def run(url: str, *options: str):
     return CliRunner().invoke(build(), ["conformance", "--server", url, *options])
 
 
-def test_our_server_keeps_the_protocol_and_is_left_as_it_was(server: ServerProcess):
+def test_our_server_passes_the_conformance_suite_and_is_left_unchanged(server: ServerProcess):
     result = run(server.url, "--json")
     assert (result.exit_code, json.loads(result.stdout)["failed"]) == (0, {})
     with Api(server.url) as api:
@@ -73,7 +73,7 @@ def reset_every_lane(path: str, body: dict[str, Any]) -> None:
         (reset_every_lane, leave, "disabled waits for a reset by mask"),
     ],
 )
-def test_a_broken_promise_fails_its_check(
+def test_a_server_that_breaks_a_protocol_rule_fails_the_check_of_that_rule(
     server: ServerProcess, monkeypatch: pytest.MonkeyPatch, request_: Forge, reply: Forge, broken: str
 ):
     monkeypatch.setattr(sessions, "CHECKS", sessions.CHECKS[:-1])  # the proxy carries no stream
@@ -86,7 +86,7 @@ def test_a_broken_promise_fails_its_check(
     assert None in outcomes.values(), "the rest passes"
 
 
-def test_a_taken_name_is_left_alone(server: ServerProcess):
+def test_the_conformance_suite_leaves_an_existing_surrogate_alone(server: ServerProcess):
     from surrogym_sampler.diagnosis.conformance.target import SPEC
 
     with Api(server.url) as api:

@@ -51,30 +51,32 @@ def failures(command: str) -> dict[str, str]:
         ),
     ],
 )
-def test_a_broken_promise_fails_its_check_alone(tmp_path: Path, before: str, after: str, broken: set[str]):
+def test_a_program_that_breaks_a_protocol_rule_fails_only_that_check(
+    tmp_path: Path, before: str, after: str, broken: set[str]
+):
     assert failures(program(tmp_path, (before, after))).keys() == broken
 
 
-def test_an_answer_without_its_number_ends_the_program_and_fails(tmp_path: Path):
+def test_a_program_that_does_not_repeat_the_request_number_fails(tmp_path: Path):
     number = ('number, method = request["id"]', "number, method = 1")
     assert "an answer repeats the number of its request" in failures(program(tmp_path, number))
 
 
-def test_a_missing_field_is_named_with_the_way_out(tmp_path: Path):
+def test_the_check_of_a_program_names_a_missing_field_and_its_remedy(tmp_path: Path):
     said = failures(program(tmp_path, ('"truncated": False', '"time": 0')))["a step gives state reward and ends"]
     assert "expected true or false for 'truncated'" in said
     assert said.endswith("give all four fields in every answer to step")
     assert "surrogym conformance" not in said, "the command does not advise to run itself"
 
 
-def test_numbers_and_missing_fields_are_named_without_words_of_python(tmp_path: Path):
+def test_program_check_errors_name_fields_without_python_terms(tmp_path: Path):
     one_start = failures(program(tmp_path, (SEEDED, "0.25")))["other seeds give other starts"]
     assert "got [0.25] each time" in one_start
     no_snapshot = failures(program(tmp_path, ('{"snapshot": ', '{"state": ')))["restore returns to what was saved"]
     assert "expected a text for 'snapshot' in the program's answer, got nothing" in no_snapshot
 
 
-def test_a_program_with_rollouts_alone_needs_no_set(tmp_path: Path):
+def test_a_program_that_supports_only_rollouts_need_not_support_set(tmp_path: Path):
     command = program(tmp_path, ('"query":"step"', '"query":"rollout"'), ('"set": put, "get": get, ', ""))
     left_out = {outcome.name for outcome in conformance(command, 10.0) if outcome.left_out}
     assert failures(command) == {}
@@ -93,14 +95,14 @@ def test_a_program_with_rollouts_alone_needs_no_set(tmp_path: Path):
         ("echo hello", "hello"),
     ],
 )
-def test_a_program_without_a_specification_is_not_checked_further(command: str, reason: str):
+def test_the_check_of_a_program_without_specification_stops_early(command: str, reason: str):
     [outcome] = conformance(command, 10.0)
     assert outcome.name == FIRST
     assert outcome.failure is not None
     assert reason in outcome.failure
 
 
-def test_the_command_shows_each_check_and_fails_with_them(tmp_path: Path):
+def test_the_program_check_command_lists_each_check_and_its_exit_code_tells_failure(tmp_path: Path):
     def run(*options: str):
         return CliRunner().invoke(build(), ["conformance", *options])
 

@@ -82,7 +82,7 @@ def said(factory) -> tuple[str, str | None]:
 
 
 @pytest.mark.parametrize("dead_steps", range(4))
-def test_a_hidden_speed_and_a_dead_time_are_found(dead_steps):
+def test_the_needed_history_for_a_hidden_speed_and_a_dead_time_is_found(dead_steps):
     machine = answering(Joint(dead_steps))
     found = look_back(machine, machine.spec(), STEPS)
     assert found is not None
@@ -91,7 +91,7 @@ def test_a_hidden_speed_and_a_dead_time_are_found(dead_steps):
     assert 0.1 < found.largest["angle"] < 2
 
 
-def test_a_whole_state_needs_no_history():
+def test_an_environment_with_a_complete_state_needs_no_history():
     machine = make("CartPole-v1", access="reset")
     found = look_back(machine, machine.spec(), STEPS)
     assert found is not None
@@ -99,12 +99,12 @@ def test_a_whole_state_needs_no_history():
     machine.close()
 
 
-def test_declared_lags_are_counted():
+def test_the_declared_lags_of_a_specification_are_counted():
     assert declared(SPEC) == (0, 0)
     assert declared(with_history(SPEC, changes=3, actions=2, largest={"angle": 1.0}, at_start={"angle": 1.0})) == (3, 2)
 
 
-def test_the_doctor_says_what_to_declare():
+def test_doctor_recommends_the_history_to_declare():
     words, way_out = said(Joint)
     assert "depends on 1 earlier changes and 2 earlier actions" in words
     assert "this took 60 real steps" in words
@@ -121,7 +121,7 @@ def test_the_doctor_says_what_to_declare():
         (Short, "episodes this short don't tell", "give --history more steps"),
     ],
 )
-def test_the_doctor_says_why_nothing_is_to_be_declared(factory, words, way_out):
+def test_doctor_tells_why_no_history_needs_to_be_declared(factory, words, way_out):
     found = said(factory)
     assert words in found[0]
     assert found[1] == way_out

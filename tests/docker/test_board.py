@@ -40,7 +40,7 @@ def labels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
 
 
 @pytest.mark.parametrize("expression", EXPRESSIONS)
-def test_a_panel_asks_for_metrics_that_the_server_has(expression: str, labels: dict[str, set[str]]) -> None:
+def test_every_grafana_panel_uses_existing_metrics_of_the_server(expression: str, labels: dict[str, set[str]]) -> None:
     selectors = SELECTOR.findall(expression)
     assert selectors
     for name, filters in selectors:
@@ -50,7 +50,7 @@ def test_a_panel_asks_for_metrics_that_the_server_has(expression: str, labels: d
             assert set(re.split(r",\s*", grouped)) <= labels[name]
 
 
-def test_every_metric_of_the_server_is_on_the_board(labels: dict[str, set[str]]) -> None:
+def test_every_metric_of_the_server_is_on_the_grafana_dashboard(labels: dict[str, set[str]]) -> None:
     def family(name: str) -> str:
         return re.sub(r"_(bucket|sum|count|created)$", "", name)
 
@@ -58,7 +58,7 @@ def test_every_metric_of_the_server_is_on_the_board(labels: dict[str, set[str]])
     assert {family(name) for name in labels} - asked == {"surrogym_build_info"}
 
 
-def test_the_board_finds_its_data_source_and_grafana_the_board() -> None:
+def test_grafana_is_provisioned_with_data_source_and_dashboard() -> None:
     sources = yaml.safe_load((DOCKER / "grafana/provisioning/datasources/prometheus.yaml").read_text())["datasources"]
     assert {panel["datasource"]["uid"] for panel in BOARD["panels"]} == {source["uid"] for source in sources}
     (provider,) = yaml.safe_load((DOCKER / "grafana/provisioning/dashboards/boards.yaml").read_text())["providers"]
@@ -66,7 +66,7 @@ def test_the_board_finds_its_data_source_and_grafana_the_board() -> None:
     assert f"./grafana/boards:{provider['options']['path']}:ro" in mounts
 
 
-def test_prometheus_looks_at_the_server_with_the_token() -> None:
+def test_prometheus_scrapes_the_server_with_its_token() -> None:
     (job,) = yaml.safe_load((DOCKER / "prometheus.yaml").read_text())["scrape_configs"]
     assert job["static_configs"] == [{"targets": ["server:8000"]}]
     prometheus = yaml.safe_load((DOCKER / "compose.yaml").read_text())["services"]["prometheus"]

@@ -50,21 +50,21 @@ def last(target: str, instruction: str) -> str:
 
 
 @pytest.mark.parametrize("target", ["server", "sampler", "trainer", "cluster"])
-def test_no_program_runs_as_root(target: str) -> None:
+def test_no_container_runs_as_root(target: str) -> None:
     user = last(target, "USER")
     assert any(f"useradd --uid 1000 --create-home {user}" in line for line in whole(target))
     assert not [line for line in whole(target)[whole(target).index(f"USER {user}") :] if line.startswith("RUN ")]
 
 
-def test_the_server_says_whether_it_is_well() -> None:
+def test_the_server_container_has_a_health_check() -> None:
     assert "/healthz" in last("server", "HEALTHCHECK")
 
 
-def test_the_sampler_carries_no_torch() -> None:
+def test_the_sampler_image_contains_no_torch() -> None:
     assert not [line for line in whole("sampler") if "torch" in line]
 
 
-def test_torch_is_its_cpu_build_unless_a_build_argument_says_cuda() -> None:
+def test_the_image_installs_cpu_torch_unless_a_build_argument_selects_cuda() -> None:
     assert "ARG TORCH=cpu" in whole("torch")
     assert all(service["build"]["args"]["TORCH"] == "${TORCH:-cpu}" for service in BUILT.values())
     (choice,) = [line for line in whole("torch") if "torch.version.cuda" in line]
@@ -73,7 +73,7 @@ def test_torch_is_its_cpu_build_unless_a_build_argument_says_cuda() -> None:
     assert "ARG PIP_EXTRA_INDEX_URL" in whole("torch")
 
 
-def test_no_host_of_packages_is_named() -> None:
+def test_the_dockerfile_names_no_package_host() -> None:
     """Where packages come from is the reader's choice: pip's settings, or a build argument without a default."""
     assert re.findall(r"\w+://([\w.]+)", DOCKERFILE) == ["127.0.0.1"]
     assert all(
@@ -81,14 +81,14 @@ def test_no_host_of_packages_is_named() -> None:
     )
 
 
-def test_every_install_is_pinned_and_no_image_keeps_a_cache() -> None:
+def test_every_image_install_is_pinned_and_keeps_no_cache() -> None:
     installs = [line for line in DOCKERFILE.splitlines() if "pip install" in line]
     assert installs
     assert all("-c constraints.txt" in line or "--no-deps" in line for line in installs)
     assert DOCKERFILE.count("PIP_NO_CACHE_DIR=1") == DOCKERFILE.count("FROM ${BASE_IMAGE}")
 
 
-def test_whatever_is_copied_is_there_and_not_ignored() -> None:
+def test_every_path_copied_by_the_dockerfile_exists_and_is_not_ignored() -> None:
     ignored = (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
     copied = [line.split()[1:-1] for line in DOCKERFILE.splitlines() if line.startswith("COPY ")]
     for source in (source for sources in copied for source in sources):
@@ -97,31 +97,31 @@ def test_whatever_is_copied_is_there_and_not_ignored() -> None:
 
 
 @pytest.mark.parametrize("name", BUILT)
-def test_a_service_is_built_from_a_target_of_the_dockerfile(name: str) -> None:
+def test_every_compose_service_is_built_from_an_existing_dockerfile_target(name: str) -> None:
     build = SERVICES[name]["build"]
     assert (COMPOSE.parent / build["context"] / build["dockerfile"]).samefile(ROOT / "docker" / "Dockerfile")
     assert build["target"] in stages()
 
 
 @pytest.mark.parametrize("name", BUILT)
-def test_no_service_starts_without_a_token_of_ones_own(name: str) -> None:
+def test_no_compose_service_starts_without_a_configured_token(name: str) -> None:
     tokens = {key: value for key, value in SERVICES[name]["environment"].items() if key.endswith("_TOKEN")}
     assert tokens
     assert all(value.startswith("${SURROGYM_TOKEN:?expected ") for value in tokens.values())
 
 
 @pytest.mark.parametrize("name", CLIENTS)
-def test_a_client_gives_a_known_command_and_waits_by_itself(name: str) -> None:
+def test_compose_clients_use_existing_commands_and_wait_for_the_server(name: str) -> None:
     values = parse([DEFAULT.sub(r"\1", word) for word in SERVICES[name]["command"]])
     assert values["wait"] >= 60
     assert SERVICES[name]["environment"]["SURROGYM_URL"] == "${SURROGYM_URL:-http://server:8000}"
 
 
-def test_the_server_is_reachable_from_this_machine_alone() -> None:
+def test_the_compose_server_port_is_bound_to_loopback_only() -> None:
     assert [port.startswith("127.0.0.1:") for port in SERVICES["server"]["ports"]] == [True]
 
 
-def test_database_and_policy_lie_in_the_volume() -> None:
+def test_database_and_policies_of_the_compose_services_are_in_a_volume() -> None:
     assert "SURROGYM_DATABASE=/data/" in last("server", "ENV")
     trainer = SERVICES["trainer"]
     policy = parse([DEFAULT.sub(r"\1", word) for word in trainer["command"]])["out"]
@@ -129,11 +129,11 @@ def test_database_and_policy_lie_in_the_volume() -> None:
     assert SERVICES["server"]["volumes"] == trainer["volumes"] == ["data:/data"]
 
 
-def test_samplers_can_be_scaled() -> None:
+def test_the_compose_sampler_service_can_be_scaled() -> None:
     assert not {"container_name", "ports"} & SERVICES["sampler"].keys()
 
 
-def test_what_is_not_built_here_waits_for_its_profile_and_has_a_version() -> None:
+def test_third_party_compose_services_have_a_profile_and_a_pinned_version() -> None:
     profiles = {name: service["profiles"] for name, service in SERVICES.items() if "profiles" in service}
     assert profiles == {
         "postgresql": ["team", "cluster"],
@@ -147,7 +147,7 @@ def test_what_is_not_built_here_waits_for_its_profile_and_has_a_version() -> Non
         assert all(port.startswith("127.0.0.1:") for port in service.get("ports", []))
 
 
-def test_the_cluster_has_one_image_and_opens_no_port_but_the_proxys() -> None:
+def test_the_compose_cluster_uses_one_image_and_opens_only_the_proxy_port() -> None:
     assert {SERVICES[name]["image"] for name in CLUSTER} == {"surrogym-cluster"}
     assert {SERVICES[name]["build"]["target"] for name in CLUSTER} == {"cluster"}
     assert [name for name in (*CLUSTER, "proxy") if "ports" in SERVICES[name]] == ["proxy"]
@@ -155,7 +155,7 @@ def test_the_cluster_has_one_image_and_opens_no_port_but_the_proxys() -> None:
     assert "docker/front.sh /usr/local/bin/front.sh" in last("cluster", "COPY")
 
 
-def test_ray_has_the_options_that_it_is_started_with() -> None:
+def test_ray_start_supports_the_options_used_in_the_compose_file() -> None:
     scripts = pytest.importorskip("ray.scripts.scripts")
     known = {option for parameter in scripts.start.params for option in parameter.opts}
     commands = [SERVICES[name]["command"] for name in ("ray-head", "ray-node")]
@@ -166,12 +166,12 @@ def test_ray_has_the_options_that_it_is_started_with() -> None:
         assert {word for word in words if word.startswith("--")} <= known
 
 
-def test_no_other_program_goes_before_a_step_of_a_session_host() -> None:
+def test_compose_session_hosts_run_without_lowered_cpu_priority() -> None:
     assert SERVICES["ray-node"]["environment"]["RAY_worker_niceness"] == "0"
 
 
 @pytest.mark.skipif(shutil.which("haproxy", path=SEARCHED) is None, reason="HAProxy is not on this machine")
-def test_haproxy_understands_the_configuration_of_the_load_balancer() -> None:
+def test_the_load_balancer_configuration_is_valid_for_haproxy() -> None:
     program = shutil.which("haproxy", path=SEARCHED)
     ended = subprocess.run(
         [str(program), "-c", "-f", COMPOSE.parent / "haproxy.cfg"], capture_output=True, text=True, check=False
@@ -179,13 +179,13 @@ def test_haproxy_understands_the_configuration_of_the_load_balancer() -> None:
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
-def test_the_script_of_a_front_server_can_run_and_joins_without_cpus() -> None:
+def test_the_front_server_script_is_executable_and_joins_ray_without_cpus() -> None:
     script = COMPOSE.parent / "front.sh"
     assert script.stat().st_mode & 0o111
     assert "--num-cpus 0" in script.read_text(encoding="utf-8")
 
 
-def test_what_is_mounted_is_there() -> None:
+def test_every_path_mounted_by_the_compose_file_exists() -> None:
     mounts = [volume.split(":")[0] for service in ADDED.values() for volume in service["volumes"]]
     files = [mount for mount in mounts if mount.startswith("./")]
     assert len(files) == 4

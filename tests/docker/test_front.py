@@ -36,7 +36,9 @@ def begun_for(head: str) -> list[int]:
     return found
 
 
-def test_a_front_server_joins_the_cluster_serves_and_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_front_server_container_script_joins_the_ray_cluster_serves_and_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("ray")
     monkeypatch.setenv("RAY_AUTH_MODE", "token")  # as the containers have it
     monkeypatch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))

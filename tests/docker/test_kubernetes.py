@@ -41,16 +41,16 @@ def problems(manifest: dict[str, Any]) -> list[str]:
 
 
 @pytest.mark.parametrize("name", OBJECTS)
-def test_a_manifest_keeps_its_schema(name: str) -> None:
+def test_every_kubernetes_manifest_matches_its_schema(name: str) -> None:
     assert problems(OBJECTS[name]) == []
 
 
 @pytest.mark.parametrize("name", OBJECTS)
-def test_a_misspelt_field_of_a_manifest_is_found(name: str) -> None:
+def test_the_schema_check_finds_a_misspelt_field_of_a_manifest(name: str) -> None:
     assert problems({**OBJECTS[name], "specs": {}})
 
 
-def test_a_misspelt_field_of_a_pod_is_found() -> None:
+def test_the_schema_check_finds_a_misspelt_field_of_a_pod() -> None:
     for kind, spec in (("Deployment", {"template": {**FRONT, "spek": 1}, "selector": {}}), ("RayCluster", {**CLUSTER})):
         wrong = {"apiVersion": OBJECTS_OF[kind]["apiVersion"], "kind": kind, "metadata": {"name": "x"}, "spec": spec}
         if kind == "RayCluster":
@@ -61,12 +61,12 @@ def test_a_misspelt_field_of_a_pod_is_found() -> None:
 OBJECTS_OF = {one["kind"]: one for one in OBJECTS.values()}
 
 
-def test_every_manifest_is_applied() -> None:
+def test_every_kubernetes_manifest_is_listed_for_application() -> None:
     applied = {*KUSTOMIZATION["resources"], "kustomization.yaml"}
     assert {path.name for path in FOLDER.glob("*.yaml")} == applied
 
 
-def test_the_secret_has_what_the_pods_read_and_stays_out_of_the_checkout() -> None:
+def test_the_kubernetes_secret_has_the_keys_the_pods_read_and_is_not_versioned() -> None:
     assert KUSTOMIZATION["secretGenerator"] == [{"name": "surrogym", "envs": ["secrets.env"]}]
     asked = {one["valueFrom"]["secretKeyRef"]["key"] for one in SERVER["env"] if "valueFrom" in one}
     assert asked == set(SECRET)
@@ -76,7 +76,7 @@ def test_the_secret_has_what_the_pods_read_and_stays_out_of_the_checkout() -> No
     assert not (FOLDER / "secrets.env").exists() or "CHANGE-ME" not in (FOLDER / "secrets.env").read_text()
 
 
-def test_the_front_server_understands_its_variables() -> None:
+def test_the_kubernetes_front_server_accepts_its_environment_variables() -> None:
     given = {
         one["name"]: one.get("value", SECRET.get(one.get("valueFrom", {}).get("secretKeyRef", {}).get("key"), ""))
         for one in SERVER["env"]
@@ -90,23 +90,23 @@ def test_the_front_server_understands_its_variables() -> None:
     assert settings.ray_hosts + settings.fit_workers <= cpus
 
 
-def test_front_servers_find_the_head_by_the_name_that_kuberay_gives() -> None:
+def test_kubernetes_front_servers_use_the_ray_head_name_of_kuberay() -> None:
     head = next(one["value"] for one in SERVER["env"] if one["name"] == "RAY_HEAD")
     assert head == f"{OBJECTS['RayCluster surrogym']['metadata']['name']}-head-svc:6379"
 
 
-def test_ray_is_the_version_that_the_image_has() -> None:
+def test_the_kubernetes_ray_version_is_that_of_the_image() -> None:
     pinned = re.search(r"^ray==(\S+)", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE)
     assert pinned is not None
     assert CLUSTER["rayVersion"] == pinned[1]
 
 
-def test_no_other_program_goes_before_a_step_of_a_session_host() -> None:
+def test_kubernetes_session_hosts_run_without_lowered_cpu_priority() -> None:
     [container] = PODS["node"]["spec"]["containers"]
     assert {"name": "RAY_worker_niceness", "value": "0"} in container["env"]
 
 
-def test_probes_ask_for_life_and_readiness_apart() -> None:
+def test_kubernetes_liveness_and_readiness_probes_use_separate_routes() -> None:
     assert SERVER["livenessProbe"]["httpGet"]["path"] == SERVER["startupProbe"]["httpGet"]["path"] == "/healthz"
     assert SERVER["readinessProbe"]["httpGet"]["path"] == "/readyz"
     for pod in PODS.values():
@@ -114,7 +114,7 @@ def test_probes_ask_for_life_and_readiness_apart() -> None:
         assert {"livenessProbe", "readinessProbe"} <= container.keys()
 
 
-def test_service_ingress_and_autoscaler_lead_to_the_front_servers() -> None:
+def test_service_ingress_and_autoscaler_select_the_front_servers() -> None:
     service = OBJECTS["Service front"]["spec"]
     assert service["selector"].items() <= FRONT["metadata"]["labels"].items()
     assert service["ports"][0]["targetPort"] == SERVER["ports"][0]["name"]
@@ -129,7 +129,7 @@ def test_service_ingress_and_autoscaler_lead_to_the_front_servers() -> None:
 
 
 @pytest.mark.parametrize("name", PODS)
-def test_no_pod_runs_as_root_or_opens_rays_ports(name: str) -> None:
+def test_no_kubernetes_pod_runs_as_root_or_exposes_ray_ports(name: str) -> None:
     pod = PODS[name]
     assert (pod["spec"]["securityContext"]["runAsNonRoot"], pod["spec"]["securityContext"]["runAsUser"]) == (True, 1000)
     assert all(

@@ -34,13 +34,11 @@ def run(folder: Path, *arguments: str) -> str:
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_a_surrogate_is_stepped(server: ServerProcess, tmp_path: Path, number: int) -> None:
+def test_the_how_to_program_for_stepping_a_surrogate_runs(server: ServerProcess, tmp_path: Path, number: int) -> None:
     run(tmp_path, "-c", programs("trainers.md")[number].replace(PRINTED_URL, server.url))
 
 
-def test_a_policy_of_another_algorithm_is_trained_and_its_states_are_known(
-    server: ServerProcess, tmp_path: Path
-) -> None:
+def test_the_how_to_program_for_training_with_another_algorithm_runs(server: ServerProcess, tmp_path: Path) -> None:
     program = programs("trainers.md")[2]
     run(tmp_path, "-c", program.replace(PRINTED_URL, server.url).replace("10_000", "500"))
     assert (tmp_path / "mine.zip").exists()
@@ -49,7 +47,7 @@ def test_a_policy_of_another_algorithm_is_trained_and_its_states_are_known(
     assert view["budget"] == 7
 
 
-def test_a_surrogate_leaves_as_a_file_and_is_stepped_without_a_server(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_how_to_program_for_stepping_a_surrogate_file_runs(server: ServerProcess, tmp_path: Path) -> None:
     on_server = ["--server", server.url]
     run(tmp_path, "-m", "surrogym", "export", "pendulum", "--out", "pendulum.surrogate", *on_server)
     run(tmp_path, "-m", "surrogym", "import", "pendulum.surrogate", "--name", "pendulum-2", *on_server)
@@ -57,14 +55,14 @@ def test_a_surrogate_leaves_as_a_file_and_is_stepped_without_a_server(server: Se
         run(tmp_path, "-c", program.replace(PRINTED_URL, server.url).replace("10_000", "512"))
 
 
-def test_an_episode_is_filmed(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_how_to_program_for_filming_an_episode_runs(server: ServerProcess, tmp_path: Path) -> None:
     film, own = programs("policies.md")[-2:]
     run(tmp_path, "-c", film.replace(PRINTED_URL, server.url))
     assert [video.stat().st_size > 0 for video in (tmp_path / "videos").glob("*.mp4")] == [True]
     run(tmp_path, "-c", f"{own}\nassert Cart().picture([0.5])[30, 140].tolist() == [200, 60, 20]")
 
 
-def test_the_lines_of_the_terminal_page_work(
+def test_the_commands_of_the_terminal_how_to_page_run(
     server: ServerProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SURROGYM_URL", server.url)
@@ -78,7 +76,7 @@ def test_the_lines_of_the_terminal_page_work(
 
 
 @pytest.mark.timeout(900)  # on a machine that others use as well
-def test_a_policy_leaves_for_other_programs(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_how_to_program_for_exporting_a_policy_runs(server: ServerProcess, tmp_path: Path) -> None:
     train = ["train", "pendulum", "--steps", "512", "--num-envs", "16", "--quiet", "--server", server.url]
     run(tmp_path, "-m", "surrogym", *train)
     for file in ("policy.onnx", "policy.pt2"):
@@ -89,7 +87,7 @@ def test_a_policy_leaves_for_other_programs(server: ServerProcess, tmp_path: Pat
     assert json.loads(run(tmp_path, "-m", "surrogym", *evaluate))["episodes"] == 2
 
 
-def test_the_wagon_that_can_only_be_reset_is_registered_and_sampled(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_how_to_program_for_a_reset_only_environment_runs(server: ServerProcess, tmp_path: Path) -> None:
     program, _ = programs("no-teleport.md")
     (tmp_path / "wagon.py").write_text(program, encoding="utf-8")
     common = ["--server", server.url, "--json", "--quiet"]
@@ -100,13 +98,13 @@ def test_the_wagon_that_can_only_be_reset_is_registered_and_sampled(server: Serv
     assert 12 <= report["steps"] <= 14
 
 
-def test_a_design_returns_to_saved_states_in_one_process(tmp_path: Path) -> None:
+def test_the_how_to_program_for_a_design_with_snapshots_runs(tmp_path: Path) -> None:
     _, program = programs("no-teleport.md")
     steps, phase = run(tmp_path, "-c", program).split()
     assert (int(steps) <= 100, phase) == (True, "ready")
 
 
-def test_the_rail_is_registered_and_sampled(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_how_to_program_for_an_own_environment_runs(server: ServerProcess, tmp_path: Path) -> None:
     (program,) = programs("own-environment.md")
     (tmp_path / "rail.py").write_text(program, encoding="utf-8")
     common = ["--server", server.url, "--json", "--quiet"]
@@ -116,13 +114,13 @@ def test_the_rail_is_registered_and_sampled(server: ServerProcess, tmp_path: Pat
     assert (report["answered"], report["failed"]) == (5, 0)
 
 
-def test_a_log_is_drafted_and_imported(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_how_to_commands_for_drafting_and_importing_a_log_run(server: ServerProcess, tmp_path: Path) -> None:
     (program,) = programs("logs.md")
     said = run(tmp_path, "-c", program.replace(PRINTED_URL, server.url))
     assert said.endswith("400 steps, 0 rows set aside\n")
 
 
-def test_a_reward_that_jumps_and_an_end_that_is_learned(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_how_to_program_for_learned_rewards_and_terminations_runs(server: ServerProcess, tmp_path: Path) -> None:
     (tmp_path / "track.py").write_text(programs("rewards-and-terminations.md")[0], encoding="utf-8")
     common = ["--server", server.url, "--json", "--quiet"]
     run(tmp_path, "-m", "surrogym", "register", "track:Track", "--name", "track", "--budget", "6", *common)
@@ -133,13 +131,13 @@ def test_a_reward_that_jumps_and_an_end_that_is_learned(server: ServerProcess, t
         run(tmp_path, "-c", program)
 
 
-def test_a_policy_acts_on_a_machine_with_a_past(tmp_path: Path) -> None:
+def test_the_how_to_program_for_a_policy_with_lagged_inputs_runs(tmp_path: Path) -> None:
     machine, own_program = programs("history.md")
     (tmp_path / "tank.py").write_text(machine, encoding="utf-8")
     run(tmp_path, "-c", f"{own_program}\nassert abs(reading - 1) < 0.1, reading")
 
 
-def test_a_simulator_is_a_prior_in_this_process(tmp_path: Path) -> None:
+def test_the_how_to_program_for_a_simulator_prior_runs(tmp_path: Path) -> None:
     plant, program = programs("priors.md")
     (tmp_path / "arm.py").write_text(plant)
     phase, steps, _ = run(tmp_path, "-c", program).split(maxsplit=2)

@@ -54,7 +54,7 @@ class Shell:
                 self.names |= {"QUERY": str(query), "LEASE": lease}
 
 
-def test_every_curl_line_works_in_its_order(server: ServerProcess, tmp_path: Path) -> None:
+def test_every_curl_command_of_the_http_pages_works_in_order(server: ServerProcess, tmp_path: Path) -> None:
     with httpx.Client(base_url=server.url, timeout=150) as client:
         shell = Shell(client, tmp_path)
         replies = [(line, shell.run(line)) for line in requests()]
@@ -63,7 +63,7 @@ def test_every_curl_line_works_in_its_order(server: ServerProcess, tmp_path: Pat
     assert steps[0] == steps[1]
 
 
-def test_every_error_code_stands_beside_its_status() -> None:
+def test_the_http_page_lists_every_error_code_with_its_status() -> None:
     rows = re.findall(r"^\| ([\d, ]+) \| (.*) \|$", PAGE, re.MULTILINE)
     told = {
         (int(status), code) for statuses, codes in rows for status in statuses.split(", ") for code in _words(codes)

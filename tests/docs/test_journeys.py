@@ -96,7 +96,7 @@ SAVED = re.compile(r"[Ss]ave (?:this|it) as `(\S+\.py)`")
 
 @pytest.mark.timeout(900)  # on a machine that others use as well
 @pytest.mark.parametrize("page", PAGES + (ALL_PAGES if os.environ.get("DOCS") == "full" else []))
-def test_a_page_is_followed_from_top_to_bottom(page: str, tmp_path: Path) -> None:
+def test_all_commands_and_programs_of_a_documentation_page_run_in_order(page: str, tmp_path: Path) -> None:
     server_folder, folder = tmp_path / "server", tmp_path / "reader"
     server_folder.mkdir()
     folder.mkdir()
@@ -150,7 +150,7 @@ def shortened(words: list[str]) -> list[str] | None:
     return ["-m", "surrogym", *words[1:], *more]
 
 
-def test_each_page_with_commands_is_followed_or_known_to_be_run_elsewhere() -> None:
+def test_every_documentation_page_with_commands_is_run_by_a_test() -> None:
     pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
     found = {
         str(page.relative_to(ROOT)) for page in pages if re.search(r"^```(?!json|text|$)\S", page.read_text(), re.M)
@@ -158,7 +158,7 @@ def test_each_page_with_commands_is_followed_or_known_to_be_run_elsewhere() -> N
     assert found == {*PAGES, *ALL_PAGES, *OTHERWISE}
 
 
-def test_ones_own_environment_takes_less_than_thirty_lines() -> None:
+def test_the_own_environment_of_the_tutorial_has_less_than_thirty_lines() -> None:
     text = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
     (own,) = [content for kind, content in steps(text) if kind == "file" and content.startswith("cart.py\n")]
     assert len([line for line in own.splitlines()[1:] if line]) < OWN_LINES

@@ -10,10 +10,10 @@ from surrogym_lab.reproduce.rows import read_rows
 ROOT = Path(__file__).parents[2]
 
 
-def test_its_commands_are_there():
+def test_the_lab_has_the_commands_efficiency_paper_and_table():
     assert {"efficiency", "paper", "table"} <= command_line(build).commands.keys()
 
 
-def test_the_page_of_results_shows_its_rows():
+def test_the_evidence_page_shows_the_recorded_result_rows():
     rows = read_rows(ROOT / "lab" / "records" / "results" / "efficiency-audited.csv")
     assert present_sections(ROOT / "docs" / "evidence.md") == {"headline": section("headline", rows, ".")}

@@ -24,7 +24,7 @@ def shown(default: Any) -> str:
     return f"{default:g}" if isinstance(default, float) else str(default).lower()
 
 
-def test_the_table_of_settings_equals_the_code() -> None:
+def test_the_documented_table_of_server_settings_equals_the_code() -> None:
     options = inspect.signature(serve).parameters
     wanted = {
         PREFIX + name.upper(): (
@@ -38,7 +38,7 @@ def test_the_table_of_settings_equals_the_code() -> None:
     assert len(rows) == len(wanted)
 
 
-def test_pages_name_only_settings_that_exist() -> None:
+def test_documentation_pages_name_only_existing_server_settings() -> None:
     known = {PREFIX + name.upper() for name in Settings.model_fields} | NOT_SETTINGS
     pages = DOCS.rglob("*.md")
     named = {name for page in pages for name in re.findall(r"\bSURROGYM_[A-Z_]*[A-Z]\b", page.read_text("utf-8"))}

@@ -43,7 +43,7 @@ def anchors(page: Path) -> set[str]:
 
 
 @each_page
-def test_links_lead_somewhere(page: Path) -> None:
+def test_every_documentation_link_has_an_existing_target(page: Path) -> None:
     broken = []
     for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
         if re.match(r"\w+:", link):
@@ -56,7 +56,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 
 @each_page
-def test_the_tests_that_a_page_names_are_there(page: Path) -> None:
+def test_every_test_named_in_the_documentation_exists(page: Path) -> None:
     named = re.findall(
         r"(?<![\w/])(?:lab/)?(?:tests|benchmarks)/[\w/-]+(?:\.(?:py|json|toml))?", page.read_text(encoding="utf-8")
     )
@@ -70,7 +70,7 @@ def named(words: list[str]) -> list[str]:
 
 
 @each_page
-def test_commands_exist_with_their_options(page: Path) -> None:
+def test_every_documented_command_exists_with_its_options(page: Path) -> None:
     for words in commands(page, "surrogym"):
         if words[0].startswith("--"):
             assert words[0] in options()
@@ -83,14 +83,14 @@ def test_commands_exist_with_their_options(page: Path) -> None:
 
 
 @each_page
-def test_targets_of_make_exist(page: Path) -> None:
+def test_every_documented_make_target_exists(page: Path) -> None:
     targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     named = {words[0] for words in commands(page, "make")}
     assert named <= set(targets)
 
 
 @each_page
-def test_python_parses_and_its_imports_work(page: Path) -> None:
+def test_documented_python_code_parses_and_its_imports_work(page: Path) -> None:
     for block in re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE):
         for node in ast.walk(ast.parse(block)):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("surrogym_"):
@@ -99,7 +99,7 @@ def test_python_parses_and_its_imports_work(page: Path) -> None:
 
 
 @each_page
-def test_rows_of_a_table_have_the_cells_of_its_header(page: Path) -> None:
+def test_rows_of_documentation_tables_have_as_many_cells_as_their_header(page: Path) -> None:
     """No row is cut off or runs into the text behind it."""
     text = re.sub(r"^```.*?^```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
     for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
@@ -107,5 +107,5 @@ def test_rows_of_a_table_have_the_cells_of_its_header(page: Path) -> None:
         assert all(line.rstrip().endswith("|") for line in table.splitlines()), table
 
 
-def test_there_are_pages() -> None:
+def test_the_documentation_tests_find_pages() -> None:
     assert {"README.md", "docs/architecture.md", "docs/http-api.md", "docs/glossary.md"} <= set(NAMES)

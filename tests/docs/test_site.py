@@ -32,7 +32,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_it_builds_with_every_page_in_its_navigation(site: Path) -> None:
+def test_the_documentation_site_builds_with_every_page_in_its_navigation(site: Path) -> None:
     pages = {path.relative_to(ROOT / "docs").with_suffix(".html") for path in (ROOT / "docs").rglob("*.md")}
     built = {path.relative_to(site) for path in site.rglob("*.html")}
     assert pages <= built
@@ -40,7 +40,7 @@ def test_it_builds_with_every_page_in_its_navigation(site: Path) -> None:
     assert [str(page) for page in pages if f'href="{page}"' not in home] == []
 
 
-def test_links_to_records_outside_the_site_are_paths_in_the_repository(site: Path) -> None:
+def test_site_links_to_records_outside_the_site_are_existing_repository_paths(site: Path) -> None:
     architecture = (site / "architecture.html").read_text(encoding="utf-8")
     assert "<code>lab/records/decisions/README.md</code>" in architecture
     outside = {
@@ -49,26 +49,26 @@ def test_links_to_records_outside_the_site_are_paths_in_the_repository(site: Pat
     assert outside == set()
 
 
-def test_nothing_is_loaded_from_another_host(site: Path) -> None:
+def test_the_documentation_site_loads_nothing_from_another_host(site: Path) -> None:
     pages = [*site.rglob("*.html"), *site.rglob("*.css")]
     found = {str(page.relative_to(site)): LOADED.findall(page.read_text(encoding="utf-8")) for page in pages}
     assert {page: loads for page, loads in found.items() if loads} == {}
 
 
-def test_every_command_is_in_the_reference(site: Path) -> None:
+def test_every_command_is_in_the_site_reference(site: Path) -> None:
     page = (site / "reference" / "commands.html").read_text(encoding="utf-8")
     names = [name for name, command in command_line().commands.items() if not command.hidden]
     assert [name for name in names if f"surrogym {name}" not in page] == []
 
 
-def test_every_route_is_in_the_reference_with_its_options(site: Path) -> None:
+def test_every_http_route_is_in_the_site_reference_with_its_parameters(site: Path) -> None:
     page = (site / "reference" / "http.html").read_text(encoding="utf-8")
     assert "POST /v1/surrogates/{name}/policies" in page
     fields = OpenSession.model_fields
     assert [name for name in fields if f"<code>{name}</code>" not in page] == []
 
 
-def test_the_client_is_in_the_reference_with_its_docstrings(site: Path) -> None:
+def test_the_python_client_is_in_the_site_reference_with_its_docstrings(site: Path) -> None:
     page = (site / "reference" / "client.html").read_text(encoding="utf-8")
     assert "Vector environment of Stable-Baselines3 whose lanes are virtual environments of one surrogate" in page
     assert "surrogym_client.transport.Api.create_surrogate" in page

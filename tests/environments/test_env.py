@@ -15,7 +15,7 @@ from surrogym_client.sb3 import SurrogateVecEnv
 ACTION = np.array([0.5], dtype=np.float32)
 
 
-def test_it_gives_the_trajectory_of_the_environment_behind_it():
+def test_the_remote_environment_gives_the_same_trajectory_as_the_local_one():
     remote, reference = RemoteEnv(ExactPendulum()), ExactEnv()
     for seed in (3, None, None):
         (ours, info), (theirs, expected) = remote.reset(seed=seed), reference.reset(seed=seed)
@@ -29,7 +29,7 @@ def test_it_gives_the_trajectory_of_the_environment_behind_it():
             over = ours[2] or ours[3]
 
 
-def test_values_have_gymnasiums_types():
+def test_the_remote_environment_returns_gymnasiums_value_types():
     env = RemoteEnv(ExactPendulum())
     observation, _ = env.reset(seed=0)
     assert observation in env.observation_space
@@ -38,14 +38,14 @@ def test_values_have_gymnasiums_types():
     assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
 
 
-def test_seed_zero_is_a_seed():
+def test_resetting_the_remote_environment_with_seed_zero_is_reproducible():
     env = RemoteEnv(ExactPendulum())
     first, _ = env.reset(seed=0)
     env.reset()
     np.testing.assert_array_equal(env.reset(seed=0)[0], first)
 
 
-def test_a_step_after_the_end_is_refused():
+def test_a_step_after_the_end_of_an_episode_is_refused():
     env = RemoteEnv(ExactPendulum(), time_limit=1)
     env.reset(seed=0)
     env.step(ACTION)
@@ -53,7 +53,7 @@ def test_a_step_after_the_end_is_refused():
         env.step(ACTION)
 
 
-def test_options_reach_the_session():
+def test_keyword_options_of_the_remote_environment_reach_its_session():
     port = ExactPendulum()
     RemoteEnv(port, variant="probabilistic", seed=4, penalty=1.5)
     request = port.opened[0]
@@ -61,14 +61,14 @@ def test_options_reach_the_session():
     assert request.autoreset_mode == "disabled"
 
 
-def test_a_value_out_of_range_is_named():
+def test_the_error_for_an_out_of_range_option_names_it():
     with pytest.raises(ValueError, match=r"session options: penalty: .*got -1"):
         RemoteEnv(ExactPendulum(), penalty=-1.0)
 
 
 @pytest.mark.parametrize("kind", [RemoteEnv, RemoteVectorEnv, SurrogateVecEnv.from_port])
 @pytest.mark.parametrize("name", ["varaint", "frameskip", "num_lanes"])
-def test_an_unknown_keyword_is_refused_in_pythons_words(kind: Callable[..., object], name: str):
+def test_an_unknown_keyword_of_the_remote_environment_raises_type_error(kind: Callable[..., object], name: str):
     """Trainers try keywords and take back those refused like this: TorchRL's ``GymEnv`` tries ``frameskip``."""
     port = ExactPendulum()
     with pytest.raises(TypeError, match=rf"got an unexpected keyword argument '{name}'.*variant, seed"):
@@ -76,30 +76,30 @@ def test_an_unknown_keyword_is_refused_in_pythons_words(kind: Callable[..., obje
     assert port.opened == []
 
 
-def test_one_lane_takes_no_autoreset_mode():
+def test_the_single_remote_environment_takes_no_autoreset_mode():
     with pytest.raises(TypeError, match="unexpected keyword argument 'autoreset_mode'"):
         RemoteEnv(ExactPendulum(), autoreset_mode="same_step")
 
 
-def test_rendering_is_refused():
+def test_rendering_a_remote_environment_without_render_mode_is_refused():
     with pytest.raises(ValueError, match=r"expected render_mode.*'human'"):
         RemoteEnv(ExactPendulum(), render_mode="human")
 
 
-def test_deviation_is_returned_on_request():
+def test_the_predictive_deviation_is_in_the_infos_on_request():
     env = RemoteEnv(ExactPendulum(), deviations=True)
     env.reset(seed=0)
     assert env.step(ACTION)[-1]["deviation"].shape == (3,)
 
 
-def test_it_pickles_and_continues():
+def test_a_pickled_remote_environment_continues():
     env = RemoteEnv(ExactPendulum())
     env.reset(seed=1)
     again = pickle.loads(pickle.dumps(env))
     np.testing.assert_array_equal(again.step(ACTION)[0], env.step(ACTION)[0])
 
 
-def test_close_ends_the_session():
+def test_closing_the_remote_environment_ends_its_session():
     port = ExactPendulum()
     with RemoteEnv(port) as env:
         assert isinstance(env, gymnasium.Env)

@@ -30,7 +30,7 @@ def start_of_new_session(port: ExactPendulum) -> np.ndarray:
     return np.stack([type(lane)(lane.seed, lane.lane).reset() for lane in lanes])
 
 
-def test_a_single_environment_is_truncated_and_begins_anew_at_reset(port: ExactPendulum):
+def test_a_lost_session_truncates_the_episode_and_reset_starts_a_new_one(port: ExactPendulum):
     env = RemoteEnv(port, seed=5)
     env.reset()
     last, *_ = env.step(ZERO[0])
@@ -43,7 +43,7 @@ def test_a_single_environment_is_truncated_and_begins_anew_at_reset(port: ExactP
     assert LOST not in env.step(ZERO[0])[-1]
 
 
-def test_next_step_shows_the_new_start_one_step_later(port: ExactPendulum):
+def test_after_a_lost_session_mode_next_step_returns_the_new_start_one_step_later(port: ExactPendulum):
     envs = vector(port, AutoresetMode.NEXT_STEP)
     last, *_ = envs.step(ZERO)
     port.lose()
@@ -62,7 +62,7 @@ def test_next_step_shows_the_new_start_one_step_later(port: ExactPendulum):
     assert not np.array_equal(moved, start)
 
 
-def test_next_step_ends_no_episode_twice(port: ExactPendulum):
+def test_a_lost_session_does_not_end_an_already_ended_episode_again(port: ExactPendulum):
     """A lane that had ended before the loss is only shown its new start."""
     envs = vector(port, AutoresetMode.NEXT_STEP)
     over = np.zeros(LANES, dtype=bool)
@@ -81,7 +81,7 @@ def test_next_step_ends_no_episode_twice(port: ExactPendulum):
     assert not np.array_equal(following[over], start_of_new_session(port)[over])
 
 
-def test_same_step_gives_the_last_observation_as_the_final_one(port: ExactPendulum):
+def test_after_a_lost_session_mode_same_step_returns_the_last_observation_as_final(port: ExactPendulum):
     envs = vector(port, AutoresetMode.SAME_STEP)
     last, *_ = envs.step(ZERO)
     port.lose()
@@ -93,7 +93,7 @@ def test_same_step_gives_the_last_observation_as_the_final_one(port: ExactPendul
     assert LOST not in infos
 
 
-def test_stable_baselines3_bootstraps_from_the_last_observation(port: ExactPendulum):
+def test_after_a_lost_session_stable_baselines3_bootstraps_from_the_last_observation(port: ExactPendulum):
     envs = SurrogateVecEnv.from_port(port, LANES)
     last = envs.reset()
     port.lose()
@@ -106,7 +106,7 @@ def test_stable_baselines3_bootstraps_from_the_last_observation(port: ExactPendu
         assert "lost with a crash" in info[LOST]
 
 
-def test_disabled_truncates_and_waits_for_a_reset(port: ExactPendulum):
+def test_after_a_lost_session_autoreset_mode_disabled_waits_for_a_reset(port: ExactPendulum):
     envs = vector(port, AutoresetMode.DISABLED)
     last, *_ = envs.step(ZERO)
     port.lose()
@@ -120,7 +120,7 @@ def test_disabled_truncates_and_waits_for_a_reset(port: ExactPendulum):
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))
-def test_a_loss_found_by_a_partial_reset_ends_the_other_lanes_at_the_next_step(
+def test_a_lost_session_found_by_a_masked_reset_truncates_the_other_environments(
     port: ExactPendulum, mode: AutoresetMode
 ):
     envs = vector(port, mode)
@@ -149,7 +149,7 @@ def test_a_lost_session_found_by_a_full_reset_is_reported(port: ExactPendulum):
     assert "lost with a crash" in info[LOST]
 
 
-def test_the_new_session_has_new_starts_and_the_same_settings(port: ExactPendulum):
+def test_a_session_that_replaces_a_lost_one_has_new_seeds_and_the_same_settings(port: ExactPendulum):
     def run(seed: int) -> list[int]:
         own = ExactPendulum()
         env = RemoteEnv(own, seed=seed, penalty=2.0)
@@ -163,7 +163,7 @@ def test_the_new_session_has_new_starts_and_the_same_settings(port: ExactPendulu
     assert len(set(run(5) + run(6))) == 6
 
 
-def test_losing_every_new_session_at_once_is_given_up(port: ExactPendulum):
+def test_the_client_gives_up_if_every_new_session_is_lost_at_once(port: ExactPendulum):
     envs = vector(port, AutoresetMode.SAME_STEP)
     opened = port.open
 

@@ -31,7 +31,7 @@ def port(pendulum_server) -> HttpSurrogate:
 
 
 @pytest.mark.parametrize("variant", ["deterministic", "probabilistic"])
-def test_both_checkers_pass(pendulum_server, variant: str):
+def test_the_environment_checkers_of_gymnasium_and_stable_baselines3_pass(pendulum_server, variant: str):
     assert surrogym_client.register
     options = {"variant": variant, "particles": 20} if variant == "probabilistic" else {}
     env = gymnasium.make(ID, url=pendulum_server.url, surrogate="pendulum", **options)
@@ -40,7 +40,7 @@ def test_both_checkers_pass(pendulum_server, variant: str):
     env.close()
 
 
-def test_make_gives_one_lane_with_the_time_limit_of_the_server(pendulum_server):
+def test_gymnasium_make_returns_one_environment_with_the_servers_time_limit(pendulum_server):
     env = gymnasium.make(ID, url=pendulum_server.url, surrogate="pendulum", time_limit=3)
     assert isinstance(env.unwrapped, RemoteEnv)
     env.reset(seed=0)
@@ -49,7 +49,7 @@ def test_make_gives_one_lane_with_the_time_limit_of_the_server(pendulum_server):
     env.close()
 
 
-def test_make_vec_gives_lanes_of_one_session(pendulum_server):
+def test_gymnasium_make_vec_returns_environments_of_one_session(pendulum_server):
     envs = gymnasium.make_vec(ID, num_envs=8, url=pendulum_server.url, surrogate="pendulum")
     assert isinstance(envs, RemoteVectorEnv)
     assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
@@ -61,7 +61,7 @@ def test_make_vec_gives_lanes_of_one_session(pendulum_server):
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_lanes_of_one_session_are_as_good_as_an_environment_each(port: HttpSurrogate, mode: AutoresetMode):
+def test_environments_of_one_session_equal_separate_sessions(port: HttpSurrogate, mode: AutoresetMode):
     options = {"time_limit": 5, "deviations": True}
     together = RemoteVectorEnv(port, len(SEEDS), autoreset_mode=mode, **options)
     apart = SyncVectorEnv([lambda: RemoteEnv(port, **options)] * len(SEEDS), autoreset_mode=mode)
@@ -81,7 +81,7 @@ SETTINGS: dict[type[BaseAlgorithm], dict[str, int]] = {
 
 
 @pytest.mark.parametrize("algorithm", list(SETTINGS))
-def test_any_algorithm_learns_on_it(pendulum_server, algorithm: type[BaseAlgorithm]):
+def test_algorithms_of_several_libraries_train_on_a_remote_environment(pendulum_server, algorithm: type[BaseAlgorithm]):
     envs = SurrogateVecEnv(pendulum_server.url, "pendulum", num_envs=4, time_limit=10)
     model = algorithm("MlpPolicy", envs, seed=0, device="cpu", **SETTINGS[algorithm])
     model.learn(total_timesteps=64)
@@ -91,7 +91,7 @@ def test_any_algorithm_learns_on_it(pendulum_server, algorithm: type[BaseAlgorit
     envs.close()
 
 
-def test_a_session_that_ended_on_the_server_is_replaced(port: HttpSurrogate):
+def test_a_session_that_expired_on_the_server_is_replaced_by_a_new_one(port: HttpSurrogate):
     envs = SurrogateVecEnv.from_port(port, 2, seed=0)
     last, ended = envs.reset(), envs.session
     port.close(ended)

@@ -64,7 +64,7 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", SPECS)
-def test_every_built_in_observation_tells_the_state(name: str) -> None:
+def test_the_state_can_be_recovered_from_every_built_in_observation(name: str) -> None:
     spec, rng = SPECS[name], np.random.default_rng(0)
     read = coordinates_from_observation(spec)
     for _ in range(20):
@@ -82,7 +82,7 @@ def mujoco_draws() -> bool:
 
 
 @pytest.mark.parametrize("name", SHOWN)
-def test_the_picture_is_the_originals_own(name: str, mujoco_draws: bool) -> None:
+def test_a_rendered_virtual_state_equals_the_original_environments_picture(name: str, mujoco_draws: bool) -> None:
     if name in SPECIFICATIONS and not mujoco_draws:
         pytest.skip("MuJoCo can't draw here: it needs a display, or libegl1 with MUJOCO_GL=egl")
     env = gymnasium.make(name, render_mode="rgb_array")
@@ -99,7 +99,7 @@ def test_the_picture_is_the_originals_own(name: str, mujoco_draws: bool) -> None
     env.close()
 
 
-def test_record_video_films_an_episode(tmp_path: Path) -> None:
+def test_gymnasiums_record_video_films_a_virtual_episode(tmp_path: Path) -> None:
     videos = tmp_path / "videos"
     virtual = RemoteEnv(ExactPendulum(), render_mode="rgb_array", time_limit=8)
     with RecordVideo(virtual, str(videos), disable_logger=True) as env:
@@ -114,7 +114,7 @@ def test_record_video_films_an_episode(tmp_path: Path) -> None:
         assert film.get_data(0).std() > 5
 
 
-def test_each_lane_is_shown() -> None:
+def test_rendering_a_vector_environment_returns_one_picture_per_environment() -> None:
     envs = RemoteVectorEnv(ExactPendulum(), 2, render_mode="rgb_array")
     envs.reset(seed=0)
     frames = envs.render()
@@ -126,7 +126,7 @@ def test_each_lane_is_shown() -> None:
     assert RemoteVectorEnv(ExactPendulum(), 2).render() is None
 
 
-def test_an_environment_of_ones_own_draws_itself(own: None) -> None:
+def test_virtual_states_are_rendered_by_an_own_environment_class(own: None) -> None:
     pictures = Pictures(LINE, "line:Line")
     assert pictures.of(np.array([2.0]))[0, 14].tolist() == [255] * 3  # far = 2 x + 1, so x = 0.5
     assert pictures.frames_per_second == 5
@@ -140,12 +140,12 @@ def test_an_environment_of_ones_own_draws_itself(own: None) -> None:
         (BLIND, "line:Line", "got none for 'x'"),
     ],
 )
-def test_an_impossible_picture_is_refused_with_a_reason(own: None, spec, original, message) -> None:
+def test_a_render_mode_that_cannot_work_is_refused_with_a_reason(own: None, spec, original, message) -> None:
     with pytest.raises(NotRenderable, match=message):
         Pictures(spec, original)
 
 
-def test_a_renderer_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_for_a_missing_renderer_package_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
     env = RemoteEnv(ExactPendulum(), render_mode="rgb_array")
     env.reset(seed=0)
@@ -171,13 +171,15 @@ def test_a_render_mode_is_declared_only_where_its_renderer_is_installed(kind, mo
         (BLIND, "line:Line", []),
     ],
 )
-def test_what_is_declared_follows_what_can_be_drawn(spec, original, modes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_declared_render_modes_are_those_that_can_be_drawn(
+    spec, original, modes, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for module in ("pygame", "mujoco"):
         monkeypatch.setitem(sys.modules, module, None)
     assert metadata_of(spec, original, None) == {"render_modes": modes}
 
 
-def test_rendering_before_a_reset_is_refused() -> None:
+def test_rendering_before_the_first_reset_is_refused() -> None:
     for env in (
         RemoteEnv(ExactPendulum(), render_mode="rgb_array"),
         RemoteVectorEnv(ExactPendulum(), 2, render_mode="rgb_array"),
@@ -186,7 +188,7 @@ def test_rendering_before_a_reset_is_refused() -> None:
             env.render()
 
 
-def test_an_impossible_rendering_opens_no_session() -> None:
+def test_a_refused_render_mode_opens_no_session() -> None:
     for kind in (RemoteEnv, RemoteVectorEnv):
         with pytest.raises(ValueError, match="expected render_mode None or rgb_array for a surrogate, got 'human'"):
             kind(port := ExactPendulum(), render_mode="human")

@@ -17,12 +17,12 @@ def run(code: str) -> str:
     return done.stdout
 
 
-def test_importing_the_package_registers_the_environment():
+def test_importing_the_package_registers_the_gymnasium_environment():
     code = "import gymnasium, surrogym_client; print(gymnasium.spec('surrogym/Remote-v0').entry_point)"
     assert run(code).strip() == "surrogym_client.environments.gym_factories:make_env"
 
 
-def test_gymnasium_may_be_imported_later():
+def test_the_gymnasium_environment_is_registered_even_if_gymnasium_is_imported_later():
     code = (
         "import sys, surrogym_client; before = 'gymnasium' in sys.modules\n"
         "import gymnasium; loader = type(gymnasium.__spec__.loader).__name__\n"
@@ -31,7 +31,7 @@ def test_gymnasium_may_be_imported_later():
     assert run(code).split() == ["False", "surrogym_client.environments.file_factories:make_env", "SourceFileLoader"]
 
 
-def test_help_loads_nothing_that_it_does_not_need():
+def test_printing_help_loads_only_needed_packages():
     """Most of the time of a command that asks a server would be these."""
     code = (
         "import sys\nfrom surrogym.cli import build\nbuild()\n"
@@ -40,7 +40,7 @@ def test_help_loads_nothing_that_it_does_not_need():
     assert run(code).strip() == "set()"
 
 
-def test_the_id_may_name_the_package_to_import():
+def test_gymnasium_make_accepts_an_id_that_names_the_package():
     code = (
         "import gymnasium\n"
         "try: gymnasium.make_vec('surrogym_client:surrogym/Remote-v0', url='nowhere', surrogate='x')\n"
@@ -49,7 +49,7 @@ def test_the_id_may_name_the_package_to_import():
     assert run(code).startswith("ServerUnreachable expected a server address")
 
 
-def test_without_a_surrogate_the_error_says_what_is_missing():
+def test_gymnasium_make_without_a_surrogate_name_tells_what_is_missing():
     for make in (gymnasium.make, partial(gymnasium.make_vec, num_envs=2)):
         with pytest.raises(
             ValueError, match=r'expected the name of a surrogate: gymnasium.make\("surrogym/Remote-v0", surrogate='
@@ -57,14 +57,14 @@ def test_without_a_surrogate_the_error_says_what_is_missing():
             make(ENVIRONMENT_ID, url="http://127.0.0.1:8000")
 
 
-def test_registering_twice_is_harmless():
+def test_registering_the_gymnasium_environment_twice_is_harmless():
     before = gymnasium.spec(ENVIRONMENT_ID)
     register()
     surrogym_client.register()
     assert gymnasium.spec(ENVIRONMENT_ID) is before
 
 
-def test_client_sampler_and_trainer_load_without_torch():
+def test_client_sampler_and_trainer_can_be_imported_without_torch():
     """In one process, the thinnest first: which module brings it is on its line."""
     modules = (
         "surrogym_client.transport",

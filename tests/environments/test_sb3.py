@@ -24,7 +24,7 @@ def assert_same_infos(ours: list[dict[str, object]], theirs: list[dict[str, obje
             np.testing.assert_array_equal(our[key], their[key], err_msg=key)
 
 
-def test_a_trajectory_is_dummy_vec_envs(remote: SurrogateVecEnv):
+def test_the_stable_baselines3_vec_env_gives_the_trajectory_of_dummy_vec_env(remote: SurrogateVecEnv):
     reference = DummyVecEnv([ExactEnv] * LANES)
     assert remote.seed(11) == reference.seed(11)
     np.testing.assert_array_equal(remote.reset(), reference.reset())
@@ -41,7 +41,7 @@ def test_a_trajectory_is_dummy_vec_envs(remote: SurrogateVecEnv):
     assert cut > 3, "expected several episodes to reach the time limit"
 
 
-def test_an_episode_that_terminates_at_its_time_limit_is_not_bootstrapped():
+def test_an_episode_that_terminates_at_its_time_limit_is_not_marked_truncated():
     def end_of(time_limit: int) -> tuple[int, dict[str, object]]:
         envs = SurrogateVecEnv.from_port(ExactPendulum(), 1, seed=0, time_limit=time_limit)
         envs.reset()
@@ -58,7 +58,7 @@ def test_an_episode_that_terminates_at_its_time_limit_is_not_bootstrapped():
     assert end_of(terminated_at - 1)[1]["TimeLimit.truncated"]
 
 
-def test_seeds_are_used_once(remote: SurrogateVecEnv):
+def test_a_seed_set_on_the_vec_env_is_used_by_one_reset(remote: SurrogateVecEnv):
     remote.seed(3)
     first = remote.reset()
     assert not np.array_equal(remote.reset(), first)
@@ -66,7 +66,7 @@ def test_seeds_are_used_once(remote: SurrogateVecEnv):
     np.testing.assert_array_equal(remote.reset(), first)
 
 
-def test_a_lane_has_what_was_set_on_it(remote: SurrogateVecEnv):
+def test_attributes_set_on_single_environments_of_the_vec_env_are_returned(remote: SurrogateVecEnv):
     remote.set_attr("mark", 1, indices=[0, 2])
     assert remote.get_attr("mark", indices=[0, 2]) == [1, 1]
     assert not remote.has_attr("mark")
@@ -76,22 +76,22 @@ def test_a_lane_has_what_was_set_on_it(remote: SurrogateVecEnv):
         remote.get_attr("gravity")
 
 
-def test_methods_of_the_original_environment_are_not_there(remote: SurrogateVecEnv):
+def test_calling_a_method_of_the_original_environment_on_the_vec_env_raises(remote: SurrogateVecEnv):
     with pytest.raises(AttributeError, match="no attribute 'fly'"):
         remote.env_method("fly")
 
 
-def test_no_lane_is_wrapped(remote: SurrogateVecEnv):
+def test_the_vec_env_reports_its_environments_as_not_wrapped(remote: SurrogateVecEnv):
     assert remote.env_is_wrapped(Monitor) == [False] * LANES
 
 
-def test_a_step_has_to_be_sent_before_it_is_waited_for(remote: SurrogateVecEnv):
+def test_step_wait_without_step_async_is_refused(remote: SurrogateVecEnv):
     remote.reset()
     with pytest.raises(RuntimeError, match="step_async"):
         remote.step_wait()
 
 
-def test_an_algorithm_learns_on_it(remote: SurrogateVecEnv):
+def test_a_stable_baselines3_algorithm_trains_on_the_vec_env(remote: SurrogateVecEnv):
     envs = VecMonitor(remote)
     model = PPO("MlpPolicy", envs, n_steps=16, batch_size=32, n_epochs=1, seed=0, device="cpu")
     model.learn(total_timesteps=128)
@@ -99,5 +99,5 @@ def test_an_algorithm_learns_on_it(remote: SurrogateVecEnv):
     assert len(model.ep_info_buffer) > 0
 
 
-def test_occupancy_is_submitted_for_the_session(remote: SurrogateVecEnv):
+def test_the_vec_env_submits_the_visited_states_of_its_session(remote: SurrogateVecEnv):
     assert remote.submit_occupancy("first").states == LANES

@@ -28,7 +28,7 @@ def assert_same(ours: object, theirs: object) -> None:
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_autoreset_is_gymnasiums(mode: AutoresetMode):
+def test_the_vector_environment_autoresets_like_gymnasiums_sync_vector_env(mode: AutoresetMode):
     remote, reference = both(mode)
     assert_same(remote.reset(seed=SEEDS), reference.reset(seed=SEEDS))
     ended = np.zeros(2)
@@ -39,7 +39,7 @@ def test_autoreset_is_gymnasiums(mode: AutoresetMode):
     assert (ended > 3).all(), "expected several episodes to end either way"
 
 
-def test_disabled_autoreset_resets_the_lanes_of_a_mask_as_gymnasium_does():
+def test_with_autoreset_disabled_a_masked_reset_equals_gymnasiums():
     remote, reference = both(AutoresetMode.DISABLED)
     assert_same(remote.reset(seed=SEEDS), reference.reset(seed=SEEDS))
     masks = 0
@@ -53,7 +53,7 @@ def test_disabled_autoreset_resets_the_lanes_of_a_mask_as_gymnasium_does():
     assert masks > 3, "expected several partial resets"
 
 
-def test_disabled_autoreset_refuses_to_step_a_finished_lane():
+def test_with_autoreset_disabled_stepping_a_finished_environment_is_refused():
     remote, _ = both(AutoresetMode.DISABLED)
     remote.reset(seed=SEEDS)
     over = False
@@ -64,13 +64,13 @@ def test_disabled_autoreset_refuses_to_step_a_finished_lane():
         remote.step(actions(1)[0])
 
 
-def test_a_list_of_seeds_may_omit_lanes():
+def test_a_list_of_reset_seeds_may_contain_none():
     remote, reference = both(AutoresetMode.NEXT_STEP)
     for seeds in (SEEDS, [None, 9, None, 10], [None] * 4):
         assert_same(remote.reset(seed=seeds), reference.reset(seed=seeds))
 
 
-def test_seeds_reach_only_the_lanes_of_the_mask():
+def test_seeds_of_a_masked_reset_reach_only_the_masked_environments():
     remote, reference = both(AutoresetMode.DISABLED)
     assert_same(remote.reset(seed=SEEDS), reference.reset(seed=SEEDS))
     first, second = actions(2)
@@ -82,7 +82,7 @@ def test_seeds_reach_only_the_lanes_of_the_mask():
     assert_same(remote.step(second), reference.step(second))
 
 
-def test_a_list_of_seeds_has_one_a_lane():
+def test_a_list_of_reset_seeds_of_wrong_length_is_refused():
     for envs in both(AutoresetMode.NEXT_STEP):
         with pytest.raises(ValueError, match="seed"):
             envs.reset(seed=[1, 2])
@@ -98,7 +98,7 @@ def test_an_int_seed_repeats_and_an_unseeded_reset_continues():
 
 
 @pytest.mark.parametrize("mode", ["same_step", "SameStep", AutoresetMode.SAME_STEP])
-def test_the_autoreset_mode_is_gymnasiums_enum(mode: object):
+def test_the_metadata_contain_gymnasiums_autoreset_mode_enum(mode: object):
     envs = RemoteVectorEnv(ExactPendulum(), 2, autoreset_mode=mode)
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
 
@@ -108,14 +108,14 @@ def test_an_unknown_autoreset_mode_is_refused():
         RemoteVectorEnv(ExactPendulum(), 2, autoreset_mode="sometimes")
 
 
-def test_the_time_limit_may_be_given_by_gymnasiums_name():
+def test_the_time_limit_may_be_given_as_max_episode_steps():
     """``gymnasium.make_vec`` hands ``max_episode_steps`` to a vector environment, which has no wrapper for it."""
     envs = RemoteVectorEnv(ExactPendulum(), 2, max_episode_steps=3)
     envs.reset(seed=0)
     assert [envs.step(actions(1)[0][:2])[3].tolist() for _ in range(3)] == [[False] * 2, [False] * 2, [True] * 2]
 
 
-def test_two_time_limits_are_refused():
+def test_giving_both_time_limit_and_max_episode_steps_is_refused():
     with pytest.raises(
         ValueError, match="expected either time_limit or max_episode_steps, which mean the same, got both"
     ):
@@ -131,14 +131,14 @@ def test_two_time_limits_are_refused():
         (np.zeros(4, dtype=bool), ValueError),
     ],
 )
-def test_a_bad_mask_is_refused_as_gymnasium_refuses_it(mask: object, error: type[Exception]):
+def test_an_invalid_reset_mask_is_refused_like_in_gymnasium(mask: object, error: type[Exception]):
     for envs in both(AutoresetMode.DISABLED):
         envs.reset(seed=SEEDS)
         with pytest.raises(error):
             envs.reset(options={"reset_mask": mask})
 
 
-def test_deviations_are_returned_on_request():
+def test_predictive_deviations_are_in_the_vector_infos_on_request():
     envs = RemoteVectorEnv(ExactPendulum(), 2, deviations=True)
     envs.reset(seed=0)
     infos = envs.step(np.zeros((2, 1), dtype=np.float32))[-1]
@@ -146,7 +146,7 @@ def test_deviations_are_returned_on_request():
     assert infos["_deviation"].all()
 
 
-def test_it_shares_no_memory_with_returned_arrays():
+def test_the_vector_environment_shares_no_memory_with_returned_arrays():
     envs, untouched = both(AutoresetMode.NEXT_STEP)
     untouched.reset(seed=SEEDS)
     envs.reset(seed=SEEDS)[0][:] = np.nan
@@ -156,7 +156,7 @@ def test_it_shares_no_memory_with_returned_arrays():
         observation[:] = np.nan
 
 
-def test_it_pickles_and_continues():
+def test_a_pickled_vector_environment_continues():
     envs, reference = both(AutoresetMode.NEXT_STEP)
     envs.reset(seed=SEEDS)
     reference.reset(seed=SEEDS)
@@ -165,7 +165,7 @@ def test_it_pickles_and_continues():
         assert_same(again.step(action), reference.step(action))
 
 
-def test_close_ends_the_session_once():
+def test_closing_the_vector_environment_twice_ends_its_session_once():
     port = ExactPendulum()
     envs = RemoteVectorEnv(port, 2)
     envs.close()
@@ -173,5 +173,5 @@ def test_close_ends_the_session_once():
     assert not port.sessions
 
 
-def test_its_length_is_the_number_of_lanes():
+def test_the_length_of_a_vector_environment_is_its_number_of_environments():
     assert len(RemoteVectorEnv(ExactPendulum(), 3)) == 3

@@ -39,7 +39,9 @@ def without_times(infos: dict) -> dict:
         (AutoresetMode.SAME_STEP, wrappers.vector.NormalizeReward),
     ],
 )
-def test_vector_wrappers_see_gymnasiums_lanes(mode: AutoresetMode, wrap: Callable[[VectorEnv], VectorEnv]):
+def test_gymnasiums_vector_wrappers_give_the_same_results_as_on_sync_vector_env(
+    mode: AutoresetMode, wrap: Callable[[VectorEnv], VectorEnv]
+):
     ours = wrap(RemoteVectorEnv(ExactPendulum(), LANES, autoreset_mode=mode))
     theirs = wrap(SyncVectorEnv([ExactEnv] * LANES, autoreset_mode=mode))
     assert data_equivalence(ours.reset(seed=SEEDS), theirs.reset(seed=SEEDS))
@@ -49,7 +51,7 @@ def test_vector_wrappers_see_gymnasiums_lanes(mode: AutoresetMode, wrap: Callabl
         assert data_equivalence(without_times(our_infos), without_times(their_infos))
 
 
-def test_no_autoreset_mode_suits_every_library():
+def test_gymnasiums_normalize_wrapper_refuses_other_autoreset_modes_than_next_step():
     """Why the default is Gymnasium's: this wrapper refuses the modes that TorchRL's ``GymWrapper`` asks for."""
     for mode in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
         for envs in (
@@ -71,7 +73,9 @@ def test_no_autoreset_mode_suits_every_library():
         lambda env: wrappers.RescaleAction(env, np.float32(-1), np.float32(1)),
     ],
 )
-def test_wrappers_of_one_lane_see_gymnasiums_environment(wrap: Callable[[gymnasium.Env], gymnasium.Env]):
+def test_gymnasiums_wrappers_give_the_same_results_as_on_the_local_environment(
+    wrap: Callable[[gymnasium.Env], gymnasium.Env],
+):
     ours, theirs = wrap(RemoteEnv(ExactPendulum())), wrap(ExactEnv())
     assert data_equivalence(ours.reset(seed=3), theirs.reset(seed=3))
     for action in np.random.default_rng(1).uniform(-1, 1, (20, 1)).astype(np.float32):
@@ -81,13 +85,13 @@ def test_wrappers_of_one_lane_see_gymnasiums_environment(wrap: Callable[[gymnasi
             assert data_equivalence(ours.reset(), theirs.reset())
 
 
-def test_a_film_without_a_render_mode_is_refused_in_gymnasiums_words(tmp_path):
+def test_record_video_without_a_render_mode_raises_gymnasiums_error(tmp_path):
     with pytest.raises(ValueError, match="Render mode is None"):
         wrappers.RecordVideo(RemoteEnv(ExactPendulum()), str(tmp_path))
 
 
 @pytest.mark.parametrize("vectorization", ["sync", "async"])
-def test_gymnasium_makes_vectors_of_single_lanes_too(pendulum_server, vectorization: str):
+def test_gymnasium_make_vec_can_combine_single_remote_environments(pendulum_server, vectorization: str):
     options = {"url": pendulum_server.url, "surrogate": "pendulum", "time_limit": 3}
     mode = {"autoreset_mode": AutoresetMode.SAME_STEP}
     envs = gymnasium.make_vec(ENVIRONMENT_ID, 2, vectorization_mode=vectorization, vector_kwargs=mode, **options)

@@ -19,7 +19,7 @@ def compared(errors: np.ndarray, deviation: float = 1.0, expected: float = 0.5, 
     return Compared(names, errors, np.full(errors.shape, deviation), np.full(errors.shape[1], expected), misplaced)
 
 
-def test_at_most_one_in_fifty_right_models_fails():
+def test_an_audit_fails_at_most_one_in_fifty_correct_models():
     rng = np.random.default_rng(0)
     failed = sum(
         not judge(compared(rng.normal(0, np.hypot(1.0, 0.5), (8, 3))), PROMISE, PROMISE, UNTRAINED).passed
@@ -29,7 +29,7 @@ def test_at_most_one_in_fifty_right_models_fails():
 
 
 @pytest.mark.parametrize("factor", [3.0, 10.0])
-def test_errors_beyond_what_the_model_claims_fail(factor: float):
+def test_an_audit_fails_a_model_whose_errors_exceed_its_predicted_deviation(factor: float):
     errors = factor * np.random.default_rng(0).normal(0, np.hypot(1.0, 0.5), (8, 2))
     errors[:, 0] = 0.0
     audit = judge(compared(errors), PROMISE, PROMISE, UNTRAINED)
@@ -38,12 +38,12 @@ def test_errors_beyond_what_the_model_claims_fail(factor: float):
     assert fault.startswith("output 1: errors of")
 
 
-def test_errors_within_the_tolerance_are_never_a_fault():
+def test_errors_within_the_tolerance_never_fail_an_audit():
     errors = np.full((8, 2), 0.5)
     assert judge(compared(errors, deviation=1e-9), PROMISE, PROMISE, UNTRAINED).passed
 
 
-def test_errors_within_the_tolerance_and_beyond_the_claim_are_surprising():
+def test_errors_within_the_tolerance_but_above_the_predicted_deviation_are_surprising():
     """A heavier pendulum's errors were 2.4 times the model's claim, within the tolerance, and nothing asked further."""
     claimed, rng = np.array([0.2, 0.2]), np.random.default_rng(0)
     right = [compared(rng.normal(0, 0.2, (8, 2)), deviation=1e-9) for _ in range(500)]
@@ -60,17 +60,17 @@ def test_errors_within_the_tolerance_and_beyond_the_claim_are_surprising():
 @pytest.mark.parametrize(
     ("after", "passed"), [(-155.0, True), (-250.0, True), (-300.0, False), (-60.0, True), (0.0, False)]
 )
-def test_a_promise_that_moves_by_a_tenth_of_what_was_learned_fails(after: float, passed: bool):
+def test_an_audit_fails_if_its_samples_move_the_promise_too_far(after: float, passed: bool):
     later = Promise(median=after, low=after - 10, high=after + 10, functions=32, episodes=256)
     assert judge(compared(np.zeros((8, 1))), PROMISE, later, UNTRAINED).passed is passed
 
 
 @pytest.mark.parametrize(("misplaced", "passed"), [(0, True), (1, True), (2, False)])
-def test_endings_against_the_prediction_fail(misplaced: int, passed: bool):
+def test_an_audit_fails_if_terminations_contradict_the_prediction(misplaced: int, passed: bool):
     assert judge(compared(np.zeros((8, 1)), misplaced=misplaced), PROMISE, PROMISE, UNTRAINED).passed is passed
 
 
-def test_a_rollout_fails_by_its_only_end():
+def test_an_audit_rollout_fails_by_one_unpredicted_termination():
     """An episode ends at most once. So one misplaced end fails a rollout, where it takes two to fail single steps."""
     beside = replace(compared(np.zeros((3, 1)), misplaced=1), cut_short=True)
     assert judge(beside, PROMISE, PROMISE, UNTRAINED).faults == (
@@ -78,18 +78,18 @@ def test_a_rollout_fails_by_its_only_end():
     )
 
 
-def test_a_step_that_the_machine_could_not_take_fails():
+def test_an_audit_fails_if_the_environment_failed_at_a_query():
     audit = judge(replace(compared(np.zeros((7, 1))), unanswered=1), PROMISE, PROMISE, UNTRAINED)
     assert audit.faults == ("the original environment failed at 1 of 8 queries, so nothing is known there",)
 
 
 @pytest.mark.parametrize("degrees", [1, 2, 8, 64])
-def test_chi_squared_is_that_of_scipy(degrees: int):
+def test_the_chi_squared_quantile_approximates_that_of_scipy(degrees: int):
     for above in (0.05, 0.01, 0.001):
         assert chi_squared(degrees, above) == pytest.approx(scipy.stats.chi2.isf(above, degrees), rel=0.06)
 
 
-def test_places_spread_over_the_way_and_keep_to_what_can_be_set():
+def test_audit_states_spread_over_the_visited_states_within_the_sampling_range():
     rng = np.random.default_rng(0)
     q = np.concatenate([rng.normal(0, 0.01, (500, 2)), [[3.0, 0.0], [-3.0, 7.0], [0.0, 7.5], [0.0, 80.0]]])
     chosen = places(pendulum(), q, np.zeros((len(q), 1)), 8, rng)
@@ -98,13 +98,13 @@ def test_places_spread_over_the_way_and_keep_to_what_can_be_set():
     assert 503 not in chosen, "the environment can't be set there"
 
 
-def test_few_visited_states_give_as_many_places():
+def test_few_visited_states_give_as_many_audit_states():
     q = np.zeros((3, 2))
     assert sorted(places(pendulum(), q, np.zeros((3, 1)), 8, np.random.default_rng(0))) == [0, 1, 2]
     assert len(places(pendulum(), q + 1e3, np.zeros((3, 1)), 8, np.random.default_rng(0))) == 0
 
 
-def test_gaps_are_the_widest_of_single_inputs():
+def test_audit_gaps_are_the_widest_unsampled_ranges_of_single_inputs():
     """Samples everywhere but beyond a speed of 4, and with small torques alone. Angles have no end, so no gap there."""
     rng = np.random.default_rng(0)
     q, u = rng.uniform([-np.pi, -8], [np.pi, 8], (1_000, 2)), rng.uniform(-2, 2, (1_000, 1))
@@ -114,7 +114,7 @@ def test_gaps_are_the_widest_of_single_inputs():
     assert q[second, 1] > 7.9, "a quarter of the speeds"
 
 
-def test_gaps_keep_to_what_can_be_set_and_are_as_many_as_asked_for():
+def test_audit_gaps_are_within_the_sampling_range_and_limited_in_number():
     q, u = np.array([[0.0, 0.0], [0.1, 2.0], [0.0, 80.0]]), np.zeros((3, 1))
     samples = np.array([[0.0, 0.1]]), np.zeros((1, 1))
     assert gaps(pendulum(), q, u, samples, 1) == [1]
@@ -122,6 +122,6 @@ def test_gaps_keep_to_what_can_be_set_and_are_as_many_as_asked_for():
     assert len(gaps(pendulum(), q, u, samples, 0)) == 0
 
 
-def test_angles_differ_by_the_shorter_way():
+def test_audit_errors_of_angles_take_the_shorter_direction():
     difference = differences(pendulum(), np.array([[3.1, 1.0]]), np.array([[-3.1, 0.5]]))
     assert difference[0].tolist() == pytest.approx([6.2 - 2 * np.pi, 0.5])

@@ -12,13 +12,13 @@ NAMES = [machine.name for machine in MACHINES]
 
 
 @pytest.mark.parametrize("machine", MACHINES, ids=NAMES)
-def test_each_machine_has_a_specification_and_stays_as_it_is_without_a_mechanism(machine: Machine) -> None:
+def test_each_study_machine_is_unchanged_without_a_fault_mechanism(machine: Machine) -> None:
     definition_from_spec(machine.spec)
     assert parameters_of(machine, RIGHT, 1.0) == dict(machine.real)
 
 
 @pytest.mark.parametrize("machine", MACHINES, ids=NAMES)
-def test_every_mechanism_changes_what_a_step_gives(machine: Machine) -> None:
+def test_every_fault_mechanism_changes_the_steps_of_its_study_machine(machine: Machine) -> None:
     rng = np.random.default_rng(0)
     low, high = np.array(list(machine.ranges.values())).T
     q, u = rng.uniform(low, high, (50, len(low))), rng.uniform(-1, 1, (50, machine.actions))
@@ -28,7 +28,7 @@ def test_every_mechanism_changes_what_a_step_gives(machine: Machine) -> None:
         assert not all(np.allclose(a, b) for a, b in zip(real, other, strict=True)), mechanism
 
 
-def test_a_shifted_sensor_moves_a_step_and_what_it_reads() -> None:
+def test_a_shifted_sensor_offsets_both_states_of_a_step() -> None:
     (machine,) = [machine for machine in MACHINES if machine.name == "mass"]
     q, u = np.array([0.3, 0.1]), np.array([0.5])
     parameters = parameters_of(machine, SHIFTED, 0.5)
@@ -38,7 +38,7 @@ def test_a_shifted_sensor_moves_a_step_and_what_it_reads() -> None:
     assert seen.reward == pytest.approx(real.reward)
 
 
-def test_returns_are_those_of_single_steps() -> None:
+def test_the_batched_returns_of_a_study_machine_equal_single_steps() -> None:
     (machine,) = [machine for machine in MACHINES if machine.name == "pole"]
     rng = np.random.default_rng([3, 77])
     low, high = np.array(list(machine.start.values())).T

@@ -31,7 +31,7 @@ def held(traces: list[Trace], errors: np.ndarray) -> Disagreements:
     return disagreements(steps, beside)
 
 
-def test_every_step_of_few_is_compared_and_many_are_thinned() -> None:
+def test_few_real_steps_are_all_compared_and_many_are_thinned() -> None:
     few = steps_of(episodes(2, 10))
     assert [(step.episode, step.number) for step in few] == [(e, t) for e in range(2) for t in range(10)]
     assert [step.terminated for step in few] == ([False] * 9 + [True]) * 2
@@ -41,12 +41,12 @@ def test_every_step_of_few_is_compared_and_many_are_thinned() -> None:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_errors_as_the_model_claims_are_no_disagreement(seed: int) -> None:
+def test_errors_of_the_predicted_size_are_not_reported_as_disagreement(seed: int) -> None:
     errors = np.random.default_rng(seed).normal(scale=0.05, size=(MOST, 2))
     assert len(held(episodes(4, 100), errors).found) <= 1
 
 
-def test_a_wrong_step_is_found_with_its_episode_state_and_output() -> None:
+def test_a_mispredicted_real_step_is_reported_with_episode_state_and_output() -> None:
     traces, errors = episodes(2, 10), np.zeros((20, 2))
     errors[13] = (0.0, -1.5)
     errors[15] = (0.9, 0.0)
@@ -61,7 +61,7 @@ def test_a_wrong_step_is_found_with_its_episode_state_and_output() -> None:
     assert Differing(found, 10_000).as_json()["steps"][0]["seed"] == 10_001
 
 
-def test_a_single_wrong_step_is_told_in_the_singular() -> None:
+def test_a_single_mispredicted_step_is_reported_in_the_singular() -> None:
     errors = np.zeros((20, 2))
     errors[13] = (0.9, 1.5)
     first, second, *_ = Differing(held(episodes(2, 10), errors), 0).in_words(SPEC)
@@ -76,7 +76,7 @@ def test_a_correct_model_has_no_disagreements() -> None:
     ]
 
 
-def test_samples_are_the_worst_of_each_episode_in_turn() -> None:
+def test_samples_for_learning_are_the_worst_predicted_steps_of_each_episode_in_turn() -> None:
     traces, errors = episodes(2, 10), np.zeros((20, 2))
     errors[3], errors[4], errors[5], errors[12] = (4.0, 0.0), (3.0, 0.0), (2.0, 0.0), (1.0, 0.0)
     found = held(traces, errors)
@@ -90,7 +90,7 @@ def test_samples_are_the_worst_of_each_episode_in_turn() -> None:
     assert samples_of(found, 0) == []
 
 
-def test_steps_within_which_a_constant_changed_are_not_compared() -> None:
+def test_real_steps_during_which_a_constant_changed_are_not_compared() -> None:
     """A model keeps a setpoint. The step at which the plant changed it was shown as the model's error, and learned."""
     wanted = SPEC.coordinates[0].model_copy(update={"name": "wanted", "kind": "constant"})
     spec = SPEC.model_copy(update={"coordinates": (*SPEC.coordinates, wanted)})
@@ -117,7 +117,7 @@ def shared(error: float) -> Compared:
     )
 
 
-def test_an_error_of_one_sign_is_found_with_its_region_and_cost_where_no_step_differs_alone() -> None:
+def test_a_small_systematic_error_is_reported_with_its_region_and_cost() -> None:
     beside, steps = shared(0.3), steps_of(episodes(2, 60))
     (effect,), share = effects_of(SPEC, beside, lambda _, weights: 1e3 * weights[:, 0, 0])
     assert (effect.output, effect.region and effect.region.name) == ("x", "action 0")
@@ -134,7 +134,7 @@ def test_an_error_of_one_sign_is_found_with_its_region_and_cost_where_no_step_di
     assert np.mean([sample.action[0] > 0 for sample in learned]) > 0.8, "the steps that show the error"
 
 
-def test_a_right_model_has_no_effects_and_a_broken_promise_is_never_no_difference() -> None:
+def test_a_correct_model_has_no_systematic_error_even_if_the_promise_is_missed() -> None:
     effects, share = effects_of(SPEC, shared(0.0), None)
     assert not effects
     assert not share.any()

@@ -66,7 +66,7 @@ def by_gymnasium(name, policy, seeds):
         ("Acrobot-v1", lambda o: np.where(o[:, 4] > 0, 2, 0)),
     ],
 )
-def test_returns_are_gymnasiums_own(name, policy):
+def test_evaluated_returns_equal_those_of_gymnasium(name, policy):
     result = evaluate(policy, opener(name), EvaluationSettings(episodes=4))
     returns, lengths = by_gymnasium(name, policy, range(10_000, 10_004))
     np.testing.assert_allclose(result.returns, returns, rtol=1e-5)
@@ -74,7 +74,7 @@ def test_returns_are_gymnasiums_own(name, policy):
     assert result.steps == sum(lengths)
 
 
-def test_success_of_cartpole_is_its_length():
+def test_success_in_cart_pole_depends_on_the_episode_length():
     good = evaluate(cartpole_policy, opener("CartPole-v1"), EvaluationSettings(episodes=3))
     bad = evaluate(lambda o: np.zeros(len(o), int), opener("CartPole-v1"), EvaluationSettings(episodes=3))
     assert good.success.all()
@@ -82,7 +82,7 @@ def test_success_of_cartpole_is_its_length():
     assert good.summary()["success_rate"] == 1.0
 
 
-def test_success_of_mountain_car_is_arrival():
+def test_success_in_mountain_car_is_reaching_the_goal():
     pumping = evaluate(lambda o: np.sign(o[:, 1:]), opener("MountainCarContinuous-v0"), EvaluationSettings(episodes=2))
     idle = evaluate(lambda o: np.zeros((len(o), 1)), opener("MountainCarContinuous-v0"), EvaluationSettings(episodes=2))
     assert pumping.success.all()
@@ -90,7 +90,7 @@ def test_success_of_mountain_car_is_arrival():
     assert idle.lengths.tolist() == [999, 999]
 
 
-def test_success_of_pendulum_is_the_last_twenty_steps_upright():
+def test_success_in_pendulum_is_being_upright_in_the_last_twenty_steps():
     held = evaluate(pendulum_policy, opener("Pendulum-v1"), EvaluationSettings(episodes=20))
     upright = np.cos(held.trace.coordinates[-20:, 0]) > 0.95
     assert held.success[0] == upright.all()
@@ -98,14 +98,14 @@ def test_success_of_pendulum_is_the_last_twenty_steps_upright():
     assert not limp.success.any()
 
 
-def test_the_trace_is_the_first_episode():
+def test_the_evaluation_trace_is_that_of_the_first_episode():
     result = evaluate(pendulum_policy, opener("Pendulum-v1"), EvaluationSettings(episodes=2))
     assert result.trace.coordinates.shape == (201, 2)
     assert result.trace.action.shape == (200, 1)
     assert result.trace.reward.sum() == pytest.approx(result.returns[0])
 
 
-def test_wide_starts_cover_the_sampling_range_and_repeat():
+def test_wide_evaluation_starts_cover_the_sampling_range_and_are_reproducible():
     settings = EvaluationSettings(episodes=30, wide=True)
     starts = []
 
@@ -119,7 +119,7 @@ def test_wide_starts_cover_the_sampling_range_and_repeat():
     assert evaluate(policy, opener("Pendulum-v1"), settings).returns.tolist() == first.returns.tolist()
 
 
-def test_perturbation_changes_the_physics_and_settles_what_follows():
+def test_perturb_changes_physical_constants_and_the_quantities_derived_from_them():
     plain = evaluate(cartpole_policy, opener("CartPole-v1"), EvaluationSettings(episodes=3))
     changed = evaluate(cartpole_policy, opener("CartPole-v1"), EvaluationSettings(episodes=3, perturb=0.3))
     assert not np.allclose(plain.trace.coordinates[:10], changed.trace.coordinates[:10])
@@ -130,7 +130,7 @@ def test_perturbation_changes_the_physics_and_settles_what_follows():
     assert env.polemass_length == env.masspole * env.length
 
 
-def test_ones_own_environment_cant_be_perturbed():
+def test_perturbing_an_own_environment_class_is_refused():
     """What its masses and lengths are, nobody here knows; that is no fault of the policy."""
     settings = EvaluationSettings(episodes=1, perturb=0.1)
     with pytest.raises(NotPerturbable):
@@ -141,7 +141,7 @@ def test_ones_own_environment_cant_be_perturbed():
         )
 
 
-def test_ones_own_environment_is_evaluated_by_its_steps():
+def test_an_own_environment_class_can_be_evaluated():
     result = evaluate(
         lambda o: -np.sign(o), partial(open_episode, "a line", None, Line), EvaluationSettings(episodes=3)
     )
@@ -151,7 +151,7 @@ def test_ones_own_environment_is_evaluated_by_its_steps():
     assert np.abs(result.trace.coordinates[-1, 0]) <= 0.1
 
 
-def test_bins_are_decoded_and_bounds_kept():
+def test_evaluation_decodes_binned_actions_and_keeps_action_bounds():
     spec = original.make("Pendulum-v1", bins=5).spec()
     np.testing.assert_allclose(decode_actions(spec, np.arange(5), 5)[:, 0], [-2, -1, 0, 1, 2])
     plain = original.make("Pendulum-v1").spec()
@@ -160,7 +160,7 @@ def test_bins_are_decoded_and_bounds_kept():
         decode_actions(plain, np.zeros((3, 1)), 2)
 
 
-def test_exploration_changes_actions_within_bounds_and_repeats():
+def test_exploration_noise_stays_within_action_bounds_and_is_reproducible():
     settings = EvaluationSettings(episodes=2, explore=0.5)
     again, alone = (evaluate(pendulum_policy, opener("Pendulum-v1"), replace(settings, parallel=n)) for n in (1, 2))
     plain = evaluate(pendulum_policy, opener("Pendulum-v1"), replace(settings, explore=0.0))
@@ -174,7 +174,7 @@ def test_exploration_changes_actions_within_bounds_and_repeats():
     assert words_of(replace(settings, explore=0.004)).endswith("actions changed at random by 0.004")
 
 
-def test_exploration_of_discrete_actions_replaces_a_share_of_them():
+def test_exploration_replaces_a_share_of_discrete_actions():
     rng, spec = np.random.default_rng(0), original.make("CartPole-v1").spec()
     changed = np.array([explored(spec, np.array([1.0]), 0.5, rng)[0] for _ in range(2_000)])
     assert set(changed) == {0.0, 1.0}
@@ -184,7 +184,7 @@ def test_exploration_of_discrete_actions_replaces_a_share_of_them():
     assert drawn == {-2.0, -1.0, 0.0, 1.0, 2.0}
 
 
-def test_exploration_spreads_by_its_share_of_half_the_range():
+def test_exploration_noise_is_relative_to_half_the_action_range():
     rng, spec = np.random.default_rng(0), original.make("Pendulum-v1").spec()
     changed = np.array([explored(spec, np.array([0.5]), 0.1, rng)[0] for _ in range(4_000)])
     assert changed.std() == pytest.approx(0.2, rel=0.05)
@@ -192,12 +192,12 @@ def test_exploration_spreads_by_its_share_of_half_the_range():
         EvaluationSettings(explore=2)
 
 
-def test_interquartile_mean_leaves_out_the_quarters():
+def test_the_interquartile_mean_leaves_out_the_outer_quarters():
     assert interquartile_mean(np.array([-1000.0, 1, 2, 3, 4, 5, 6, 1000])) == 3.5
     assert interquartile_mean(np.array([7.0])) == 7.0
 
 
-def test_every_given_criterion_must_hold():
+def test_an_episode_succeeds_only_if_every_success_criterion_holds():
     spec = original.make("CartPole-v1").spec()
     strict = spec.model_copy(update={"success": Success(min_steps=100, min_return=1e6)})
     result = evaluate(
@@ -206,7 +206,7 @@ def test_every_given_criterion_must_hold():
     assert not result.success.any()
 
 
-def test_scaled_starts_are_declared_ones_spread_about_their_middle():
+def test_start_scale_widens_the_declared_start_range_about_its_middle():
     starts = []
 
     def policy(observation):
@@ -219,7 +219,7 @@ def test_scaled_starts_are_declared_ones_spread_about_their_middle():
         EvaluationSettings(wide=True, start_scale=2.0)
 
 
-def test_an_interruption_reports_the_real_steps_taken():
+def test_an_interrupted_evaluation_reports_the_real_steps_taken():
     def interrupt(share, _):
         if share >= 3 / 200:
             raise KeyboardInterrupt
@@ -238,7 +238,7 @@ def noting(factory, episodes, **choices):
     return result, remarks
 
 
-def test_equal_episodes_are_noticed_while_it_saves_real_steps():
+def test_equal_evaluation_episodes_are_reported_after_the_third():
     """A deterministic plant repeated one episode a hundred times without a word."""
     result, remarks = noting(Alike, 8)
     assert result.equal
@@ -248,13 +248,13 @@ def test_equal_episodes_are_noticed_while_it_saves_real_steps():
 
 
 @pytest.mark.parametrize(("factory", "episodes"), [(Line, 8), (Alike, 1), (Alike, 3)])
-def test_other_episodes_or_few_of_them_get_no_remark(factory, episodes):
+def test_different_or_few_evaluation_episodes_give_no_remark_about_equality(factory, episodes):
     result, remarks = noting(factory, episodes)
     assert remarks == []
     assert result.equal is (factory is Alike and episodes > 1)
 
 
-def test_a_single_different_number_makes_episodes_differ():
+def test_episodes_that_differ_in_one_number_are_not_reported_as_equal():
     result, _ = noting(Alike, 4)
     paid = result.traces[3].reward + np.eye(5)[4] * 1e-12
     other = replace(result, traces=(*result.traces[:3], replace(result.traces[3], reward=paid)))

@@ -26,7 +26,7 @@ def acting(low: float, high: float, bins: int | None = None) -> EnvironmentSpec:
     return changed(action=BoxAction(low=(low,), high=(high,), bins=None if bins is None else (bins,)))
 
 
-def test_evaluation_refuses_a_policy_of_another_environment_before_it_resets() -> None:
+def test_evaluating_a_policy_of_another_environment_is_refused_before_the_first_reset() -> None:
     begun = []
 
     class Noting(Line):
@@ -64,23 +64,23 @@ def test_evaluation_refuses_a_policy_of_another_environment_before_it_resets() -
     ],
     ids=["discrete", "bins", "stronger", "observes more", "observes otherwise"],
 )
-def test_what_does_not_fit_is_named(trained: EnvironmentSpec, message: str) -> None:
+def test_the_error_for_a_policy_that_does_not_fit_names_the_difference(trained: EnvironmentSpec, message: str) -> None:
     with pytest.raises(PolicyMisfit, match=message):
         check_policy(trained, LINE)
 
 
-def test_bins_of_other_limits_are_refused_because_they_would_be_other_actions() -> None:
+def test_a_policy_with_action_bins_of_other_bounds_is_refused() -> None:
     with pytest.raises(PolicyMisfit, match=r"expected actions from \[-1\] to \[1\], got \[-2\] to \[2\]"):
         check_policy(acting(-1, 1, bins=5), acting(-2, 2, bins=5))
 
 
-def test_weaker_actions_and_other_access_fit() -> None:
+def test_a_policy_with_narrower_action_bounds_fits_the_environment() -> None:
     """A log shows fewer actions than the plant has, and steps from any state of a plant that can only be reset."""
     check_policy(acting(-0.5, 0.9), LINE)
     check_policy(LINE, RAIL)
 
 
-def test_the_command_of_a_stranger_is_not_repeated() -> None:
+def test_the_error_for_a_policy_that_does_not_fit_does_not_repeat_its_exec_command() -> None:
     with pytest.raises(PolicyMisfit) as refused:
         check_policy(pendulum().model_copy(update={"environment": "exec:rm -rf /"}), LINE)
     assert "rm" not in str(refused.value)

@@ -35,12 +35,12 @@ def run(factory, policy=push, **settings):
 
 
 @pytest.mark.parametrize("machine", [Machine, SettableMachine])
-def test_one_driver_holds_the_machine_at_a_time(diary, machine):
+def test_only_one_environment_instance_is_open_at_a_time(diary, machine):
     assert run(machine).steps == EPISODES * STEPS
     assert most_at_once(diary()) == 1
 
 
-def test_episodes_come_one_after_the_other_each_after_its_reset(diary):
+def test_evaluation_episodes_on_one_machine_run_one_after_the_other(diary):
     run(Machine)
     moved = [what for what in diary() if what.startswith(("reset", "step"))]
     resets = [i for i, what in enumerate(moved) if what.startswith("reset")]
@@ -48,18 +48,18 @@ def test_episodes_come_one_after_the_other_each_after_its_reset(diary):
     assert resets == [0, 1, STEPS + 2, 2 * (STEPS + 1) + 1]
 
 
-def test_a_simulator_says_that_it_runs_side_by_side(diary):
+def test_evaluation_opens_several_instances_of_an_environment_declared_parallel(diary):
     run(Simulator)
     assert most_at_once(diary()) == EPISODES
 
 
-def test_a_person_may_ask_for_several_instances(diary):
+def test_evaluation_opens_several_instances_if_the_user_asks_for_them(diary):
     run(Machine, parallel=2)
     assert most_at_once(diary()) == 2
 
 
 @pytest.mark.parametrize("factory", [Simulator, Machine])
-def test_returns_are_the_same_whether_side_by_side_or_not(diary, factory):
+def test_evaluated_returns_are_equal_in_parallel_and_in_sequence(diary, factory):
     together, apart = run(factory, parallel=EPISODES), run(factory, parallel=1)
     assert together.returns.tolist() == apart.returns.tolist()
     assert together.lengths.tolist() == apart.lengths.tolist()
@@ -76,7 +76,7 @@ def test_returns_are_the_same_whether_side_by_side_or_not(diary, factory):
         ("InvertedPendulum-v5", {"perturb": 0.3}),
     ],
 )
-def test_a_simulator_used_again_gives_the_returns_of_fresh_ones(name, choices):
+def test_a_reused_simulator_gives_the_same_returns_as_fresh_ones(name, choices):
     if name.endswith("v5"):
         pytest.importorskip("mujoco")
     spec = original.make(name).spec()
@@ -90,7 +90,7 @@ def test_a_simulator_used_again_gives_the_returns_of_fresh_ones(name, choices):
     assert results[0].returns.tolist() == results[1].returns.tolist() == results[2].returns.tolist()
 
 
-def test_every_driver_lets_go_although_one_fails_to_close(diary):
+def test_every_environment_instance_is_closed_although_closing_one_fails(diary):
     class Stuck(Simulator):
         def close(self):
             super().close()
@@ -120,7 +120,7 @@ def acting(act):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_an_interrupted_policy_stops_after_the_step_and_the_machine_is_closed(diary, number):
+def test_an_interrupted_evaluation_ends_after_the_step_and_closes_the_environment(diary, number):
     pressed = acting(partial(signal.raise_signal, number))
     with terminations_as_interrupts(), pytest.raises(EvaluationInterrupted) as interrupted:
         run(pressed)
@@ -129,7 +129,7 @@ def test_an_interrupted_policy_stops_after_the_step_and_the_machine_is_closed(di
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_second_interrupt_stops_in_the_step_which_counts_and_the_machine_is_closed(diary):
+def test_a_second_interrupt_ends_evaluation_within_the_step_and_closes_the_environment(diary):
     with pytest.raises(EvaluationInterrupted) as interrupted:
         run(acting(lambda: [signal.raise_signal(signal.SIGINT) for _ in range(2)]))
     assert interrupted.value.steps == 3
@@ -138,7 +138,7 @@ def test_a_second_interrupt_stops_in_the_step_which_counts_and_the_machine_is_cl
 
 
 @pytest.mark.parametrize("kind", [RuntimeError, SystemExit])
-def test_an_exception_in_the_middle_counts_its_step_and_closes_the_machine(diary, kind):
+def test_an_exception_during_a_step_counts_the_step_and_closes_the_environment(diary, kind):
     """``sys.exit`` ended the command without a word, and no ledger had the steps."""
 
     def stall():
@@ -151,19 +151,19 @@ def test_an_exception_in_the_middle_counts_its_step_and_closes_the_machine(diary
     assert diary()[-1] == "close"
 
 
-def test_an_action_that_is_no_number_is_not_sent(diary):
+def test_an_action_that_is_nan_is_not_sent_to_the_environment(diary):
     with pytest.raises(PolicyMisfit, match=r"expected finite actions, got \[\[nan\]\]"):
         run(Machine, lambda observation: np.full_like(observation, np.nan))
     assert diary() == ["open", "reset 10000", "reset 10000", "close"]
 
 
-def test_an_action_beyond_the_bounds_is_sent_at_the_bound(diary):
+def test_an_action_beyond_its_bounds_is_clipped_before_it_is_sent(diary):
     run(Machine, lambda observation: np.full_like(observation, -7.0))
     assert "step -1" in diary()
     assert "step -7" not in diary()
 
 
-def test_an_episode_that_the_machine_ends_is_not_stepped_further(diary):
+def test_an_episode_ended_by_the_environment_is_not_stepped_further(diary):
     class Ends(Machine):
         def step(self, action):
             observation, reward, terminated, _, info = super().step(action)
@@ -172,7 +172,7 @@ def test_an_episode_that_the_machine_ends_is_not_stepped_further(diary):
     assert run(Ends).lengths.tolist() == [1] * EPISODES
 
 
-def test_a_reading_that_is_no_number_ends_the_evaluation(diary):
+def test_a_nan_observation_ends_the_evaluation(diary):
     class Blind(Machine):
         def coordinates(self, observation):
             return observation[:1] if self.x == 0 else observation[:1] * np.nan
@@ -187,7 +187,7 @@ def test_a_reading_that_is_no_number_ends_the_evaluation(diary):
     assert diary()[-2:] == ["step 1", "close"]
 
 
-def test_a_training_in_the_original_has_one_lane_of_one_machine(diary):
+def test_training_in_the_original_environment_uses_one_instance(diary):
     port = OriginalPort(Machine.spec(None), partial(open_episode, "a machine", None, Machine))
     with pytest.raises(NotParallel, match="expected one lane in one session"):
         port.open(OpenSession(num_envs=2, autoreset_mode="same_step"))

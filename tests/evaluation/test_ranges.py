@@ -18,7 +18,7 @@ def way(*speeds: float) -> np.ndarray:
     return np.array([[50.0, speed] for speed in speeds])
 
 
-def test_the_end_that_most_states_pass_is_named_with_its_share_and_the_farthest_state() -> None:
+def test_the_sampling_range_end_that_most_visited_states_exceed_is_reported() -> None:
     left = range_left(SPEC, way(9, 8.5, -10, 0, 1, 2, 3, 4))
     assert left == RangeLeft(coordinate=SPEC.coordinates[1].name, side="upper", end=8.0, share=0.25, farthest=9.0)
     left = range_left(SPEC, way(9, -8.5, -10, 0))
@@ -26,14 +26,14 @@ def test_the_end_that_most_states_pass_is_named_with_its_share_and_the_farthest_
     assert (left.side, left.end, left.farthest) == ("lower", -8.0, -10.0)
 
 
-def test_a_few_states_beyond_an_end_are_usual_and_an_angle_has_no_end() -> None:
+def test_a_few_visited_states_beyond_the_sampling_range_are_not_reported() -> None:
     states = way(9, *[0.0] * 99)
     assert LITTLE > 0.01
     assert range_left(SPEC, states) is None
 
 
 @pytest.mark.parametrize("left", [None, RangeLeft(coordinate="speed", side="upper", end=8, share=0.34, farthest=11.2)])
-def test_the_line_before_the_promise_says_what_to_change(left: RangeLeft | None) -> None:
+def test_the_result_recommends_a_wider_sampling_range_if_the_policy_leaves_it(left: RangeLeft | None) -> None:
     promise = Promise(median=1, low=0, high=2, functions=32, episodes=256)
     audit = Audit(steps=8, passed=True, before=promise, after=promise, range_left=left)
     *before, last = words_of_handover(Handover(promise, audit, True, "because")).split("\n")

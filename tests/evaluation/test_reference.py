@@ -52,7 +52,7 @@ def opened():
 
 
 @pytest.mark.parametrize("parallel", [1, 3])
-def test_each_episode_has_a_controller_of_its_own(controllers: str, parallel: int) -> None:
+def test_each_evaluation_episode_gets_a_new_reference_controller(controllers: str, parallel: int) -> None:
     settings = EvaluationSettings(episodes=3, parallel=parallel)
     found = evaluate(load_reference(f"{controllers}:Counting"), opened, settings)
     for trace in found.traces:
@@ -60,13 +60,13 @@ def test_each_episode_has_a_controller_of_its_own(controllers: str, parallel: in
     assert __import__(controllers).Counting.made == 3
 
 
-def test_a_function_gets_one_observation_at_a_time(controllers: str) -> None:
+def test_a_reference_controller_function_gets_one_observation_at_a_time(controllers: str) -> None:
     found = evaluate(load_reference(f"{controllers}:brake"), opened, EvaluationSettings(episodes=2, parallel=2))
     for trace in found.traces:
         assert trace.action[:, 0] == pytest.approx(np.clip(-trace.coordinates[:-1, 1], -2, 2), abs=1e-5)
 
 
-def test_an_invalid_controller_is_refused_before_a_real_step(controllers: str, tmp_path: Path) -> None:
+def test_an_invalid_reference_controller_is_refused_before_a_real_step(controllers: str, tmp_path: Path) -> None:
     with pytest.raises(PolicyMisfit, match=r"expected actions of shape \(1, 1\)"):
         evaluate(load_reference(f"{controllers}:wrong"), opened, EvaluationSettings(episodes=1))
     with pytest.raises(UnknownEnvironment, match="absent"):

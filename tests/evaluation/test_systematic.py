@@ -25,30 +25,30 @@ def jointly(seed: int, steps: int, shift: float = 0.0, tilt: float = 0.0, scale:
     return systematic("abc", errors, np.full(errors.shape, 0.1), np.ones(OUTPUTS), inputs, x)
 
 
-def test_a_right_model_is_rarely_called_shifted_at_any_number_of_steps():
+def test_a_correct_model_rarely_shows_a_systematic_error_at_any_number_of_steps():
     alarms = sum(max(jointly(seed, steps).evidence for steps in (8, 16, 40)) >= 20 for seed in range(60))
     assert alarms <= 3
 
 
 @pytest.mark.parametrize("scale", [0.05, 3.0])
-def test_errors_of_another_size_than_claimed_are_no_evidence(scale: float):
+def test_independent_errors_of_any_size_are_not_taken_for_systematic(scale: float):
     """On a policy's way they may be much smaller than elsewhere. Larger ones are what other tests are for."""
     assert sum(jointly(seed, 16, scale=scale).evidence >= 20 for seed in range(60)) <= 3
 
 
-def test_a_shared_error_far_below_the_claim_is_found_where_the_others_are_small():
+def test_a_systematic_error_below_the_predicted_deviation_is_found_if_other_errors_are_small():
     assert all(jointly(seed, 8, shift=0.7, scale=0.1).evidence > 20 for seed in range(20))
 
 
 @pytest.mark.parametrize(("shift", "tilt"), [(1.0, 0.0), (0.0, 1.5)], ids=["everywhere", "by an input"])
-def test_an_error_that_all_steps_share_is_found_in_forty(shift: float, tilt: float):
+def test_an_error_shared_by_all_steps_is_found_within_forty_steps(shift: float, tilt: float):
     """Each error is within what the model claims, and all are of one sign, or follow one input."""
     found = [jointly(seed, 40, shift=shift, tilt=tilt) for seed in range(20)]
     assert sum(one.evidence >= 20 for one in found) >= 19
     assert all(int(np.argmax(one.chances)) == 1 for one in found if one.evidence >= 20)
 
 
-def test_the_evidence_is_the_ratio_of_the_densities_of_the_errors():
+def test_the_evidence_for_a_systematic_error_equals_the_explicit_likelihood_ratio():
     """Both are written out, with matrices of the size of the steps."""
     rng, steps = np.random.default_rng(0), 12
     x = np.concatenate([np.ones((steps, 1)), rng.standard_normal((steps, INPUTS))], 1)
@@ -69,7 +69,7 @@ def test_the_evidence_is_the_ratio_of_the_densities_of_the_errors():
         np.testing.assert_allclose(form.mean, expected, atol=1e-9)
 
 
-def test_draws_are_the_shift_and_its_uncertainty():
+def test_draws_of_a_systematic_error_have_its_mean_and_uncertainty():
     found = jointly(0, 40, shift=2.0)
     weights = found.draws(400, np.random.default_rng(0))
     assert weights.shape == (400, OUTPUTS, 1 + INPUTS)
@@ -80,7 +80,7 @@ def test_draws_are_the_shift_and_its_uncertainty():
     assert not found.expected()[[0, 2]].any()
 
 
-def test_no_draw_leaves_an_output_right_whose_errors_are_too_large():
+def test_every_draw_gives_a_systematic_error_to_an_output_known_to_be_wrong():
     found, rng = jointly(0, 8, scale=3.0), np.random.default_rng(0)
     wrong = np.array([False, True, False])
     drawn = found.draws(400, rng, wrong)
@@ -95,11 +95,11 @@ def consequence(seed: int, shift: float, cost: float, steps: int = 40) -> Conseq
     return Consequence(found, changes, PROMISE, slack=10.0)
 
 
-def test_a_shift_that_costs_the_return_is_proven():
+def test_a_systematic_error_that_lowers_the_return_is_proven():
     assert consequence(0, shift=1.5, cost=-60.0).proven
 
 
-def test_a_shift_that_costs_nothing_is_no_fault_and_leaves_the_promise():
+def test_a_systematic_error_without_effect_on_the_return_keeps_the_promise():
     harmless = consequence(0, shift=1.5, cost=-5.0)
     assert harmless.shifted.evidence > 20
     assert not harmless.proven
@@ -107,7 +107,7 @@ def test_a_shift_that_costs_nothing_is_no_fault_and_leaves_the_promise():
     assert harmless.widened(PROMISE) is PROMISE
 
 
-def test_a_possible_shift_that_would_cost_much_asks_for_more_steps_and_widens_the_promise():
+def test_a_possible_costly_systematic_error_asks_more_steps_and_widens_the_promise():
     possible = consequence(0, shift=0.9, cost=-150.0, steps=8)
     assert possible.shifted.evidence < 20
     assert possible.undecided
@@ -116,7 +116,7 @@ def test_a_possible_shift_that_would_cost_much_asks_for_more_steps_and_widens_th
     assert wider.high <= PROMISE.high + 1
 
 
-def test_the_region_of_an_error_is_named():
+def test_the_input_region_of_a_systematic_error_is_found():
     rng = np.random.default_rng(0)
     values = rng.uniform(-1, 1, (300, 2))
     errors = 0.1 * rng.standard_normal(300) + np.where(values[:, 1] > 0.4, 0.5, 0.0)
@@ -128,7 +128,7 @@ def test_the_region_of_an_error_is_named():
     assert region(["x", "u"], values, 0.1 * rng.standard_normal(300)) is None
 
 
-def test_inputs_show_angles_by_cosine_and_sine():
+def test_the_inputs_of_a_systematic_error_encode_angles_by_cosine_and_sine():
     rng = np.random.default_rng(0)
     q, u = rng.uniform(-3, 3, (50, 2)), rng.uniform(-2, 2, (50, 1))
     inputs = Inputs.over(pendulum(), q, u)

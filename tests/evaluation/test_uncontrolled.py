@@ -13,7 +13,7 @@ from surrogym_trainer.evaluation.reporting import as_reported, paired_start
 from surrogym_trainer.evaluation.uncontrolled import baseline, default_baseline
 
 
-def test_zero_where_zero_is_an_action_and_random_choices_elsewhere():
+def test_the_uncontrolled_baseline_uses_zero_actions_or_random_discrete_ones():
     assert default_baseline(pendulum()) == "zero"
     assert default_baseline(cartpole()) == "random"
     positive = pendulum().model_copy(update={"action": BoxAction(low=(1.0,), high=(2.0,))})
@@ -22,7 +22,7 @@ def test_zero_where_zero_is_an_action_and_random_choices_elsewhere():
         baseline(positive, "zero")
 
 
-def test_actions_are_those_of_the_environment():
+def test_the_uncontrolled_baseline_uses_valid_actions():
     observations = np.zeros((500, 3), dtype=np.float32)
     zero = decode_actions(pendulum(), baseline(pendulum(), "zero")(observations), 500)
     assert not zero.any()
@@ -32,7 +32,7 @@ def test_actions_are_those_of_the_environment():
     assert set(np.unique(chosen)) == {0.0, 1.0}
 
 
-def test_paired_best_median_and_worst_episodes_are_reported_with_their_seeds():
+def test_paired_best_median_and_worst_episodes_are_reported_with_seeds():
     returns = np.array([-3.0, -1.0, -5.0, -2.0])
     traces = tuple(Trace(np.full((2, 2), r), np.zeros((1, 1)), np.array([r])) for r in returns)
     result = Evaluation(returns, np.ones(4, dtype=np.int64), np.array([True, True, False, True]), traces)
@@ -48,7 +48,7 @@ def test_paired_best_median_and_worst_episodes_are_reported_with_their_seeds():
     assert said.note == "starts anywhere in the sampling range, from seed 100"
 
 
-def test_report_of_the_most_coordinates_and_episodes_fits_into_a_request():
+def test_the_largest_evaluation_report_fits_into_a_request():
     rng, steps = np.random.default_rng(0), 2_000
     trace = Trace(rng.normal(size=(steps + 1, 64)), rng.normal(size=(steps, 64)), rng.normal(size=steps))
     result = Evaluation(rng.normal(size=10_000), np.full(10_000, steps), None, (trace,) * 10_000)

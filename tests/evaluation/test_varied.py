@@ -63,7 +63,7 @@ def episodes(drift: float) -> Evaluation:
 
 
 @pytest.mark.parametrize(("drift", "names"), [(0.0, ()), (1e-9, ()), (-0.2, ("wanted",))])
-def test_a_constant_that_changed_within_an_episode_is_named(drift: float, names: tuple[str, ...]) -> None:
+def test_a_constant_that_changed_within_an_evaluation_episode_is_named(drift: float, names: tuple[str, ...]) -> None:
     result = episodes(drift)
     assert result.varied == names, "a change by rounding is none"
     assert result.summary()["varied"] == list(names)
@@ -104,7 +104,7 @@ def run(**options: Any) -> Evaluation:
 
 
 @pytest.mark.parametrize(("length", "limit"), [(100, 6), (6, 6), (4, 4)])
-def test_a_promise_is_not_for_episodes_that_the_environment_ends_earlier(length: int, limit: int) -> None:
+def test_episodes_the_environment_truncates_early_do_not_judge_the_promise(length: int, limit: int) -> None:
     result = run(length=length)
     assert result.limit == limit
     assert is_promised(SETTINGS, result, SPEC) is (limit == SPEC.time_limit)
@@ -116,7 +116,7 @@ def test_a_promise_is_not_for_episodes_that_the_environment_ends_earlier(length:
 
 
 @pytest.mark.parametrize("deaf", [True, False])
-def test_an_environment_that_ignores_its_seed_is_noticed(deaf: bool) -> None:
+def test_evaluation_notices_an_environment_that_ignores_its_seed(deaf: bool) -> None:
     result = run(deaf=deaf)
     assert result.seeded is not deaf
     told = as_reported(result, SETTINGS, "a" * 32)

@@ -29,7 +29,7 @@ def episodes(*lengths: int) -> Evaluation:
     return Evaluation(returns, np.array(lengths), None, tuple(traces))
 
 
-def test_the_episodes_are_side_by_side_and_the_short_ones_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_evaluation_video_shows_episodes_side_by_side_and_holds_ended_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     video = videos.record(SPEC, None, episodes(20, 40, 10), "declared starts")
     assert video.form == "gif"
@@ -51,7 +51,9 @@ def nearest(frame: np.ndarray, place: int) -> float:
     return min(drawn, key=lambda x: float(np.abs(panel - drawn[x].astype(np.float64)).mean()))
 
 
-def test_mp4_where_ffmpeg_is_and_long_episodes_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evaluation_videos_are_mp4_if_ffmpeg_is_installed_and_limited_in_length(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     pytest.importorskip("imageio_ffmpeg")
     monkeypatch.setattr(videos, "MOST_FRAMES", 30)
     video = videos.record(SPEC, None, episodes(200), "declared starts")
@@ -60,6 +62,6 @@ def test_mp4_where_ffmpeg_is_and_long_episodes_have_a_bound(monkeypatch: pytest.
     assert len(video.content) < 100_000
 
 
-def test_what_can_not_be_drawn_says_why() -> None:
+def test_the_error_for_an_evaluation_video_that_cannot_be_drawn_gives_the_reason() -> None:
     with pytest.raises(NotRenderable, match="expected original="):
         videos.record(SPEC.model_copy(update={"environment": "my plant"}), None, episodes(3), "")
