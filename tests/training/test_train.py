@@ -218,7 +218,7 @@ def test_dqn_takes_one_discrete_action_and_sac_none(tmp_path: Path):
     settings = small(algorithm="dqn", num_envs=4, total_steps=64, hyperparameters=quick)
     result = train(surrogate, tmp_path / "policy.zip", settings)
     assert load_policy(result.path, "dqn")(np.zeros((5, 4), np.float32)).shape == (5,)
-    with pytest.raises(ValueError, match=r"SAC can't be trained here: .*Discrete"):
+    with pytest.raises(ValueError, match=r"SAC can't be trained in this surrogate: .*Discrete"):
         train(surrogate, tmp_path / "policy.zip", small(algorithm="SAC", hyperparameters=quick))
 
 

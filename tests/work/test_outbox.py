@@ -124,5 +124,5 @@ def test_a_file_that_no_worker_wrote_is_set_aside(
     good = Waiting(surrogate=NAME, job=1, lease_token="a", status="done").model_dump(mode="json")
     (tmp_path / "x.waiting.json").write_text(json.dumps(good | changes))
     outbox.send(api)
-    assert "is no result of a job" in told[0]
+    assert "is not the result of a job" in told[0]
     assert [path.name for path in tmp_path.iterdir()] == ["x.refused.json"]

@@ -1,4 +1,4 @@
-"""Handover of a policy: its promise, its audit, and whether the promise is to be trusted."""
+"""The handover of a policy: its promise, its audit, and the decision whether the promise is trusted."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ from surrogym_trainer.evaluation.uncontrolled import baseline
 from surrogym_trainer.policies.evidence import Audit, Promise
 from surrogym_trainer.policies.predict import Predict
 
-LEAST_AUDITED = 128  # real steps of audits that every surrogate may take
-MOST_AUDITS = 3  # audits of one training at most, which share these steps
-WAY_LANES = 16  # virtual episodes whose states an audit chooses from
-MOST_OF_A_WAY = 200  # steps of an episode that are compared with a log
-ELSEWHERE = 4  # an audit of a ready design takes one of every four steps in a gap of the samples
-ANYWHERE = 1_024  # points of the sampling range that such steps are chosen from
-WIDE = 0.5  # share of the gain over an untrained policy: a promise with a wider lower half is not trusted
+LEAST_AUDITED = 128  # number of real steps of audits that every surrogate may take
+MOST_AUDITS = 3  # largest number of audits in one training, which share these steps
+WAY_LANES = 16  # number of virtual episodes from whose states an audit chooses
+MOST_OF_A_WAY = 200  # largest number of steps of an episode that are compared with a log
+ELSEWHERE = 4  # an audit of a ready design takes one of this many steps in a gap of the samples
+ANYWHERE = 1_024  # number of points of the sampling range from which such steps are chosen
+WIDE = 0.5  # share of the gain over an untrained policy; a promise with a wider lower half is not trusted
 NO_SAMPLER = "no sampler is connected"
 
 Array = NDArray[np.float64]
@@ -63,9 +63,9 @@ class Handover:
     """A policy's promise, with the evidence for it.
 
     Attributes:
-        promise: promise of the latest model; None if the policy goes where the log has no data.
-        audit: audit of the policy; None without one.
-        trusted: whether the promise is to be trusted.
+        promise: promise of the latest model; None if the policy visits states where the log has no data.
+        audit: audit of the policy; None if there was none.
+        trusted: whether the promise is trusted.
         reason: why it is trusted or not, in one sentence.
         model: hash of the samples of the promise's model.
     """
@@ -79,19 +79,19 @@ class Handover:
 
 @dataclass(frozen=True)
 class AuditSettings:
-    """Settings of an audit."""
+    """The settings of an audit: number of real steps, patience and seed."""
 
     steps: int = AUDIT_STEPS
-    patience_seconds: float = 3_600.0  # longest time that a sampler may take
+    patience_seconds: float = 3_600.0  # seconds that a sampler may take
     seed: int = 0
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A policy to hand over, with the session and the seed that it was trained with."""
+    """A policy to hand over, with the session options and the seed that it was trained with."""
 
     api: Api
-    name: str  # of the surrogate
+    name: str  # name of the surrogate
     port: SurrogatePort
     predict: Predict
     session: dict[str, Any] = field(default_factory=dict)  # fields of ``OpenSession``
@@ -115,7 +115,7 @@ def hand_over(
 
     Raises:
         DesignUnfinished: the audit's queries were not answered in time.
-        SurrogymClientError: the server refused.
+        SurrogymClientError: the server refused a request.
     """
     return replace(_handed_over(subject, audit, progress), model=subject.api.model(subject.name).data_hash)
 
@@ -137,7 +137,7 @@ def _handed_over(
 
 
 def _left_the_log(subject: Subject) -> Outside | None:
-    """Return how much of a policy's way lies outside the log; None if the model is not of a log alone."""
+    """Return which part of a policy's states is outside the log; None if the model was not learned from a log alone."""
     view, spec = subject.api.surrogate(subject.name), subject.port.spec()
     if view.phase != "from_log":
         return None
@@ -150,11 +150,17 @@ def _left_the_log(subject: Subject) -> Outside | None:
 def take(
     subject: Subject, settings: AuditSettings, before: Promise, progress: Callable[[SurrogateView], None] | None
 ) -> Audit | None:
-    """Take the real steps of an audit, fit the model to them, and judge.
+    """Take the real steps of an audit, fit the model to them, and judge the model.
 
-    It takes more steps, up to ``MOST_STEPS``, as long as the errors so far may be shared by all steps and cost the
-    promise, while no test has failed. Returns None if there was no step to take. An audit whose steps the original
-    environment all failed to take has failed.
+    More steps are taken, up to ``MOST_STEPS``, as long as no test has failed but the errors so far may have a part that
+    all steps share and that moves the return out of the promise. Returns None if there was no step to take. If the
+    original environment failed to take all steps, the audit has failed.
+
+    Args:
+        subject: the policy.
+        settings: settings of the audit.
+        before: promise before the audit.
+        progress: called each time the surrogate is polled.
     """
     api, name, spec = subject.api, subject.name, subject.port.spec()
     view = api.surrogate(name)
@@ -188,11 +194,11 @@ def take(
 def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
     """Judge a policy's promise by whole real episodes: by their steps, and by their returns.
 
-    This tests what single steps can't reach where no state can be set: the goal, and what happens on the way to it. The
+    If no state can be set, this tests what single steps can't reach: the goal, and what happens on the way to it. The
     model does not learn from the steps.
 
     Raises:
-        SurrogymClientError: the server refused, or has no model yet.
+        SurrogymClientError: the server refused a request, or has no model yet.
     """
     api, spec = subject.api, subject.port.spec()
     view, before = api.surrogate(subject.name), subject.promise()
@@ -213,7 +219,7 @@ def _answers(
     wanted: set[int],
     progress: Callable[[SurrogateView], None] | None,
 ) -> tuple[list[SampleView], list[QueryView]]:
-    """Wait for the answers to queries. Returns their samples, and the queries that have none."""
+    """Wait for the answers to the queries ``wanted``. Returns their samples, and the queries that have none."""
     api, name = subject.api, subject.name
     try:
         wait_for_answers(api, name, wanted, settings.patience_seconds, progress)
@@ -227,9 +233,16 @@ def _answers(
 def _consequence(
     subject: Subject, beside: Compared, before: Promise, view: SurrogateView, inputs: Inputs
 ) -> Consequence | None:
-    """Test the errors on the policy's way together, and compute what they would change in the return.
+    """Test the audit's errors together, and compute the effect on the return of the part that all steps share.
 
-    Returns None without a step on the way.
+    Returns None if there is no step in a state that the policy visits.
+
+    Args:
+        subject: the policy.
+        beside: the real steps with their predictions.
+        before: promise before the audit.
+        view: the surrogate.
+        inputs: the standardisation of the inputs.
     """
     if len(beside.errors) == beside.elsewhere or view.model_version is None:
         return None
@@ -242,8 +255,8 @@ def _consequence(
 
 
 def _asked_more(subject: Subject, settings: AuditSettings, q: Array, u: Array) -> set[int]:
-    """Add further queries of an audit on the policy's way. Returns their numbers; none if the surrogate's audits have
-    taken as many steps as they may, or if states can't be set."""
+    """Add further queries of an audit in states q (m, C) with actions u (m, F). Returns their ids; none if the
+    surrogate's audits have taken as many steps as they may, or if states can't be set."""
     if settings.steps < 1 or subject.port.spec().query == "rollout":
         return set()
     try:
@@ -253,12 +266,12 @@ def _asked_more(subject: Subject, settings: AuditSettings, q: Array, u: Array) -
 
 
 def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, claims: bool) -> tuple[set[int], set[int]]:
-    """Add the queries of an audit, at some of the states q (m, C) of the policy's way with their actions u (m, F).
+    """Add the queries of an audit, in some of the states q (m, C) that the policy visits, with its actions u (m, F).
 
     If the design ``claims`` to know the whole sampling range, one query in ``ELSEWHERE`` is in a gap of its samples
-    instead: what the model got wrong there may have kept the policy away. If the environment can't be set to a state,
-    the query is the sequence of actions of one imagined episode, whole if the surrogate's audits may take that many
-    steps. Returns the queries' numbers, and those off the policy's way.
+    instead, because an error of the model there may have kept the policy away. If the environment can't be set to a
+    state, the query is the sequence of actions of one imagined episode, which is whole if the surrogate's audits may
+    take that many steps. Returns the queries' ids, and the ids of those in gaps.
     """
     spec, rng = subject.port.spec(), np.random.default_rng(settings.seed)
     if spec.query == "rollout":
@@ -280,8 +293,8 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, cla
 
 
 def length_of_rollout(view: SurrogateView, steps: int) -> int:
-    """Number of real steps of an audit from a reset: those of a whole episode, or its share of what audits may take, at
-    least ``steps``."""
+    """Return the number of real steps of an audit from a reset: those of a whole episode, or its share of what audits
+    may take, at least ``steps``."""
     spec = view.spec
     longest = min(spec.time_limit or LONGEST_EPISODE, spec.max_rollout or LONGEST_EPISODE)
     share = max(view.budget, LEAST_AUDITED) // MOST_AUDITS
@@ -289,7 +302,7 @@ def length_of_rollout(view: SurrogateView, steps: int) -> int:
 
 
 def _left_for_audits(view: SurrogateView) -> int:
-    """Number of real steps that the surrogate's audits may still take."""
+    """Return the number of real steps that the surrogate's audits may still take."""
     return max(view.budget, LEAST_AUDITED) - view.ledger.audit
 
 
@@ -307,9 +320,13 @@ def _in_gaps(subject: Subject, count: int) -> tuple[Array, Array]:
 def way_of(subject: Subject, episodes: int, steps: int, start_box: float = 0.0) -> tuple[Array, Array]:
     """Return the states (m, C) and actions (m, F) of a policy in whole virtual episodes.
 
-    They begin at the declared starts; a share ``start_box`` of them begins anywhere in the sampling range.
+    Each episode follows a sampled function of its own. Actions are in the original environment's units.
 
-    Each episode follows a drawn function of its own. Actions are in the original environment's units.
+    Args:
+        subject: the policy.
+        episodes: number of episodes.
+        steps: largest number of steps in an episode.
+        start_box: share of episodes that begin anywhere in the sampling range; the others begin as declared.
     """
     spec = subject.port.spec()
     options = {**subject.session, **WHOLE, "start_box": start_box, "variant": "pathwise", "seed": subject.seed}
@@ -372,7 +389,7 @@ def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
 
 
 def _unaudited(subject: Subject, promise: Promise, why: str) -> Handover:
-    """Return a handover whose promise no real step supports."""
+    """Return a handover whose promise is not supported by any real step; ``why`` is the reason."""
     if (left := _left_the_log(subject)) is not None and left.much:
         return Handover(None, None, False, f"{left.words()}: no promise can be made for them")
     return _without(subject.api.surrogate(subject.name), promise, subject.floor, why)
@@ -389,7 +406,8 @@ def _without(view: SurrogateView, promise: Promise, floor: float | None, why: st
 
 
 def _doubtful(promise: Promise, floor: float | None) -> str | None:
-    """Return why a promise can't be trusted by its numbers alone; None if it can."""
+    """Return why the numbers of a promise make it doubtful; None if they don't. ``floor`` is the return of an untrained
+    policy."""
     if floor is not None and promise.high <= floor:
         return (
             f"the promise is no more than the return of an untrained policy, {floor:.4g}: perhaps no policy can change "

@@ -1,17 +1,17 @@
-"""PolicySearch: the port of policy searches, and the names of the installed ones.
+"""PolicySearch, the interface of policy searches, and the registry of the installed ones.
 
 The laws of a search, which ``surrogym_trainer.testing`` checks:
 
-1. The same surrogate, settings and seed give the same policy, bit for bit.
-2. It takes at most ``task.steps`` virtual steps, rounded to whole units of its own work (a rollout, a generation), and
+1. The same surrogate, settings and seed give the same policy, bit for bit. 2. It takes at most ``task.steps`` virtual
+steps, rounded to whole units of its own work (a rollout, a generation), and
    at least one unit. Steps that only compare policies are not counted.
-3. It reports progress with steps that never decrease and never exceed their total.
-4. On Ctrl-C it returns the best policy so far, with ``whole=False``. It raises ``KeyboardInterrupt`` only if there is
+3. It reports progress with steps that never decrease and never exceed their total. 4. On Ctrl-C it returns the best
+policy so far, with ``whole=False``. It raises ``KeyboardInterrupt`` only if there is
    no policy yet.
-5. It closes every session that it opens, also after errors. It writes no file; the policy's ``save`` does.
-6. ``load_policy`` reads the saved policy without trust, and the policy gives actions of the surrogate's action space.
-7. Impossible settings raise ``ValueError`` with what was expected and what came, before the first virtual step.
-8. It starts from the policy of ``settings.start_from`` if that is set. A search that can't has ``resumable = False``.
+5. It closes every session that it opens, also after errors. It writes no file; the policy's ``save`` does. 6.
+``load_policy`` reads the saved policy without trust, and the policy gives actions of the surrogate's action space. 7.
+Impossible settings raise ``ValueError`` with what was expected and what came, before the first virtual step. 8. It
+starts from the policy of ``settings.start_from`` if that is set. A search that can't has ``resumable = False``.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from surrogym_trainer.policies import load_policy
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training.settings import TrainProgress, TrainSettings, prolongs
 
-MAX_STEPS = 10_000_000  # most virtual steps of a training: hours of PPO
-ALGORITHMS = ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3")  # of Stable-Baselines3
-FAST = "FASTPPO"  # default
-REFERENCE = "PPO"  # of Stable-Baselines3
+MAX_STEPS = 10_000_000  # largest number of virtual steps in a training, which takes PPO hours
+ALGORITHMS = ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3")  # names of searches by Stable-Baselines3
+FAST = "FASTPPO"  # name of the default search
+REFERENCE = "PPO"  # name of the search by Stable-Baselines3's PPO
 
 Progress = Callable[[TrainProgress], None]
 
 
 @dataclass(frozen=True)
 class SearchTask:
-    """Task of a policy search."""
+    """The task of a policy search."""
 
     port: SurrogatePort
     settings: TrainSettings
-    steps: int  # virtual steps at most
-    out: Path  # where the policy will be saved; names the run to trackers
+    steps: int  # largest number of virtual steps
+    out: Path  # file to which the policy will be saved; also the name of the run in trackers
     prolong: bool = False  # whether to take more cycles while the return rises, and to refine the policy
     progress: Progress = lambda _: None
 
@@ -54,29 +54,29 @@ class Saved(Protocol):
     """A policy that can be saved: a ``Network`` of arrays, or a ``LearnedPolicy`` of Stable-Baselines3."""
 
     def save(self, path: Path) -> None:
-        """Write the file that ``load_policy`` reads."""
+        """Write a file that ``load_policy`` can read."""
         ...
 
 
 @dataclass(frozen=True)
 class Found:
-    """Result of a policy search."""
+    """The result of a policy search."""
 
     policy: Saved
     virtual_steps: int
-    imagined_return: float | None  # of the policy; None if it was not measured
-    settings: Mapping[str, Any] = field(default_factory=dict)  # settings of the search, defaults included
-    algorithm: str | None = None  # class of Stable-Baselines3 that reads the file; None if the file needs none
-    whole: bool = True  # False after Ctrl-C
+    imagined_return: float | None  # imagined return of the policy; None if it was not measured
+    settings: Mapping[str, Any] = field(default_factory=dict)  # settings of the search, including defaults
+    algorithm: str | None = None  # class of Stable-Baselines3 that can read the file; None if the file needs none
+    whole: bool = True  # whether the search finished; False after Ctrl-C
     episode_penalty: float | None = None
     lost_episodes: int = 0
     networks: int = 1
     gaining: bool = False
-    untrained: float | None = None  # imagined return of a network that has learned nothing; None: not measured
+    untrained: float | None = None  # imagined return of an untrained network; None if not measured
 
 
 class PolicySearch(ABC):
-    """One way to find a policy. Its hyperparameters are the arguments of its class.
+    """A method to find a policy. Its hyperparameters are the arguments of its class.
 
     Examples:
         >>> @dataclass(frozen=True)
@@ -90,16 +90,17 @@ class PolicySearch(ABC):
         ...         return Found(Network.of(spec, zeros, ones, self.units, vector), 0, None)
     """
 
-    suggested_steps: ClassVar[int] = 600_000  # virtual steps by default
-    most_steps: ClassVar[int | None] = MAX_STEPS  # None: no limit, for a search whose steps are cheap
-    prolongable: ClassVar[bool] = False  # supports ``task.prolong``
-    whole_episodes: ClassVar[bool] = True  # knows no other starts than the declared ones, and no shorter episodes
-    tracked: ClassVar[bool] = False  # logs its curves to ``settings.tracker``
-    resumable: ClassVar[bool] = True  # can start from a policy, and so learn in rounds
+    suggested_steps: ClassVar[int] = 600_000  # default number of virtual steps
+    # largest number of virtual steps; None if there is no limit, because steps are cheap
+    most_steps: ClassVar[int | None] = MAX_STEPS
+    prolongable: ClassVar[bool] = False  # whether the search supports task.prolong
+    whole_episodes: ClassVar[bool] = True  # whether episodes always start as declared and are never shortened
+    tracked: ClassVar[bool] = False  # whether the search logs curves to settings.tracker
+    resumable: ClassVar[bool] = True  # whether the search can start from a saved policy, which the closed loop needs
 
     @abstractmethod
     def search(self, task: SearchTask) -> Found:
-        """Find a policy. The invariants are at the top of this module."""
+        """Find a policy by the task's virtual steps. The module docstring lists the laws that a search must keep."""
 
     def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:  # noqa: ARG002  for those that have noise
         """Load a saved policy that explores as in training; a policy without noise takes its most probable actions."""
@@ -119,7 +120,7 @@ SEARCHES = Registry[PolicySearch](
 
 
 def name_of(settings: TrainSettings) -> str:
-    """Return the registered name of the settings' search.
+    """Return the registered name of the search in the settings.
 
     Raises:
         ValueError: no search has this name.
@@ -128,7 +129,8 @@ def name_of(settings: TrainSettings) -> str:
 
 
 def with_algorithm(settings: TrainSettings, spec: EnvironmentSpec) -> TrainSettings:
-    """Return the settings with a search. If they name none, it is ``FAST``, or ``REFERENCE`` if only that one serves.
+    """Return the settings with a search. If they name none, it is ``FAST``, or ``REFERENCE`` if only that one supports
+    the settings.
 
     Only ``REFERENCE`` has trackers and some of the hyperparameters, and can continue a policy of Stable-Baselines3. It
     is also the search of the paper's preset.
@@ -149,14 +151,14 @@ def search_for(settings: TrainSettings) -> PolicySearch:
     """Return the search that the settings name, with its hyperparameters.
 
     Raises:
-        ValueError: the settings name no search, the name or a hyperparameter is unknown, or the search can't be
-            prolonged, tracked or started from a policy, or chooses no starts and horizon, as the settings require.
+        ValueError: the settings name no search, the name or a hyperparameter is unknown, or the search does not support
+            a setting: to be prolonged, tracked or started from a policy, or other starts and a horizon.
     """
     name, kind = name_of(settings), SEARCHES.get(name_of(settings))
     if settings.prolong and not kind.prolongable:
         raise ValueError(
             f"algorithm {name} trains for a fixed number of steps, which can't be prolonged: train without prolong, or "
-            "by another algorithm"
+            "with another algorithm"
         )
     if kind.whole_episodes and (settings.start_visited is not None or settings.horizon is not None):
         raise ValueError(
@@ -183,7 +185,7 @@ def search_for(settings: TrainSettings) -> PolicySearch:
 
 
 def planned_steps(settings: TrainSettings) -> int:
-    """Return the virtual steps of a training.
+    """Return the planned number of virtual steps of a training.
 
     Raises:
         ValueError: the steps exceed the maximum, or the algorithm is unknown.
@@ -198,6 +200,9 @@ def planned_steps(settings: TrainSettings) -> int:
 
 
 def is_prolonged(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
-    """Whether a training takes more cycles while its return rises, and refines its policy. Raises as
-    ``search_for``."""
+    """Return whether a training takes more cycles while its return rises, and refines its policy.
+
+    Raises:
+        ValueError: the settings don't fit the search.
+    """
     return search_for(settings).prolongable and prolongs(settings, spec)

@@ -1,4 +1,4 @@
-"""Settings, progress and result of a training, which all policy searches share."""
+"""Settings, progress and result of a training, which are common to all policy searches."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ from typing import Any, Literal
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import OF_PARTICLES, SurrogateView
 
-CHECKS = 12  # checks of the imagined return in one training; the best policy is kept
+CHECKS = 12  # number of checks of the imagined return in one training; the best policy is kept
 CHECK_EPISODES = 64
-SUGGESTED_STEPS = 1_000_000  # most virtual steps by default, for all rounds together; the paper's maximum
-DRAWS: dict[str, Any] = {"variant": "probabilistic", "particles": 1, "spread": 0.0}  # each step of a lane is a draw
-FUNCTIONS: dict[str, Any] = {"variant": "pathwise"}  # each episode follows one function
+SUGGESTED_STEPS = 1_000_000  # default largest number of virtual steps, for all rounds together; the paper's maximum
+# session options with which each step is a draw from the model's prediction
+DRAWS: dict[str, Any] = {"variant": "probabilistic", "particles": 1, "spread": 0.0}
+# session options with which each episode follows one sampled function
+FUNCTIONS: dict[str, Any] = {"variant": "pathwise"}
 
-START_BOX = 0.5  # default
+START_BOX = 0.5  # default share of episodes that start anywhere in the sampling range
 
-MOST_THREADS = 1_024  # more than any machine has; torch would end the process when the system refuses another thread
+MOST_THREADS = 1_024  # more than any machine has; with too many, torch would end the process
 
-TENSORBOARD = "tensorboard"  # folder beside the policy
+TENSORBOARD = "tensorboard"  # name of the default folder of TensorBoard's files, beside the policy
 
 Tracker = Literal["tensorboard", "wandb", "mlflow"]
 
@@ -28,31 +30,31 @@ Tracker = Literal["tensorboard", "wandb", "mlflow"]
 class TrainSettings:
     """Settings of a training. None takes the specification's suggestion.
 
-    ``session`` has further fields of ``OpenSession`` (variant, particles, model, penalty, ...). ``hyperparameters`` go
-    to the algorithm's constructor and replace its defaults.
+    ``session`` has further fields of ``OpenSession`` (variant, particles, model, penalty, ...). ``hyperparameters`` are
+    passed to the algorithm's constructor and replace its defaults.
 
     Raises:
-        ValueError: ``threads`` exceeds any machine's.
+        ValueError: ``threads`` is not an integer from 1 to ``MOST_THREADS``.
     """
 
-    algorithm: str | None = None  # name of a ``PolicySearch``, in any case; None: as ``with_algorithm`` chooses
+    algorithm: str | None = None  # name of a PolicySearch, in upper or lower case; None lets with_algorithm choose
     total_steps: int | None = None
     num_envs: int | None = None
     seed: int = 0
-    start_box: float | None = None  # share of episodes that start anywhere in the sampling range; None: START_BOX
-    start_visited: float | None = None  # share of episodes that start at a state of a real step; None: 0
-    horizon: int | None = None  # longest training episode, in steps; None: the time limit
+    start_box: float | None = None  # share of episodes that start anywhere in the sampling range; None takes START_BOX
+    start_visited: float | None = None  # share of episodes that start at a state of a real step; None takes 0
+    horizon: int | None = None  # longest training episode, in steps; None takes the time limit
     start_from: Path | None = None  # saved policy to continue from
-    trust_policy: bool = False  # unpickle that policy's objects, which may run code
-    anew: bool = False  # begin with a new network, and use the saved policy only if the new one stays worse
-    prolong: bool | None = None  # whether to take cycles while they gain, and to refine; None: as ``prolongs``
+    trust_policy: bool = False  # whether to unpickle that policy's objects, which may run code
+    anew: bool = False  # whether to begin with a new network, and use the saved policy only if the new one stays worse
+    prolong: bool | None = None  # whether to take cycles while they gain, and to refine; None lets prolongs decide
     threads: int = 1
-    tracker: Tracker | None = None  # for searches that log curves
+    tracker: Tracker | None = None  # tracker of curves, for searches that log them
     tensorboard: Path | None = (
-        None  # folder of TensorBoard's files; None: beside the policy, where the tracker has some
+        None  # folder of TensorBoard's files; None takes one beside the policy, if the tracker has such files
     )
     session: dict[str, Any] = field(default_factory=dict)
-    judge: dict[str, Any] | None = None  # session fields for comparing policies; None: those of the training
+    judge: dict[str, Any] | None = None  # session fields for comparing policies; None takes those of the training
     hyperparameters: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -61,8 +63,8 @@ class TrainSettings:
 
     @property
     def learning(self) -> dict[str, Any]:
-        """Return the session fields of the lanes that a policy learns in. If a share of the episodes starts at visited
-        states, none starts anywhere unless that was chosen."""
+        """The session fields of the lanes in which a policy learns. If a share of the episodes starts at visited
+        states, none starts anywhere in the range by default."""
         usual = START_BOX if self.start_visited is None else 0.0
         fields: dict[str, Any] = {"seed": self.seed, "start_box": usual if self.start_box is None else self.start_box}
         if self.start_visited is not None:
@@ -77,11 +79,11 @@ class TrainSettings:
 
 
 def chosen_for(view: SurrogateView, settings: TrainSettings) -> TrainSettings:
-    """Return settings adapted to the phase that the surrogate's design ended in.
+    """Return settings adapted to the phase in which the surrogate's design ended.
 
     - If the design has confirmed noise, the learned noise is added to the state. Noise of the sensors is added to
       observations instead.
-    - If the design is not ready, each step of a lane goes to a new draw from the model's prediction (TS1 of Chua et al.
+    - If the design is not ready, each step of a lane is a new draw from the model's prediction (TS1 of Chua et al.
       2018), because a policy that relies on an uncertain mean fails in the original environment. Policies are then
       compared along drawn functions of the posterior: independent draws would shake a lane out of a state in which the
       policy would remain.
@@ -105,7 +107,7 @@ def chosen_for(view: SurrogateView, settings: TrainSettings) -> TrainSettings:
 
 
 def noise_of(view: SurrogateView) -> dict[str, Any]:
-    """Return the session fields of the noise that the design has confirmed; empty without any."""
+    """Return the session fields that add the noise which the design has confirmed; empty if there is none."""
     outputs = [] if view.fidelity is None else view.fidelity.outputs
     sensors = {output.name: output.sensor_noise for output in outputs if output.sensor_noise > 0}
     fields: dict[str, Any] = {"process_noise": True} if any(output.noise > 0 for output in outputs) else {}
@@ -113,9 +115,9 @@ def noise_of(view: SurrogateView) -> dict[str, Any]:
 
 
 def prolongs(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
-    """Whether a training takes more cycles while its return rises, and refines its policy.
+    """Return whether a training takes more cycles while its return rises, and refines its policy.
 
-    By default it does if the number of steps was not chosen. With preset ``paper``, the paper's maximum holds.
+    By default it does if the user did not choose the number of steps. With preset ``paper``, the paper's maximum holds.
     """
     if settings.prolong is not None:
         return settings.prolong
@@ -123,8 +125,8 @@ def prolongs(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
 
 
 def with_folder(settings: TrainSettings, out: Path) -> TrainSettings:
-    """Return the settings with the folder for TensorBoard's files, if the tracker has some. Default: beside the
-    policy."""
+    """Return the settings with the folder for TensorBoard's files, if the tracker has such files. The default is beside
+    the policy."""
     if settings.tensorboard is not None or settings.tracker not in ("tensorboard", "wandb"):
         return settings
     return replace(settings, tensorboard=out.parent / TENSORBOARD)
@@ -132,39 +134,40 @@ def with_folder(settings: TrainSettings, out: Path) -> TrainSettings:
 
 @dataclass(frozen=True)
 class TrainProgress:
-    """State of a training at one report."""
+    """The state of a training at one report."""
 
     steps: int
     total_steps: int
-    imagined_return: float | None  # at the last check: mean return of virtual episodes from the declared starts
-    penalty_share: float  # size of the penalty as a share of the reward's size, since the last report
-    episode_penalty: float | None = None  # what it takes off a training episode's return; mean of the last 100
+    # imagined return at the last check: mean return of virtual episodes from the declared starts
+    imagined_return: float | None
+    penalty_share: float  # sum of the penalties as a share of the sum of absolute rewards, since the last report
+    episode_penalty: float | None = None  # mean penalty of the last 100 training episodes; None without a penalty
     visited_confidence: float | None = (
         None  # confidence index over the states that the policy visited in the last round
     )
-    stage: str | None = None  # name of the present stage, of a search that has some
+    stage: str | None = None  # name of the current stage, if the search has stages
 
 
 @dataclass(frozen=True)
 class TrainResult:
-    """Result of a training."""
+    """The result of a training."""
 
     path: Path
     algorithm: str
     virtual_steps: int
     seconds: float
-    imagined_return: float | None  # of the saved policy
-    lost_episodes: int  # episodes that ended because the server lost the session
+    imagined_return: float | None  # imagined return of the saved policy
+    lost_episodes: int  # number of episodes that ended because the server lost the session
     settings: dict[str, Any]
-    episode_penalty: float | None = None  # what it takes off a training episode's return; mean of the last 100
-    networks: int = 1  # networks of the last training; more than one if some learned nothing
+    episode_penalty: float | None = None  # mean penalty of the last 100 training episodes; None without a penalty
+    networks: int = 1  # number of networks in the last training; more than one if some learned nothing
     gaining: bool = False  # whether the best policy was still improving when the training ended
-    untrained: float | None = None  # imagined return of a network that has learned nothing; None: not measured
-    visited_confidence: tuple[float | None, ...] = ()  # confidence index over the visited states, of each round
+    untrained: float | None = None  # imagined return of an untrained network; None if not measured
+    visited_confidence: tuple[float | None, ...] = ()  # confidence index over the visited states of each round
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """Ctrl-C interrupted a training. ``result`` is that of the policy that was saved then."""
+    """Ctrl-C interrupted a training; ``result`` is that of the best policy so far, which was saved."""
 
     def __init__(self, result: TrainResult) -> None:
         super().__init__()

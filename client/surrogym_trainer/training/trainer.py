@@ -1,4 +1,4 @@
-"""One training: run a policy search, save the policy, and write the settings beside it."""
+"""A training: run a policy search, save the policy, and write the settings and results beside it."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ def train(
 
     Args:
         port: the surrogate.
-        out: file to write the policy to; its settings go to the file with suffix .json beside it.
+        out: file to write the policy to; its settings are written beside it, to a file with the suffix .json.
         settings: settings of the training, which name the search.
         progress: called after every rollout, generation or other unit of the search.
 
     Raises:
-        ValueError: an unknown algorithm, one that does not support the action space, or too many steps.
+        ValueError: the algorithm is unknown or does not support the action space, or there are too many steps.
         SurrogymClientError: the surrogate can't be reached, or has no model yet.
-        UnusablePolicy: the file to start from is not a policy of the algorithm, or the card would replace another
-            kind of file.
+        UnusablePolicy: the file to start from is not a policy of the algorithm, or the card would replace another kind
+            of file.
         TrainingInterrupted: Ctrl-C was pressed; the policy with the best imagined return so far is saved.
     """
     require_card_or_none(out)
@@ -53,7 +53,7 @@ def train(
     started = time.perf_counter()
     found = search.search(task)
     out.parent.mkdir(parents=True, exist_ok=True)
-    card_path(out).unlink(missing_ok=True)  # no promise of an earlier policy stands beside this one
+    card_path(out).unlink(missing_ok=True)  # an earlier policy's card must not remain beside this policy
     found.policy.save(out)
     result = _result(found, settings, out, time.perf_counter() - started)
     card_path(out).write_text(json.dumps(asdict(result), indent=2, default=str) + "\n")

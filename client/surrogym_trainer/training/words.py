@@ -21,11 +21,11 @@ def words_of_result(
     server: str | None = None,
     env_option: str = "",
 ) -> str:
-    """Describe the result of a training and the next command.
+    """Return a text about the result of a training, with the next command.
 
     Args:
-        result: what was trained.
-        handover: its promise and whether to trust it.
+        result: result of the training.
+        handover: the promise and whether it is trusted.
         asked: number of virtual steps that ``--steps`` gave; None without it.
         closed_loop: whether ``--improve`` was given.
         server: address that the next command needs; None if it needs none.
@@ -43,7 +43,8 @@ def words_of_result(
 
 
 def _of_asked(result: TrainResult, asked: int | None) -> str:
-    """Why there are fewer virtual steps than asked for, if the last rollout had no room."""
+    """Return why fewer virtual steps than requested were taken, if the rest was less than a rollout; else an empty
+    text."""
     rollout = result.settings.get("n_steps", 0) * result.settings.get("num_envs", 0)
     if asked is None or not 0 < asked - result.virtual_steps < rollout:
         return ""
@@ -51,8 +52,8 @@ def _of_asked(result: TrainResult, asked: int | None) -> str:
 
 
 def words_of_handover(handover: Handover) -> str:
-    """Describe the promise of a policy, and whether to trust it, in one line. If the policy's way leaves a sampling
-    range, the line before describes where."""
+    """Return a line about the promise of a policy, and whether it is trusted. If the policy leaves a sampling range, a
+    line before says where."""
     promise, trusted = handover.promise, "trusted" if handover.trusted else "not trusted"
     if promise is None:
         return f"no promise, {trusted}: {handover.reason}"
@@ -66,8 +67,8 @@ def words_of_handover(handover: Handover) -> str:
 
 
 def words_of_no_sampler(result: TrainResult, handover: Handover | None, sample: str) -> str:
-    """Describe how to audit a policy that was not audited for want of a sampler, in a line of its own; empty for
-    others. ``sample`` is the command that starts a sampler."""
+    """Return a line about how to audit a policy that was not audited because no sampler was connected; empty for other
+    policies. ``sample`` is the command that starts a sampler."""
     from surrogym_trainer.training.handover import NO_SAMPLER
 
     if handover is None or not handover.reason.endswith(NO_SAMPLER):
@@ -76,7 +77,7 @@ def words_of_no_sampler(result: TrainResult, handover: Handover | None, sample: 
 
 
 def words_of_range(left: RangeLeft) -> str:
-    """Describe where a policy's way leaves a sampling range, and what to do."""
+    """Return a sentence about the sampling range that a policy leaves, and what to do."""
     beyond, way = ("above", "up") if left.side == "upper" else ("below", "down")
     return (
         f"{100 * left.share:.0f} % of the policy's states have {left.coordinate} {beyond} {left.end:.4g}, the end of "
@@ -86,8 +87,8 @@ def words_of_range(left: RangeLeft) -> str:
 
 
 def words_of_interruption(result: TrainResult, asked: str) -> str:
-    """Describe what Ctrl-C has left and how to continue. ``asked`` holds the arguments of the command: the surrogate
-    and its options."""
+    """Return a text about what Ctrl-C has left and how to continue. ``asked`` holds the arguments of the command: the
+    surrogate and its options."""
     return (
         f"interrupted after {result.virtual_steps} virtual steps; the policy so far is in {result.path}; to continue: "
         f"surrogym train {asked} --start-from {result.path} --out {result.path}"
@@ -95,7 +96,7 @@ def words_of_interruption(result: TrainResult, asked: str) -> str:
 
 
 def words_of(now: dict[str, Any]) -> str:
-    """Describe the state of a training, from the fields of ``TrainProgress``."""
+    """Return a line about the state of a training, from the fields of ``TrainProgress``."""
     penalty = f", penalty {now['episode_penalty']:.1f} an episode" if now["episode_penalty"] else ""
     known, stage = _known(now.get("visited_confidence")), f"{now['stage']}: " if now.get("stage") else ""
     steps = f"{now['steps']} of about {now['total_steps']} virtual steps"
@@ -111,7 +112,7 @@ def _gaining(result: TrainResult) -> str:
 
 
 def _loop(rounds: Sequence[float | None]) -> str:
-    """Describe the closed loop by the confidence index of each round."""
+    """Return a text about the closed loop, from the confidence index of each round."""
     if not rounds:
         return "; the design was ready, so no round was needed"
     return f"; {len(rounds)} round{'s' * (len(rounds) > 1)}{_known(rounds[-1])}"

@@ -1,1 +1,1 @@
-"""A stream of real steps compared with a model, to find out that the plant has changed."""
+"""Comparison of a stream of real steps with a model, to detect that the plant has changed."""

@@ -1,16 +1,16 @@
-"""Find drift in an endless stream of errors, with a stated rate of false alarms. Pure.
+"""Detection of drift in an endless stream of errors, with a known rate of false alarms. All functions are pure.
 
 An audit tests once whether its few errors share a part (``evaluation.systematic``). A stream has no end, and the plant
 may change at any step, so the test has to begin again at each step and to forget what was long ago. That is an
 e-detector: the sum, over all steps at which a change may have begun, of the evidence for a change since then. The sum
 is the recursion M <- (M + 1) L, where L is the evidence of one step, whose expectation is at most 1 without a change.
-An alarm at M >= N has an average run length of at least N steps without a change (J. Shin, A. Ramdas, A. Rinaldo
-2024, "E-detectors: a nonparametric framework for sequential change detection", New England Journal of Statistics in
-Data Science 2(2), theorem 2.4; the recursion is that of Shiryaev and Roberts). M is the mean over bets.
+An alarm at M >= N has an average run length of at least N steps without a change (J. Shin, A. Ramdas, A. Rinaldo 2024,
+"E-detectors: a nonparametric framework for sequential change detection", New England Journal of Statistics in Data
+Science 2(2), theorem 2.4; the recursion is that of Shiryaev and Roberts). M is the mean over bets.
 
-Each bet is on the standardised error z of one output, L = exp(l z - l^2 / 2) for a shift of size l in one direction,
-or L = sqrt(1 - g) exp(g z^2 / 2) for a spread. Both have an expectation of at most 1 if z has mean 0 and is no wider
-than a standard normal variable.
+Each bet is on the standardised error z of one output, L = exp(l z - l^2 / 2) for a shift of size l in one direction, or
+L = sqrt(1 - g) exp(g z^2 / 2) for a spread. Both have an expectation of at most 1 if z has mean 0 and is no wider than
+a standard normal variable.
 
 Without a change the error e of a step has these parts, of which z = (e - m) / sqrt(s^2 + (SHARE d)^2) is made:
 
@@ -33,27 +33,27 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-FALSE_ALARM_STEPS = 10_000  # average number of steps up to a false alarm
-SHIFTS = (0.5, 1.0, 2.0)  # sizes of a shift, in deviations
-SPREADS = (0.25, 0.5)  # g of a spread; the evidence grows most if the variance is 1 / (1 - g)
-BIAS = 3.0  # deviations of the model up to which a mean error counts as the model's own
-SHARE = 1.5  # deviations of the model that count as one of the error
+FALSE_ALARM_STEPS = 10_000  # average number of steps until a false alarm
+SHIFTS = (0.5, 1.0, 2.0)  # sizes of a shift of the errors, in standard deviations
+SPREADS = (0.25, 0.5)  # parameters g of a spread; the evidence grows most if the errors' variance is 1 / (1 - g)
+BIAS = 3.0  # standard deviations of the model up to which a mean error counts as the model's own
+SHARE = 1.5  # factor on the model's standard deviation in that of the error
 MOST = 4.0  # deviations to which an error is limited
-OUTLYING = 3.0  # deviations to which an error is limited before mean and noise learn from it
-NOISE_STEPS = 20.0  # weight of the error on left-out samples, in steps
-PAID_STEPS = 100.0  # weight of "a bet pays 1 on average", in steps
-MOST_PAID = 1.5  # most that a healthy stream may pay a bet on average
-NEGLIGIBLE = 0.1  # share of the tolerance below which no error means anything
+OUTLYING = 3.0  # standard deviations to which an error is limited before mean and noise are learned from it
+NOISE_STEPS = 20.0  # weight of the error on left-out samples in the noise, in steps
+PAID_STEPS = 100.0  # weight of the prior that a bet pays 1 on average, in steps
+MOST_PAID = 1.5  # largest average payment of a bet by a stream without a change
+NEGLIGIBLE = 0.1  # share of the tolerance below which an error is negligible
 
 Array = NDArray[np.float64]
 
 
 class Drift(NamedTuple):
-    """A change that was found.
+    """A change in the errors that was detected.
 
     Attributes:
-        output: number of the output whose evidence is largest.
-        shifted: whether its errors have a mean; otherwise they are only larger than before.
+        output: index of the output with the largest evidence.
+        shifted: whether its errors have a new mean; otherwise they are only larger than before.
         steps: number of latest steps that show the change.
     """
 
@@ -63,42 +63,46 @@ class Drift(NamedTuple):
 
 
 class Detector:
-    """Looks at the errors of a model step by step."""
+    """A detector that tests the errors of a model step by step for a change."""
 
     def __init__(self, claimed: Array, tolerance: Array, false_alarm_steps: float = FALSE_ALARM_STEPS) -> None:
-        """Args:
-        claimed: error (O,) of the model on left-out samples, which includes the noise.
-        tolerance: error (O,) that is too small to matter.
-        false_alarm_steps: average number of steps up to a false alarm, at least."""
+        """Start a detector.
+
+        Args:
+            claimed: error (O,) of the model on left-out samples, which includes the noise.
+            tolerance: error (O,) that is too small to matter.
+            false_alarm_steps: smallest average number of steps until a false alarm.
+        """
         self._least = NEGLIGIBLE * tolerance
         self._alarm = false_alarm_steps
         self._sum, self._known_steps = np.zeros(len(claimed)), np.zeros(len(claimed))
         self._squares = NOISE_STEPS * np.maximum(claimed, self._least) ** 2
         count = 2 * len(SHIFTS) + len(SPREADS)
         half = [1 / (4 * len(SHIFTS))] * (2 * len(SHIFTS)) + [1 / (2 * len(SPREADS))] * len(SPREADS)
-        self._weights = np.array(half) / len(claimed)  # (B,): half of the stake is on shifts, half on spreads
-        self._evidence = np.zeros((len(claimed), count))  # M of each bet
-        self._paid = np.full((len(claimed), count), PAID_STEPS)  # what each bet has paid in all steps
-        self._run = np.zeros((len(claimed), count))  # logarithm of the evidence since the likeliest change
-        self._begun = np.zeros((len(claimed), count), dtype=np.int64)  # step of that change
+        self._weights = np.array(half) / len(claimed)  # (B,) weights of the bets: half on shifts, half on spreads
+        self._evidence = np.zeros((len(claimed), count))  # (O, B) evidence M of each bet
+        self._paid = np.full((len(claimed), count), PAID_STEPS)  # (O, B) sum of what each bet has paid
+        self._run = np.zeros((len(claimed), count))  # (O, B) logarithm of the evidence since the likeliest change
+        self._begun = np.zeros((len(claimed), count), dtype=np.int64)  # (O, B) step of that change
         self.steps = 0
 
     @property
     def evidence(self) -> float:
-        """Evidence for a change at any step so far; the alarm is at ``false_alarm_steps``."""
+        """The evidence for a change at any step so far; the alarm is at ``false_alarm_steps``."""
         return float((self._evidence * self._weights).sum())
 
     def step(self, error: Array, deviation: Array) -> Drift | None:
-        """Take one step, and return the change if there is enough evidence.
+        """Add the errors of one step, and return the change if there is enough evidence, else None.
 
         Args:
-            error: real minus predicted values (O,); NaN for an output of which this step says nothing.
+            error: real minus predicted values (O,); NaN for an output that this step does not test.
             deviation: standard deviations (O,) of the model at this step, without noise.
         """
         known = np.isfinite(error)
         uncertain = np.hypot(deviation, self._least)
         noise = np.sqrt(self._squares / (NOISE_STEPS + self._known_steps))
-        mean = self._sum / (self._known_steps + (noise / uncertain) ** 2)  # given the errors, with the prior N(0, d^2)
+        # posterior mean given the errors, with the prior N(0, d^2)
+        mean = self._sum / (self._known_steps + (noise / uncertain) ** 2)
         mean = mean.clip(-BIAS * uncertain, BIAS * uncertain)
         beyond = np.where(known, error - mean, 0.0)
         paid = (self._paid / (PAID_STEPS + self._known_steps[:, None])).clip(1.0, MOST_PAID)
@@ -113,7 +117,7 @@ class Detector:
         return self._found() if self.evidence >= self._alarm else None
 
     def _learn(self, known: NDArray[np.bool_], mean: Array, beyond: Array, noise: Array) -> None:
-        """Learn the mean and the noise of the errors. An outlier, such as after a change, teaches little."""
+        """Update the estimated mean and noise of the errors. Outliers, such as after a change, are limited."""
         limited = beyond.clip(-OUTLYING * noise, OUTLYING * noise)
         self._sum += np.where(known, mean + limited, 0.0)
         self._squares += np.where(known, limited**2, 0.0)
@@ -126,7 +130,7 @@ class Detector:
 
 
 def _log_bets(z: Array) -> Array:
-    """Logarithms (O, B) of the evidence of standardised errors z (O,)."""
+    """Return the logarithms (O, B) of the evidence in standardised errors z (O,)."""
     z = z.clip(-MOST, MOST)[:, None]
     shifts, spreads = np.array([sign * size for sign in (1, -1) for size in SHIFTS]), np.array(SPREADS)
     return np.concatenate([shifts * z - shifts**2 / 2, 0.5 * np.log(1 - spreads) + spreads * z**2 / 2], 1)

@@ -1,4 +1,4 @@
-"""Logs of real steps for a watcher: read once, or piece by piece while they grow."""
+"""Logs of real steps for a watcher: read once, or in pieces while they grow."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from surrogym_shared.logs.units import BEYOND
 from surrogym_shared.spec import EnvironmentSpec, limits
 from surrogym_trainer.evaluation.comparing import StepOfEpisode
 
-LOOK_SECONDS = 1.0  # between two looks at a log that grows
-LATEST = 1_000  # rows of such a log that are kept: its clock and its units are judged by them
-CHUNK = 2**20  # most bytes of a stream at once
-UNITS = (1.0, 1e3, 1e6, 1e9)  # of a clock in a second
-OFF = 0.1  # share by which the interval of a log may differ from the sampling period
+LOOK_SECONDS = 1.0  # seconds between two reads of a log that grows
+LATEST = 1_000  # number of rows of a growing log that are kept, by which its clock and units are checked
+CHUNK = 2**20  # largest number of bytes read at once from a stream
+UNITS = (1.0, 1e3, 1e6, 1e9)  # possible numbers of a clock's units in a second
+OFF = 0.1  # share by which the interval of a log's rows may differ from the sampling period
 
 Mapping_ = Path | Mapping[str, Any] | None
 
 
 def steps_after(log: ReadLog, line: int) -> list[StepOfEpisode]:
-    """Return the steps of a log after a line, each with its line as its ``number``."""
+    """Return the steps of a log after a line; the ``number`` of each is its line."""
     steps, reward, lines = log.steps, log.reward, log.table.lines[log.steps.row]
     return [
         StepOfEpisode(
@@ -51,7 +51,8 @@ def steps_after(log: ReadLog, line: int) -> list[StepOfEpisode]:
 
 
 def impossible(spec: EnvironmentSpec, step: StepOfEpisode) -> str | None:
-    """Say which coordinate of a step is so far outside its range that it is in another unit, or no measurement."""
+    """Return a sentence about the coordinate of a step that is so far outside its range that its unit or measurement
+    must be wrong; None if there is none."""
     for number, coordinate in enumerate(spec.coordinates):
         low, high = limits(coordinate.sampling)
         if coordinate.kind == "angle" or low == high:
@@ -64,21 +65,28 @@ def impossible(spec: EnvironmentSpec, step: StepOfEpisode) -> str | None:
 
 
 def read_once(path: Path, mapping: Mapping_, spec: EnvironmentSpec) -> ReadLog:
-    """Read a log and check its rows by a specification.
+    """Read a log, and check its rows by a specification.
 
     Raises:
-        UnusableLog: it is no log, its columns don't fit the specification or are in other units, or it was recorded at
-            another sampling period.
-        OSError: it can't be read.
+        UnusableLog: the file is not a log, its columns don't fit the specification or are in other units, or it was
+            recorded at another sampling period.
+        OSError: the file can't be read.
     """
     return _checked(read_log(path, Options(mapping, spec)), spec)
 
 
 def read_growing(chunks: Iterable[bytes], where: str, mapping: Mapping_, spec: EnvironmentSpec) -> Iterator[ReadLog]:
-    """Read a log of text in pieces, and return its latest rows after each piece that completes a line.
+    """Read a text log in pieces, and yield its latest rows after each piece that completes a line.
+
+    Args:
+        chunks: the pieces.
+        where: name of the log, for messages.
+        mapping: roles of the columns; None infers them from their names.
+        spec: specification to check the rows against.
 
     Raises:
-        UnusableLog: as of ``read_once``.
+        UnusableLog: the text is not a log, its columns don't fit the specification or are in other units, or it was
+            recorded at another sampling period.
     """
     growing = _Growing(where, mapping, spec)
     for chunk in chunks:
@@ -87,11 +95,11 @@ def read_growing(chunks: Iterable[bytes], where: str, mapping: Mapping_, spec: E
 
 
 def chunks_of_file(path: Path) -> Iterator[bytes]:
-    """Return what a file has and what is added to it, without end.
+    """Yield the content of a file and what is added to it, without end.
 
     Raises:
-        UnusableLog: it is no text, or has become shorter.
-        OSError: it can't be read.
+        UnusableLog: the file is not a text log, or has become shorter.
+        OSError: the file can't be read.
     """
     if (kind := format_of(path)) != "csv":
         raise UnusableLog(f"expected a log of text (CSV) that grows, got {kind} in {path}: leave out --follow")
@@ -108,23 +116,24 @@ def chunks_of_file(path: Path) -> Iterator[bytes]:
 
 
 def chunks_of_stream(stream: BinaryIO) -> Iterator[bytes]:
-    """Return what comes from a stream as soon as it comes. Its last line may lack its end."""
+    """Yield what arrives from a stream as soon as it arrives, and a final line end, which the last line may lack."""
     while chunk := os.read(stream.fileno(), CHUNK):
         yield chunk
     yield b"\n"
 
 
 class _Growing:
-    """The heading and the latest rows of a log of text that grows."""
+    """The heading and the latest rows of a text log that grows."""
 
     def __init__(self, where: str, mapping: Mapping_, spec: EnvironmentSpec) -> None:
         self._where, self._spec = where, spec
         self._mapping: Mapping_ | LogMapping = mapping
-        self._text, self._rest = b"", b""  # complete lines, and a line that is not complete yet
-        self._dropped = 0  # lines between the heading and the latest rows
+        self._text, self._rest = b"", b""  # complete lines, and the beginning of a line that is not complete yet
+        self._dropped = 0  # number of dropped lines between the heading and the latest rows
 
     def add(self, chunk: bytes) -> ReadLog | None:
-        """Return the latest rows with those of a chunk; None if it completes no line, or there is no usable step."""
+        """Return the latest rows including those of a chunk; None if it completes no line, or there is no
+        usable step."""
         complete, end, self._rest = (self._rest + chunk).rpartition(b"\n")
         if not complete.strip():
             return None
@@ -143,7 +152,7 @@ class _Growing:
             return None
 
     def _drop(self, rows: Ints) -> None:
-        """Drop all rows but the latest. ``rows`` are the lines of all rows, (n,)."""
+        """Drop all rows but the latest; ``rows`` (n,) contains the line of each row."""
         first, kept = int(rows[0]) - self._dropped - 1, int(rows[-LATEST]) - self._dropped - 1
         lines = self._text.splitlines(keepends=True)
         self._text = b"".join([*lines[:first], *lines[kept:]])
@@ -151,13 +160,14 @@ class _Growing:
 
 
 def _checked(log: ReadLog, spec: EnvironmentSpec) -> ReadLog:
-    """Refuse a log of another sampling period than the declared one. Its clock may count seconds or parts of them."""
+    """Raise ``UnusableLog`` if the rows of a log have another interval than the declared sampling period. Its clock may
+    count seconds, or milli-, micro- or nanoseconds."""
     period, interval = spec.sampling_period, log.steps.interval
     if period is None or interval is None or log.roles.time is None:
         return log
     if not any(abs(interval / (unit * period) - 1) <= OFF for unit in UNITS):
         raise UnusableLog(
-            f"expected a step every {period:g} s, as the specification declares by sampling_period, got one every "
-            f"{interval:g} of the column {log.roles.time!r}"
+            f"expected a step every {period:g} s, the sampling_period of the specification, got one every "
+            f"{interval:g} in the column {log.roles.time!r}: record the log at this period"
         )
     return log

@@ -1,4 +1,4 @@
-"""Real steps that arrive, compared with one model of a surrogate, and a drift in words.
+"""Comparison of arriving real steps with one model of a surrogate, and descriptions of a drift.
 
 Shapes: n steps, O outputs, C coordinates, F action entries.
 """
@@ -25,10 +25,10 @@ from surrogym_trainer.evaluation.audit import Compared
 from surrogym_trainer.evaluation.comparing import StepOfEpisode, compared, steady
 from surrogym_trainer.watching.detector import FALSE_ALARM_STEPS, Detector
 
-BATCH = 500  # steps of one request
-KEPT = 2_000  # latest steps from which a drift is described
+BATCH = 500  # largest number of steps in one request
+KEPT = 2_000  # number of latest steps from which a drift is described
 QUARTERS = ("lowest", "second", "third", "highest")
-TELLING = 0.1  # nats by which an error's place has to differ from where the stream has been
+TELLING = 0.1  # relative entropy (nats) above which errors are concentrated in a part of an input's range
 
 Array = NDArray[np.float64]
 
@@ -51,18 +51,18 @@ class Region(NamedTuple):
 
 @dataclass(frozen=True)
 class Alarm:
-    """A drift that was found.
+    """A drift that was detected.
 
     Attributes:
         output: name of the output.
-        error: mean of real minus predicted values since the change, in the output's unit; their root mean square if
-            the errors have grown in both directions.
-        both: whether they have.
-        expected: root mean square error that the model claims at these steps.
+        error: mean of real minus predicted values since the change, in the output's unit; their root mean square if the
+            errors have grown in both directions.
+        both: whether the errors have grown in both directions.
+        expected: root mean square error that the model predicts at these steps.
         latest: number of steps since the change.
         compared: number of steps that were compared.
-        line: line of the step that gave the alarm, in its log.
-        region: where the error is; None if no input has a range.
+        line: line in the log of the step that gave the alarm.
+        region: the part of an input's range with most of the error; None if no input has a range.
     """
 
     output: str
@@ -76,11 +76,11 @@ class Alarm:
 
     @property
     def from_the_start(self) -> bool:
-        """Whether most of the steps show it, so that no healthy time came before."""
+        """Whether most of the compared steps show the drift, so that there were few steps without it."""
         return self.latest > self.compared / 2
 
     def words(self) -> str:
-        """Describe the error in a sentence."""
+        """Return a sentence about the error."""
         how = "in both directions, root mean square" if self.both else "on average"
         size = f"{self.error:.3g}" if self.both else f"{self.error:+.3g}"
         last = "the last real step" if self.latest == 1 else f"the last {self.latest} real steps"
@@ -92,21 +92,25 @@ class Alarm:
 
 
 class Watcher:
-    """Compares real steps with the model that a surrogate serves now, and looks for drift. No model learns from
-    them."""
+    """Compares real steps with the model that a surrogate serves now, and detects drift. The model does not learn from
+    the steps."""
 
     def __init__(self, api: Api, view: SurrogateView, false_alarm_steps: float = FALSE_ALARM_STEPS) -> None:
-        """Args:
-        api: the server.
-        view: the surrogate, which has a model.
-        false_alarm_steps: average number of real steps up to a false alarm, at least."""
+        """Start watching a surrogate.
+
+        Args:
+            api: the connection to the server.
+            view: the surrogate, which has a model.
+            false_alarm_steps: smallest average number of real steps until a false alarm.
+        """
         self._api, self._view = api, view
         self._false_alarm_steps = false_alarm_steps
         self._detector: Detector | None = None
-        self._recent: deque[tuple[Array, Array, Array]] = deque(maxlen=KEPT)  # errors (O,), deviations (O,), inputs
+        # errors (O,), deviations (O,) and inputs (C + F,) of the latest steps
+        self._recent: deque[tuple[Array, Array, Array]] = deque(maxlen=KEPT)
         self._inputs = _inputs_of(view.spec)
         self._visits = np.zeros((len(self._inputs), len(QUARTERS)))
-        self.left_out = 0  # steps in which a constant changed
+        self.left_out = 0  # number of steps that were left out, because a constant changed or a lag was not known
 
     @property
     def compared(self) -> int:
@@ -115,14 +119,15 @@ class Watcher:
 
     @property
     def evidence(self) -> float:
-        """Evidence for a drift now; the alarm is at ``false_alarm_steps``."""
+        """The evidence for a drift now; the alarm is at ``false_alarm_steps``."""
         return 0.0 if self._detector is None else self._detector.evidence
 
     def take(self, steps: Sequence[StepOfEpisode]) -> Alarm | None:
-        """Compare at most ``BATCH`` steps, up to an alarm. Their ``number`` is the line of the log.
+        """Compare at most ``BATCH`` steps, and return the alarm if there is one. The ``number`` of each step is its
+        line in the log.
 
         Raises:
-            SurrogymClientError: as every request.
+            SurrogymClientError: the server can't be reached, or refuses a request.
         """
         spec = self._view.spec
         usable = steady(spec, [step for step in steps if spec.known(step.coordinates)])
@@ -142,7 +147,7 @@ class Watcher:
         return None
 
     def withdraw(self, version: int, alarm: Alarm) -> PolicyView:
-        """Report a drift for a policy, so that its promise is not trusted. Returns the policy."""
+        """Report a drift for a version of the policy, so that its promise is no longer trusted. Returns the policy."""
         content = f"{self._view.model_version} {alarm!r}".encode()
         body = AddDrift(
             output=alarm.output,
@@ -175,8 +180,8 @@ class Watcher:
         )
 
     def _region(self, errors: Array, inputs: Array) -> Region | None:
-        """Return the quarter that has more of the squared errors (n,) than of the stream's steps; without one, the
-        quarter in which most of them are."""
+        """Return the quarter of an input's range in which the squared errors (n,) are concentrated more than the
+        stream's steps; if there is none, the quarter with most of the squared errors."""
         if not self._inputs:
             return None
         quarters, weight = self._quarters(inputs), errors**2 / max(float((errors**2).sum()), 1e-300)
@@ -192,7 +197,8 @@ class Watcher:
         )
 
     def _quarters(self, inputs: Array) -> NDArray[np.intp]:
-        """Quarters (n, K), from 0, of the ranged ones of inputs (n, C + F). Values outside count to the outer ones."""
+        """Return the quarters (n, K), from 0, of the K inputs with a range in inputs (n, C + F). Values outside count
+        to the outer quarters."""
         names = [*self._view.spec.coordinate_names, *_actions(self._view.spec)]
         columns = inputs[:, [names.index(name) for name, _, _ in self._inputs]]
         low, high = (np.array([one[end] for one in self._inputs]) for end in (1, 2))
@@ -202,7 +208,7 @@ class Watcher:
 
 
 def _inputs_of(spec: EnvironmentSpec) -> list[tuple[str, float, float]]:
-    """Name and ends of the range of each coordinate and action entry that has a range."""
+    """Return name, low and high of each coordinate and action entry that has a range."""
     ranged = [(one.name, *limits(one.sampling)) for one in spec.coordinates]
     if isinstance(spec.action, BoxAction):
         ranged += zip(_actions(spec), spec.action.low, spec.action.high, strict=True)
@@ -214,7 +220,8 @@ def _actions(spec: EnvironmentSpec) -> list[str]:
 
 
 def _without_terminal_rewards(beside: Compared, steps: Sequence[StepOfEpisode]) -> Array:
-    """Errors (n, O), NaN for the reward of a step that ended its episode: it may contain a terminal reward."""
+    """Return the errors (n, O), with NaN for the reward of a step that ended its episode, because it may contain a
+    terminal reward."""
     errors = beside.errors.copy()
     if "reward" in beside.names:
         errors[[step.terminated for step in steps], list(beside.names).index("reward")] = np.nan

@@ -1,1 +1,1 @@
-"""The trainer worker: it runs trainings and evaluations that people ask the server for."""
+"""The trainer worker, which runs the trainings and evaluations that people request from the server."""

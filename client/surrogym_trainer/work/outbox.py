@@ -1,4 +1,4 @@
-"""Results that wait in a folder until the server has them. Sending one twice is harmless."""
+"""Results that are stored in a folder until the server has them. Sending a result twice has no effect."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ ENDING = ".waiting.json"
 REFUSED = ".refused.json"
 MAX_BYTES = 64 * 1024 * 1024
 AWAY = (ServerUnreachable, Unavailable)
-FILE_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,199}$"  # in the same folder
+FILE_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,199}$"  # name of a file in the folder
 VIDEO_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,195}\.(mp4|gif)$"
 
 
 class Waiting(BaseModel):
-    """Result of a job that the server does not have yet."""
+    """The result of a job that the server does not have yet."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -37,10 +37,10 @@ class Waiting(BaseModel):
     status: wire.JobEnd
     error: str | None = None
     policy: Annotated[str, Field(pattern=FILE_NAME)] | None = None  # file of a trained policy, in the same folder
-    version: int | None = None  # of an evaluated policy
-    video: Annotated[str, Field(pattern=VIDEO_NAME)] | None = None  # file of its video, in the same folder
+    version: int | None = None  # version of an evaluated policy
+    video: Annotated[str, Field(pattern=VIDEO_NAME)] | None = None  # file of the evaluation's video, in the same folder
     evaluations: tuple[wire.AddEvaluation, ...] = ()
-    steps: tuple[wire.ReportSteps, ...] = ()  # real steps for the ledger
+    steps: tuple[wire.ReportSteps, ...] = ()  # real steps to be counted in the ledger
 
 
 class Outbox:
@@ -65,16 +65,16 @@ class Outbox:
         os.replace(part, path)
 
     def send(self, api: Api) -> None:
-        """Send all results. Those that the server refuses are set aside, with the reason.
+        """Send all results. Those that the server refuses are renamed, and reported with the reason.
 
         Raises:
-            ServerUnreachable, Unavailable: the server is away; what was not sent keeps waiting.
+            ServerUnreachable, Unavailable: the server can't be reached; what was not sent stays in the folder.
         """
         for path in sorted(self._folder.glob(f"*{ENDING}")):
             try:
                 waiting = _read(path)
             except FileNotFoundError:
-                continue  # another worker has sent it
+                continue  # another worker has sent this result
             except UnusablePolicy as error:
                 self._set_aside(path, error)
                 continue
@@ -93,7 +93,7 @@ class Outbox:
         self._tell(f"the server does not take the result in {aside}: {error}")
 
     def _sent(self, api: Api, waiting: Waiting) -> str:
-        """Send one result, and describe what became of it."""
+        """Send one result, and return a sentence about the outcome."""
         name, status = waiting.surrogate, waiting.status
         for steps in waiting.steps:
             key = steps.idempotency_key
@@ -106,7 +106,8 @@ class Outbox:
             self._send_video(api, waiting)
         except AWAY:
             raise
-        except (SurrogymClientError, OSError) as refused:  # the job has to end all the same
+        # the job has to end on the server even if its result is refused
+        except (SurrogymClientError, OSError) as refused:
             error = in_one_line("; ".join([*([error] if error else []), f"the result was not stored: {refused}"]))
             status = "failed" if status == "done" else status
         try:
@@ -118,7 +119,7 @@ class Outbox:
         return f"job {waiting.job} {status}{f': {error}' if error else ''}{_stored(name, version)}"
 
     def _send_video(self, api: Api, waiting: Waiting) -> None:
-        """Send the video of an evaluation. It takes the place of an older one of its form."""
+        """Send the video of an evaluation. It replaces an older one of the same form."""
         if waiting.video is not None and waiting.version is not None:
             path = self._folder / waiting.video
             form: wire.PolicyForm = "mp4" if path.suffix == ".mp4" else "gif"
@@ -126,7 +127,7 @@ class Outbox:
 
 
 def _evaluated(api: Api, name: str, version: int | None, evaluations: tuple[wire.AddEvaluation, ...]) -> int | None:
-    """Send the evaluations of a policy, and return the number of its own; None without one."""
+    """Send the evaluations of a policy, and return the id of the policy's own; None if there is none."""
     stored = [api.policies.evaluate(name, version or 0, evaluation) for evaluation in evaluations]
     return next((one.id for one in stored if one.controller == "policy"), None)
 
@@ -136,7 +137,7 @@ def _stored(name: str, version: int | None) -> str:
 
 
 def in_one_line(text: str) -> str:
-    """Return a text as the server takes it: one line of visible characters, not too long."""
+    """Return a text in the form that the server accepts: one line of visible characters, not too long."""
     return " ".join(re.sub(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]", " ", text).split())[:2_000]
 
 
@@ -148,4 +149,4 @@ def _read(path: Path) -> Waiting:
             raise UnusablePolicy(f"{path} has more than {MAX_BYTES} bytes: train smaller networks")
         return Waiting.model_validate_json(content)
     except ValidationError as error:
-        raise UnusablePolicy(f"{path} is no result of a job: {first_fault(error)}") from error
+        raise UnusablePolicy(f"{path} is not the result of a job: {first_fault(error)}; delete the file") from error

@@ -1,4 +1,4 @@
-"""Reports of a running job: how far it is, that its worker lives, and whether it is to stop."""
+"""Reports of a running job to the server: its progress, that its worker is alive, and whether it has to stop."""
 
 from __future__ import annotations
 
@@ -19,28 +19,29 @@ from surrogym_trainer.training import TrainProgress
 from surrogym_trainer.training.course import Course
 
 AWAY = (ServerUnreachable, Unavailable)
-ONE_ATTEMPT = Retries(seconds=0)  # the next report repeats it
-REPORT_SECONDS = 1.0  # between two reports of a job that goes on; people see them a moment later
+ONE_ATTEMPT = Retries(seconds=0)  # no retries, because the next report repeats a failed one
+REPORT_SECONDS = 1.0  # seconds between two reports of a running job
 
 
 @dataclass(frozen=True)
 class Stand:
-    """How far a job is, as the worker knows it."""
+    """The progress of a job, as the worker knows it."""
 
     stage: wire.JobStage = "preparing"
     share: float = 0.0
     now: TrainProgress | None = None
     curve: tuple[wire.CurvePoint, ...] = ()
-    course: Course = field(default_factory=Course, compare=False)  # of the training; it goes on from stand to stand
+    # progress of the training, shared by all stands of a job
+    course: Course = field(default_factory=Course, compare=False)
 
     def trained(self, now: TrainProgress, seconds: float) -> Stand:
-        """Add the progress of a training."""
+        """Return the progress after a report of the training, ``seconds`` after the job's start."""
         point = wire.CurvePoint(steps=now.steps, imagined_return=finite(now.imagined_return), seconds=seconds)
         share = self.course.share(now.steps, now.total_steps)
         return replace(self, stage="training", share=share, now=now, curve=(*self.curve, point))
 
     def as_sent(self) -> wire.JobState:
-        """Return the form that the server stores."""
+        """Return the progress in the form that the server stores."""
         now = self.now
         return wire.JobState(
             stage=self.stage,
@@ -55,25 +56,25 @@ class Stand:
 
 
 def finite(value: float | None) -> float | None:
-    """Return a number that JSON can hold, and None for any other."""
+    """Return a number if JSON and the server can store it, else None."""
     return value if value is not None and math.isfinite(value) and abs(value) <= wire.MAX_MEASURED else None
 
 
 class JobStopped(KeyboardInterrupt):
-    """A person cancelled the job, or another worker has it. Searches and evaluations end as after Ctrl-C."""
+    """A person cancelled the job, or another worker has it. Searches and evaluations then end as after Ctrl-C."""
 
 
 @dataclass
 class Reporter:
     """Reports one job from a thread, each second or as often as its lease needs.
 
-    A server that is away is tried again by the next report, and the job goes on.
+    If the server can't be reached, the next report tries again, and the job continues.
 
     Attributes:
-        api: the server.
+        api: the connection to the server.
         surrogate: name of the surrogate.
         job: the job.
-        show: called with each new stand.
+        show: called with the progress each time it changes.
     """
 
     api: Api
@@ -81,8 +82,8 @@ class Reporter:
     job: wire.LeasedJob
     show: Callable[[Stand], None] = lambda _: None
     stand: Stand = field(default_factory=Stand, init=False)
-    cancelled: bool = field(default=False, init=False)  # a person asked for it
-    taken: bool = field(default=False, init=False)  # the job has ended, or another worker has it
+    cancelled: bool = field(default=False, init=False)  # whether a person cancelled the job
+    taken: bool = field(default=False, init=False)  # whether the job has ended on the server, or another worker has it
 
     def __post_init__(self) -> None:
         self._started = time.monotonic()
@@ -101,15 +102,16 @@ class Reporter:
         self._thread.join(timeout=5.0)
 
     def trained(self, now: TrainProgress) -> None:
-        """Note the progress of a training. Raises ``JobStopped`` if it is to end."""
+        """Record the progress of a training. Raises ``JobStopped`` if the job has to stop."""
         self._note(self.stand.trained(now, round(time.monotonic() - self._started, 3)))
 
     def at(self, stage: wire.JobStage, share: float = 0.0) -> None:
-        """Note that a stage has come so far. Raises ``JobStopped`` if it is to end."""
+        """Record the share of a stage that is done. Raises ``JobStopped`` if the job has to stop."""
         self._note(replace(self.stand, stage=stage, share=share))
 
     def storing(self) -> None:
-        """Report at once that the result is being sent, which nothing stops, with the end of the curve."""
+        """Report at once that the result is being sent, with the end of the curve. From then on the job can't be
+        stopped."""
         self.stand = replace(self.stand, stage="storing", share=0.0)
         self.show(self.stand)
         self._report(self.stand)

@@ -1,4 +1,4 @@
-"""What a worker does for a job, with the code of ``surrogym train`` and ``surrogym evaluate``."""
+"""The execution of jobs by a worker, with the code of ``surrogym train`` and ``surrogym evaluate``."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ from surrogym_trainer.training.search import SEARCHES, name_of, with_algorithm
 from surrogym_trainer.training.settings import TrainingInterrupted, TrainResult, TrainSettings
 from surrogym_trainer.work.reporter import Reporter
 
-QUICK = 4  # a quick training takes this part of the steps that the algorithm suggests
+QUICK = 4  # factor by which a quick training takes fewer steps than the algorithm suggests
 
 
 @dataclass(frozen=True)
 class Environment:
-    """The original environment of a worker, which evaluates in it.
+    """The original environment in which a worker evaluates policies.
 
     Attributes:
         spec: its specification.
         opener: opens an episode in it.
-        most_episodes: real episodes of one job at most.
-        name: name by which its states are drawn; empty without pictures.
-        reference: loads the reference controller of one job; None: there is none.
+        most_episodes: largest number of real episodes in one job.
+        name: name by which its states are drawn; empty if there are no pictures.
+        reference: loads the reference controller for one job; None if there is none.
     """
 
     spec: EnvironmentSpec
@@ -53,18 +53,18 @@ class Environment:
 
 @dataclass
 class Gathered:
-    """What a job has given so far, also if it is stopped or fails."""
+    """The results of a job so far, which are kept even if the job is stopped or fails."""
 
     policy: Path | None = None
     version: int | None = None
     video: Path | None = None
-    lacks: str | None = None  # why there is no video that was asked for
+    lacks: str | None = None  # why a requested video could not be made
     evaluations: list[wire.AddEvaluation] = field(default_factory=list)
     steps: list[wire.ReportSteps] = field(default_factory=list)
 
 
 def settings_of(task: wire.TrainTask, spec: EnvironmentSpec) -> TrainSettings:
-    """Return the settings of a training. Raises ``ValueError`` if the algorithm is not installed."""
+    """Return the settings of a training task. Raises ``ValueError`` if the algorithm is not installed."""
     asked = TrainSettings(algorithm=task.algorithm, total_steps=task.steps, seed=task.seed)
     settings = with_algorithm(asked, spec)
     if task.preset != "quick":
@@ -77,9 +77,18 @@ def train(
 ) -> None:
     """Train a policy, and write it with its card.
 
+    Args:
+        api: the connection to the server.
+        port: the surrogate.
+        task: the training task.
+        out: file to write the policy to.
+        reporter: reports the progress.
+        gathered: receives the policy's file.
+
     Raises:
         KeyboardInterrupt: the training was stopped. If there was a policy by then, it is in ``gathered``.
-        ValueError, SurrogymClientError: as ``AuditedTraining``.
+        ValueError: the settings don't fit the search.
+        SurrogymClientError: the server can't be reached, or refuses a request.
     """
     name, spec = port.surrogate, port.spec()
 
@@ -116,13 +125,22 @@ def run_episodes(
     reporter: Reporter,
     gathered: Gathered,
 ) -> None:
-    """Run real episodes of a stored policy, and those of its comparisons. Then draw a video, if the task asks for one.
+    """Run real episodes of a stored policy, and those of its comparisons. Then draw a video, if the task requests one.
 
     The real steps are in ``gathered`` even if the episodes fail or are stopped.
 
+    Args:
+        api: the connection to the server.
+        surrogate: name of the surrogate.
+        task: the evaluation task.
+        environment: the original environment.
+        folder: folder for the policy's file and the video.
+        reporter: reports the progress.
+        gathered: receives evaluations, real steps and the video.
+
     Raises:
-        ValueError: the task has more episodes than the worker takes, or asks for a reference controller that it lacks.
-        PolicyMisfit: the environment is not that of the surrogate, whose policies learned for it; it was not reset.
+        ValueError: the task has more episodes than the worker allows, or requests a reference controller that it lacks.
+        PolicyMisfit: the environment is not the one that the surrogate's policies were trained for; it was not reset.
         UnusablePolicy: the file can't be read without running code in it.
         KeyboardInterrupt: the evaluation was stopped.
         EvaluationFailed: the environment or the policy raised an error after real steps.
@@ -163,7 +181,7 @@ def run_episodes(
 
 
 def _controllers(task: wire.EvaluateTask, environment: Environment, policy: Predict) -> dict[wire.Controller, Acting]:
-    """What chooses the actions, the policy first."""
+    """Return the controllers to run, by kind, the policy first."""
     controllers: dict[wire.Controller, Acting] = {"policy": policy}
     if task.compare is not None:
         controllers[task.compare] = baseline(environment.spec, task.compare)
@@ -177,12 +195,13 @@ def _controllers(task: wire.EvaluateTask, environment: Environment, policy: Pred
 def _filmed(
     environment: Environment, result: Evaluation, settings: EvaluationSettings, path: Path
 ) -> tuple[Path | None, str | None]:
-    """Write a video, and return its file, or the reason why there is none: it must not spoil an evaluation."""
+    """Write a video, and return its file, or the reason why it could not be made, because that must not fail an
+    evaluation."""
     try:
         video = record(environment.spec, environment.name, result, words_of(settings))
     except NotRenderable as error:
         return None, f"no video: {error}"
-    except Exception as error:  # one's own environment may raise anything when it is drawn
+    except Exception as error:  # a user's environment may raise anything when it is drawn
         return None, f"no video: {type(error).__name__}: {error}"
     file = path.with_name(f"{path.name}.{video.form}")
     file.write_bytes(video.content)
@@ -198,7 +217,7 @@ def _counted(
     gathered: Gathered,
     trained_for: EnvironmentSpec,
 ) -> Evaluation:
-    """Run the episodes of one controller, and note their real steps."""
+    """Run the episodes of one controller, and record their real steps in ``gathered``."""
 
     def note(steps: int, episodes: int, what: str) -> None:
         if steps:
@@ -221,10 +240,12 @@ def _counted(
 
 
 def _loaded(api: Api, surrogate: str, found: wire.PolicyDetail, folder: Path) -> Predict:
-    """Fetch a policy's file, and load it without unpickling anything."""
+    """Download a policy's file, and load it without unpickling anything."""
     forms: list[wire.PolicyForm] = [file.form for file in found.files if file.stored and file.form in ("zip", "onnx")]
     if not forms:
-        raise ValueError(f"{surrogate}@{found.version} has no file that can act: expected zip or onnx")
+        raise ValueError(
+            f"expected a stored zip or onnx file of {surrogate}@{found.version}, got none: push the policy again"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{surrogate}-{found.version}.{forms[0]}"
     path.write_bytes(api.policies.file(surrogate, found.version, forms[0]))

@@ -1,4 +1,4 @@
-"""Text about jobs."""
+"""Text about the tasks of jobs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from surrogym_shared.words import counted
 
 
 def words_of_task(task: wire.Task) -> str:
-    """Describe what a job asks for."""
+    """Return a sentence about the task of a job."""
     if isinstance(task, wire.TrainTask):
         steps = "" if task.steps is None else f", {task.steps} virtual steps"
         by = "" if task.algorithm is None else f" by {task.algorithm}"

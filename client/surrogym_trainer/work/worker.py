@@ -1,4 +1,4 @@
-"""The worker: claims jobs, runs them, and sends what they gave."""
+"""The worker: it claims jobs from the server, runs them, and sends their results."""
 
 from __future__ import annotations
 
@@ -31,7 +31,15 @@ __all__ = ["Environment", "Worker", "WorkerReport", "WorkerSettings"]
 
 @dataclass(frozen=True)
 class WorkerSettings:
-    """Settings of a worker. ``once``: stop after the first job."""
+    """Settings of a worker.
+
+    Attributes:
+        name: name of the worker.
+        folder: folder for policies and results that wait to be sent.
+        wait_seconds: seconds that a claim waits for a job.
+        lease_seconds: seconds for which a claimed job is reserved for this worker.
+        once: whether to stop after the first job.
+    """
 
     name: str = field(default_factory=worker_name)
     folder: Path = Path("work")
@@ -42,7 +50,7 @@ class WorkerSettings:
 
 @dataclass(frozen=True)
 class WorkerReport:
-    """Numbers of jobs by how they ended, as the worker knows it."""
+    """The numbers of jobs by how they ended."""
 
     done: int = 0
     failed: int = 0
@@ -50,21 +58,21 @@ class WorkerReport:
 
 
 class Worker:
-    """Runs the trainings and evaluations of one surrogate that people ask the server for.
+    """Runs the trainings and evaluations of one surrogate that people request from the server.
 
-    What a job asks for is numbers and words from fixed lists. The code is the worker's own, and so is the environment.
+    A job's task consists of numbers and of words from fixed lists. The code and the environment are the worker's own.
 
-    A policy is written to a file before it is sent. If the server is away, the worker waits for it, and sends the
-    result later, also after it was started again with the same folder.
+    A policy is written to a file before it is sent. If the server can't be reached, the worker waits for it, and sends
+    the result later, also after a restart with the same folder.
 
     Args:
-        api: the server.
+        api: the connection to the server.
         surrogate: name of the surrogate.
         settings: name, folder, and when to stop.
         environment: the original environment to evaluate in; None only trains.
-        token: bearer token of the sessions that policies learn in; default as of ``Api``.
+        token: access token of the sessions in which policies learn; the default is that of ``Api``.
         tell: called with a sentence about each job.
-        show: called with each new stand of a job.
+        show: called with the progress of a job each time it changes.
     """
 
     def __init__(
@@ -88,10 +96,10 @@ class Worker:
         self._counts: dict[wire.JobEnd, int] = {"done": 0, "failed": 0, "cancelled": 0}
 
     def run(self) -> WorkerReport:
-        """Run jobs until Ctrl-C, or the first one with ``once``.
+        """Run jobs until Ctrl-C, or only the first one with the setting ``once``.
 
         Raises:
-            ServerUnreachable, Unavailable: the server was away for longer than ``PATIENCE``.
+            ServerUnreachable, Unavailable: the server could not be reached for longer than ``PATIENCE``.
             UnknownSurrogate: the surrogate was deleted.
             KeyboardInterrupt: Ctrl-C was pressed. The best policy of a running training was kept, and sent if the
                 server answered.
@@ -104,11 +112,11 @@ class Worker:
                     return self.report()
 
     def report(self) -> WorkerReport:
-        """Return the numbers of jobs so far."""
+        """Return the numbers of jobs so far, by how they ended."""
         return WorkerReport(**self._counts)
 
     def _next(self) -> wire.LeasedJob | None:
-        """Send what waits, and claim the next job."""
+        """Send the results that wait in the folder, and claim the next job."""
         self._outbox.send(self._api)
         s = self._settings
         return self._api.jobs.claim(
@@ -132,7 +140,7 @@ class Worker:
             except KeyboardInterrupt:
                 stopped = not (reporter.cancelled or reporter.taken)
                 status, error = "cancelled", STOPPED if stopped else CANCELLED
-            except Exception as failure:  # a job that fails must not end the worker
+            except Exception as failure:  # a failing job must not end the worker
                 status, error = "failed", in_one_line(_words(failure))
             reporter.storing()
             self._hand_in(job, reporter, gathered, status, error)
@@ -180,14 +188,14 @@ class Worker:
         )
 
     def _send_once(self) -> None:
-        """Send what waits, without waiting for a server that is away."""
+        """Send the results that wait in the folder, without waiting for a server that can't be reached."""
         try:
             self._outbox.send(self._api)
         except AWAY as error:
             self._tell(f"the result waits in {self._settings.folder} for the next start of the worker: {error}")
 
     def _patiently(self, request: Callable[[], T]) -> T:
-        """Repeat a request until the server answers. Raises its error after ``PATIENCE``."""
+        """Repeat a request until the server answers. Raises the request's error after ``PATIENCE``."""
         delays: Iterator[float] = PATIENCE.delays()
         while True:
             try:
@@ -200,7 +208,7 @@ class Worker:
 
 
 def _words(error: Exception) -> str:
-    """Describe why a job failed, as a command would."""
+    """Return why a job failed, as a command would print it."""
     match error:
         case ModuleNotFoundError(name=str(name)):
             return missing(name.partition(".")[0]) or str(error)

@@ -1,1 +1,1 @@
-"""Policy search by the algorithms of Stable-Baselines3; needs torch."""
+"""Policy search by the algorithms of Stable-Baselines3, which needs torch."""

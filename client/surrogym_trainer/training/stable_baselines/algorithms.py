@@ -18,7 +18,8 @@ from surrogym_trainer.training.stable_baselines.search import StableBaselinesSea
 
 
 class OnPolicySearch(StableBaselinesSearch):
-    """Policy search by an on-policy algorithm: many lanes, and the paper's policy networks."""
+    """Policy search by an on-policy algorithm, with many lanes (environments that step together) and the paper's policy
+    networks."""
 
     suggested_steps = 600_000
     lanes = LANES
@@ -29,8 +30,8 @@ class OnPolicySearch(StableBaselinesSearch):
 
 
 class OffPolicySearch(StableBaselinesSearch):
-    """Policy search by an off-policy algorithm. It updates after each step of all lanes, so each step takes far
-    longer."""
+    """Policy search by an off-policy algorithm. It updates after each step of all lanes, so each step takes far longer
+    than with an on-policy algorithm."""
 
     suggested_steps = 50_000
     lanes = 4
@@ -38,7 +39,8 @@ class OffPolicySearch(StableBaselinesSearch):
 
 
 class PPO(OnPolicySearch):
-    """PPO with large batches and a decreasing learning rate: lab/records/decisions/0011."""
+    """Policy search by PPO, with large batches and a decreasing learning rate; lab/records/decisions/0011 has the
+    reasons."""
 
     algorithm = stable_baselines3.PPO
 
@@ -55,30 +57,30 @@ class PPO(OnPolicySearch):
 
 
 class A2C(OnPolicySearch):
-    """A2C of Stable-Baselines3."""
+    """Policy search by A2C of Stable-Baselines3."""
 
     algorithm = stable_baselines3.A2C
 
 
 class SAC(OffPolicySearch):
-    """SAC of Stable-Baselines3."""
+    """Policy search by SAC of Stable-Baselines3."""
 
     algorithm = stable_baselines3.SAC
 
 
 class TD3(OffPolicySearch):
-    """TD3 of Stable-Baselines3."""
+    """Policy search by TD3 of Stable-Baselines3."""
 
     algorithm = stable_baselines3.TD3
 
 
 class DDPG(OffPolicySearch):
-    """DDPG of Stable-Baselines3."""
+    """Policy search by DDPG of Stable-Baselines3."""
 
     algorithm = stable_baselines3.DDPG
 
 
 class DQN(OffPolicySearch):
-    """DQN of Stable-Baselines3."""
+    """Policy search by DQN of Stable-Baselines3."""
 
     algorithm = stable_baselines3.DQN

@@ -1,4 +1,4 @@
-"""Checks of a training by imagined return, as a callback of Stable-Baselines3."""
+"""A callback of Stable-Baselines3 that checks a training by the policy's imagined return."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Checking(BaseCallback):
         total: virtual steps of the training.
         progress: called after every rollout.
         imagine: measures a learner's returns in virtual episodes.
-        untrained: a learner that has learned nothing yet.
+        untrained: a learner with an untrained network.
     """
 
     def __init__(
@@ -36,11 +36,11 @@ class Checking(BaseCallback):
         self._total, self._progress, self._imagine = total, progress, imagine
         self.checks = Checks(imagine(untrained))
         self._kept: tuple[BaseAlgorithm, dict[str, Any]] | None = (
-            None  # the best learner, and its parameters at that check
+            None  # the best learner, and its parameters at the check
         )
         self._penalty = self._size = 0.0
-        self._penalties: deque[float] = deque(maxlen=100)  # of the last episodes
-        self._checked = 0  # checks that were due
+        self._penalties: deque[float] = deque(maxlen=100)  # penalties of the last episodes
+        self._checked = 0  # number of checks that were due so far
         self.steps = self.lost = 0
 
     @property
@@ -55,7 +55,7 @@ class Checking(BaseCallback):
     def best_of(self, last: BaseAlgorithm) -> BaseAlgorithm:
         """Return the learner with the best imagined return of all checks, with its parameters of that check.
 
-        Without any check, the last learner is returned.
+        If there was no check, the last learner is returned.
         """
         if self._kept is None:
             return last

@@ -1,4 +1,4 @@
-"""Training by an algorithm of Stable-Baselines3, for a fixed number of steps. The best policy of its checks is kept."""
+"""Training by an algorithm of Stable-Baselines3, for a fixed number of steps. The best policy of all checks is kept."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from surrogym_trainer.training.settings import TrainSettings
 from surrogym_trainer.training.stable_baselines.callback import Checking
 from surrogym_trainer.training.stable_baselines.tracking import tracking
 
-Statistics = tuple[Sequence[float], Sequence[float]]  # mean and deviation of observations, (D,) each
+Statistics = tuple[Sequence[float], Sequence[float]]  # mean and standard deviation of observations, (D,) each
 
 
 @dataclass(frozen=True)
 class LearnedPolicy:
-    """Policy of a Stable-Baselines3 algorithm."""
+    """A policy of a Stable-Baselines3 algorithm, which can be saved."""
 
     learner: BaseAlgorithm
 
@@ -45,8 +45,8 @@ class LearnedPolicy:
 
 
 class StableBaselinesSearch(PolicySearch):
-    """Policy search by one algorithm. Its hyperparameters go to the algorithm's constructor and replace its
-    defaults."""
+    """Policy search by one algorithm of Stable-Baselines3. Its hyperparameters are passed to the algorithm's
+    constructor and replace its defaults."""
 
     algorithm: ClassVar[type[BaseAlgorithm]]
     policy: ClassVar[type[BasePolicy] | str]
@@ -67,7 +67,7 @@ class StableBaselinesSearch(PolicySearch):
         learner = load_learner(policy, algorithm)
         if learner.use_sde:
             noisy: Any = learner.policy
-            noisy.reset_noise(num_envs)  # each lane explores its own way
+            noisy.reset_noise(num_envs)  # each lane has exploration noise of its own
         return lambda observation: learner.predict(observation, deterministic=False)[0]
 
     def defaults(self, env: VecNormalize) -> dict[str, Any]:  # noqa: ARG002  for algorithms that have some
@@ -91,7 +91,7 @@ class StableBaselinesSearch(PolicySearch):
 
 
 class _Training:
-    """One network, and the checks of its policy."""
+    """A training of one network, with the checks of its policy."""
 
     def __init__(self, search: StableBaselinesSearch, task: SearchTask, env: VecNormalize, gamma: float) -> None:
         self._search, self._task, self._env, self._gamma = search, task, env, gamma
@@ -105,12 +105,12 @@ class _Training:
             self._total, task.progress, lambda learner: imagined_returns_of(task.port, learner, settings), new
         )
         if saved is not None:
-            self._checking.check(saved)  # stays the best if training does not earn as much
+            self._checking.check(saved)  # the saved policy stays the best if the training does not exceed it
 
     def run(self) -> Found:
         """Train until the steps are taken, or Ctrl-C is pressed."""
         checking, whole = self._checking, True
-        if self._learner.tensorboard_log is None:  # otherwise a temporary folder is made
+        if self._learner.tensorboard_log is None:  # without a logger, Stable-Baselines3 would make a temporary folder
             self._learner.set_logger(Logger(folder=None, output_formats=[]))
         with tracking(self._task.settings, self._task.out) as callbacks:
             try:
@@ -146,6 +146,14 @@ def make_learner(
 ) -> BaseAlgorithm:
     """Make a new network, or load the policy of ``settings.start_from``.
 
+    Args:
+        search: the policy search.
+        env: the virtual environment to learn in.
+        settings: settings of the training.
+        spec: specification of the environment.
+        statistics: mean and standard deviation of observations, (D,) each.
+        gamma: discount factor.
+
     Raises:
         ValueError: the algorithm does not support this surrogate.
         UnusablePolicy: the saved policy can't be read, or does not fit the surrogate.
@@ -172,11 +180,14 @@ def make_learner(
             **({"gamma": gamma} | search.defaults(env) | settings.hyperparameters),
         )
     except (AssertionError, TypeError) as error:
-        raise ValueError(f"{settings.algorithm} can't be trained here: {error}") from error
+        raise ValueError(
+            f"algorithm {settings.algorithm} can't be trained in this surrogate: {error}; choose another algorithm"
+        ) from error
 
 
 def imagined_returns_of(port: SurrogatePort, learner: BaseAlgorithm, settings: TrainSettings) -> Returns:
-    """Return the returns of the present policy without exploration, from the same starts at every check."""
+    """Return the returns of the current policy in virtual episodes without exploration, from the same starts at every
+    check."""
 
     def predict(observation: Any) -> Any:
         return learner.predict(observation, deterministic=True)[0]
@@ -185,7 +196,7 @@ def imagined_returns_of(port: SurrogatePort, learner: BaseAlgorithm, settings: T
 
 
 def effective(learner: BaseAlgorithm) -> dict[str, Any]:
-    """Return the algorithm's settings that are numbers or text, defaults included, and those of the network."""
+    """Return the algorithm's settings that are numbers or text, including defaults, and those of the network."""
     names = inspect.signature(type(learner).__init__).parameters
     given = {name: getattr(learner, name, None) for name in names if name not in ("self", "seed", "verbose")}
     plain = {name: value for name, value in given.items() if isinstance(value, bool | int | float | str)}
@@ -193,6 +204,6 @@ def effective(learner: BaseAlgorithm) -> dict[str, Any]:
 
 
 def _whole_rollouts(learner: BaseAlgorithm, total: int) -> int:
-    """Round the steps down to whole rollouts, at least one. Stable-Baselines3 would round up."""
+    """Round a number of steps down to whole rollouts, at least one. Stable-Baselines3 would round up."""
     rollout = learner.n_envs * (learner.n_steps if isinstance(learner, OnPolicyAlgorithm) else 1)
     return max(total // rollout, 1) * rollout
