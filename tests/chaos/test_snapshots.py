@@ -71,7 +71,7 @@ def test_two_samplers_that_drop_each_others_snapshots_lose_no_sample(
             require_true(api, name, notes, RACE_BUDGET)
             require_no_dead_snapshots(api, name, folder)
             assert (notes.begun, ledger.unresolved) == (ledger.total, 0)
-            assert all("it was dropped" in error for outcome, error in notes.said if outcome != "answered")
+            assert all("it was deleted" in error for outcome, error in notes.said if outcome != "answered")
             errors = {error for outcome, error in notes.said if outcome == "answered" and error}
             assert all("that the server knew" in error for error in errors), "no rollout is cut short"
             for outcome, _ in notes.said:

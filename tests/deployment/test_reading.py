@@ -170,14 +170,14 @@ def test_a_controller_keeps_the_normalisation_and_clipping_of_vecnormalize(tmp_p
 def test_deployment_options_that_do_not_fit_the_policy_are_refused(tmp_path: Path):
     path = network(tmp_path, plant())
     for wrong, words in [
-        (Choices(fallback=(0.0,)), "fallback of 2 entries"),
+        (Choices(fallback=(0.0,)), "--fallback: expected 2 entries"),
         (Choices(fallback=(0.0, 11.0)), r"got \[0.0, 11.0\]"),
-        (Choices(timeout=0.0), "a timeout of 1e-06 s"),
+        (Choices(timeout=0.0), "--timeout: expected 1e-06 s"),
         (Choices(ranges={"speed": (0.0, 1.0)}), r"angle, slide, target\), got speed"),
-        (Choices(ranges={"slide": (1.0, 1.0)}), "that rises, .* got 1 to 1"),
+        (Choices(ranges={"slide": (1.0, 1.0)}), "range of slide: .* got 1 to 1"),
         (Choices(ranges={"slide": (0.0, np.inf)}), "range of slide: .* got 0 to inf"),
         (Choices(ranges={"slide": (0.0, 1e39)}), r"within -1e\+37 to 1e\+37, got 0 to 1e\+39"),
-        (Choices(timeout=1e38), r"a timeout of 1e-06 s to 1e\+37 s, got 1e\+38"),
+        (Choices(timeout=1e38), r"--timeout: expected 1e-06 s to 1e\+37 s, got 1e\+38"),
         (Choices(period=1e-9), r"a period of 1e-06 s"),
     ]:
         with pytest.raises(NotDeployable, match=words):

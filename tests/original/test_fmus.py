@@ -172,7 +172,7 @@ def test_states_kept_in_memory_are_lost_with_their_process(tanks: Path, tmp_path
         one.step(np.ones(1))
         one.go_back(snapshot)
         assert bits(one.read()) == bits(at)
-        with pytest.raises(StepFailed, match="no longer in memory"):
+        with pytest.raises(StepFailed, match="dropped from memory"):
             other.go_back(snapshot)
     finally:
         one.close()

@@ -56,7 +56,7 @@ def test_broken_files_are_named(tanks: Path, tmp_path: Path) -> None:
     (tmp_path / "broken.fmu").write_bytes(flipped)
     with pytest.raises(UnknownEnvironment, match="is damaged: copy or export"):
         open_simulator(f"fmu:{tmp_path / 'broken.fmu'}")
-    with pytest.raises(UnknownEnvironment, match="got no file"):
+    with pytest.raises(UnknownEnvironment, match="which does not exist"):
         open_simulator(f"fmu:{tmp_path / 'none.fmu'}")
 
 

@@ -125,7 +125,7 @@ def test_lags_that_the_class_reads_itself_are_refused():
         def coordinates(self, observation):
             return [observation[0], 0, 0, 0, 0]
 
-    with pytest.raises(StepFailed, match=r"coordinates \(x\), got an array of shape \(5,\)"):
+    with pytest.raises(StepFailed, match=r"to return \(x\), got an array of shape \(5,\)"):
         answering(Reads()).begin()
 
 

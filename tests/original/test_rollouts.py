@@ -72,7 +72,7 @@ def test_a_reset_that_is_not_gymnasiums_and_coordinates_of_the_wrong_size_say_so
 
     with pytest.raises(StepFailed, match=r"reset to return \(observation, info\), got a ndarray"):
         answering(Old()).begin()
-    with pytest.raises(StepFailed, match=r"coordinates \(x\), got an array of shape \(2,\)"):
+    with pytest.raises(StepFailed, match=r"to return \(x\), got an array of shape \(2,\)"):
         answering(Wide()).begin()
 
 

@@ -152,7 +152,7 @@ def test_a_rollout_is_checked_whole_before_its_first_step():
     for actions, why in (([[1.0]] * 21, "1 to 20 actions, got 21"), ([], "got 0"), ([[0.0], [9.0]], "got 9")):
         with pytest.raises(QueryRefused, match=why):
             check_query(RAIL, rollout(actions))
-    with pytest.raises(QueryRefused, match="expected a rollout query, got a step query"):
+    with pytest.raises(QueryRefused, match=r"expected a rollout query, .* got a step query"):
         check_query(RAIL, step([0.0], [0.0]))
 
 

@@ -227,8 +227,8 @@ def test_dqn_takes_one_discrete_action_and_sac_none(tmp_path: Path):
     [
         ({"algorithm": "DreamerV9"}, r"algorithm: expected one of .*PPO.*, got 'DreamerV9'"),
         ({"algorithm": "VecEnv"}, "got 'VecEnv'"),
-        ({"algorithm": "DQN"}, "DQN can't be trained here"),
-        ({"hyperparameters": {"learning_speed": 1}}, "PPO can't be trained here"),
+        ({"algorithm": "DQN"}, "DQN can't be trained in this surrogate"),
+        ({"hyperparameters": {"learning_speed": 1}}, "PPO can't be trained in this surrogate"),
         ({"total_steps": 0}, f"expected 1 to {MAX_STEPS}, got 0"),
         ({"total_steps": MAX_STEPS + 1}, f"expected 1 to {MAX_STEPS}, got {MAX_STEPS + 1}"),
     ],

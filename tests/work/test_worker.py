@@ -130,7 +130,7 @@ def test_an_evaluation_takes_a_reference_controller_and_draws_a_video(api: Api, 
 def test_a_job_that_fails_says_why_and_the_worker_goes_on(api: Api, run_one):
     job = run_one(SHORT.model_copy(update={"algorithm": "dqn"}))
     assert job.status == "failed"
-    assert "can't be trained here" in (job.error or "")
+    assert "can't be trained in this surrogate" in (job.error or "")
     version = api.policies.push(NAME, wire.PushedCard(), [], "zip", network_file(seed=4)).version
 
     def broken() -> GymnasiumEpisode:
